@@ -1,0 +1,98 @@
+# perilune: datasets, networks and their explanation. `make help` lists the targets.
+PYTHON ?= python3.11
+PRESET ?= small
+KIND ?= both
+VENV := .venv
+BIN := $(VENV)/bin
+
+# OUT moves what the target makes: datasets for `make dataset`, runs for the others.
+DATA := data/$(PRESET)
+RUNS := runs
+ifneq ($(OUT),)
+  ifneq ($(filter dataset,$(MAKECMDGOALS)),)
+    DATA := $(OUT)
+  else
+    RUNS := $(OUT)
+  endif
+endif
+
+COMMON := --preset $(PRESET) $(if $(CONFIG),--config $(CONFIG)) $(foreach setting,$(SET),--set $(setting))
+TRAIN := $(COMMON) --runs $(RUNS) --name $(NAME)
+NAME ?= $(PRESET)
+RENDER = $(BIN)/perilune-render dataset $(COMMON) $(if $(DEM),--dem $(DEM)) --out $(DATA)
+
+DETECT := $(RUNS)/detect/$(NAME)/metrics.json
+NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
+EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
+	@echo
+	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  KIND=detect|nav  NAME=run'
+
+setup: $(VENV)/.ready ## make the environment (.venv) with everything in it
+
+$(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pyproject.toml train/pyproject.toml scripts/system-libraries
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is not here: Blender's module needs Python 3.11 (sudo apt-get install -y python3.11 python3.11-venv)" >&2; exit 2; }
+	@scripts/system-libraries
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@echo "installing into $(VENV) (some minutes the first time)"
+	@$(BIN)/python -m pip install -q -c constraints.txt setuptools wheel torch
+	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e train -r requirements-dev.txt
+	@touch $@
+
+demo: setup ## everything: set-up, datasets, detection, navigation, explanation (PRESET=small)
+	@$(MAKE) --no-print-directory train-detect
+	@$(MAKE) --no-print-directory train-nav
+	@$(MAKE) --no-print-directory explain
+	@echo
+	@echo "Datasets    $(DATA)/detect  $(DATA)/nav           pictures: overview.png"
+	@echo "Detection   $(RUNS)/detect/$(NAME)                metrics.json, *.png, detections.parquet"
+	@echo "Navigation  $(RUNS)/navigate/$(NAME)[-stack]      metrics.json, *.png, navigation.parquet"
+	@echo "Explanation $(RUNS)/explain/$(NAME)               metrics.json, *.png, correlations.parquet"
+
+dataset: setup ## render the preset's datasets (KIND=detect|nav for one); goes on where it was stopped
+	@$(RENDER) --kind $(KIND)
+
+$(DATA)/%/dataset.json: | setup
+	@$(RENDER) --kind $*
+
+# A dataset.json may be that of a stopped rendering: the command itself finds out and goes on.
+.PHONY: detect-frames nav-frames
+detect-frames: setup
+	@grep -qs '"complete": true' $(DATA)/detect/dataset.json || $(RENDER) --kind detect
+nav-frames: setup
+	@grep -qs '"complete": true' $(DATA)/nav/dataset.json || $(RENDER) --kind nav
+
+train-detect: detect-frames ## train and evaluate crater detection
+	@test -f $(DETECT) && echo "$(DETECT) is there; remove its folder to train again" || \
+	  $(BIN)/perilune-train detect $(TRAIN) --dataset $(DATA)/detect --resume
+
+train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
+	@$(BIN)/perilune-train detect $(COMMON) --set detect.attention=none --runs $(RUNS) --name $(NAME)-none --dataset $(DATA)/detect --resume
+
+train-nav: nav-frames ## train and evaluate navigation (warp and stack)
+	@test -f $(DETECT) || $(MAKE) --no-print-directory train-detect
+	@test -f $(NAVIGATE) && test -f $(RUNS)/navigate/$(NAME)-stack/metrics.json && echo "$(NAVIGATE) is there; remove its folder to train again" || \
+	  $(BIN)/perilune-train navigate $(TRAIN) --dataset $(DATA)/nav --resume
+
+explain: ## attention masks and correlations of the trained networks
+	@test -f $(NAVIGATE) -a -f $(DETECT) || $(MAKE) --no-print-directory train-nav
+	@test -f $(EXPLAIN) && echo "$(EXPLAIN) is there; remove its folder to explain again" || \
+	  $(BIN)/perilune-train explain $(TRAIN) --data $(DATA)
+
+test: setup ## run all tests
+	@$(BIN)/python -m pytest
+
+lint: setup ## ruff and mypy
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train
+
+bench-render: setup ## time of a frame against a bare Blender loop; writes runs/bench/render.json
+	@$(BIN)/python benchmarks/render.py
+
+clean: ## remove the environment; data and runs stay
+	rm -rf $(VENV)

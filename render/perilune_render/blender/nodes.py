@@ -1,0 +1,69 @@
+"""Arithmetic that builds shader nodes: the same Python formula that computes with NumPy arrays draws the shader.
+
+A `Symbol` answers operators and NumPy's ufuncs by adding a Math node to the tree.
+"""
+
+import numbers
+from typing import Any
+
+import bpy
+import numpy as np
+
+_OPERATIONS = {
+    np.add: "ADD",
+    np.subtract: "SUBTRACT",
+    np.multiply: "MULTIPLY",
+    np.true_divide: "DIVIDE",
+    np.power: "POWER",
+    np.maximum: "MAXIMUM",
+    np.minimum: "MINIMUM",
+    np.sqrt: "SQRT",
+    np.exp: "EXPONENT",
+    np.arccos: "ARCCOSINE",
+    np.cos: "COSINE",
+    np.sin: "SINE",
+    np.tan: "TANGENT",
+    np.arctan: "ARCTANGENT",
+    np.absolute: "ABSOLUTE",
+}
+
+
+class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
+    """A float value inside a shader: the output socket of a node."""
+
+    def __init__(self, tree: bpy.types.NodeTree, socket: bpy.types.NodeSocket):
+        self.tree = tree
+        self.socket = socket
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> "Symbol":
+        if method != "__call__" or kwargs or ufunc not in _OPERATIONS:
+            return NotImplemented
+        node = self.tree.nodes.new("ShaderNodeMath")
+        node.operation = _OPERATIONS[ufunc]
+        for place, value in zip(node.inputs, inputs, strict=False):
+            if isinstance(value, Symbol):
+                self.tree.links.new(value.socket, place)
+            elif isinstance(value, numbers.Real):
+                place.default_value = float(value)
+            else:
+                return NotImplemented
+        return Symbol(self.tree, node.outputs[0])
+
+
+def at_least(value: Symbol, least: float) -> Symbol:
+    """The larger of a symbol and a number (np.maximum, whose type hints know arrays only)."""
+    return value.__array_ufunc__(np.maximum, "__call__", value, least)
+
+
+def dot(
+    tree: bpy.types.NodeTree, first: bpy.types.NodeSocket, second: bpy.types.NodeSocket | tuple[float, ...]
+) -> Symbol:
+    """Dot product of two vectors, the second of which may be a constant."""
+    node = tree.nodes.new("ShaderNodeVectorMath")
+    node.operation = "DOT_PRODUCT"
+    tree.links.new(first, node.inputs[0])
+    if isinstance(second, bpy.types.NodeSocket):
+        tree.links.new(second, node.inputs[1])
+    else:
+        node.inputs[1].default_value = second
+    return Symbol(tree, node.outputs["Value"])

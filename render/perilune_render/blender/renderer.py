@@ -1,0 +1,118 @@
+"""Cycles on the CPU: settings, and one frame at a time through a temporary EXR."""
+
+import errno
+import os
+import tempfile
+from pathlib import Path
+from types import TracebackType
+
+import bpy
+import numpy as np
+
+from perilune_render.blender import stage as blender_stage
+from perilune_render.config import DatasetConfig
+from perilune_render.exr import Radiance, read_exr
+from perilune_render.terrain.scene import Scene
+from perilune_shared.camera import Camera
+from perilune_shared.errors import UserError
+from perilune_shared.frames import Array
+
+BLENDER_VERSION: str = bpy.app.version_string
+_FAR_M = 1e9
+
+
+class Renderer:
+    """Renders frames of one scene. A context manager, since it keeps a temporary folder."""
+
+    def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array):
+        self.stage = blender_stage.build(scene, config, camera, sun)
+        configure(self.stage, camera, config.render.samples, config.render.threads)
+        self._folder = tempfile.TemporaryDirectory(prefix="perilune-")
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._folder.cleanup()
+
+    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0) -> Radiance:
+        """One frame as the radiance factor averaged over each pixel, with depth and normal of one point in it."""
+        blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
+        self.stage.cycles.seed = seed & 0x7FFFFFFF
+        path = Path(self._folder.name) / "frame.exr"
+        self.stage.render.filepath = str(path)
+        path.unlink(missing_ok=True)
+        try:
+            with _quiet():
+                bpy.ops.render.render(write_still=True)
+            return _radiance(path)
+        except (UserError, RuntimeError) as error:
+            # Blender tells of a failed write only in its log; the file is then missing or cut.
+            raise OSError(errno.ENOSPC, f"Blender could not write a frame ({error})", str(path.parent)) from None
+
+
+def configure(stage: bpy.types.Scene, camera: Camera, samples: int, threads: int) -> None:
+    """Direct Sunlight alone, linear float32 output, the acceleration structure kept from frame to frame."""
+    render, cycles = stage.render, stage.cycles
+    render.engine = "CYCLES"
+    render.resolution_x, render.resolution_y, render.resolution_percentage = (
+        camera.width_px,
+        camera.height_px,
+        100,
+    )
+    render.pixel_aspect_x, render.pixel_aspect_y = _pixel_aspect(camera)
+    render.use_persistent_data = True
+    render.use_file_extension = False
+    render.threads_mode = "FIXED" if threads else "AUTO"
+    if threads:
+        render.threads = threads
+    render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
+    render.image_settings.color_depth = "32"
+    render.image_settings.exr_codec = "NONE"
+    render.film_transparent = False
+    cycles.device = "CPU"
+    cycles.samples = samples
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = False
+    cycles.max_bounces = 0
+    cycles.use_light_tree = False
+    # Cycles would drop faint contributions at random: below 0.01 that is most of the Moon at low Sun.
+    cycles.light_sampling_threshold = 0.0
+    cycles.pixel_filter_type = "BOX"
+    # A box of one pixel: the sensor's own point spread is laid on afterwards.
+    cycles.filter_width = 1.0
+    stage.view_settings.view_transform = "Raw"
+    layer = stage.view_layers[0]
+    layer.use_pass_z = True
+    layer.use_pass_normal = True
+
+
+def _pixel_aspect(camera: Camera) -> tuple[float, float]:
+    ratio = camera.fx_px / camera.fy_px
+    return (1.0, ratio) if ratio >= 1 else (1.0 / ratio, 1.0)
+
+
+def _radiance(path: Path) -> Radiance:
+    channels = read_exr(path)
+    by_pass = {name.split(".", 1)[1]: pixels for name, pixels in channels.items() if "." in name}
+    depth = by_pass["Depth.Z"].astype(np.float32)
+    # Normals are averaged over the pixel's samples, which shortens them at edges; the sky has none.
+    normal = np.stack([by_pass[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    return Radiance(by_pass["Combined.R"], np.where(depth > _FAR_M, np.float32(np.inf), depth), normal)
+
+
+class _quiet:
+    """Send Blender's own chatter on file descriptor 1 to nowhere."""
+
+    def __enter__(self) -> None:
+        self._saved = os.dup(1)
+        sink = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(sink, 1)
+        os.close(sink)
+
+    def __exit__(self, *_: object) -> None:
+        os.dup2(self._saved, 1)
+        os.close(self._saved)

@@ -1,0 +1,141 @@
+"""A scene on Blender's stage: ground, boulders, Sun, camera, materials."""
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Quaternion
+
+from perilune_render.blender.nodes import Symbol, at_least, dot
+from perilune_render.config import DatasetConfig
+from perilune_render.photometry import radiance_factor
+from perilune_render.terrain.boulders import rock
+from perilune_render.terrain.mesh import quads, vertices
+from perilune_render.terrain.scene import Scene
+from perilune_shared.camera import Camera
+from perilune_shared.frames import Array
+
+_BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
+"""Blender's camera has y up and looks along -z."""
+
+
+def clear() -> bpy.types.Scene:
+    """An empty file, with nothing of the last scene left in memory."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return bpy.context.scene
+
+
+def build(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> bpy.types.Scene:
+    """Build a scene with its Sun in the direction `sun` (3,) of O_L; the camera is placed by `aim`."""
+    stage = clear()
+    stage.world = bpy.data.worlds.new("sky")
+    stage.world.use_nodes = True
+    stage.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0
+    ground = ground_object(scene)
+    ground.data.materials.append(surface_material("ground", config.light.photometry, sun, albedo_attribute="albedo"))
+    stage.collection.objects.link(ground)
+    stone = surface_material("rock", config.light.photometry, sun)
+    for item in boulder_objects(scene, stone):
+        stage.collection.objects.link(item)
+    stage.collection.objects.link(sun_object(sun, config.light.sun_angular_diameter_deg))
+    stage.camera = camera_object(camera)
+    stage.collection.objects.link(stage.camera)
+    return stage
+
+
+def mesh_from_arrays(name: str, points: np.ndarray, faces: np.ndarray) -> bpy.types.Mesh:
+    """A mesh from vertices (V, 3) and faces (F, k), without a Python loop."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(points))
+    mesh.vertices.foreach_set("co", np.ascontiguousarray(points, np.float32).ravel())
+    mesh.loops.add(faces.size)
+    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, faces.shape[1], dtype=np.int32))
+    mesh.update(calc_edges=True)
+    return mesh
+
+
+def ground_object(scene: Scene) -> bpy.types.Object:
+    """The height field as one smooth mesh with its albedo as a vertex attribute."""
+    mesh = mesh_from_arrays("ground", vertices(scene), quads(scene.height_m.shape[0]))
+    albedo = mesh.attributes.new("albedo", "FLOAT", "POINT")
+    albedo.data.foreach_set("value", np.ascontiguousarray(scene.albedo, np.float32).ravel())
+    return bpy.data.objects.new("ground", mesh)
+
+
+def boulder_objects(scene: Scene, material: bpy.types.Material) -> list[bpy.types.Object]:
+    """Every boulder as an instance of one of the scene's rocks."""
+    shapes = {}
+    for shape_id in np.unique(scene.boulders.shape_id):
+        solid = rock(int(shape_id), scene.seed)
+        mesh = mesh_from_arrays(f"rock {shape_id}", solid.vertices, solid.faces)
+        mesh.shade_flat()
+        mesh.materials.append(material)
+        shapes[int(shape_id)] = mesh
+    objects = []
+    for k in range(len(scene.boulders)):
+        item = bpy.data.objects.new(f"boulder {k}", shapes[int(scene.boulders.shape_id[k])])
+        place = (scene.boulders.x_m[k], scene.boulders.y_m[k], scene.boulder_z_m[k])
+        item.matrix_world = Matrix.LocRotScale(
+            place, Quaternion(scene.boulders.rotation_wxyz[k]), [scene.boulders.diameter_m[k]] * 3
+        )
+        objects.append(item)
+    return objects
+
+
+def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | None = None) -> bpy.types.Material:
+    """A material whose radiance under `sun_object` is the radiance factor of a law.
+
+    Cycles multiplies a diffuse colour by mu0 / pi and by the Sun's irradiance, here pi: the colour that gives the
+    radiance I/F is therefore I/F over mu0, evaluated at the shading point.
+    """
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    geometry = tree.nodes.new("ShaderNodeNewGeometry")
+    mu0 = at_least(dot(tree, geometry.outputs["Normal"], tuple(sun)), 1e-4)
+    mu = at_least(dot(tree, geometry.outputs["Normal"], geometry.outputs["Incoming"]), 1e-4)
+    cos_phase = dot(tree, geometry.outputs["Incoming"], tuple(sun))
+    colour = radiance_factor(law, mu0, mu, cos_phase) / mu0
+    if albedo_attribute is not None:
+        attribute = tree.nodes.new("ShaderNodeAttribute")
+        attribute.attribute_name = albedo_attribute
+        colour = colour * Symbol(tree, attribute.outputs["Fac"])
+    diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(colour.socket, diffuse.inputs["Color"])
+    tree.links.new(diffuse.outputs["BSDF"], output.inputs["Surface"])
+    return material
+
+
+def sun_object(sun: Array, angular_diameter_deg: float) -> bpy.types.Object:
+    """The Sun with irradiance pi, so that radiance is the radiance factor."""
+    lamp = bpy.data.lights.new("Sun", "SUN")
+    lamp.energy = np.pi
+    lamp.angle = np.radians(angular_diameter_deg)
+    item = bpy.data.objects.new("Sun", lamp)
+    helper = np.array([1.0, 0, 0]) if abs(sun[0]) < 0.9 else np.array([0, 1.0, 0])
+    x = np.cross(helper, sun)
+    x /= np.linalg.norm(x)
+    item.matrix_world = Matrix(np.stack([x, np.cross(sun, x), sun], axis=1).tolist()).to_4x4()
+    return item
+
+
+def camera_object(camera: Camera) -> bpy.types.Object:
+    """The camera's intrinsics."""
+    lens = bpy.data.cameras.new("camera")
+    lens.sensor_fit = "HORIZONTAL"
+    lens.sensor_width = 36.0
+    lens.lens = camera.fx_px / camera.width_px * 36.0
+    lens.shift_x = (camera.width_px / 2 - camera.cx_px) / camera.width_px
+    lens.shift_y = (camera.cy_px - camera.height_px / 2) / camera.width_px * camera.fx_px / camera.fy_px
+    lens.clip_start, lens.clip_end = 0.1, 100_000.0
+    return bpy.data.objects.new("camera", lens)
+
+
+def aim(stage: bpy.types.Scene, position_m: Array, rotation_camera_from_site: Array) -> None:
+    """Place the camera."""
+    rotation_site_from_blender = rotation_camera_from_site.T @ _BLENDER_FROM_OPENCV.T
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_site_from_blender, position_m
+    stage.camera.matrix_world = Matrix(matrix.tolist())

@@ -1,0 +1,131 @@
+"""`perilune-render`: datasets, previews and meshes from a configuration."""
+
+import enum
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+
+from perilune_render.config import DatasetConfig
+from perilune_render.plan import make_plan
+from perilune_shared.config import resolve
+from perilune_shared.errors import run_command_line
+from perilune_shared.progress import progress_bar
+
+app = typer.Typer(
+    help="Grow lunar terrain, fly descents over it and render labelled frames with Blender.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+
+class Kind(enum.StrEnum):
+    """Which of a preset's datasets."""
+
+    DETECT = "detect"
+    NAV = "nav"
+    BOTH = "both"
+
+
+Preset = Annotated[
+    str,
+    typer.Option(
+        help="tiny (seconds, for tests), small (minutes), paper (the paper's protocol), large (343 terrains)."
+    ),
+]
+Config = Annotated[Path | None, typer.Option(help="YAML file whose section `dataset` overrides the preset.")]
+Setting = Annotated[
+    list[str] | None, typer.Option("--set", help="One setting, as dataset.key.key=value; may be repeated.")
+]
+Dem = Annotated[
+    Path | None,
+    typer.Option(help="GeoTIFF elevation model as the base; craters below its resolution are added."),
+]
+
+
+def _first(kind: Kind) -> Literal["detect", "nav"]:
+    return "nav" if kind is Kind.NAV else "detect"
+
+
+def _resolve(preset: str, config: Path | None, setting: list[str] | None, dem: Path | None) -> DatasetConfig:
+    resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
+    if dem is None:
+        return resolved
+    return resolved.model_copy(update={"terrain": resolved.terrain.model_copy(update={"dem": str(dem)})})
+
+
+@app.command()
+def dataset(
+    preset: Preset = "small",
+    config: Config = None,
+    setting: Setting = None,
+    dem: Dem = None,
+    kind: Annotated[Kind, typer.Option(help="Crater detection, navigation, or both.")] = Kind.BOTH,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the datasets `detect` and `nav`; data/<preset> unless given."),
+    ] = None,
+) -> None:
+    """Render a preset's datasets. Stopped at any moment, the same command goes on where it was."""
+    resolved = _resolve(preset, config, setting, dem)
+    folder = out or Path("data") / preset
+    from perilune_render.dataset import (
+        make_dataset,
+    )  # Blender is loaded only once the settings are known to be right.
+
+    names: tuple[Literal["detect", "nav"], ...] = ("detect", "nav")
+    for name in names if kind is Kind.BOTH else (_first(kind),):
+        with progress_bar() as progress:
+            made = make_dataset(resolved, name, preset, folder / name, progress)
+        counts = made.info.counts
+        Console().print(
+            f"{folder / name}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
+            f"look at {folder / name / 'overview.png'}",
+            soft_wrap=True,
+        )
+
+
+@app.command()
+def preview(
+    preset: Preset = "small",
+    config: Config = None,
+    setting: Setting = None,
+    dem: Dem = None,
+    kind: Annotated[Kind, typer.Option(help="Whose first scene and descent (detect or nav).")] = Kind.DETECT,
+    out: Annotated[Path, typer.Option(help="Where the picture goes.")] = Path("preview.png"),
+) -> None:
+    """Make one contact sheet of a configuration, with and without labels, in seconds."""
+    resolved = _resolve(preset, config, setting, dem)
+    from perilune_render.preview import write_preview
+
+    write_preview(resolved, _first(kind), out)
+    Console().print(f"look at {out}")
+
+
+@app.command()
+def mesh(
+    preset: Preset = "small",
+    config: Config = None,
+    setting: Setting = None,
+    dem: Dem = None,
+    kind: Annotated[Kind, typer.Option(help="Whose first scene (detect or nav).")] = Kind.DETECT,
+    step: Annotated[int, typer.Option(min=1, help="Keep every step-th vertex of the ground.")] = 4,
+    out: Annotated[Path, typer.Option(help="A .glb, .ply, .obj or .stl file.")] = Path("scene.glb"),
+) -> None:
+    """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
+    resolved = _resolve(preset, config, setting, dem)
+    from perilune_render.terrain.mesh import export_mesh
+    from perilune_render.terrain.scene import grow_scene
+
+    name = _first(kind)
+    plan = make_plan(resolved, name)
+    scene = grow_scene(resolved, plan.camera, resolved.kind(name).flight, plan.scenes[0].seed)
+    export_mesh(scene, out, step=step)
+    Console().print(f"{out}: {len(scene.craters)} craters, {len(scene.boulders)} boulders")
+
+
+def main() -> None:
+    """Entry point of the command line."""
+    run_command_line(app)

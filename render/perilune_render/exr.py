@@ -1,0 +1,48 @@
+"""EXR files: what Blender writes, and what the dataset holds."""
+
+import errno
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from perilune_shared.errors import UserError
+from perilune_shared.files import written_aside
+
+CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "crater")
+
+
+@dataclass(frozen=True, slots=True)
+class Radiance:
+    """What a renderer gives for one frame, before the sensor."""
+
+    radiance_factor: np.ndarray
+    """I/F (h, w) float32."""
+    depth_m: np.ndarray
+    """Along the camera's axis, metres; infinite where nothing is hit (h, w) float32."""
+    normal: np.ndarray
+    """Unit normal in O_L (h, w, 3) float32."""
+
+
+def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:
+    """Write a frame's EXR: float32 channels R, Z, N.X, N.Y, N.Z and crater (h, w; -1 none), losslessly compressed."""
+    values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), crater)
+    channels = {name: np.ascontiguousarray(value, np.float32) for name, value in zip(CHANNELS, values, strict=True)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with written_aside(path) as aside:
+        try:
+            OpenEXR.File(header, channels).write(str(aside))
+        except RuntimeError as error:
+            raise OSError(errno.ENOSPC, f"cannot write ({error})", str(path)) from None
+
+
+def read_exr(path: Path) -> dict[str, np.ndarray]:
+    """Channels (h, w) by name. Raises UserError where the file is missing or damaged."""
+    if not path.is_file():
+        raise UserError(path, "exr", "no such file", "an EXR frame")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as image:
+            return {name: channel.pixels for name, channel in image.channels().items()}
+    except (RuntimeError, ValueError) as error:
+        raise UserError(path, "exr", error, "a whole EXR file") from None

@@ -1,0 +1,104 @@
+"""The plan: every scene, descent and frame of a dataset, decided before a pixel is rendered.
+
+The plan is plain data and follows from the configuration alone. Scenes are planned by their seed: their craters and
+boulders (`perilune_render.terrain.scene.grow_scene`) follow from it without rendering.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.config import DatasetConfig, KindConfig
+from perilune_render.flight import Flight, fly
+from perilune_render.streams import derived_seed, stream
+from perilune_shared.camera import Camera
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePlan:
+    """One terrain under one Sun."""
+
+    scene_id: str
+    """Unique in the dataset."""
+    seed: int
+    """Of the scene's own streams."""
+    sun_azimuth_deg: float
+    """Clockwise from north, degrees."""
+    sun_elevation_deg: float
+    """Above the ground plane, degrees."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryPlan:
+    """One descent."""
+
+    scene_id: str
+    """Its terrain."""
+    trajectory_id: str
+    """Unique in its scene."""
+    seed: int
+    """Of the descent's own streams."""
+    splits: tuple[str, ...]
+    """Split of each frame."""
+    flight: Flight
+    """True motion."""
+
+    def frame_id(self, index: int) -> str:
+        """Unique in the dataset."""
+        return f"{self.scene_id}/{self.trajectory_id}/{index:06d}"
+
+    @property
+    def split(self) -> str | None:
+        """The descent's split, or None where its frames are split among several."""
+        return self.splits[0] if len(set(self.splits)) == 1 else None
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A dataset before rendering."""
+
+    camera: Camera
+    """Of all frames."""
+    scenes: tuple[ScenePlan, ...]
+    """Terrains."""
+    trajectories: tuple[TrajectoryPlan, ...]
+    """Descents, in the order of their scenes."""
+
+    def of_scene(self, scene_id: str) -> list[TrajectoryPlan]:
+        """The descents over one terrain."""
+        return [trajectory for trajectory in self.trajectories if trajectory.scene_id == scene_id]
+
+
+def make_plan(config: DatasetConfig, kind: str) -> Plan:
+    """The plan of the dataset `detect` or `nav`."""
+    settings = config.kind(kind)
+    camera = Camera.from_field_of_view(
+        config.camera.width_px, config.camera.height_px, config.camera.horizontal_fov_deg
+    )
+    splits = _splits(settings, stream(config.seed, kind, "splits"))
+    scenes, trajectories = [], []
+    for s in range(settings.n_scenes):
+        seed = derived_seed(config.seed, kind, "scene", s)
+        sun = stream(seed, "sun")
+        azimuth = sun.uniform(settings.sun.azimuth_deg.low, settings.sun.azimuth_deg.high)
+        elevation = sun.uniform(settings.sun.elevation_deg.low, settings.sun.elevation_deg.high)
+        scenes.append(ScenePlan(f"scene-{s:04d}", seed, float(azimuth), float(elevation)))
+        for t in range(settings.trajectories_per_scene):
+            own = derived_seed(seed, "trajectory", t)
+            flight = fly(settings.flight, settings.n_frames, own)
+            trajectories.append(
+                TrajectoryPlan(scenes[-1].scene_id, f"trajectory-{t:04d}", own, tuple(splits[s, t]), flight)
+            )
+    return Plan(camera, tuple(scenes), tuple(trajectories))
+
+
+def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:
+    """Split names (n_scenes, trajectories_per_scene, n_frames); whole units of `split_by` go together."""
+    shape = (settings.n_scenes, settings.trajectories_per_scene, settings.n_frames)
+    n_axes = ("scene", "trajectory", "frame").index(settings.split_by) + 1
+    n_units = int(np.prod(shape[:n_axes]))
+    n_test = min(int(np.ceil(settings.test_share * n_units)), max(n_units - 2, 0))
+    n_val = min(int(np.ceil(settings.val_share * n_units)), max(n_units - n_test - 1, 0))
+    names = np.array(["train"] * (n_units - n_val - n_test) + ["val"] * n_val + ["test"] * n_test)
+    units = rng.permutation(names).reshape(shape[:n_axes] + (1,) * (3 - n_axes))
+    return np.broadcast_to(units, shape)

@@ -1,0 +1,37 @@
+"""One contact sheet of a configuration: for anyone who changes a setting and wants to see what it does."""
+
+from pathlib import Path
+
+import numpy as np
+
+from perilune_render.blender.renderer import Renderer
+from perilune_render.config import DatasetConfig
+from perilune_render.labels import label_frame
+from perilune_render.picture import draw_labels, enlarge, write_sheet
+from perilune_render.plan import make_plan
+from perilune_render.sensor import develop
+from perilune_render.streams import stream
+from perilune_render.terrain.scene import grow_scene
+from perilune_shared.frames import sun_direction
+
+
+def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 4) -> None:
+    """The first scene from the first descent, evenly spaced in time: frames above, the same with labels below."""
+    plan = make_plan(config, kind)
+    scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
+    scene = grow_scene(config, plan.camera, config.kind(kind).flight, scene_plan.seed)
+    ratio = scene.rims.depth_m / scene.craters.diameter_m
+    plain, drawn = [], []
+    with Renderer(
+        scene, config, plan.camera, sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
+    ) as renderer:
+        for index in np.linspace(0, len(trajectory.splits) - 1, n_frames).astype(int):
+            pose = trajectory.flight.position_m[index], trajectory.flight.rotation_camera_from_site[index]
+            radiance = renderer.render(*pose)
+            image = develop(radiance.radiance_factor, config.sensor, stream(trajectory.seed, "sensor", index))
+            labels = label_frame(
+                scene, plan.camera, *pose, radiance, config.labels.min_radius_px, config.labels.max_radius_px
+            )
+            plain.append(enlarge(image, 2))
+            drawn.append(draw_labels(image, labels, ratio[labels.crater_id]))
+    write_sheet(path, plain + drawn, n_frames)

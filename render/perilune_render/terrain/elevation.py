@@ -1,0 +1,110 @@
+"""A real elevation model as the base of a scene: any projection, any pixel size, holes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import rasterio.warp
+from rasterio.errors import RasterioError
+from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline
+
+from perilune_render.terrain.grid import Grid
+from perilune_shared.errors import UserError
+from perilune_shared.files import sha256_of
+from perilune_shared.frames import MOON_RADIUS_M, Array, selenographic_from_site
+
+_MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
+_LARGEST_PIXELS = 100_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class ElevationModel:
+    """An elevation model in memory."""
+
+    height_m: Array
+    """Rows from the raster's top (rows, columns), metres, holes filled."""
+    transform: rasterio.Affine
+    """Projected coordinates from (column, row), raster corners."""
+    crs: rasterio.crs.CRS
+    """The projection."""
+    latitude_deg: float
+    """Of the raster's middle, which becomes the site."""
+    longitude_deg: float
+    """Of the raster's middle."""
+    pixel_m: float
+    """Ground size of a pixel, metres."""
+    source: str
+    """File name and SHA-256."""
+
+
+def read_elevation(path: Path) -> ElevationModel:
+    """Read a GeoTIFF. Raises UserError where it is missing, no raster, without projection or pixel size, or empty.
+
+    Holes (nodata, NaN) are filled from the nearest known height. Heights may be elevations or radii: only differences
+    count, since the site is put at height 0.
+    """
+    if not path.is_file():
+        raise UserError(path, "dem", "no such file", "a GeoTIFF elevation model")
+    try:
+        with rasterio.open(path) as raster:
+            if raster.width * raster.height > _LARGEST_PIXELS:
+                raise UserError(path, "size", f"{raster.width} x {raster.height}", f"at most {_LARGEST_PIXELS} pixels")
+            height = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+            transform, crs = raster.transform, raster.crs
+    except RasterioError as error:
+        raise UserError(path, "dem", error, "a readable GeoTIFF") from None
+    if transform.is_identity or transform.determinant == 0:
+        raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
+    if crs is None:
+        raise UserError(path, "projection", "none", "a coordinate reference system of the Moon")
+    known = np.isfinite(height)
+    if known.sum() < 16:
+        raise UserError(path, "heights", f"{known.sum()} known", "an elevation model with data")
+    if not known.all():
+        nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+        height = height[tuple(nearest)]
+    middle = (height.shape[1] / 2, height.shape[0] / 2)
+    try:
+        lon, lat = rasterio.warp.transform(crs, _MOON, *([v] for v in transform @ middle))
+    except RasterioError as error:
+        raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
+    pixel = _pixel_m(transform, crs, middle, lat[0], lon[0])
+    return ElevationModel(
+        height, transform, crs, float(lat[0]), float(lon[0]), pixel, f"{path.name} sha256:{sha256_of(path)}"
+    )
+
+
+def base_heights(model: ElevationModel, grid: Grid) -> tuple[Array, Array]:
+    """Heights (n, n; rows are y) of the model on the grid in metres, site at 0, and the share (n, n) that is real.
+
+    Bicubic inside. Beyond the model the ground is its mirror image about the edge, and the share falls to 0: what lies
+    there looks alike but is no measurement.
+    """
+    rows, columns = model.height_m.shape
+    # Pixel coordinates vary slowly over a site: project a coarse net and interpolate.
+    net = np.linspace(grid.coordinates_m[0], grid.coordinates_m[-1], 65)
+    x, y = np.meshgrid(net, net)
+    lat, lon = selenographic_from_site(x, y, model.latitude_deg, model.longitude_deg)
+    east, north = rasterio.warp.transform(_MOON, model.crs, lon.ravel(), lat.ravel())
+    column, row = ~model.transform @ (np.array(east), np.array(north))
+    c = grid.coordinates_m
+    column = RectBivariateSpline(net, net, column.reshape(x.shape))(c, c)
+    row = RectBivariateSpline(net, net, row.reshape(x.shape))(c, c)
+    height = ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="reflect")
+    outside = np.maximum.reduce([-row, row - rows, -column, column - columns, np.zeros_like(row)])
+    share = np.clip(1 - outside / 4, 0, 1)
+    middle = len(c) // 2
+    return height - height[middle, middle], share
+
+
+def _pixel_m(
+    transform: rasterio.Affine, crs: rasterio.crs.CRS, middle: tuple[float, float], lat: float, lon: float
+) -> float:
+    """Ground size of the middle pixel, from the great-circle distance of its neighbours."""
+    places = [transform @ (middle[0] + 1, middle[1]), transform @ (middle[0], middle[1] + 1)]
+    lons, lats = rasterio.warp.transform(crs, _MOON, [p[0] for p in places], [p[1] for p in places])
+    to_east = np.cos(np.radians(lat)) * np.radians((np.array(lons) - lon + 180) % 360 - 180)
+    to_north = np.radians(np.array(lats) - lat)
+    return float(MOON_RADIUS_M * np.hypot(to_east, to_north).mean())

@@ -1,0 +1,40 @@
+"""Self-affine relief beside the craters.
+
+A self-affine surface of Hurst exponent H has slopes that fall with wavelength as L^(H-1) (Cai & Fa 2020,
+doi 10.1029/2020JE006429, find H about 0.9 down to metres on the Moon). It is built here as a sum of gradient noise in
+octaves whose amplitudes fall as L^H, from the longest wave down to the shortest that the grid holds at each place.
+"""
+
+import numpy as np
+
+from perilune_render.config import ReliefConfig
+from perilune_render.streams import derived_seed, stream
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.noise import RMS_SLOPE, add_waves
+from perilune_shared.frames import Array
+
+
+def add_relief(height_m: Array, grid: Grid, config: ReliefConfig, seed: int, longest_wavelength_m: float) -> None:
+    """Add relief with waves of at most `longest_wavelength_m` to height_m (n, n; rows are y), in place.
+
+    `config.rms_slope_deg` is that of all octaves down to a metre; a real elevation model brings its own long waves,
+    so that only the shorter octaves are added to it.
+    """
+    rng = stream(seed, "relief")
+    finest = 3 * float(np.diff(grid.coordinates_m).min())
+    lengths = config.longest_wavelength_m / 2.0 ** np.arange(
+        np.ceil(np.log2(config.longest_wavelength_m / min(finest, 1.0)))
+    )
+    slopes = lengths ** (config.hurst_exponent - 1)
+    slopes *= np.tan(np.radians(config.rms_slope_deg)) / np.sqrt(np.sum(slopes[lengths >= 1] ** 2))
+    for length, slope in zip(lengths, slopes, strict=True):
+        # Each octave is shifted, since gradient noise is zero on its own lattice.
+        shifted = grid.coordinates_m + rng.uniform(0, length)
+        if finest <= length <= longest_wavelength_m:
+            add_waves(
+                height_m,
+                shifted,
+                float(length),
+                float(slope * length / RMS_SLOPE),
+                derived_seed(seed, "relief", length),
+            )

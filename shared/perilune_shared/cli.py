@@ -1,0 +1,63 @@
+"""`perilune-manifest`: look after datasets without Blender and without torch."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from perilune_shared.errors import EXIT_USER_ERROR, run_command_line
+from perilune_shared.manifest import open_dataset
+from perilune_shared.progress import progress_bar
+from perilune_shared.stats import summary
+from perilune_shared.validate import validate as find_faults
+
+app = typer.Typer(
+    help="Look after perilune datasets: Parquet manifests and their frames.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the one that holds dataset.json.")]
+
+
+@app.command()
+def validate(
+    dataset: DatasetArgument, most: Annotated[int, typer.Option(help="Show at most this many faults.")] = 50
+) -> None:
+    """Check schema, ranges, keys, splits, labels against poses, and the hash of every file. Exit code 2 on a fault."""
+    with progress_bar() as progress:
+        faults = find_faults(open_dataset(dataset), progress)
+    console = Console()
+    if not faults:
+        console.print(f"{dataset}: no fault")
+        return
+    table = Table("file", "row", "column", "found", "wanted", title=f"{dataset}: {len(faults)} faults")
+    for fault in faults[:most]:
+        table.add_row(fault.file, "" if fault.row is None else str(fault.row), fault.column, fault.found, fault.wanted)
+    console.print(table)
+    raise typer.Exit(EXIT_USER_ERROR)
+
+
+@app.command()
+def stats(dataset: DatasetArgument) -> None:
+    """Print counts, labels per frame and crater radii for each split."""
+    opened = open_dataset(dataset)
+    frame = summary(opened)
+    info = opened.info
+    state = "" if info.complete else ", not complete"
+    table = Table(title=f"{info.name}: {info.kind}, split by {info.split_by}, seed {info.seed}{state}")
+    for column in frame.columns:
+        table.add_column(column, justify="right")
+    for row in frame.itertuples(index=False):
+        table.add_row(*(str(value) for value in row))
+    console = Console()
+    console.print(table)
+    counts = info.counts.model_dump()
+    console.print(", ".join(f"{count} {name}" for name, count in counts.items()))
+
+
+def main() -> None:
+    """Entry point of the command line."""
+    run_command_line(app)

@@ -1,0 +1,47 @@
+"""Errors that a user can cause, told in one line, and the exit code that goes with them."""
+
+import errno
+import os
+import sys
+from collections.abc import Callable
+
+EXIT_USER_ERROR = 2
+_DISK_FAULTS = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EFBIG,
+    errno.EIO,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENOTDIR,
+    errno.EISDIR,
+)
+
+
+class UserError(Exception):
+    """A fault in what the user gave: file or place, field, value found, and what would be right."""
+
+    def __init__(self, where: object, field: str, found: object, wanted: str):
+        text = str(found)
+        if len(text) > 120:
+            text = text[:117] + "..."
+        super().__init__(" ".join(f"{where}: {field}: found {text}; wanted {wanted}".split()))
+
+
+def run_command_line(app: Callable[[], object]) -> None:
+    """Run a command line; a user's fault or a failing disk ends it with one line and exit code 2."""
+    try:
+        app()
+    except UserError as error:
+        fail = f"error: {error}"
+    except OSError as error:
+        if error.errno not in _DISK_FAULTS:
+            raise
+        fail = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; what was finished stays valid"
+    except KeyboardInterrupt:
+        sys.exit("stopped; what was finished stays valid, and the same command goes on from there")
+    else:
+        return
+    print(fail, file=sys.stderr)
+    sys.exit(EXIT_USER_ERROR)

@@ -1,0 +1,58 @@
+"""Files written aside and renamed, and relative paths that cannot leave their folder."""
+
+import contextlib
+import hashlib
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from perilune_shared.errors import UserError
+
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+
+
+@contextlib.contextmanager
+def written_aside(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
+
+    The temporary name keeps the suffix of `path`, since image writers choose their format by it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield aside
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a whole file, or nothing."""
+    with written_aside(path) as aside:
+        aside.write_bytes(content)
+
+
+def write_text(path: Path, content: str) -> None:
+    """Write a whole UTF-8 file, or nothing."""
+    write_bytes(path, content.encode())
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def inside(root: Path, relative: str) -> Path:
+    """The file that a manifest's relative POSIX path names below `root`.
+
+    Raises UserError where the path is absolute, climbs, has an odd name or leaves `root` through a link.
+    """
+    parts = PurePosixPath(relative).parts if isinstance(relative, str) else ()
+    if not parts or not all(_PLAIN_NAME.fullmatch(part) for part in parts):
+        raise UserError(root, "path", repr(relative), "a relative POSIX path of plain names inside the dataset")
+    path = root.joinpath(*parts)
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise UserError(root, "path", repr(relative), "a path that no link leads out of the dataset")
+    return path

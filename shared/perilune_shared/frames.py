@@ -1,0 +1,112 @@
+"""Frames of reference and rotations.
+
+Frames, as the paper names them (section "Coordinates"):
+
+- O_S selenographic: latitude (north positive) and longitude (east positive) on a sphere of the IAU mean radius.
+- O_L landing site: origin at the ideal landing point, Z up, Y to the Moon's south pole, X completing the right
+  hand, so X points west.
+- O_W world: O_L's axes, origin at the lander's first position.
+- O_B body: fixed to the lander.
+- O_C camera: OpenCV axes, x right, y down, z along the view.
+
+A rotation is named `rotation_<to>_from_<from>` and acts on column vectors: v_to = R v_from. A quaternion is
+(w, x, y, z), of length 1, and stands for the same matrix.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+MOON_RADIUS_M = 1_737_400.0
+"""Mean radius of the Moon, IAU Working Group report 2015 (doi 10.1007/s10569-017-9805-5)."""
+
+Array = NDArray[np.float64]
+
+
+def matrix_from_quaternion(rotation_wxyz: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4); the length is divided out."""
+    q = np.asarray(rotation_wxyz, dtype=np.float64)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_matrix(rotation: ArrayLike) -> Array:
+    """Quaternion (4,) with w >= 0 of a rotation matrix (3, 3).
+
+    Takes the eigenvector of the largest eigenvalue (Bar-Itzhack 2000, doi 10.2514/2.4654), which stays accurate
+    at half turns.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    k = np.array(
+        [
+            [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
+            [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
+            [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
+        ]
+    )
+    q = np.linalg.eigh(k, UPLO="U")[1][:, -1]
+    return q if q[0] >= 0 else -q
+
+
+def matrix_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Array:
+    """Rotation matrix (3, 3) that turns by |v| radians about v (3,) (Rodrigues' formula)."""
+    v = np.asarray(rotation_vector_rad, dtype=np.float64)
+    angle = float(np.linalg.norm(v))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = v / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
+
+def sun_direction(azimuth_deg: float, elevation_deg: float) -> Array:
+    """Unit vector (3,) in O_L towards the Sun; azimuth clockwise from north, so 90 degrees is east."""
+    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
+    east, north = np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation)
+    return np.array([-east, -north, np.sin(elevation)])
+
+
+def selenographic_from_site(
+    x_m: ArrayLike, y_m: ArrayLike, latitude_deg: float, longitude_deg: float
+) -> tuple[Array, Array]:
+    """Latitude and longitude in degrees of points on O_L's ground plane, for a site at the given place.
+
+    The plane is wrapped onto the sphere by an azimuthal equidistant projection about the site: distance and
+    bearing from the site are kept. Inverse of `site_from_selenographic`. At a pole, where "to the south pole"
+    names no direction, longitude_deg gives it: the plane's -Y is along that meridian.
+    """
+    west, south = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
+    distance = np.hypot(west, south)
+    angle = distance / MOON_RADIUS_M
+    safe = np.where(distance > 0, distance, 1.0)
+    north_share, east_share = -south / safe, -west / safe
+    lat0, lon0 = np.radians([latitude_deg, longitude_deg])
+    sin_lat = np.cos(angle) * np.sin(lat0) + np.sin(angle) * np.cos(lat0) * north_share
+    latitude = np.arcsin(np.clip(sin_lat, -1, 1))
+    longitude = lon0 + np.arctan2(
+        np.sin(angle) * east_share,
+        np.cos(lat0) * np.cos(angle) - np.sin(lat0) * np.sin(angle) * north_share,
+    )
+    return np.degrees(latitude), (np.degrees(longitude) + 180) % 360 - 180
+
+
+def site_from_selenographic(
+    point_latitude_deg: ArrayLike, point_longitude_deg: ArrayLike, latitude_deg: float, longitude_deg: float
+) -> tuple[Array, Array]:
+    """x and y in O_L, metres, of points on the sphere, for a site at (latitude_deg, longitude_deg)."""
+    lat, lon = (
+        np.radians(np.asarray(point_latitude_deg, np.float64)),
+        np.radians(np.asarray(point_longitude_deg, np.float64)),
+    )
+    lat0, lon0 = np.radians([latitude_deg, longitude_deg])
+    east = np.cos(lat) * np.sin(lon - lon0)
+    north = np.cos(lat0) * np.sin(lat) - np.sin(lat0) * np.cos(lat) * np.cos(lon - lon0)
+    up = np.sin(lat0) * np.sin(lat) + np.cos(lat0) * np.cos(lat) * np.cos(lon - lon0)
+    sine = np.hypot(east, north)
+    scale = MOON_RADIUS_M * np.arctan2(sine, up) / np.where(sine > 0, sine, 1.0)
+    return -east * scale, -north * scale

@@ -1,0 +1,129 @@
+"""The tables of a dataset: every column with its type, unit and frame of reference (schema version 1).
+
+The same text stands in the metadata of every Parquet file, so that a file found alone still says what it holds.
+"""
+
+from typing import Literal
+
+import pyarrow as pa
+
+SCHEMA_VERSION = "1"
+_TEXT, _REAL, _INTEGER = pa.string(), pa.float64(), pa.int64()
+
+
+def _vector(length: int) -> pa.DataType:
+    return pa.list_(_REAL, length)
+
+
+def _column(name: str, kind: pa.DataType, unit: str, meaning: str, *, optional: bool = False) -> pa.Field:
+    return pa.field(name, kind, nullable=optional, metadata={"unit": unit, "meaning": meaning})
+
+
+def _table(name: str, *columns: pa.Field) -> pa.Schema:
+    return pa.schema(columns, metadata={"perilune.table": name, "perilune.schema_version": SCHEMA_VERSION})
+
+
+_SCENE = _column("scene_id", _TEXT, "", "the terrain")
+_TRAJECTORY = _column("trajectory_id", _TEXT, "", "the descent within its scene")
+_FRAME = _column("frame_id", _TEXT, "", "scene_id/trajectory_id/frame_index with 6 digits")
+_SPLIT = "train, val or test"
+
+TABLES: dict[str, pa.Schema] = {
+    "scenes": _table(
+        "scenes",
+        _SCENE,
+        _column("seed", _INTEGER, "", "seed of the scene's own random streams"),
+        _column("latitude_deg", _REAL, "deg", "of the site, O_S, north positive"),
+        _column("longitude_deg", _REAL, "deg", "of the site, O_S, east positive"),
+        _column("sun_azimuth_deg", _REAL, "deg", "clockwise from north"),
+        _column("sun_elevation_deg", _REAL, "deg", "above the site's ground plane"),
+        _column("photometry", _TEXT, "", "name of the reflectance law and parameter set"),
+        _column("dem_source", _TEXT, "", "name and SHA-256 of the elevation model, or 'procedural'"),
+        _column("extent_m", _REAL, "m", "side of the square terrain, centred on the site"),
+    ),
+    "craters": _table(
+        "craters",
+        _SCENE,
+        _column("crater_id", _INTEGER, "", "unique within the scene"),
+        _column("x_m", _REAL, "m", "rim circle's centre, O_L"),
+        _column("y_m", _REAL, "m", "rim circle's centre, O_L"),
+        _column("z_m", _REAL, "m", "rim circle's centre, O_L, measured on the finished height field"),
+        _column("normal_x", _REAL, "", "rim circle's unit normal, O_L"),
+        _column("normal_y", _REAL, "", "rim circle's unit normal, O_L"),
+        _column("normal_z", _REAL, "", "rim circle's unit normal, O_L"),
+        _column("diameter_m", _REAL, "m", "rim crest to rim crest"),
+        _column("depth_m", _REAL, "m", "rim to floor, measured on the finished height field"),
+        _column("fresh_depth_m", _REAL, "m", "rim to floor when it formed"),
+        _column("age_myr", _REAL, "Myr", "time since it formed"),
+        _column("latitude_deg", _REAL, "deg", "O_S"),
+        _column("longitude_deg", _REAL, "deg", "O_S"),
+    ),
+    "boulders": _table(
+        "boulders",
+        _SCENE,
+        _column("boulder_id", _INTEGER, "", "unique within the scene"),
+        _column("x_m", _REAL, "m", "centre, O_L"),
+        _column("y_m", _REAL, "m", "centre, O_L"),
+        _column("z_m", _REAL, "m", "centre, O_L"),
+        _column("diameter_m", _REAL, "m", "mean of the three axes"),
+        _column("shape_id", _INTEGER, "", "which rock of the scene's set"),
+        _column("rotation_wxyz", _vector(4), "", "rotation_site_from_rock, unit quaternion"),
+    ),
+    "trajectories": _table(
+        "trajectories",
+        _SCENE,
+        _TRAJECTORY,
+        _column("seed", _INTEGER, "", "seed of the descent's own random streams"),
+        _column("n_frames", _INTEGER, "", "number of frames"),
+        _column("split", _TEXT, "", f"{_SPLIT}; null where frames of one descent are split", optional=True),
+        _column("nominal_position_m", _vector(3), "m", "nominal curve at time 0, O_L"),
+        _column("nominal_velocity_mps", _vector(3), "m/s", "nominal curve at time 0, O_L"),
+        _column("nominal_acceleration_mps2", _vector(3), "m/s^2", "nominal curve, constant, O_L"),
+        _column("duration_s", _REAL, "s", "first to last frame"),
+    ),
+    "frames": _table(
+        "frames",
+        _FRAME,
+        _SCENE,
+        _TRAJECTORY,
+        _column("frame_index", _INTEGER, "", "place in the descent, from 0"),
+        _column("time_s", _REAL, "s", "since the first frame"),
+        _column("split", _TEXT, "", _SPLIT),
+        _column("width_px", _INTEGER, "px", "image width"),
+        _column("height_px", _INTEGER, "px", "image height"),
+        _column("fx_px", _REAL, "px", "focal length"),
+        _column("fy_px", _REAL, "px", "focal length"),
+        _column("cx_px", _REAL, "px", "principal point, origin at the outer corner of the top-left pixel"),
+        _column("cy_px", _REAL, "px", "principal point, origin at the outer corner of the top-left pixel"),
+        _column("position_m", _vector(3), "m", "camera, O_L"),
+        _column("rotation_wxyz", _vector(4), "", "rotation_camera_from_site, unit quaternion"),
+        _column("velocity_mps", _vector(3), "m/s", "camera, O_L"),
+        _column("sun_direction", _vector(3), "", "unit vector towards the Sun, O_L"),
+        _column("png_path", _TEXT, "", "relative to the dataset"),
+        _column("png_sha256", _TEXT, "", "of the whole file"),
+        _column("png_bytes", _INTEGER, "B", "file size"),
+        _column("exr_path", _TEXT, "", "relative to the dataset; null where not written", optional=True),
+        _column("exr_sha256", _TEXT, "", "of the whole file; null where not written", optional=True),
+        _column("exr_bytes", _INTEGER, "B", "file size; null where not written", optional=True),
+    ),
+    "labels": _table(
+        "labels",
+        _FRAME,
+        _column("crater_id", _INTEGER, "", "the crater, within the frame's scene"),
+        _column("ellipse_cx_px", _REAL, "px", "ellipse's centre"),
+        _column("ellipse_cy_px", _REAL, "px", "ellipse's centre"),
+        _column("ellipse_a_px", _REAL, "px", "semi-major axis"),
+        _column("ellipse_b_px", _REAL, "px", "semi-minor axis"),
+        _column("ellipse_theta_rad", _REAL, "rad", "direction of the semi-major axis, x towards y, [0, pi)"),
+        _column("bbox_x0_px", _REAL, "px", "tight on the whole ellipse"),
+        _column("bbox_y0_px", _REAL, "px", "tight on the whole ellipse"),
+        _column("bbox_x1_px", _REAL, "px", "tight on the whole ellipse"),
+        _column("bbox_y1_px", _REAL, "px", "tight on the whole ellipse"),
+        _column("radius_px", _REAL, "px", "sqrt(a b)"),
+        _column("visible_fraction", _REAL, "", "share of the rim inside the image and not hidden"),
+        _column("sunlit_fraction", _REAL, "", "share of the crater's seen pixels that the Sun reaches"),
+    ),
+}
+Kind = Literal["detect", "nav"]
+SplitUnit = Literal["scene", "trajectory", "frame"]
+SPLITS = ("train", "val", "test")

@@ -1,0 +1,30 @@
+"""A dataset rendered by the command line itself, shared by all tests that read one."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory) -> Path:
+    """Folder with the `tiny` preset's datasets `detect` and `nav`. Read only: copy before a change."""
+    folder = tmp_path_factory.mktemp("tiny")
+    command = [
+        str(Path(sys.executable).parent / "perilune-render"),
+        "dataset",
+        "--preset",
+        "tiny",
+        "--out",
+        str(folder),
+    ]
+    subprocess.run(command, check=True, capture_output=True, text=True)
+    return folder
+
+
+@pytest.fixture
+def tiny_detect(tiny, tmp_path) -> Path:
+    """A copy of the tiny detection dataset that a test may damage."""
+    return Path(shutil.copytree(tiny / "detect", tmp_path / "detect"))

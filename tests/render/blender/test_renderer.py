@@ -1,0 +1,141 @@
+"""What Blender renders against what the formulas say: photometry, depth, pixels of rims, shadows."""
+
+import numpy as np
+import pytest
+
+from perilune_render.blender.renderer import Renderer
+from perilune_render.config import LightConfig, RenderConfig
+from perilune_render.labels import crater_index, label_frame
+from perilune_render.photometry import radiance_factor
+from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.measure import height_at
+from perilune_shared.camera import Camera
+from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.frames import matrix_from_rotation_vector, sun_direction
+from tests.render.conftest import config_with, flat_scene
+
+CAMERA = Camera(96, 64, 110.0, 110.0, 50.0, 30.0)
+TILTED = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector(np.radians([12, -20, 30]))
+POSITION = np.array([3.0, -5.0, 60.0])
+
+
+def ground_points(camera, position, rotation):
+    """Where each pixel's centre meets the plane z = 0, and the view direction there (from the ground to the camera)."""
+    rays = camera.rays(camera.pixel_centres()) @ rotation
+    depth = -position[2] / rays[..., 2]
+    return position + rays * depth[..., None], depth, -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("law", ["hapke_highland", "hapke_mare", "lommel_seeliger", "lambert"])
+@pytest.mark.parametrize(("azimuth", "elevation"), [(70, 25), (200, 80), (310, 6)])
+def test_radiance_is_the_formulas(law, azimuth, elevation):
+    sun = sun_direction(azimuth, elevation)
+    config = config_with(
+        light=LightConfig(photometry=law, sun_angular_diameter_deg=0.0), render=RenderConfig(samples=64)
+    )
+    with Renderer(flat_scene(400, 41), config, CAMERA, sun) as renderer:
+        radiance = renderer.render(POSITION, TILTED)
+    # The mean over each pixel, since the opposition surge has a cusp.
+    fine = Camera(96 * 8, 64 * 8, 110.0 * 8, 110.0 * 8, 50.0 * 8, 30.0 * 8)
+    _, _, view = ground_points(fine, POSITION, TILTED)
+    expected = radiance_factor(law, sun[2], view[..., 2], view @ sun).reshape(64, 8, 96, 8).mean(axis=(1, 3))
+    relative = np.abs(radiance.radiance_factor / expected - 1)
+    assert relative.max() < 0.005 and np.median(relative) < 0.0005
+
+
+def test_depth_is_along_the_axis_and_normals_are_in_the_sites_frame():
+    slope = np.tile(0.2 * np.linspace(-200, 200, 41), (41, 1))
+    with Renderer(flat_scene(400, 41, height_m=slope), config_with(), CAMERA, sun_direction(0, 60)) as renderer:
+        radiance = renderer.render(POSITION, TILTED)
+    rays = CAMERA.rays(CAMERA.pixel_centres()) @ TILTED
+    normal = np.array([-0.2, 0, 1]) / np.hypot(0.2, 1)
+    depth = -(POSITION @ normal) / (rays @ normal)
+    # Depth is that of one sample somewhere in the pixel: within half a pixel's change.
+    tolerance = np.abs(np.gradient(depth, axis=0)) + np.abs(np.gradient(depth, axis=1))
+    assert (np.abs(radiance.depth_m - depth) <= 0.51 * tolerance + 1e-3).all()
+    assert np.allclose(radiance.normal, normal, atol=1e-3)
+
+
+def test_rendered_pixels_lie_on_the_height_field(scene, small_config, camera):
+    position, rotation = np.array([40.0, -25.0, 500.0]), TILTED
+    with Renderer(scene, small_config, camera, sun_direction(90, 40)) as renderer:
+        radiance = renderer.render(position, rotation)
+    points = position + (camera.rays(camera.pixel_centres()) * radiance.depth_m[..., None]) @ rotation
+    error = points[..., 2] - height_at(scene.height_m, scene.grid, points[..., 0], points[..., 1])
+    assert np.isfinite(radiance.depth_m).all()
+    assert np.median(np.abs(error)) < 0.5 and np.quantile(np.abs(error), 0.99) < 2.5
+
+
+def test_the_sun_casts_shadows_away_from_itself():
+    height = np.zeros((201, 201))
+    height[95:106, 95:106] = 10.0
+    camera = Camera(200, 200, 200.0, 200.0, 100.0, 100.0)
+    east = sun_direction(90, 45)
+    with Renderer(flat_scene(100, 201, height_m=height), config_with(), camera, east) as renderer:
+        image = renderer.render(np.array([0, 0, 100.0]), ROTATION_CAMERA_FROM_BODY).radiance_factor
+    dark = np.argwhere(image < 1e-6)
+    # East is -X, left in the image: the shadow falls to the right, about as long as the block is high.
+    assert 120 < len(dark) < 400 and dark[:, 1].min() > 100 and dark[:, 1].max() < 140
+
+
+def test_label_ellipses_lie_on_rendered_rims():
+    """A fresh crater's crest is where the normal turns: fit its pixels and compare with the label."""
+    x, y, d = np.array([-25.0, 75.0, 20.0]), np.array([20.0, -50.0, 70.0]), np.array([80.0, 60.0, 45.0])
+    craters = Craters(x, y, d, 0.15 * d, np.zeros(3), 1e-3 * (d / 2) ** 2)
+    from perilune_render.terrain.grid import Grid
+    from perilune_render.terrain.stamp import stamp_craters
+
+    height, grid = np.zeros((1001, 1001)), Grid(np.linspace(-200, 200, 1001))
+    stamp_craters(height, np.ones_like(height), grid, craters, np.zeros(3))
+    scene = flat_scene(400, 1001, craters, height)
+    camera = Camera.from_field_of_view(512, 512, 50.0)
+    position, rotation = (
+        np.array([10.0, 15.0, 330.0]),
+        ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector([0.2, 0.15, 0.4]),
+    )
+    with Renderer(scene, config_with(), camera, sun_direction(90, 60)) as renderer:
+        radiance = renderer.render(position, rotation)
+    labels = label_frame(scene, camera, position, rotation, radiance, 2, 150)
+    assert labels.crater_id.tolist() == [0, 1, 2]
+    assert (labels.visible_fraction > 0.95).all() and (labels.sunlit_fraction > 0.95).all()
+    points = position + (camera.rays(camera.pixel_centres()) * radiance.depth_m[..., None]) @ rotation
+    for k in range(3):
+        # Pixels whose ground lies on the rim circle must lie on the ellipse.
+        on_rim = np.abs(np.hypot(points[..., 0] - x[k], points[..., 1] - y[k]) - d[k] / 2) < 0.15
+        e = labels.ellipses
+        dv, du = np.argwhere(on_rim).T + 0.5
+        du, dv = du - e.cx_px[k], dv - e.cy_px[k]
+        cos, sin = np.cos(e.theta_rad[k]), np.sin(e.theta_rad[k])
+        radial = np.sqrt(((du * cos + dv * sin) / e.a_px[k]) ** 2 + ((dv * cos - du * sin) / e.b_px[k]) ** 2)
+        assert len(radial) > 50 and abs(radial.mean() - 1) * e.a_px[k] < 0.3
+    index = crater_index(scene, camera, position, rotation)
+    # Each crater's floor carries its own index, the ground between none.
+    floor = np.hypot(points[..., 0] - x[1], points[..., 1] - y[1]) < 20
+    between = np.min([np.hypot(points[..., 0] - x[k], points[..., 1] - y[k]) / d[k] for k in range(3)], axis=0) > 0.55
+    assert (index[floor] == 1).all() and (index[between] == -1).all()
+
+
+def test_a_hidden_rim_and_a_dark_crater_are_told():
+    """A low Sun leaves the crater behind a wall dark; a wall between hides its rim from a slanted view."""
+    n = 401
+    height = np.zeros((n, n))
+    height[:, 150:160] = 60.0
+    craters = Craters(
+        np.array([-5.0]), np.array([0.0]), np.array([30.0]), np.array([3.0]), np.zeros(1), np.array([0.2])
+    )
+    scene = flat_scene(200, n, craters, height)
+    camera = Camera.from_field_of_view(256, 256, 50.0)
+    sun = sun_direction(90, 20)
+    slanted = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector([0, np.radians(50), 0])
+    with Renderer(scene, config_with(), camera, sun) as renderer:
+        above = np.array([0, 0, 180.0])
+        lit = label_frame(
+            scene, camera, above, ROTATION_CAMERA_FROM_BODY, renderer.render(above, ROTATION_CAMERA_FROM_BODY), 2, 90
+        )
+        assert lit.visible_fraction[0] > 0.9 and lit.sunlit_fraction[0] < 0.1
+        aside = np.array([-150.0, 0, 100.0])
+        hidden = label_frame(scene, camera, aside, slanted, renderer.render(aside, slanted), 2, 90)
+        if len(hidden.crater_id) == 0:
+            slanted = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector([0, np.radians(-50), 0])
+            hidden = label_frame(scene, camera, aside, slanted, renderer.render(aside, slanted), 2, 90)
+    assert hidden.visible_fraction[0] < 0.6

@@ -1,0 +1,44 @@
+"""Small scenes that tests share."""
+
+import numpy as np
+import pytest
+
+from perilune_render.config import BouldersConfig, DatasetConfig, KindConfig, TerrainConfig
+from perilune_render.terrain.boulders import Boulders
+from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.measure import Rims, measure_rims
+from perilune_render.terrain.scene import Scene, grow_scene
+from perilune_shared.camera import Camera
+
+NO_BOULDERS = Boulders(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty((0, 4)))
+
+
+def config_with(**changes) -> DatasetConfig:
+    """The defaults with some sections replaced."""
+    kind = KindConfig(n_scenes=1, trajectories_per_scene=1, n_frames=4, split_by="scene")
+    return DatasetConfig(**{"detect": kind, "nav": kind, **changes})
+
+
+def flat_scene(extent_m: float, n: int, craters: Craters | None = None, height_m: np.ndarray | None = None) -> Scene:
+    """A scene on an even grid, flat unless a height field is given."""
+    grid = Grid(np.linspace(-extent_m / 2, extent_m / 2, n))
+    height = np.zeros((n, n)) if height_m is None else height_m
+    none = craters if craters is not None else Craters(*(np.empty(0) for _ in range(6)))
+    rims = measure_rims(height, grid, none) if len(none) else Rims(np.empty(0), np.empty((0, 3)), np.empty(0))
+    return Scene(1, 0.0, 0.0, grid, height, np.ones((n, n)), none, rims, NO_BOULDERS, np.empty(0), "procedural")
+
+
+@pytest.fixture(scope="session")
+def camera() -> Camera:
+    return Camera.from_field_of_view(128, 128, 50.0)
+
+
+@pytest.fixture(scope="session")
+def small_config() -> DatasetConfig:
+    return config_with(terrain=TerrainConfig(max_vertices=300_000, boulders=BouldersConfig(density=0.0)))
+
+
+@pytest.fixture(scope="session")
+def scene(small_config, camera) -> Scene:
+    return grow_scene(small_config, camera, small_config.detect.flight, 3)

@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+import rasterio
+
+from perilune_render.terrain.elevation import base_heights, read_elevation
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.scene import grow_scene
+from perilune_shared.errors import UserError
+from tests.render.conftest import config_with
+
+POLAR = "+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m"
+LONLAT = "+proj=longlat +R=1737400"
+METRES_PER_DEGREE = np.pi * 1737400 / 180
+
+
+def write(path, height, crs, transform):
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=height.shape[0],
+        width=height.shape[1],
+        count=1,
+        dtype="float32",
+        crs=crs,
+        transform=transform,
+        nodata=-9999,
+    ) as raster:
+        raster.write(height.astype(np.float32), 1)
+    return path
+
+
+def ramp_to_the_north(path, crs=LONLAT):
+    """100 x 100 pixels of 20 m at 30 S, 10 E, rising to the north by one metre a pixel."""
+    degree = 20 / METRES_PER_DEGREE
+    height = np.tile(np.arange(100, 0, -1.0)[:, None], (1, 100))
+    return write(path, height, crs, rasterio.Affine(degree / np.cos(np.radians(30)), 0, 10, 0, -degree, -30))
+
+
+def test_north_is_minus_y(tmp_path):
+    model = read_elevation(ramp_to_the_north(tmp_path / "a.tif"))
+    assert model.pixel_m == pytest.approx(20, rel=0.01)
+    grid = Grid(np.linspace(-600, 600, 61))
+    height, share = base_heights(model, grid)
+    assert height[30, 30] == 0 and (share == 1).all()
+    slope = (height[-1, 30] - height[0, 30]) / 1200
+    assert slope == pytest.approx(-1 / 20, rel=0.01)
+    assert abs(height[30, -1] - height[30, 0]) < 0.5
+
+
+def test_polar_stereographic_near_the_south_pole(tmp_path):
+    # 127 km from the pole along +x, which is longitude 90 E: "south" is -x on the map, so +Y_L must be that way.
+    x = np.arange(100.0)[None, :] * np.ones((100, 1))
+    model = read_elevation(write(tmp_path / "a.tif", x, POLAR, rasterio.Affine(10, 0, 127_000, 0, -10, 0)))
+    assert model.latitude_deg < -85 and model.longitude_deg == pytest.approx(90, abs=0.5)
+    height, _ = base_heights(model, Grid(np.linspace(-300, 300, 31)))
+    assert height[-1, 15] - height[0, 15] == pytest.approx(-60, rel=0.02)
+
+
+def test_holes_are_filled_and_the_outside_is_marked(tmp_path):
+    height = np.full((60, 60), 5.0)
+    height[20:25, 20:25] = -9999
+    model = read_elevation(write(tmp_path / "a.tif", height, POLAR, rasterio.Affine(5, 0, 1000, 0, -5, 1000)))
+    assert np.allclose(model.height_m, 5)
+    base, share = base_heights(model, Grid(np.linspace(-400, 400, 81)))
+    assert np.allclose(base, 0, atol=1e-9) and share[40, 40] == 1 and share[0, 0] == 0
+
+
+def test_craters_are_added_only_below_what_it_resolves(tmp_path, camera):
+    path = ramp_to_the_north(tmp_path / "a.tif")
+    config = config_with(terrain={"dem": str(path), "max_vertices": 300_000})
+    scene = grow_scene(config, camera, config.detect.flight, 1)
+    assert len(scene.craters) > 100 and scene.craters.diameter_m.max() <= 80.5
+    assert scene.dem_source.startswith("a.tif sha256:") and scene.latitude_deg == pytest.approx(-30, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        (lambda p: p.unlink(), "no such file"),
+        (lambda p: p.write_bytes(b"not a raster"), "readable GeoTIFF"),
+        (lambda p: write(p, np.ones((50, 50)), LONLAT, rasterio.Affine.identity()), "pixel size"),
+        (lambda p: write(p, np.ones((50, 50)), None, rasterio.Affine(5, 0, 0, 0, -5, 0)), "projection"),
+        (lambda p: write(p, np.full((50, 50), -9999.0), POLAR, rasterio.Affine(5, 0, 0, 0, -5, 0)), "heights"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_bad_elevation_models_are_told_in_one_line(tmp_path, change, part):
+    path = ramp_to_the_north(tmp_path / "bad.tif")
+    change(path)
+    with pytest.raises(UserError, match=part) as caught:
+        read_elevation(path)
+    assert "bad.tif" in str(caught.value)

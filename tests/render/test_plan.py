@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from perilune_render.config import KindConfig
+from perilune_render.plan import make_plan
+from perilune_render.streams import derived_seed, stream
+from tests.render.conftest import config_with
+
+
+def plan(split_by, **changes):
+    kind = KindConfig(
+        n_scenes=10, trajectories_per_scene=3, n_frames=20, split_by=split_by, val_share=0.1, test_share=0.2
+    )
+    return make_plan(config_with(detect=kind, **changes), "detect")
+
+
+@pytest.mark.parametrize("unit", ["scene", "trajectory", "frame"])
+def test_units_are_never_shared_between_splits(unit):
+    keys = {}
+    for t in plan(unit).trajectories:
+        for index, split in enumerate(t.splits):
+            key = {"scene": (t.scene_id,), "trajectory": (t.scene_id, t.trajectory_id), "frame": t.frame_id(index)}[
+                unit
+            ]
+            assert keys.setdefault(key, split) == split
+    counts = {s: sum(v == s for v in keys.values()) / len(keys) for s in ("train", "val", "test")}
+    assert counts == pytest.approx({"train": 0.7, "val": 0.1, "test": 0.2}, abs=0.01)
+
+
+def test_frames_split_at_random_have_no_split_of_their_descent():
+    assert plan("frame").trajectories[0].split is None and plan("scene").trajectories[0].split in (
+        "train",
+        "val",
+        "test",
+    )
+
+
+def test_a_plan_follows_from_the_configuration_alone():
+    first, second = plan("scene"), plan("scene")
+    assert first.scenes == second.scenes
+    for a, b in zip(first.trajectories, second.trajectories, strict=True):
+        assert a.splits == b.splits and np.array_equal(a.flight.position_m, b.flight.position_m)
+    assert plan("scene", seed=2).scenes != first.scenes
+
+
+def test_adding_scenes_leaves_the_first_ones_as_they_were():
+    few = config_with(detect=KindConfig(n_scenes=2, trajectories_per_scene=1, n_frames=4, split_by="scene"))
+    more = config_with(detect=KindConfig(n_scenes=5, trajectories_per_scene=1, n_frames=4, split_by="scene"))
+    assert make_plan(few, "detect").scenes == make_plan(more, "detect").scenes[:2]
+
+
+def test_the_papers_protocol_has_its_numbers():
+    from perilune_render.config import DatasetConfig
+    from perilune_shared.config import resolve
+
+    config = resolve(DatasetConfig, "dataset", "perilune_render", "paper")
+    assert (config.detect.n_scenes, config.detect.trajectories_per_scene, config.detect.n_frames) == (1, 343, 100)
+    assert (config.nav.n_scenes, config.nav.trajectories_per_scene, config.nav.n_frames) == (1, 49, 100)
+    assert config.detect.split_by == "frame" and config.nav.split_by == "trajectory"
+    splits = [s for t in make_plan(config, "nav").trajectories for s in t.splits[:1]]
+    assert splits.count("train") == 39
+
+
+def test_streams_are_named_and_independent():
+    assert derived_seed(1, "a", "b") != derived_seed(1, "ab") != derived_seed(2, "ab")
+    assert stream(1, "a").random() == stream(1, "a").random() != stream(1, "b").random()

@@ -1,0 +1,104 @@
+import pytest
+from pydantic import ValidationError
+
+from perilune_render.config import DatasetConfig
+from perilune_shared.config import SECTIONS, parse_setting, parse_yaml, resolve, to_yaml
+from perilune_shared.errors import UserError
+
+
+def dataset(**kwargs):
+    return resolve(DatasetConfig, "dataset", "perilune_render", "tiny", **kwargs)
+
+
+def fault(**kwargs) -> str:
+    with pytest.raises(UserError) as caught:
+        dataset(**kwargs)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_later_sources_win(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("dataset: {seed: 5, terrain: {relief: {rms_slope_deg: 1}}}")
+    config = dataset(config_file=file, settings=("dataset.seed=7", "dataset.camera.width_px=64"))
+    assert config.seed == 7 and config.terrain.relief.rms_slope_deg == 1.0
+    assert config.camera.width_px == 64 and config.camera.height_px == 128
+
+
+def test_an_unknown_key_is_named_with_the_nearest(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("dataset: {terrain: {craters: {max_diametre_m: 3}}}")
+    text = fault(config_file=file)
+    assert "a.yaml" in text and "dataset.terrain.craters.max_diametre_m" in text and "max_diameter_m" in text
+
+
+@pytest.mark.parametrize(
+    ("setting", "parts"),
+    [
+        ("dataset.camera.width_px=-4", ["--set", "dataset.camera.width_px", "-4", "greater than or equal to 16"]),
+        ("dataset.camera.width_px=wide", ["dataset.camera.width_px", "'wide'", "integer"]),
+        ("dataset.seed=1.5", ["dataset.seed", "1.5"]),
+        ("dataset.detect.split_by=crater", ["dataset.detect.split_by", "'scene'"]),
+        ("dataset.detect.flight.end_altitude_m=2000", ["below start_altitude_m"]),
+        ("dataset.seeed=1", ["unknown key", "seed (nearest known)"]),
+        ("datset.seed=1", ["unknown section", "dataset (nearest known)"]),
+        ("seed=1", ["section.key=value"]),
+        ("dataset.seed", ["section.key=value"]),
+        ("dataset.terrain.relief.rms_slope_deg=.inf", ["rms_slope_deg"]),
+        ("dataset.terrain=flat", ["dataset.terrain", "'flat'"]),
+    ],
+)
+def test_a_wrong_setting_is_told_in_one_line(setting, parts):
+    text = fault(settings=(setting,))
+    for part in parts:
+        assert part in text
+
+
+def test_an_unknown_preset():
+    with pytest.raises(UserError, match="small"):
+        resolve(DatasetConfig, "dataset", "perilune_render", "smal")
+
+
+@pytest.mark.parametrize(
+    "content", ["dataset: [1, 2]", "- a", "dataset: {a: 1", "a: &x [1]\nb: *x", "!!python/object:os.system {}"]
+)
+def test_files_that_are_no_configuration(tmp_path, content):
+    file = tmp_path / "a.yaml"
+    file.write_text(content)
+    assert "a.yaml" in fault(config_file=file)
+
+
+def test_a_missing_file(tmp_path):
+    assert "no such file" in fault(config_file=tmp_path / "none.yaml")
+
+
+def test_other_sections_may_stand_in_the_same_file(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("detect: {anything: 1}\ndataset: {seed: 9}")
+    assert dataset(config_file=file).seed == 9
+
+
+def test_numbers_with_an_exponent_are_numbers():
+    assert parse_yaml("{a: 1e-4, b: 2E5, c: 1.5e3, d: text}", "") == {"a": 1e-4, "b": 2e5, "c": 1500.0, "d": "text"}
+
+
+def test_a_setting_is_a_path_and_a_value():
+    assert parse_setting("detect.strides=[4, 8, 16]") == (["detect", "strides"], [4, 8, 16])
+
+
+def test_a_resolved_section_reads_back(tmp_path):
+    config = dataset(settings=("dataset.seed=11",))
+    file = tmp_path / "a.yaml"
+    file.write_text(to_yaml("dataset", config))
+    assert dataset(config_file=file) == config
+
+
+def test_a_configuration_is_frozen():
+    with pytest.raises(ValidationError):
+        dataset().seed = 3
+
+
+@pytest.mark.parametrize("preset", ["tiny", "small", "paper", "large"])
+def test_every_preset_is_valid(preset):
+    assert resolve(DatasetConfig, SECTIONS[0], "perilune_render", preset).seed >= 0

@@ -1,0 +1,39 @@
+import pytest
+
+from perilune_shared import files
+from perilune_shared.errors import UserError
+
+
+def test_a_file_is_there_whole_or_not_at_all(tmp_path):
+    target = tmp_path / "folder" / "a.txt"
+    with pytest.raises(RuntimeError), files.written_aside(target) as aside:
+        aside.write_text("half")
+        raise RuntimeError
+    assert not target.exists() and list(target.parent.iterdir()) == []
+    files.write_text(target, "whole")
+    assert target.read_text() == "whole" and len(list(target.parent.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    "path", ["/etc/passwd", "../x.png", "a/../../x", "", "a\\b", "a/./../b", ".hidden", "a//../b", "a b", "-rf", "a\n"]
+)
+def test_paths_that_could_leave_the_folder_are_refused(tmp_path, path):
+    with pytest.raises(UserError):
+        files.inside(tmp_path, path)
+
+
+def test_a_link_out_of_the_folder_is_refused(tmp_path):
+    root = tmp_path / "dataset"
+    root.mkdir()
+    (root / "out").symlink_to(tmp_path)
+    with pytest.raises(UserError):
+        files.inside(root, "out/secret.png")
+
+
+def test_a_plain_path_is_given_back(tmp_path):
+    assert files.inside(tmp_path, "frames/scene-0000/000001.png") == tmp_path / "frames/scene-0000/000001.png"
+
+
+def test_sha256_of_abc(tmp_path):
+    (tmp_path / "a").write_bytes(b"abc")
+    assert files.sha256_of(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"

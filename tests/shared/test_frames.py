@@ -1,0 +1,59 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perilune_shared import frames
+
+ANGLES = st.floats(-np.pi, np.pi)
+
+
+def test_quaternion_of_a_quarter_turn_about_z():
+    half = np.sqrt(0.5)
+    expected = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    assert np.allclose(frames.matrix_from_quaternion([half, 0, 0, half]), expected)
+    assert np.allclose(frames.quaternion_from_matrix(expected), [half, 0, 0, half])
+
+
+@given(ANGLES, ANGLES, ANGLES)
+def test_quaternion_and_matrix_are_inverse(a, b, c):
+    matrix = frames.matrix_from_rotation_vector([a, b, c])
+    quaternion = frames.quaternion_from_matrix(matrix)
+    assert np.isclose(np.linalg.norm(quaternion), 1) and quaternion[0] >= 0
+    assert np.allclose(frames.matrix_from_quaternion(quaternion), matrix, atol=1e-12)
+    assert np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-12) and np.isclose(np.linalg.det(matrix), 1)
+
+
+def test_rotation_vector_turns_by_its_length():
+    turned = frames.matrix_from_rotation_vector([0, 0, np.radians(30)]) @ [1, 0, 0]
+    assert np.allclose(turned, [np.cos(np.radians(30)), np.sin(np.radians(30)), 0])
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "expected"), [(0, [0, -1, 0]), (90, [-1, 0, 0]), (180, [0, 1, 0]), (270, [1, 0, 0])]
+)
+def test_sun_stands_where_the_compass_says(azimuth, expected):
+    # Y is south and X is west: a Sun in the north is at -Y, one in the east at -X.
+    assert np.allclose(frames.sun_direction(azimuth, 0), expected, atol=1e-12)
+
+
+def test_sun_in_the_zenith():
+    assert np.allclose(frames.sun_direction(123, 90), [0, 0, 1], atol=1e-12)
+
+
+def test_a_degree_south_of_the_site():
+    metres = frames.MOON_RADIUS_M * np.pi / 180
+    latitude, longitude = frames.selenographic_from_site(0.0, metres, -45.0, 10.0)
+    assert np.allclose([latitude, longitude], [-46, 10])
+
+
+def test_x_is_west():
+    _, longitude = frames.selenographic_from_site(1000.0, 0.0, 0.0, 10.0)
+    assert longitude < 10
+
+
+@given(st.floats(-5e4, 5e4), st.floats(-5e4, 5e4), st.floats(-89.9, 89.9), st.floats(-180, 180))
+def test_site_and_selenographic_are_inverse(x, y, latitude, longitude):
+    lat, lon = frames.selenographic_from_site(x, y, latitude, longitude)
+    back = frames.site_from_selenographic(lat, lon, latitude, longitude)
+    assert np.allclose(back, [x, y], atol=1e-4)

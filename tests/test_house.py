@@ -1,0 +1,97 @@
+"""The rules of the house: who may import whom, and what stands in no file."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+MAY_IMPORT = {
+    "shared": {"perilune_shared"},
+    "render": {"perilune_shared", "perilune_render"},
+    "train": {"perilune_shared", "perilune_train"},
+}
+BLENDER = {"bpy", "bmesh", "mathutils", "gpu"}
+
+
+def imported(path: Path) -> set[str]:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.split(".")[0])
+    return names
+
+
+def sources() -> list[tuple[str, Path]]:
+    found = [
+        (house, path) for house in MAY_IMPORT for path in (ROOT / house).rglob("*.py") if "build" not in path.parts
+    ]
+    assert len(found) > 40
+    return found
+
+
+def test_distributions_import_only_what_they_may():
+    for house, path in sources():
+        ours = {name for name in imported(path) if name.startswith("perilune_")}
+        assert ours <= MAY_IMPORT[house], path
+
+
+def test_blender_is_imported_in_one_folder_only():
+    users = [path for _, path in sources() if imported(path) & BLENDER]
+    assert users
+    # The orchestration asks bpy for its version only through the folder.
+    assert all(path.is_relative_to(ROOT / "render/perilune_render/blender") for path in users), users
+
+
+def test_no_file_imports_torchvision_or_agpl():
+    for _, path in sources():
+        assert not imported(path) & {"torchvision", "ultralytics"}, path
+
+
+def test_imports_have_no_circle():
+    modules = {
+        ".".join(path.relative_to(ROOT / house).with_suffix("").parts).removesuffix(".__init__"): path
+        for house, path in sources()
+    }
+    edges = {}
+    for name, path in modules.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        targets = set()
+        for node in tree.body:
+            if isinstance(node, ast.ImportFrom) and node.module:
+                targets |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+            elif isinstance(node, ast.Import):
+                targets |= {alias.name for alias in node.names}
+        edges[name] = {target for target in targets if target in modules and target != name}
+    done: set[str] = set()
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, " -> ".join((*trail, name))
+        if name not in done:
+            for target in edges[name]:
+                visit(target, (*trail, name))
+            done.add(name)
+
+    for name in edges:
+        visit(name, ())
+
+
+def test_licences_are_as_promised():
+    wanted = {"shared": "Apache-2.0", "render": "GPL-3.0-or-later", "train": "Apache-2.0"}
+    for house, licence in wanted.items():
+        project = tomllib.loads((ROOT / house / "pyproject.toml").read_text())["project"]
+        assert project["license"] == {"text": licence}
+        assert (ROOT / house / "LICENSE").is_file()
+
+
+def test_every_direct_dependency_is_pinned():
+    pinned = {
+        re.split(r"==", line)[0].lower().replace("_", "-") for line in (ROOT / "constraints.txt").read_text().split()
+    }
+    for house in MAY_IMPORT:
+        for requirement in tomllib.loads((ROOT / house / "pyproject.toml").read_text())["project"]["dependencies"]:
+            name = re.split(r"[<>=!~ ]", requirement)[0].lower()
+            assert name in pinned or name == "perilune-shared", name
