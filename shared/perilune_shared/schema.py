@@ -52,7 +52,7 @@ TABLES: dict[str, pa.Schema] = {
         _column("normal_y", _REAL, "", "rim circle's unit normal, O_L"),
         _column("normal_z", _REAL, "", "rim circle's unit normal, O_L"),
         _column("diameter_m", _REAL, "m", "rim crest to rim crest"),
-        _column("depth_m", _REAL, "m", "rim to floor, measured on the finished height field"),
+        _column("depth_m", _REAL, "m", "rim to floor on the finished height field, less the sag of older ground"),
         _column("fresh_depth_m", _REAL, "m", "rim to floor when it formed"),
         _column("age_myr", _REAL, "Myr", "time since it formed"),
         _column("latitude_deg", _REAL, "deg", "O_S"),

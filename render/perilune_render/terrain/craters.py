@@ -5,6 +5,7 @@ fresh, worn and nearly erased craters stand together, as in real images. Equilib
 that people could still see, so no crater in equilibrium is drawn more worn than `_LAST_SEEN_WEAR`.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,10 @@ class Craters:
 
     def __len__(self) -> int:
         return len(self.x_m)
+
+    def chosen(self, which: np.ndarray) -> "Craters":
+        """The craters at some places, or where a mask is true."""
+        return Craters(*(getattr(self, field.name)[which] for field in dataclasses.fields(self)))
 
 
 def diffusivity_m2_per_myr(diameter_m: Array) -> Array:

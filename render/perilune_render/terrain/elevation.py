@@ -17,6 +17,10 @@ from perilune_shared.frames import MOON_RADIUS_M, Array, selenographic_from_site
 
 _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
 _LARGEST_PIXELS = 100_000_000
+_SWELL_M = 120.0
+"""Waves longer than about four times this keep their slope beyond the model's edge."""
+_SEAM_M = 100.0
+"""Width of the band along the edge in which short waves keep their slope too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +83,7 @@ def read_elevation(path: Path) -> ElevationModel:
 def base_heights(model: ElevationModel, grid: Grid) -> tuple[Array, Array]:
     """Heights (n, n; rows are y) of the model on the grid in metres, site at 0, and the share (n, n) that is real.
 
-    Bicubic inside. Beyond the model the ground is its mirror image about the edge, and the share falls to 0: what lies
+    Bicubic inside. Beyond the model the ground is continued (see `_continued`) and the share falls to 0: what lies
     there looks alike but is no measurement.
     """
     rows, columns = model.height_m.shape
@@ -92,11 +96,31 @@ def base_heights(model: ElevationModel, grid: Grid) -> tuple[Array, Array]:
     c = grid.coordinates_m
     column = RectBivariateSpline(net, net, column.reshape(x.shape))(c, c)
     row = RectBivariateSpline(net, net, row.reshape(x.shape))(c, c)
-    height = ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="reflect")
     outside = np.maximum.reduce([-row, row - rows, -column, column - columns, np.zeros_like(row)])
-    share = np.clip(1 - outside / 4, 0, 1)
+    margin = int(np.ceil(outside.max())) + 2
+    padded = _continued(model.height_m, margin, model.pixel_m)
+    height = ndimage.map_coordinates(padded, [row - 0.5 + margin, column - 0.5 + margin], order=3, mode="nearest")
     middle = len(c) // 2
-    return height - height[middle, middle], share
+    return height - height[middle, middle], np.clip(1 - outside / 4, 0, 1)
+
+
+def _continued(height_m: Array, margin: int, pixel_m: float) -> Array:
+    """Heights with `margin` more pixels on each side, without a crease at the old edge.
+
+    Long waves go on by point reflection, which keeps the slope across the edge; short ones by mirroring, so that
+    craters stay craters, and by point reflection too in a narrow band along the edge.
+    """
+    point_reflected = np.pad(height_m, margin, mode="reflect", reflect_type="odd")
+    swell = ndimage.gaussian_filter(point_reflected, _SWELL_M / pixel_m, mode="nearest")
+    inner = slice(margin, -margin)
+    mirrored = np.pad(height_m - swell[inner, inner], margin, mode="reflect")
+    rows, columns = (
+        np.maximum(np.maximum(margin - i, i - margin - n + 1), 0)
+        for i, n in zip(np.ogrid[: len(swell), : swell.shape[1]], height_m.shape, strict=True)
+    )
+    away = np.clip(np.maximum(rows, columns) * pixel_m / _SEAM_M, 0, 1)
+    away = away * away * (3 - 2 * away)
+    return swell + away * mirrored + (1 - away) * (point_reflected - swell)
 
 
 def _pixel_m(

@@ -21,7 +21,7 @@ class Rims:
     normal: Array
     """Unit normal of the plane through the rim, O_L (N, 3)."""
     depth_m: Array
-    """Mean height of the rim less that of the floor (the inner fifth), at least 0, metres (N,)."""
+    """Mean height of the rim less that of the floor (the inner fifth), less the older ground's sag, at least 0 (N,)."""
 
 
 def height_at(height_m: Array, grid: Grid, x_m: Array, y_m: Array) -> Array:
@@ -32,8 +32,11 @@ def height_at(height_m: Array, grid: Grid, x_m: Array, y_m: Array) -> Array:
     return ndimage.map_coordinates(height_m, [row, column], order=1, mode="nearest")
 
 
-def measure_rims(height_m: Array, grid: Grid, craters: Craters) -> Rims:
-    """Fit a plane to 16 points of each rim by least squares, and measure the depth below it."""
+def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | float = 0.0) -> Rims:
+    """Fit a plane to 16 points of each rim by least squares, and measure the depth below it.
+
+    `sag_m` (N,) is taken off the depth: a worn crater on the floor of a large one is not as deep as that one's bowl.
+    """
     angle = 2 * np.pi * np.arange(_N_RIM) / _N_RIM
     cos, sin = np.cos(angle), np.sin(angle)
     radius = craters.diameter_m[:, None] / 2
@@ -47,4 +50,4 @@ def measure_rims(height_m: Array, grid: Grid, craters: Craters) -> Rims:
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     floor = height_at(height_m, grid, x + 0.2 * radius * cos[::2], y + 0.2 * radius * sin[::2]).mean(axis=1)
     centre = height_at(height_m, grid, craters.x_m, craters.y_m)
-    return Rims(level, normal, np.maximum(level - (floor + centre) / 2, 0))
+    return Rims(level, normal, np.maximum(level - (floor + centre) / 2 - sag_m, 0))

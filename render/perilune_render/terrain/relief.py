@@ -14,27 +14,23 @@ from perilune_render.terrain.noise import RMS_SLOPE, add_waves
 from perilune_shared.frames import Array
 
 
-def add_relief(height_m: Array, grid: Grid, config: ReliefConfig, seed: int, longest_wavelength_m: float) -> None:
-    """Add relief with waves of at most `longest_wavelength_m` to height_m (n, n; rows are y), in place.
+def add_relief(
+    height_m: Array, grid: Grid, config: ReliefConfig, seed: int, shortest_m: float, longest_m: float
+) -> None:
+    """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n, n; rows are y), in place.
 
-    `config.rms_slope_deg` is that of all octaves down to a metre; a real elevation model brings its own long waves,
-    so that only the shorter octaves are added to it.
+    `config.rms_slope_deg` is that of all octaves down to a metre. Long waves are laid before the craters, which cut
+    them; short ones after, since a worn crater is as rough as the ground about it.
     """
     rng = stream(seed, "relief")
     finest = 3 * float(np.diff(grid.coordinates_m).min())
-    lengths = config.longest_wavelength_m / 2.0 ** np.arange(
-        np.ceil(np.log2(config.longest_wavelength_m / min(finest, 1.0)))
-    )
+    n_octaves = int(np.ceil(np.log2(config.longest_wavelength_m / min(finest, 1.0))))
+    lengths = config.longest_wavelength_m / 2.0 ** np.arange(n_octaves)
     slopes = lengths ** (config.hurst_exponent - 1)
     slopes *= np.tan(np.radians(config.rms_slope_deg)) / np.sqrt(np.sum(slopes[lengths >= 1] ** 2))
     for length, slope in zip(lengths, slopes, strict=True):
         # Each octave is shifted, since gradient noise is zero on its own lattice.
         shifted = grid.coordinates_m + rng.uniform(0, length)
-        if finest <= length <= longest_wavelength_m:
-            add_waves(
-                height_m,
-                shifted,
-                float(length),
-                float(slope * length / RMS_SLOPE),
-                derived_seed(seed, "relief", length),
-            )
+        if max(finest, shortest_m) <= length < longest_m:
+            own = derived_seed(seed, "relief", length)
+            add_waves(height_m, shifted, float(length), float(slope * length / RMS_SLOPE), own)

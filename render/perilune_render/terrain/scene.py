@@ -14,12 +14,16 @@ from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.measure import Rims, height_at, measure_rims
 from perilune_render.terrain.noise import add_waves
 from perilune_render.terrain.relief import add_relief
-from perilune_render.terrain.stamp import stamp_craters
+from perilune_render.terrain.stamp import rim_left, stamp_craters
 from perilune_shared.camera import Camera
 from perilune_shared.frames import Array
 
 _RESOLVED_PIXELS = 4.0
 """An elevation model shows craters of at least this many pixels across; smaller ones are added."""
+_ROUGHNESS_M = 100.0
+"""Shorter waves lie on top of the craters."""
+_LEAST_RIM = 0.3
+"""A crater of whose rim younger craters have left less than this share is no crater any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +43,7 @@ class Scene:
     albedo: Array
     """Factor on the reflectance (n, n), about 1."""
     craters: Craters
-    """In the order in which they were laid; the crater_id is the place in this order."""
+    """Those that younger ones have not removed, in the order in which they were laid; crater_id is the place in it."""
     rims: Rims
     """The same craters as found on the finished ground."""
     boulders: Boulders
@@ -58,7 +62,8 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
     n = len(grid.coordinates_m)
     height = np.zeros((n, n)) if model is None else base_heights(model, grid)[0]
     resolved = None if model is None else _RESOLVED_PIXELS * model.pixel_m
-    add_relief(height, grid, terrain.relief, seed, resolved or terrain.relief.longest_wavelength_m)
+    longest = np.inf if resolved is None else resolved
+    add_relief(height, grid, terrain.relief, seed, _ROUGHNESS_M, longest)
     craters = draw_craters(terrain.craters, grid, seed, resolved)
     albedo = np.ones((n, n))
     variation = config.light.albedo_variation
@@ -71,7 +76,11 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
                 amplitude * variation,
                 derived_seed(seed, "albedo", length),
             )
-    stamp_craters(height, albedo, grid, craters, variation * _brightness(craters))
+    sag = stamp_craters(height, albedo, grid, craters, variation * _brightness(craters))
+    add_relief(height, grid, terrain.relief, seed, 0.0, min(_ROUGHNESS_M, longest))
+    if len(craters):
+        kept = rim_left(craters) >= _LEAST_RIM
+        craters, sag = craters.chosen(kept), sag[kept]
     height -= height_at(height, grid, np.zeros(1), np.zeros(1))
     boulders = draw_boulders(terrain.boulders, grid, craters, seed)
     return Scene(
@@ -81,7 +90,7 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
         height,
         np.clip(albedo, 0.5, 1.8),
         craters,
-        measure_rims(height, grid, craters),
+        measure_rims(height, grid, craters, sag),
         boulders,
         boulders.centre_height_m(height_at(height, grid, boulders.x_m, boulders.y_m)),
         "procedural" if model is None else model.source,

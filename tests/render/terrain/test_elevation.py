@@ -74,6 +74,18 @@ def test_craters_are_added_only_below_what_it_resolves(tmp_path, camera):
     assert scene.dem_source.startswith("a.tif sha256:") and scene.latitude_deg == pytest.approx(-30, abs=0.1)
 
 
+def test_no_crease_where_the_model_ends(tmp_path):
+    # A slope that rises across the edge goes on rising: a mirror image would fold it.
+    height = np.tile(np.arange(200.0), (200, 1)) + np.random.default_rng(1).normal(0, 0.2, (200, 200))
+    model = read_elevation(write(tmp_path / "a.tif", height, POLAR, rasterio.Affine(5, 0, 1e5, 0, -5, 0)))
+    grid = Grid(np.linspace(-800, 800, 321))
+    base, share = base_heights(model, grid)
+    gy, gx = np.gradient(base, 5.0)
+    slope = np.stack([gx, gy])
+    inside, outside = (np.median(slope[:, share == s], axis=1) for s in (1, 0))
+    assert np.linalg.norm(inside) > 0.15 and np.allclose(inside, outside, atol=0.02)
+
+
 @pytest.mark.parametrize(
     ("change", "part"),
     [

@@ -1,9 +1,10 @@
 import numpy as np
+import pytest
 
 from perilune_render.terrain.craters import Craters, draw_craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import height_at, measure_rims
-from perilune_render.terrain.stamp import stamp_craters
+from perilune_render.terrain.stamp import rim_left, stamp_craters
 from tests.render.conftest import config_with
 
 GRID = Grid(np.linspace(-200, 200, 801))
@@ -85,3 +86,28 @@ def test_population_is_ordered_by_wear_and_differs_by_seed():
     again, other = draw_craters(config, GRID, 4), draw_craters(config, GRID, 5)
     assert np.array_equal(craters.x_m, again.x_m) and not np.array_equal(craters.x_m[:50], other.x_m[:50])
     assert draw_craters(config, GRID, 4, max_diameter_m=20).diameter_m.max() <= 20
+
+
+def test_a_crater_under_a_younger_one_is_gone():
+    # In order: under the second; beside it; half under it; the youngest one itself, smaller and inside.
+    _, _, craters = laid(
+        [(0, 0, 30, 0.1, 0.001), (0, 5, 90, 0.1, 0.001), (100, 0, 30, 0.1, 0.001), (10, 0, 20, 0.1, 0.001)]
+    )
+    assert rim_left(craters).tolist() == pytest.approx([0, 1, 1, 1], abs=0.02)
+    _, _, half = laid([(45, 0, 30, 0.1, 0.001), (0, 0, 90, 0.1, 0.001)])
+    assert 0.4 < rim_left(half)[0] < 0.7
+    _, _, worn = laid([(0, 0, 30, 0.1, 0.5), (0, 0, 90, 0.1, 0.4)])
+    assert rim_left(worn)[0] > 0.3
+
+
+def test_a_worn_crater_on_a_bowls_floor_is_not_as_deep_as_the_bowl():
+    rows = np.array([(0, 0, 160, 0.2, 0.001), (0, 0, 50, 0.13, 0.2)], float)
+    x, y, diameter, ratio, wear = rows.T
+    craters = Craters(x, y, diameter, ratio * diameter, np.zeros(2), wear * (diameter / 2) ** 2)
+    height = np.zeros((801, 801))
+    sag = stamp_craters(height, np.ones_like(height), GRID, craters, np.zeros(2))
+    alone, _, small = laid([(0, 0, 50, 0.13, 0.2)])
+    own = measure_rims(alone, GRID, small).depth_m[0]
+    assert sag[0] == pytest.approx(0, abs=1e-9) and sag[1] > 0.5
+    assert measure_rims(height, GRID, craters).depth_m[1] > 1.5 * own
+    assert measure_rims(height, GRID, craters, sag).depth_m[1] == pytest.approx(own, rel=0.5)
