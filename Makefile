@@ -2,6 +2,7 @@
 PYTHON ?= python3.11
 PRESET ?= small
 KIND ?= both
+NAME ?= $(PRESET)
 VENV := .venv
 BIN := $(VENV)/bin
 
@@ -17,8 +18,7 @@ ifneq ($(OUT),)
 endif
 
 COMMON := --preset $(PRESET) $(if $(CONFIG),--config $(CONFIG)) $(foreach setting,$(SET),--set $(setting))
-TRAIN := $(COMMON) --runs $(RUNS) --name $(NAME)
-NAME ?= $(PRESET)
+TRAIN := $(COMMON) --out $(RUNS) --name $(NAME)
 RENDER = $(BIN)/perilune-render dataset $(COMMON) $(if $(DEM),--dem $(DEM)) --out $(DATA)
 
 DETECT := $(RUNS)/detect/$(NAME)/metrics.json
@@ -72,7 +72,7 @@ train-detect: detect-frames ## train and evaluate crater detection
 	  $(BIN)/perilune-train detect $(TRAIN) --dataset $(DATA)/detect --resume
 
 train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
-	@$(BIN)/perilune-train detect $(COMMON) --set detect.attention=none --runs $(RUNS) --name $(NAME)-none --dataset $(DATA)/detect --resume
+	@$(BIN)/perilune-train detect $(COMMON) --set detect.attention=none --out $(RUNS) --name $(NAME)-none --dataset $(DATA)/detect --resume
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f $(DETECT) || $(MAKE) --no-print-directory train-detect
@@ -82,7 +82,7 @@ train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 explain: ## attention masks and correlations of the trained networks
 	@test -f $(NAVIGATE) -a -f $(DETECT) || $(MAKE) --no-print-directory train-nav
 	@test -f $(EXPLAIN) && echo "$(EXPLAIN) is there; remove its folder to explain again" || \
-	  $(BIN)/perilune-train explain $(TRAIN) --data $(DATA)
+	  $(BIN)/perilune-train explain $(TRAIN) --dataset $(DATA)
 
 test: setup ## run all tests
 	@$(BIN)/python -m pytest

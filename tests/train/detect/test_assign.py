@@ -1,0 +1,65 @@
+"""Assignment by hand: which cells answer for which label."""
+
+import torch
+
+from perilune_train.detect.assign import Targets, assign, matching_anchors
+
+ANCHORS = torch.tensor([[[4.0, 4.0], [8.0, 8.0], [16.0, 16.0]], [[32.0, 32.0], [64.0, 64.0], [100.0, 100.0]]])
+SHAPES = [(2, 16, 16), (2, 8, 8)]
+
+
+def targets(*boxes, frame=None, wanted=None):
+    count = len(boxes)
+    return Targets(
+        torch.tensor(boxes).view(-1, 4),
+        torch.tensor(frame or [0] * count, dtype=torch.long),
+        torch.tensor(wanted or [True] * count, dtype=torch.bool),
+    )
+
+
+def test_anchors_within_the_ratio_take_part():
+    boxes = torch.tensor([[0.0, 0.0, 6.0, 6.0], [0.0, 0.0, 500.0, 500.0], [0.0, 0.0, 0.0, 0.0]])
+    matches = matching_anchors(boxes, ANCHORS.flatten(0, 1), 2.0)
+    assert matches[0].tolist() == [True, True, False, False, False, False]
+    assert matches[1].tolist() == [False] * 5 + [True]
+    assert matches[2].sum() == 1
+
+
+def test_centre_cell_and_two_neighbours():
+    # Centre (13, 22) px, stride 8: cell column 1, row 2 at (0.625, 0.75): neighbours right and below.
+    made = assign(targets([9.0, 18.0, 17.0, 26.0]), ANCHORS, (8, 16), SHAPES, 1.5)
+    first = made[0]
+    assert sorted(zip(first.column.tolist(), first.row.tolist(), strict=True)) == [(1, 2), (1, 3), (2, 2)]
+    assert first.anchor.tolist() == [1, 1, 1]
+    assert first.label.tolist() == [0, 0, 0]
+    assert first.frame.tolist() == [0, 0, 0]
+    assert len(made[1].row) == 0
+    assert first.positive.sum() == 3
+    assert not (first.positive & first.free).any()
+
+
+def test_neighbours_off_the_grid_are_left_out():
+    # Centre (1, 1) px: the nearest neighbours of cell (0, 0) are left of and above the image.
+    made = assign(targets([-2.0, -2.0, 4.0, 4.0]), ANCHORS, (8, 16), SHAPES, 1.4)
+    assert (made[0].column.tolist(), made[0].row.tolist()) == ([0], [0])
+
+
+def test_ignored_labels_are_neither_positive_nor_negative():
+    made = assign(targets([56.0, 56.0, 72.0, 72.0], frame=[1], wanted=[False]), ANCHORS, (8, 16), SHAPES, 1.5)
+    assert len(made[0].row) == 0
+    free = made[0].free.nonzero()
+    # 16 px box about (64, 64): cell centres nearer than 16 / 4 + 8 / 2 = 8 px, in the anchor that fits.
+    assert free.tolist() == [[1, 2, r, c] for r in (7, 8) for c in (7, 8)]
+    assert not made[1].free.any()
+
+
+def test_empty_batch_and_crowded_batch():
+    for part in assign(targets(), ANCHORS, (8, 16), SHAPES, 2.0):
+        assert len(part.label) == 0
+        assert not part.free.any()
+    corner = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 120
+    boxes = torch.cat([corner, corner + 6], 1)
+    crowd = Targets(boxes, torch.zeros(500, dtype=torch.long), torch.ones(500, dtype=torch.bool))
+    made = assign(crowd, ANCHORS, (8, 16), SHAPES, 1.6)[0]
+    assert set(made.label.tolist()) == set(range(500))
+    assert made.row.max() < 16 and made.column.max() < 16

@@ -1,0 +1,28 @@
+"""Overlap and suppression by hand."""
+
+import numpy as np
+
+from perilune_train.detect.boxes import iou_matrix, suppress
+
+
+def test_iou_by_hand():
+    boxes = [[0, 0, 2, 2], [1, 1, 3, 3], [5, 5, 6, 6], [1, 1, 1, 1]]
+    expected = [[1, 1 / 7, 0, 0], [1 / 7, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]]
+    np.testing.assert_allclose(iou_matrix(boxes, boxes), expected)
+    assert iou_matrix(np.zeros((0, 4)), boxes).shape == (0, 4)
+
+
+def test_suppression_keeps_the_better_of_two():
+    boxes = np.array([[0, 0, 10, 10], [0, 0, 10, 9], [20, 0, 30, 10], [0, 0, 10, 4]], float)
+    scores = np.array([0.5, 0.9, 0.3, 0.4])
+    # Box 0 overlaps box 1 by 0.9; box 3 by 4 / 9, which is below the threshold.
+    assert suppress(boxes, scores, 0.5, 10).tolist() == [1, 3, 2]
+    assert suppress(boxes, scores, 0.4, 10).tolist() == [1, 2]
+    assert suppress(boxes, scores, 0.5, 2).tolist() == [1, 3]
+    assert suppress(boxes[:0], scores[:0], 0.5, 2).tolist() == []
+
+
+def test_a_suppressed_box_suppresses_nothing():
+    boxes = np.array([[0, 0, 10, 10], [4, 0, 14, 10], [8, 0, 18, 10]], float)
+    # Neighbours overlap by 6 / 14; the outer two by 2 / 18.
+    assert suppress(boxes, np.array([0.9, 0.8, 0.7]), 0.4, 10).tolist() == [0, 2]

@@ -1,0 +1,130 @@
+"""Labels that are wanted, augmentation, order, batches."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perilune_shared.camera import Camera
+from perilune_shared.errors import UserError
+from perilune_shared.frames import quaternion_from_matrix
+from perilune_shared.manifest import open_dataset
+from perilune_train.detect.config import AugmentSettings, DetectConfig, LabelSettings
+from perilune_train.detect.data import (
+    EvaluationFrames,
+    TrainingFrames,
+    augment,
+    load_split,
+    loader,
+    turn,
+    unlabelled_craters,
+)
+
+PLAIN = AugmentSettings(flips_and_turns=False, gain=0.0, gamma=0.0, blur_px=0.0, noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def split(dataset_detect):
+    return load_split(open_dataset(dataset_detect), "train", LabelSettings())
+
+
+def test_worn_craters_are_ignored_and_no_others(dataset_detect, split):
+    dataset = open_dataset(dataset_detect)
+    labels = dataset.table("labels").to_pandas()
+    # In this dataset every fourth crater is worn to a depth of 0.01 diameters.
+    for name, part in zip(split.frames.table["frame_id"], split.labels, strict=True):
+        rows = labels[labels["frame_id"] == name]
+        assert part.wanted[part.labelled].tolist() == (rows["crater_id"] % 4 != 3).tolist()
+        np.testing.assert_array_equal(part.boxes[part.labelled, 0], rows["bbox_x0_px"])
+    assert any((~part.wanted).any() for part in split.labels)
+    everything = load_split(dataset, "train", LabelSettings(min_depth_ratio=0.0))
+    assert all(part.wanted[part.labelled].all() for part in everything.labels)
+    large = load_split(dataset, "train", LabelSettings(min_depth_ratio=0.0, radius_px=(10.0, 50.0)))
+    for part in large.labels:
+        np.testing.assert_array_equal(part.wanted[part.labelled], part.radius_px[part.labelled] >= 10)
+
+
+def test_craters_just_outside_the_labelled_range_are_ignored():
+    camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
+    # Straight down from 100 m: a pixel is a metre, O_L's x is the image's x, its y runs up.
+    frame = {"position_m": [0.0, 0.0, 100.0], "rotation_wxyz": quaternion_from_matrix(np.diag([1.0, -1.0, -1.0]))}
+    places = [(0, 10, 2.0), (20, 0, 3.6), (-20, 0, 130.0), (0, 0, 160.0), (52, 0, 20.0), (80, 0, 20.0)]
+    craters = pd.DataFrame(
+        [
+            {"x_m": x, "y_m": y, "z_m": 0.0, "normal_x": 0.0, "normal_y": 0.0, "normal_z": 1.0, "diameter_m": diameter}
+            for x, y, diameter in places
+        ]
+    )
+    rows = unlabelled_craters(craters, camera, frame, (2.0, 50.0))
+    # Radius 1 px: too small; 1.8 px; 65 px; 80 px: too large; off the image but reaching in; altogether off.
+    np.testing.assert_allclose(rows["radius_px"], [1.8, 65.0, 10.0], rtol=1e-6)
+    np.testing.assert_allclose(rows[["ellipse_cx_px", "ellipse_cy_px"]], [[70, 50], [30, 50], [102, 50]], atol=1e-6)
+    np.testing.assert_allclose(rows["bbox_x0_px"], [68.2, -35, 92], atol=1e-6)
+    assert not rows["wanted"].any() and not rows["labelled"].any()
+
+
+def test_frames_that_do_not_divide_by_32_are_refused(tmp_path, make_dataset):
+    root = make_dataset(tmp_path / "odd", "detect", side_px=100, n_frames=1, craters=20)
+    with pytest.raises(UserError, match="width_px: found 100; wanted a multiple of 32"):
+        load_split(open_dataset(root), "train", LabelSettings())
+
+
+SIDE = st.integers(1, 3)
+
+
+@given(kind=st.integers(0, 7), x=st.integers(0, 4), y=st.integers(0, 6), size=st.tuples(SIDE, SIDE))
+def test_turns_move_boxes_with_the_pixels(kind, x, y, size):
+    image = np.zeros((9, 9), np.uint8)
+    image[y : y + size[1], x : x + size[0]] = 255
+    turned, boxes = turn(image, np.array([[x, y, x + size[0], y + size[1]]], float), kind)
+    rows, columns = np.nonzero(turned)
+    assert boxes.tolist() == [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
+
+
+def test_the_eight_turns_differ():
+    image = np.arange(9, dtype=np.uint8).reshape(3, 3)
+    assert len({turn(image, np.zeros((0, 4)), kind)[0].tobytes() for kind in range(8)}) == 8
+
+
+def test_augmentation_off_changes_nothing(split):
+    image, boxes = split.frames.images[0], split.labels[0].boxes
+    pixels, moved = augment(image, boxes, PLAIN, np.random.default_rng(0))
+    np.testing.assert_allclose(pixels, image, atol=1e-3)
+    np.testing.assert_array_equal(moved, boxes)
+
+
+@pytest.mark.parametrize("setting", [{"gain": 0.5}, {"gamma": 0.5}, {"blur_px": 3.0}, {"noise": 5.0}])
+def test_each_augmentation_changes_the_pixels_alone(split, setting):
+    image, boxes = split.frames.images[0], split.labels[0].boxes
+    pixels, moved = augment(image, boxes, PLAIN.model_copy(update=setting), np.random.default_rng(1))
+    assert np.abs(pixels - image).mean() > 0.3
+    np.testing.assert_array_equal(moved, boxes)
+
+
+def test_an_epoch_follows_from_seed_and_number_alone(split):
+    first, again = (TrainingFrames(split, AugmentSettings(), 5, 2) for _ in range(2))
+    other = TrainingFrames(split, AugmentSettings(), 5, 3)
+    assert sorted(first.order) == list(range(len(split)))
+    assert first.order.tolist() == again.order.tolist() != other.order.tolist()
+    # The sample does not depend on what was drawn before it.
+    again[0]
+    np.testing.assert_array_equal(first[3][0], again[3][0])
+    same_frame = int(np.flatnonzero(other.order == first.order[3])[0])
+    assert not np.array_equal(first[3][0], other[same_frame][0])
+
+
+def test_batches(split):
+    config = DetectConfig(batch_size=5, in_channels=3)
+    batches = list(loader(EvaluationFrames(split), config))
+    assert [len(images) for images, _ in batches] == [5, 5, 5, 5, 4]
+    images, targets = batches[1]
+    assert images.shape == (5, 3, 96, 96)
+    assert images.is_contiguous(memory_format=torch.channels_last)
+    torch.testing.assert_close(images.mean((2, 3)), torch.zeros(5, 3), atol=1e-4, rtol=0)
+    torch.testing.assert_close(images.std((2, 3)), torch.ones(5, 3), atol=1e-2, rtol=0)
+    assert torch.equal(images[:, 0], images[:, 2])
+    assert torch.bincount(targets.frame, minlength=5).tolist() == [len(part.boxes) for part in split.labels[5:10]]
+    np.testing.assert_allclose(targets.boxes[targets.frame == 2], split.labels[7].boxes, rtol=1e-6)
+    assert targets.wanted[targets.frame == 2].tolist() == split.labels[7].wanted.tolist()

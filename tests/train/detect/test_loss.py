@@ -1,0 +1,91 @@
+"""CIoU and the loss, by hand."""
+
+import math
+
+import pytest
+import torch
+
+from perilune_train.detect.assign import Targets
+from perilune_train.detect.config import LossSettings
+from perilune_train.detect.loss import ciou_loss, detection_loss
+
+
+def test_equal_circles_cost_nothing():
+    box = torch.tensor([[1.0, 2.0, 7.0, 8.0]])
+    torch.testing.assert_close(ciou_loss(box, box), torch.zeros(1), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("aspect", "ratio_label"), [("circular", 1.0), ("standard", 0.5)])
+def test_by_hand(aspect, ratio_label):
+    predicted, label = torch.tensor([[0.0, 0.0, 4.0, 2.0]]), torch.tensor([[0.0, 0.0, 2.0, 4.0]])
+    iou = 4 / 12
+    distance = (1 + 1) / (16 + 16)
+    v = 4 / math.pi**2 * (math.atan(ratio_label) - math.atan(2.0)) ** 2
+    expected = 1 - iou + distance + v / (1 - iou + v) * v
+    assert ciou_loss(predicted, label, aspect).item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_circular_prior_pulls_towards_a_circle_where_the_label_is_an_ellipse():
+    ellipse = torch.tensor([[0.0, 0.0, 10.0, 5.0]])
+    assert ciou_loss(ellipse, ellipse, "standard").item() == pytest.approx(0, abs=1e-6)
+    # IoU is 1 here, so alpha = v / v = 1 and the aspect term stands alone.
+    v = 4 / math.pi**2 * (math.pi / 4 - math.atan(2.0)) ** 2
+    assert ciou_loss(ellipse, ellipse, "circular").item() == pytest.approx(v, rel=1e-3)
+
+
+def test_alpha_carries_no_gradient():
+    box = torch.tensor([[0.0, 0.0, 6.0, 4.0]], requires_grad=True)
+    label = torch.tensor([[0.0, 0.0, 5.0, 5.0]])
+    ciou_loss(box, label).sum().backward()
+    w, h = torch.tensor(6.0, requires_grad=True), torch.tensor(4.0)
+    iou = 20 / (w * h + 25 - 20)
+    centre = ((w - 5) / 2) ** 2 + ((h - 5) / 2) ** 2
+    v = 4 / math.pi**2 * (math.pi / 4 - torch.atan(w / h)) ** 2
+    alpha = (v / (1 - iou + v)).item()
+    (1 - iou + centre / (w**2 + 25) + alpha * v).backward()
+    assert box.grad[0, 2].item() == pytest.approx(w.grad.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+def test_degenerate_boxes_are_finite_in_every_type(dtype):
+    box = torch.tensor([[0, 0, 0, 0], [5, 5, 5, 9], [0, 0, 3, 3]], dtype=dtype, requires_grad=True)
+    loss = ciou_loss(box, torch.tensor([[0, 0, 0, 0], [0, 0, 0, 0], [9, 9, 9, 9]], dtype=dtype))
+    loss.sum().backward()
+    assert loss.dtype == torch.float32
+    assert loss.isfinite().all() and box.grad.isfinite().all()
+    assert ciou_loss(box[:0], box[:0]).shape == (0,)
+
+
+def anchors_and_output():
+    return torch.tensor([[[8.0, 8.0], [16.0, 16.0], [30.0, 30.0]]]), torch.zeros(1, 3, 4, 4, 5)
+
+
+def test_loss_by_hand():
+    anchors, raw = anchors_and_output()
+    label = Targets(torch.tensor([[8.0, 8.0, 16.0, 16.0]]), torch.tensor([0]), torch.tensor([True]))
+    box, confidence = detection_loss([raw], label, anchors, (8,), 1.5, LossSettings(lambda_noobj=0.5))
+    # Centre (12, 12): cell (1, 1) exactly, its neighbours right and below 8 px off; 3 of 48 predictors positive.
+    # Shifted boxes: IoU 0, distance 64 / (256 + 64). Reach of the free ones: 8 / 4 + 4 = 6 px, only cell (1, 1).
+    assert box.item() == pytest.approx((0 + 2 * (1 + 64 / 320)) / 3, abs=1e-5)
+    assert confidence.item() == pytest.approx((3 + 0.5 * 45) * math.log(2) / 48, rel=1e-5)
+
+
+def test_ignored_label_takes_its_predictors_out_of_the_loss():
+    anchors, raw = anchors_and_output()
+    boxes = torch.tensor([[8.0, 8.0, 16.0, 16.0]])
+    none = Targets(boxes[:0], torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.bool))
+    ignored = Targets(boxes, torch.tensor([0]), torch.tensor([False]))
+    full = detection_loss([raw], none, anchors, (8,), 1.5, LossSettings())[1]
+    less = detection_loss([raw], ignored, anchors, (8,), 1.5, LossSettings())[1]
+    assert full.item() == pytest.approx(math.log(2), rel=1e-5)
+    assert less.item() == pytest.approx(47 / 48 * math.log(2), rel=1e-5)
+
+
+def test_empty_frame_has_a_gradient():
+    anchors, raw = anchors_and_output()
+    raw.requires_grad_()
+    none = Targets(torch.zeros(0, 4), torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.bool))
+    box, confidence = detection_loss([raw], none, anchors, (8,), 2.0, LossSettings())
+    (box + confidence).backward()
+    assert box.item() == 0
+    assert raw.grad[..., 4].min() > 0 and raw.grad[..., :4].abs().max() == 0

@@ -1,0 +1,116 @@
+"""Matching and average precision by hand."""
+
+import numpy as np
+import pytest
+
+from perilune_train.detect.data import FrameLabels
+from perilune_train.detect.metrics import (
+    FALSE,
+    FOUND,
+    IGNORED,
+    Curve,
+    Detections,
+    Matches,
+    at_threshold,
+    curve,
+    figures,
+    match_frame,
+    match_split,
+)
+
+
+def square(x, y, side=10.0):
+    return [x, y, x + side, y + side]
+
+
+def labels(boxes, wanted=None):
+    boxes = np.array(boxes, float).reshape(-1, 4)
+    wanted = np.ones(len(boxes), bool) if wanted is None else np.array(wanted)
+    return FrameLabels(boxes, (boxes[:, 2] - boxes[:, 0]) / 2, np.zeros((len(boxes), 5)), wanted, wanted)
+
+
+def detections(boxes, scores=None):
+    boxes = np.array(boxes, float).reshape(-1, 4)
+    return Detections(boxes, np.linspace(0.9, 0.1, len(boxes)) if scores is None else np.array(scores))
+
+
+def judge(found, truth):
+    return match_split([found], [truth], (100, 100), 0.5, (2.0, 50.0))
+
+
+def test_a_label_is_found_once_by_the_best_score():
+    found = detections([square(1, 0), square(0, 0), square(50, 50)])
+    assert match_frame(found, labels([square(0, 0)]), 0.5).tolist() == [0, -1, -1]
+
+
+def test_a_detection_takes_the_free_label_of_highest_overlap():
+    truth = labels([square(0, 0), square(3, 0)])
+    assert match_frame(detections([square(2, 0), square(2, 0)]), truth, 0.5).tolist() == [1, 0]
+
+
+def test_wanted_labels_come_before_ignored_ones():
+    truth = labels([square(0, 0), square(2, 0)], [False, True])
+    # The first lies exactly on the ignored label, yet overlaps the wanted one enough; the second only the ignored.
+    assert match_frame(detections([square(0, 0), square(-1, 0), square(0, 0)]), truth, 0.5).tolist() == [1, -2, -2]
+
+
+def test_what_no_one_can_judge_is_left_out_unless_strict():
+    truth = labels([square(10, 10), square(40, 40)], [True, False])
+    found = detections([square(10, 10), square(40, 40), square(-9, 20), square(70, 70, 3.0), square(70, 20)])
+    matches = judge(found, truth)
+    # On a worn crater, centre off the image, radius 1.5 px: ignored. In the open: false.
+    assert matches.outcome.tolist() == [FOUND, IGNORED, IGNORED, IGNORED, FALSE]
+    assert matches.strict().outcome.tolist() == [FOUND, FALSE, FALSE, FALSE, FALSE]
+    assert at_threshold(matches, 0.0) == pytest.approx((0.5, 1.0, 2 / 3))
+    assert at_threshold(matches.strict(), 0.0) == pytest.approx((0.2, 1.0, 1 / 3))
+
+
+def outcomes(*kinds, wanted):
+    count = len(kinds)
+    return Matches(np.linspace(0.9, 0.1, count), np.array(kinds, np.int8), np.full(count, 5.0), np.full(wanted, 5.0))
+
+
+def test_average_precision_by_hand():
+    points = curve(outcomes(FOUND, FALSE, FOUND, FALSE, wanted=4))
+    assert points.precision.tolist() == pytest.approx([1, 1 / 2, 2 / 3, 1 / 2])
+    assert points.recall.tolist() == [0.25, 0.25, 0.5, 0.5]
+    assert points.average_precision() == pytest.approx(0.25 * 1 + 0.25 * 2 / 3)
+    # Recalls 0 .. 0.25 are 26 of the 101 points, 0.26 .. 0.50 another 25.
+    assert points.average_precision_101() == pytest.approx((26 * 1 + 25 * 2 / 3) / 101)
+
+
+def test_interpolation_takes_the_best_later_precision():
+    points = curve(outcomes(FALSE, FOUND, FOUND, wanted=2))
+    assert points.average_precision() == pytest.approx(2 / 3)
+
+
+def test_ignored_detections_do_not_move_the_curve():
+    with_ignored = curve(outcomes(FOUND, IGNORED, FALSE, FOUND, IGNORED, wanted=2))
+    without = curve(outcomes(FOUND, FALSE, FOUND, wanted=2))
+    assert with_ignored.average_precision() == pytest.approx(without.average_precision())
+
+
+def test_threshold_of_best_f1():
+    points = Curve(np.array([0.9, 0.8, 0.7]), np.array([1.0, 0.5, 2 / 3]), np.array([0.25, 0.25, 0.5]))
+    # F1: 0.4, 1 / 3, 4 / 7.
+    assert points.best_threshold() == 0.7
+
+
+def test_nothing_found_and_nothing_wanted():
+    none = judge(detections([]), labels([square(0, 0)]))
+    assert curve(none).average_precision() == 0
+    assert curve(none).average_precision_101() == 0
+    assert curve(none).best_threshold() == 1.0
+    assert at_threshold(none, 0.5) == (0, 0, 0)
+    nothing_wanted = judge(detections([square(20, 20)]), labels([]))
+    assert curve(nothing_wanted).average_precision() == 0
+
+
+def test_recall_by_radius():
+    truth = labels([square(0, 0, 8), square(20, 0, 8), square(40, 40, 30)])
+    result = figures(judge(detections([square(0, 0, 8), square(40, 40, 30)], [0.9, 0.2]), truth), threshold=0.5)
+    assert result["recall_radius_3_5_px"] == 0.5
+    assert result["recall_radius_10_20_px"] == 0
+    assert "recall_radius_5_10_px" not in result
+    assert result["recall"] == pytest.approx(1 / 3)
+    assert result["ap50"] == pytest.approx(2 / 3)

@@ -1,0 +1,115 @@
+"""A whole detection run, and what wrong input gets."""
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from perilune_shared.config import parse_yaml, resolve
+from perilune_shared.errors import UserError
+from perilune_train import runs
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.run import build_network, load_detector, run_detect, start_backbone
+from perilune_train.detect.task import DetectTask
+
+QUICK = ("detect.epochs=2", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
+
+
+def settings(*more):
+    return resolve(DetectConfig, "detect", "perilune_train", "tiny", None, (*QUICK, *more))
+
+
+@pytest.fixture(scope="module")
+def finished(dataset_detect, tmp_path_factory):
+    return run_detect(settings(), dataset_detect, tmp_path_factory.mktemp("runs"), "a")
+
+
+def test_a_run_leaves_all_its_files(finished):
+    for name in (
+        "config.yaml",
+        "metrics.json",
+        "detections.parquet",
+        "detections.png",
+        "precision_recall.png",
+        "checkpoints/best.ckpt",
+        "checkpoints/last.ckpt",
+    ):
+        assert finished.root.joinpath(name).stat().st_size > 0, name
+    assert list(finished.root.glob("events.out.tfevents*"))
+    assert not list(finished.root.rglob(".*part*"))
+    metrics = json.loads(finished.metrics.read_text())
+    for account in ("test/", "test/strict/", "val/"):
+        assert 0 <= metrics[account + "ap50"] <= 1
+    assert metrics["test/strict/precision"] <= metrics["test/precision"]
+    assert metrics["test/frames"] == 8
+    assert metrics["train/epochs"] == 2
+    assert parse_yaml(finished.config.read_text(), "")["detect"]["strides"] == [4, 8, 16]
+
+
+def test_the_table_of_detections(finished, dataset_detect):
+    table = pq.read_table(finished.root / "detections.parquet").to_pandas()
+    assert list(table.columns) == ["frame_id", "x0_px", "y0_px", "x1_px", "y1_px", "score"]
+    assert set(table["frame_id"]) <= {f"s004/t004/{k:06d}" for k in range(8)}
+    assert (table["x1_px"] > table["x0_px"]).all()
+    assert table["score"].between(0.01, 1).all()
+
+
+def test_the_same_seed_gives_the_same_weights_also_when_resumed(finished, dataset_detect, tmp_path, monkeypatch):
+    original = DetectTask.training_step
+
+    def dies(self, batch, batch_idx):
+        if self.current_epoch == 1 and batch_idx == 1:
+            raise KeyError("killed")
+        return original(self, batch, batch_idx)
+
+    monkeypatch.setattr(DetectTask, "training_step", dies)
+    with pytest.raises(KeyError):
+        run_detect(settings(), dataset_detect, tmp_path, "b")
+    monkeypatch.undo()
+    run = run_detect(settings(), dataset_detect, tmp_path, "b", resume=True)
+    first, again = (torch.load(r.last, weights_only=True)["state_dict"] for r in (finished, run))
+    assert first.keys() == again.keys()
+    assert all(torch.equal(first[key], again[key]) for key in first)
+    timed = ("train/seconds", "train/images_per_s", "test/images_per_s")
+    metrics = [{k: v for k, v in json.loads(r.metrics.read_text()).items() if k not in timed} for r in (finished, run)]
+    assert metrics[0] == metrics[1]
+
+
+def test_a_detector_comes_back_as_it_was_saved(finished):
+    network = load_detector(finished.best)
+    saved = runs.load_weights(finished.best)["state_dict"]
+    assert network.strides == (4, 8, 16)
+    assert torch.equal(network.anchors, saved["anchors"])
+    assert not network.training
+
+
+def test_a_backbone_is_taken_over(finished, tmp_path):
+    config = settings("detect.attention=none")
+    network = build_network(config, torch.rand(50, 2).numpy() + 4, tmp_path)
+    start_backbone(network, finished.best, config)
+    saved = runs.load_weights(finished.best)["state_dict"]
+    assert torch.equal(network.backbone.stem.conv.weight, saved["backbone.stem.conv.weight"])
+    with pytest.raises(UserError, match=r"best.ckpt: width: found 0.125; wanted 0.25"):
+        start_backbone(network, finished.best, settings("detect.width=0.25"))
+
+
+def test_another_kind_of_checkpoint(tmp_path):
+    path = tmp_path / "best.ckpt"
+    runs.save_weights(path, {"hidden": 3}, torch.nn.Linear(2, 2))
+    with pytest.raises(UserError, match="a detect run's checkpoint"):
+        load_detector(path)
+
+
+def test_nothing_is_written_for_a_missing_dataset_or_checkpoint(dataset_detect, tmp_path):
+    with pytest.raises(UserError, match=r"dataset.json: found no such file"):
+        run_detect(settings(), tmp_path / "absent", tmp_path / "runs", "a")
+    with pytest.raises(UserError, match="no such file"):
+        run_detect(settings("detect.init_from=absent.ckpt"), dataset_detect, tmp_path / "runs", "a")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_dataset_without_craters_to_find(tmp_path, make_dataset):
+    root = make_dataset(tmp_path / "d", "detect", n_frames=1, craters=20)
+    with pytest.raises(UserError, match="no visible crater in the training split"):
+        run_detect(settings("detect.labels.min_depth_ratio=0.9"), root, tmp_path / "runs", "a")

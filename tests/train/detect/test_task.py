@@ -1,0 +1,84 @@
+"""Schedule, moving average, freezing; that the loss learns."""
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from perilune_shared.manifest import open_dataset
+from perilune_train.detect.config import AugmentSettings, DetectConfig, EvaluationSettings, LabelSettings
+from perilune_train.detect.data import EvaluationFrames, load_split, loader
+from perilune_train.detect.loss import detection_loss
+from perilune_train.detect.metrics import curve
+from perilune_train.detect.run import build_network, judge, label_sizes
+from perilune_train.detect.task import DetectTask, detections_of, learning_rate_factor, update_average
+
+
+def test_learning_rate_by_hand():
+    factors = [learning_rate_factor(step, 10, 110) for step in (0, 9, 10, 60, 110, 200)]
+    assert factors == pytest.approx([0.1, 1.0, 1.0, 0.01 + 0.99 / 2, 0.01, 0.01])
+    # A warm-up longer than half the training is cut.
+    assert learning_rate_factor(1, 100, 4) == 1.0
+
+
+def test_moving_average_by_hand():
+    old, new = nn.BatchNorm1d(1), nn.BatchNorm1d(1)
+    nn.init.constant_(new.weight, 3.0)
+    new.running_mean.fill_(10.0)
+    new.num_batches_tracked.fill_(7)
+    update_average(old, new, 0.9)
+    assert old.weight.item() == pytest.approx(0.9 * 1 + 0.1 * 3)
+    assert old.running_mean.item() == pytest.approx(1.0)
+    assert old.num_batches_tracked.item() == 7
+
+
+def test_weak_and_doubled_predictions_go():
+    boxes = torch.tensor([[0.0, 0.0, 8.0, 8.0], [0.0, 0.0, 8.0, 7.0], [20.0, 20.0, 28.0, 28.0], [40.0, 0.0, 48.0, 8.0]])
+    found = detections_of(boxes, torch.tensor([0.3, 0.8, 0.001, 0.5]), EvaluationSettings())
+    assert found.boxes[:, 0].tolist() == [0, 40]
+    np.testing.assert_allclose(found.scores, [0.8, 0.5])
+
+
+@pytest.fixture(scope="module")
+def split(dataset_detect):
+    return load_split(open_dataset(dataset_detect), "train", LabelSettings())
+
+
+def test_while_frozen_only_gates_and_head_may_learn(split, tmp_path):
+    config = DetectConfig(width=0.125, in_channels=1, epochs=3, strides=(4, 8, 16))
+    task = DetectTask(build_network(config, label_sizes(split), tmp_path), config, split, split, frozen_epochs=1)
+    task.train()
+    task.on_train_epoch_start()
+    learning = {name for name, p in task.network.named_parameters() if p.requires_grad}
+    assert {name.split(".")[1] for name in learning if name.startswith("backbone.")} == {"attentions"}
+    assert any(name.startswith("heads.") for name in learning)
+    assert not task.network.backbone.units["B_11"].reduce.norm.training
+    assert task.network.branches["4"][0].norm.training
+    task.frozen_epochs = 0
+    task.on_train_epoch_start()
+    assert all(p.requires_grad for p in task.network.parameters())
+    assert task.network.backbone.units["B_11"].reduce.norm.training
+
+
+def test_a_few_frames_can_be_learned_by_heart(split, tmp_path):
+    """The whole chain (assignment, loss, decoding, suppression, matching) agrees: else this cannot work."""
+    config = DetectConfig(width=0.125, in_channels=1, strides=(4, 8, 16), attention="cbam_identity", batch_size=4)
+    few = type(split)(type(split.frames)(split.frames.table[:4], split.frames.images[:4]), split.labels[:4])
+    network = build_network(config, label_sizes(few), tmp_path).train()
+    images, targets = next(iter(loader(EvaluationFrames(few), config)))
+    optimizer = torch.optim.AdamW(network.parameters(), 5e-3)
+    for _ in range(60):
+        box, confidence = detection_loss(network(images), targets, network.anchors, network.strides, 2.0, config.loss)
+        optimizer.zero_grad()
+        (0.05 * box + confidence).backward()
+        optimizer.step()
+    # Batch statistics of the very batch, since the running ones lag behind after so few steps.
+    boxes, scores = network.detect(images)
+    found = [detections_of(b, s, config.evaluation) for b, s in zip(boxes, scores, strict=True)]
+    assert curve(judge(few, found, config)).average_precision() > 0.6
+
+
+def test_augmentation_settings_reach_the_task(split, tmp_path):
+    config = DetectConfig(width=0.125, in_channels=1, augment=AugmentSettings(noise=0.0))
+    task = DetectTask(build_network(config, label_sizes(split), tmp_path), config, split, split, 0)
+    assert task.train_dataloader().dataset.settings.noise == 0.0

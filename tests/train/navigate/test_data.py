@@ -1,0 +1,137 @@
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import open_dataset
+from perilune_train.navigate import data
+from perilune_train.navigate.data import EpochBatches, Jitter, load_descents, mirrored, pair_sequence
+from perilune_train.navigate.geometry import pixel_index_homography, plane_homography
+
+
+@pytest.fixture(scope="module")
+def descents(dataset_nav):
+    return load_descents(open_dataset(dataset_nav))
+
+
+def _misfit(sequence, descent, pair):
+    """Root mean square difference of the later frame, laid onto the earlier by the stated motion, in the middle."""
+    down = -descent.rotation_camera_from_site[pair][:, 2]
+    homography = plane_homography(
+        descent.camera.matrix,
+        sequence.translation_m[pair],
+        sequence.rotation_c2_from_c1[pair],
+        down,
+        descent.position_m[pair, 2],
+    )
+    laid = cv2.warpPerspective(
+        sequence.second[pair],
+        pixel_index_homography(homography),
+        sequence.second.shape[:0:-1],
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+    )
+    middle = (slice(20, -20), slice(20, -20))
+    return float(np.sqrt(np.mean((laid - sequence.first[pair])[middle] ** 2)))
+
+
+def test_descents_hold_poses_and_nominal_motion(descents):
+    assert [d.split for d in descents] == ["train"] * 4 + ["val", "test"]
+    d = descents[0]
+    assert d.images.shape == (8, 96, 96) and d.images.dtype == np.uint8 and d.n_pairs == 7
+    translation, rotation = d.nominal_motion
+    np.testing.assert_allclose(rotation, np.broadcast_to(np.eye(3), (7, 3, 3)), atol=1e-12)
+    # The nominal descent sinks evenly from 1400 to 400 m, and the camera's z axis looks down.
+    np.testing.assert_allclose(translation[:, 2], 1000 / 7)
+    np.testing.assert_allclose(d.down_c, [0, 0, 1])
+    assert np.abs(d.motion[0] - translation).max() < 40
+
+
+def test_shrinking_keeps_the_rays(descents):
+    small = descents[0].shrunk(32)
+    assert small.images.shape[1:] == (32, 32)
+    np.testing.assert_allclose(small.camera.rays([16.0, 4.0]), descents[0].camera.rays([48.0, 12.0]))
+
+
+def test_warping_by_the_nominal_motion_brings_frames_together(descents):
+    plain = pair_sequence(descents[0], 0, 7, warp=False)
+    warped = pair_sequence(descents[0], 0, 7, warp=True)
+    middle = (slice(None), slice(30, -30), slice(30, -30))
+
+    def apart(s):
+        return np.sqrt(np.mean((s.second - s.first)[middle] ** 2))
+
+    assert apart(warped) < 0.8 * apart(plain)
+    np.testing.assert_array_equal(warped.first, plain.first)
+
+
+def test_the_stated_motion_lays_the_later_frame_onto_the_earlier(descents):
+    d = descents[0]
+    plain = pair_sequence(d, 0, 3, warp=False)
+    wrong = pair_sequence(d, 0, 3, warp=False)
+    wrong.translation_m[:, 0] += 60
+    for pair in range(3):
+        assert _misfit(plain, d, pair) < 0.5 * _misfit(wrong, d, pair)
+
+
+def test_jitter_moves_image_and_truth_alike(descents, monkeypatch):
+    d = descents[0]
+    monkeypatch.setattr(data, "mirrored", lambda sequence, camera, rng: sequence)
+    plain = pair_sequence(d, 0, 3, warp=False)
+    moved = pair_sequence(d, 0, 3, warp=False, rng=np.random.default_rng(5), jitter=Jitter(np.full(3, 30.0), 0.01))
+    assert np.linalg.norm(moved.translation_m - plain.translation_m, axis=1).min() > 5
+    for pair in range(3):
+        assert _misfit(moved, d, pair) < _misfit(plain, d, pair) + 0.15
+        stale = replace(moved, translation_m=plain.translation_m, rotation_c2_from_c1=plain.rotation_c2_from_c1)
+        assert _misfit(moved, d, pair) < 0.7 * _misfit(stale, d, pair)
+
+
+def test_mirrored_pairs_obey_the_mirrored_motion(descents):
+    d = descents[0]
+    plain = pair_sequence(d, 0, 2, warp=False)
+    level = np.broadcast_to(np.eye(3), (2, 3, 3))
+    # With an exactly level camera the ground's normal is the same in the mirror.
+    flat = replace(d, rotation_camera_from_site=np.broadcast_to(d.nominal_rotation_camera_from_site, (8, 3, 3)))
+    seen = set()
+    for seed in range(30):
+        found = mirrored(plain, d.camera, np.random.default_rng(seed))
+        seen.add(tuple(np.round(found.translation_m[0], 6)))
+        assert np.linalg.det(found.rotation_c2_from_c1[0]) == pytest.approx(1)
+        assert _misfit(found, flat, 0) < 1.3 * _misfit(plain, flat, 0)
+        still = replace(found, translation_m=plain.translation_m, rotation_c2_from_c1=level)
+        turned = not np.allclose(found.translation_m, plain.translation_m)
+        assert not turned or _misfit(found, flat, 0) < 0.9 * _misfit(still, flat, 0)
+    assert len(seen) == 8
+
+
+def test_residual_flow_is_zero_for_the_nominal_motion_and_a_shift_by_hand(descents):
+    d = replace(
+        descents[0],
+        position_m=descents[0].nominal_position_m,
+        rotation_camera_from_site=np.stack([descents[0].nominal_rotation_camera_from_site] * 8),
+    )
+    np.testing.assert_allclose(pair_sequence(d, 0, 3, warp=True).flow_px, 0, atol=1e-9)
+    # 14 m more along x, seen from 1400 m: the ground moves back by 1 % of the focal length, in frame 1's pixels.
+    beside = d.nominal_position_m + np.array([0, *[14] * 7])[:, None] * [1, 0, 0]
+    flow = pair_sequence(replace(d, position_m=beside), 0, 1, warp=True).flow_px
+    assert flow.shape == (1, 12, 12, 2)
+    np.testing.assert_allclose(flow[0], np.broadcast_to([-0.01 * d.camera.fx_px, 0], (12, 12, 2)), atol=1e-9)
+
+
+def test_epoch_follows_from_the_key_alone(descents):
+    training = [d for d in descents if d.split == "train"]
+
+    def epoch(key):
+        return list(EpochBatches(training, 3, 2, warp=True, augmented=True, jitter=None, key=key))
+
+    one, again, other = epoch((3, 0)), epoch((3, 0)), epoch((3, 1))
+    assert [len(batch) for batch in one] == [2, 2, 2, 2]  # 4 descents of 7 pairs: 2 runs of 3 each
+    np.testing.assert_array_equal(one[1][0].second, again[1][0].second)
+    assert not np.array_equal(one[0][0].first, other[0][0].first)
+    assert len(EpochBatches(training, 3, 3, warp=True, augmented=True, jitter=None, key=(0, 0))) == 3
+
+
+def test_a_detection_dataset_is_refused(dataset_detect):
+    with pytest.raises(UserError, match="nav"):
+        load_descents(open_dataset(dataset_detect))

@@ -1,0 +1,179 @@
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import open_dataset
+from perilune_train.models.yolo import YOLOv3
+from perilune_train.navigate.config import NavigateConfig
+from perilune_train.navigate.data import load_descents, pair_sequence
+from perilune_train.navigate.run import navigate_run
+from perilune_train.navigate.task import NavigationTask, Scales, load_navigator, predict, translation_units
+from perilune_train.runs import save_weights
+
+_NETWORK = {
+    "size_px": 64,
+    "width": 0.125,
+    "hidden": 16,
+    "sequence_pairs": 4,
+    "batch_sequences": 2,
+    "coarse_epochs": 1,
+    "fine_epochs": 1,
+    "learning_rate": 1e-3,
+}
+
+
+def _settings(**changes):
+    return NavigateConfig(
+        **{"precision": "float32", "device": "cpu", "warp": _NETWORK | {"jitter": 1.0}, "stack": _NETWORK} | changes
+    )
+
+
+@pytest.fixture(scope="module")
+def descents(dataset_nav):
+    return load_descents(open_dataset(dataset_nav))
+
+
+@pytest.fixture(scope="module")
+def detector(tmp_path_factory):
+    torch.manual_seed(3)
+    architecture = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [4, 8, 16]}
+    path = tmp_path_factory.mktemp("detector") / "best.ckpt"
+    save_weights(path, architecture, YOLOv3(None, **architecture))
+    return path
+
+
+@pytest.fixture(scope="module")
+def runs(dataset_nav, tmp_path_factory, detector):
+    """Both networks, trained for two epochs; the stack's backbone from a detector."""
+    folder = tmp_path_factory.mktemp("runs")
+    navigate_run(_settings(), dataset_nav, folder, "tiny", detector, False)
+    return folder / "navigate"
+
+
+def test_a_run_leaves_one_table_of_all_methods(runs):
+    table = pd.read_parquet(runs / "tiny" / "navigation.parquet").set_index("method")
+    assert list(table.index) == ["warp", "stack", "klt", "nominal", "mean_at_step", "mean"]
+    metrics = json.loads((runs / "tiny" / "metrics.json").read_text())
+    assert metrics["test/position_rmse_m"] == pytest.approx(table.loc["warp", "position_rmse_m"])
+    for method in ("klt", "nominal", "mean_at_step", "mean"):
+        for key in ("position_rmse_m", "orientation_rmse_deg", "drift_rms_m"):
+            assert metrics[f"baseline/{method}/{key}"] == pytest.approx(table.loc[method, key])
+    stack = json.loads((runs / "tiny-stack" / "metrics.json").read_text())
+    assert stack["test/drift_rms_m"] == pytest.approx(table.loc["stack", "drift_rms_m"])
+    for name in ("tiny", "tiny-stack"):
+        for file in ("config.yaml", "checkpoints/best.ckpt", "checkpoints/last.ckpt", "descent.png", "errors.png"):
+            assert (runs / name / file).stat().st_size > 100, file
+
+
+def test_the_table_of_pairs_agrees_with_the_summary(runs):
+    pairs = pd.read_parquet(runs / "tiny" / "errors.parquet")
+    table = pd.read_parquet(runs / "tiny" / "navigation.parquet").set_index("method")
+    for method, own in pairs.groupby("method"):
+        assert len(own) == 7
+        assert np.sqrt((own["position_error_m"] ** 2).mean()) == pytest.approx(table.loc[method, "position_rmse_m"])
+
+
+def test_the_saved_network_gives_the_figures_again(runs, descents):
+    network, architecture = load_navigator(runs / "tiny" / "checkpoints" / "best.ckpt", "warp")
+    test = next(d for d in descents if d.split == "test")
+    translation, rotation = predict(network, architecture, test)
+    own = pd.read_parquet(runs / "tiny" / "errors.parquet").query("method == 'warp'")
+    np.testing.assert_allclose(np.linalg.norm(translation - test.motion[0], axis=1), own["position_error_m"], rtol=1e-4)
+    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, 1, 2), np.broadcast_to(np.eye(3), (7, 3, 3)), atol=1e-5)
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(dataset_nav, tmp_path, monkeypatch):
+    settings = _settings(fusion="warp")
+    original = NavigationTask.training_step
+
+    def dies(self, batch, batch_idx):
+        if self.current_epoch == 1 and batch_idx == 1:
+            raise KeyError("killed")
+        return original(self, batch, batch_idx)
+
+    (whole,) = navigate_run(settings, dataset_nav, tmp_path, "a", None, False)
+    monkeypatch.setattr(NavigationTask, "training_step", dies)
+    with pytest.raises(KeyError):
+        navigate_run(settings, dataset_nav, tmp_path, "b", None, False)
+    monkeypatch.undo()
+    (resumed,) = navigate_run(settings, dataset_nav, tmp_path, "b", None, True)
+    first, again = (torch.load(run.last, weights_only=True)["state_dict"] for run in (whole, resumed))
+    assert first.keys() == again.keys()
+    assert all(torch.equal(first[key], again[key]) for key in first)
+
+
+def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path, detector):
+    given = torch.load(detector, weights_only=True)["state_dict"]
+
+    def backbone(coarse, fine):
+        network = _NETWORK | {"coarse_epochs": coarse, "fine_epochs": fine}
+        (run,) = navigate_run(_settings(fusion="stack", stack=network), dataset_nav, tmp_path, "t", detector, False)
+        state = torch.load(run.last, weights_only=True)["state_dict"]
+        own = {key.removeprefix("network."): value for key, value in state.items()}
+        return {key: value for key, value in own.items() if key.startswith("backbone.")}
+
+    coarse = backbone(1, 0)
+    # Weights and batch statistics alike; only the counter of batches may move.
+    assert all(torch.equal(value, given[key]) for key, value in coarse.items())
+    fine = backbone(1, 1)
+    assert not torch.equal(fine["backbone.stem.conv.weight"], given["backbone.stem.conv.weight"])
+
+
+def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
+    settings = _settings(fusion="stack", stack=_NETWORK | {"width": 0.25})
+    (run,) = navigate_run(settings, dataset_nav, tmp_path, "t", detector, False)
+    assert "width" in json.loads(run.metrics.read_text())["network/backbone"]
+    with pytest.raises(UserError, match=r"width: found 0\.125"):
+        navigate_run(settings.model_copy(update={"detector": detector}), dataset_nav, tmp_path, "t", None, False)
+    with pytest.raises(UserError, match="fusion"):
+        load_navigator(run.best, "warp")
+
+
+def test_scales_by_hand(descents):
+    training = [d for d in descents if d.split == "train"]
+    translation = np.concatenate([d.motion[0] for d in training])
+    stack = Scales.measured(training, "stack")
+    np.testing.assert_allclose(stack.mean_m, translation.mean(0))
+    np.testing.assert_allclose(stack.spread_m, translation.std(0))
+    warp = Scales.measured(training, "warp")
+    sequence = pair_sequence(training[0], 2, 3, warp=True)
+    reference, unit = translation_units([sequence], warp, "warp")
+    np.testing.assert_allclose(reference[0], training[0].nominal_motion[0][2:5], rtol=1e-5)
+    residual = translation - np.concatenate([d.nominal_motion[0] for d in training])
+    across = np.sqrt((residual[:, :2] ** 2).mean())
+    np.testing.assert_allclose(unit, [across, across, np.sqrt((residual[:, 2] ** 2).mean())], rtol=1e-5)
+
+
+def test_outputs_made_from_the_truth_have_no_loss(descents, monkeypatch):
+    """The loss agrees with `Scales` on what an output means."""
+    task = NavigationTask(_settings(), "stack", descents)
+    sequence = pair_sequence(descents[0].shrunk(64), 0, 4, warp=False)
+    columns = np.concatenate([sequence.rotation_c2_from_c1[:, :, 0], sequence.rotation_c2_from_c1[:, :, 1]], axis=1)
+    truth = np.concatenate(
+        [
+            (sequence.translation_m - task.scales.mean_m) / task.scales.spread_m,
+            (columns - [1, 0, 0, 0, 1, 0]) / task.scales.rotation_rad,
+        ],
+        axis=1,
+    )
+    monkeypatch.setattr(task, "log_dict", lambda *_, **__: None)
+
+    class Gives(torch.nn.Module):
+        def __init__(self, output):
+            super().__init__()
+            self.output = torch.from_numpy(output)[None].float()
+
+        def forward(self, first, second):
+            return self.output
+
+    def loss(output):
+        task.network = Gives(output)
+        return float(task.training_step([sequence], 0))
+
+    assert loss(truth) == pytest.approx(0, abs=1e-6)
+    # One unit too far in x at one of four pairs: a quarter.
+    assert loss(truth + np.eye(4, 9) * np.array([1, 0, 0, 0])[:, None]) == pytest.approx(0.25, abs=1e-5)

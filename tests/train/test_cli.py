@@ -1,0 +1,80 @@
+"""The command line as a person meets it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from perilune_train.cli import app
+
+
+def call(*arguments, cwd=None):
+    program = Path(sys.executable).parent / "perilune-train"
+    return subprocess.run(
+        [program, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        check=False,
+    )
+
+
+def test_help_names_the_commands():
+    result = CliRunner().invoke(app, ["--help"])
+    assert result.exit_code == 0
+    for command in ("detect", "navigate", "explain"):
+        assert command in result.output
+
+
+@pytest.mark.parametrize("command", ["detect", "navigate", "explain"])
+def test_each_command_tells_its_options(command):
+    result = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0
+    for option in ("--preset", "--config", "--set", "--dataset", "--runs", "--name"):
+        assert option in result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--set", "detect.epoch=3"], ["detect.epoch", "unknown key", "epochs (nearest known)"]),
+        (["--set", "detect.width=-1"], ["detect.width", "-1", "greater than or equal to 0.125"]),
+        (["--set", "detect.epochs=many"], ["detect.epochs", "'many'", "valid integer"]),
+        (["--set", "detect.strides=[8, 16, 64]"], ["detect", "strides 8, 16, 32 or 4, 8, 16"]),
+        (["--preset", "smal"], ["preset", "smal", "small (nearest known)"]),
+        (["--dataset", "nowhere"], ["nowhere", "dataset.json", "no such file"]),
+        (["--config", "nowhere.yaml"], ["nowhere.yaml", "no such file"]),
+    ],
+)
+def test_a_mistake_gets_one_line_exit_code_2_and_leaves_nothing(tmp_path, arguments, words):
+    result = call("detect", *arguments, cwd=tmp_path)
+    assert result.returncode == 2
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1, result.stderr
+    for word in words:
+        assert word in lines[0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_detect_runs(tmp_path, dataset_detect):
+    result = call(
+        "detect",
+        "--preset",
+        "tiny",
+        "--dataset",
+        dataset_detect,
+        "--name",
+        "x",
+        "--set",
+        "detect.epochs=1",
+        "--set",
+        "detect.precision=float32",
+        cwd=tmp_path,
+    )
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "runs" / "detect" / "x" / "metrics.json").is_file()
+    assert "detections.png" in result.stderr

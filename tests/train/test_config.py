@@ -1,0 +1,28 @@
+"""The presets."""
+
+import pytest
+from pydantic import ValidationError
+
+from perilune_shared.config import PRESETS, resolve
+from perilune_train.detect.config import DetectConfig
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_resolves(preset):
+    config = resolve(DetectConfig, "detect", "perilune_train", preset)
+    paper = preset in ("paper", "large")
+    assert config.width == (1.0 if paper else config.width)
+    assert config.strides == ((8, 16, 32) if paper else (4, 8, 16))
+    assert config.attention != "none"
+
+
+def test_the_papers_weights_and_limits_are_the_defaults():
+    config = DetectConfig()
+    assert (config.loss.lambda_iou, config.loss.lambda_obj, config.loss.aspect) == (0.05, 1.0, "circular")
+    assert config.labels.radius_px == (2.0, 50.0)
+    assert config.evaluation.match_iou == 0.5
+
+
+def test_frozen_epochs_must_leave_some_to_train():
+    with pytest.raises(ValidationError, match="fewer frozen_epochs than epochs"):
+        DetectConfig(epochs=3, frozen_epochs=3)

@@ -1,0 +1,72 @@
+"""A dataset's frames in memory: pixels as 8-bit grey, beside their rows of the manifest."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import Dataset
+from perilune_shared.progress import progress_bar
+
+
+@dataclass(frozen=True)
+class FrameStore:
+    """Frames of one split, in the order scene, trajectory, frame index."""
+
+    table: pd.DataFrame
+    """Rows of the manifest's table `frames`, index 0..N-1."""
+    images: NDArray[np.uint8]
+    """Pixels (N, height, width), 8-bit grey."""
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+def read_image(path: Path, height_px: int, width_px: int, size_bytes: int | None = None) -> NDArray[np.uint8]:
+    """One frame (height, width), 8-bit grey.
+
+    Raises UserError where the file is missing, is not `size_bytes` long as the manifest says, is no image, or has
+    another size in pixels.
+    """
+    if not path.is_file():
+        raise UserError(path, "frame", "no such file", "the PNG that the manifest names")
+    # A decoder may fill the missing rows of a truncated file without a word; its length tells.
+    if size_bytes is not None and path.stat().st_size != size_bytes:
+        raise UserError(path, "png_bytes", f"{path.stat().st_size} bytes", f"{size_bytes} bytes; the file is damaged")
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise UserError(path, "frame", "a file that does not decode", "an 8-bit grey PNG")
+    if image.shape != (height_px, width_px):
+        raise UserError(path, "size", f"{image.shape[1]} x {image.shape[0]}", f"{width_px} x {height_px} pixels")
+    return image.astype(np.uint8, copy=False)
+
+
+def load_frames(dataset: Dataset, split: str) -> FrameStore:
+    """All frames of a split, 64 kB each at 256 x 256. Raises UserError on a split without frames or a bad frame."""
+    table = dataset.table("frames", split=split).to_pandas()
+    if table.empty:
+        raise UserError(dataset.root, "split", f"no {split} frames", "a dataset with frames in train, val and test")
+    table = table.sort_values(["scene_id", "trajectory_id", "frame_index"], ignore_index=True)
+    camera = dataset.info.camera
+    images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
+    with progress_bar() as progress:
+        task = progress.add_task(f"load {split}", total=len(table), unit="frames", note="")
+        for i, row in enumerate(table.itertuples()):
+            images[i] = read_image(dataset.file(row.png_path), camera.height_px, camera.width_px, row.png_bytes)
+            progress.advance(task)
+    return FrameStore(table, images)
+
+
+def normalised(images: NDArray) -> NDArray[np.float32]:
+    """Images (..., height, width) with each image's mean taken off and its standard deviation divided out.
+
+    A constant image becomes zero. The exposure of a frame carries nothing about craters or motion.
+    """
+    pixels = images.astype(np.float32)
+    mean = pixels.mean(axis=(-2, -1), keepdims=True)
+    deviation = pixels.std(axis=(-2, -1), keepdims=True)
+    return (pixels - mean) / np.maximum(deviation, 1.0)

@@ -1,0 +1,1 @@
+"""Crater detection: anchors, assignment, loss, training, evaluation."""

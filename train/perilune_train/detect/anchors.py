@@ -1,0 +1,47 @@
+"""Anchors: k-means over the sizes of the labels, with 1 - IoU as distance (Redmon & Farhadi 2017, arXiv 1612.08242)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+_SAMPLE = 20_000
+_ROUNDS = 100
+
+
+def size_iou(sizes: Array, anchors: Array) -> Array:
+    """IoU (N, K) of boxes of widths and heights (N, 2) with anchors (K, 2), all centred on one point."""
+    overlap = np.minimum(sizes[:, None], anchors[None]).prod(axis=2)
+    return overlap / (sizes.prod(axis=1)[:, None] + anchors.prod(axis=1)[None] - overlap)
+
+
+def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator) -> Array:
+    """`count` anchors (count, 2), width and height in pixels, sorted by area, for sizes (N, 2) > 0.
+
+    Starts from evenly spaced quantiles of the area, so that large craters, which are few, get anchors too; a
+    cluster that runs empty takes the size that is fitted worst. At most 20,000 sizes, drawn by `rng`, are used.
+    """
+    sizes = np.asarray(sizes_px, np.float64)
+    if len(sizes) == 0:
+        raise ValueError("no sizes to cluster")
+    if len(sizes) > _SAMPLE:
+        sizes = sizes[rng.choice(len(sizes), _SAMPLE, replace=False)]
+    log_area = np.log(sizes.prod(axis=1))
+    side = np.exp(np.linspace(log_area.min(), log_area.max(), count) / 2)
+    anchors = np.stack([side, side], axis=1)
+    for _ in range(_ROUNDS):
+        overlap = size_iou(sizes, anchors)
+        nearest = overlap.argmax(axis=1)
+        worst = sizes[overlap.max(axis=1).argmin()]
+        moved = np.array(
+            [np.median(sizes[nearest == k], axis=0) if (nearest == k).any() else worst for k in range(count)]
+        )
+        if np.allclose(moved, anchors):
+            break
+        anchors = moved
+    return anchors[np.argsort(anchors.prod(axis=1), kind="stable")]
+
+
+def best_possible_recall(sizes_px: Array, anchors: Array, ratio: float) -> float:
+    """Share of sizes (N, 2) that have an anchor within the factor `ratio` in width and in height."""
+    quotient = np.asarray(sizes_px)[:, None] / anchors[None]
+    return float((np.maximum(quotient, 1 / quotient).max(axis=2) < ratio).any(axis=1).mean())

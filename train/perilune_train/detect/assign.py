@@ -1,0 +1,124 @@
+"""Which predictors answer for which label."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Labels of a batch, one row each."""
+
+    boxes: Tensor
+    """x0, y0, x1, y1 in pixels (T, 4)."""
+    frame: Tensor
+    """Place of the label's frame in the batch (T,)."""
+    wanted: Tensor
+    """False for a hardly visible crater, which is ignored (T,)."""
+
+    def to(self, device: torch.device) -> "Targets":
+        """The same on another device."""
+        return Targets(self.boxes.to(device), self.frame.to(device), self.wanted.to(device))
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """One scale's predictors: those that answer for a label, and those that are left alone."""
+
+    frame: Tensor
+    """Of each positive predictor, its frame (P,)."""
+    anchor: Tensor
+    """... its anchor (P,)."""
+    row: Tensor
+    """... its cell's row (P,)."""
+    column: Tensor
+    """... its cell's column (P,)."""
+    label: Tensor
+    """... the label it answers for, a row of Targets (P,)."""
+    free: Tensor
+    """Predictors that are neither positive nor negative (N, 3, h, w), bool."""
+
+    @property
+    def positive(self) -> Tensor:
+        """The positive predictors (N, 3, h, w), bool."""
+        mask = torch.zeros_like(self.free)
+        mask[self.frame, self.anchor, self.row, self.column] = True
+        return mask
+
+
+def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float) -> Tensor:
+    """Whether anchors (K, 2) take part in boxes (T, 4): (T, K) bool.
+
+    All anchors whose width and height are within the factor `ratio`, and always the one of best IoU.
+    """
+    size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)[:, None]
+    quotient = size / anchors
+    near = torch.maximum(quotient, 1 / quotient).amax(2) < ratio
+    overlap = torch.minimum(size, anchors).prod(2)
+    iou = overlap / (size.prod(2) + anchors.prod(1) - overlap)
+    best = torch.zeros_like(near)
+    if len(boxes):
+        best[torch.arange(len(boxes), device=boxes.device), iou.argmax(1)] = True
+    return near | best
+
+
+def assign(
+    targets: Targets, anchors: Tensor, strides: tuple[int, ...], shapes: list[tuple[int, int, int]], ratio: float
+) -> list[Assignment]:
+    """Positive and free predictors of every scale, for anchors (scales, 3, 2) and grids (N, h, w).
+
+    Deviation from YOLOv3, which makes one predictor of one scale positive for each label: every anchor of every
+    scale within the factor `ratio` is, in the cell that holds the label's centre and in the two cells nearest to the
+    centre beside it (as later members of the family do): about nine times as many positives, so that a short
+    training suffices. Free are predictors with a matching anchor whose cell touches the middle half of a label's
+    box: for ignored labels all of them, for wanted ones those that are not positive. This takes the place of
+    YOLOv3's rule (IoU of the prediction above 0.5), at a small part of its cost.
+    """
+    matches = matching_anchors(targets.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
+    centre = (targets.boxes[:, :2] + targets.boxes[:, 2:]) / 2
+    size = targets.boxes[:, 2:] - targets.boxes[:, :2]
+    result = []
+    for scale, stride in enumerate(strides):
+        frames, height, width = shapes[scale]
+        label, anchor = matches[:, scale].nonzero(as_tuple=True)
+        at = centre[label] / stride
+        limit = at.new_tensor([width, height])
+        grid = (frames, anchors.shape[1], height, width)
+        free = _cells_touched(targets.frame[label], anchor, at, size[label] / stride, grid)
+        wanted = targets.wanted[label]
+        label, anchor, at = label[wanted], anchor[wanted], at[wanted]
+        cell = at.floor()
+        side = torch.where(at - cell < 0.5, -1.0, 1.0)
+        zero = torch.zeros_like(side[:, 0])
+        steps = torch.stack(
+            [torch.stack([zero, zero], 1), torch.stack([side[:, 0], zero], 1), torch.stack([zero, side[:, 1]], 1)]
+        )
+        cells = (cell + steps).flatten(0, 1)
+        label, anchor = label.repeat(3), anchor.repeat(3)
+        inside = ((cells >= 0) & (cells < limit)).all(1)
+        cells, label, anchor = cells[inside].long(), label[inside], anchor[inside]
+        made = Assignment(targets.frame[label], anchor, cells[:, 1], cells[:, 0], label, free)
+        result.append(Assignment(made.frame, made.anchor, made.row, made.column, label, free & ~made.positive))
+    return result
+
+
+def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shape: tuple[int, int, int, int]) -> Tensor:
+    """Cells (N, 3, h, w) whose centre is within a quarter of a box, plus half a cell, of the box's middle.
+
+    `at` and `size` (P, 2) are the boxes' middles and sizes in cells.
+    """
+    touched = torch.zeros(shape, dtype=torch.bool, device=at.device)
+    if not len(at):
+        return touched
+    reach = size / 4 + 0.5
+    span = int(reach.max().ceil()) + 1
+    offsets = torch.arange(-span, span + 1, device=at.device)
+    step = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), dim=-1).flatten(0, 1)
+    cells = at.floor()[:, None] + step
+    limit = at.new_tensor([shape[3], shape[2]])
+    hit = ((cells + 0.5 - at[:, None]).abs() < reach[:, None]).all(2) & ((cells >= 0) & (cells < limit)).all(2)
+    which, place = hit.nonzero(as_tuple=True)
+    chosen = cells[which, place].long()
+    touched[frame[which], anchor[which], chosen[:, 1], chosen[:, 0]] = True
+    return touched

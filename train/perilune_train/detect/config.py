@@ -1,0 +1,105 @@
+"""Settings of crater detection: the section `detect`."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from perilune_shared.config import Section
+from perilune_train.config import Attention, Count, Device, Positive, Precision, Share
+
+
+class LabelSettings(Section):
+    """Which labels are craters to find. The others are ignored: neither wanted nor counted as false."""
+
+    min_depth_ratio: Share = 0.04
+    """Least depth over diameter, on the finished terrain: below it a crater is worn away."""
+    min_visible_fraction: Share = 0.3
+    """Least share of the rim that lies inside the image and is not hidden."""
+    min_sunlit_fraction: Share = 0.1
+    """Least share of the crater's pixels that the Sun reaches."""
+    radius_px: tuple[Positive, Positive] = (2.0, 50.0)
+    """Radii that are labelled and judged (the paper's 2 to 50), pixels."""
+
+
+class AugmentSettings(Section):
+    """Random changes of training frames; 0 turns one off."""
+
+    flips_and_turns: bool = True
+    """The eight flips and quarter turns of a square frame, each as likely."""
+    gain: Share = 0.3
+    """Contrast and brightness change by up to this factor, up or down."""
+    gamma: Share = 0.3
+    """Exponent of the grey values, up to this far from 1 in logarithm."""
+    blur_px: Annotated[float, Field(ge=0, le=5)] = 0.8
+    """Largest standard deviation of a Gaussian blur, pixels."""
+    noise: Annotated[float, Field(ge=0, le=100)] = 4.0
+    """Largest standard deviation of Gaussian noise, grey levels of 255."""
+
+
+class LossSettings(Section):
+    """L = lambda_iou L_ciou + lambda_obj L_obj (paper, eq. "loss")."""
+
+    aspect: Literal["circular", "standard"] = "circular"
+    """Aspect term of CIoU: against a circle (the paper's), or against the label's own aspect ratio."""
+    lambda_iou: Positive = 0.05
+    lambda_obj: Positive = 1.0
+    lambda_noobj: Positive = 1.0
+    """Weight of empty predictors within L_obj."""
+
+
+class EvaluationSettings(Section):
+    """How detections are made of outputs, and judged."""
+
+    match_iou: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    """Least IoU of a detection with the label that it finds."""
+    nms_iou: Annotated[float, Field(gt=0, lt=1)] = 0.45
+    """Of two detections that overlap more than this, the weaker goes."""
+    min_score: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    """Detections below this score are dropped before anything else (the floor of the precision-recall curve)."""
+    max_detections: Count = 500
+    """Most detections kept in a frame; the usual 100 would truncate crowded frames."""
+
+
+class DetectConfig(Section):
+    """The section `detect`."""
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    width: Annotated[float, Field(ge=0.125, le=2)] = 1.0
+    """Factor on all channel counts; 1 is the paper's network."""
+    attention: Attention = "cbam"
+    """none (the baseline), cbam (the paper's), or cbam_identity (gates that start at exactly 1)."""
+    in_channels: Literal[1, 3] = 3
+    """3: the grey frame three times over, as the paper's RGB network takes it."""
+    strides: tuple[int, int, int] = (8, 16, 32)
+    """Strides with heads: 8 16 32 (the paper's) or 4 8 16 (better for tiny craters)."""
+    epochs: Count = 20
+    frozen_epochs: Annotated[int, Field(ge=0)] = 0
+    """First epochs with the backbone frozen, its attention gates excepted. They count only with `init_from`: a
+    backbone of random weights, frozen, teaches nothing, so without it training starts unfrozen."""
+    init_from: str | None = None
+    """best.ckpt of an earlier detect run whose backbone (and gates, where both have them) to start from."""
+    batch_size: Count = 8
+    learning_rate: Positive = 1e-3
+    """Peak of AdamW's learning rate: linear warm-up, then a cosine down to a hundredth."""
+    warmup_steps: Annotated[int, Field(ge=0)] = 100
+    weight_decay: Annotated[float, Field(ge=0)] = 0.01
+    ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
+    """Moving average of the weights, per step; the average is what is judged and kept."""
+    anchor_ratio: Annotated[float, Field(gt=1)] = 2.0
+    """An anchor takes part in a label whose width and height are within this factor of its own."""
+    labels: LabelSettings = LabelSettings()
+    augment: AugmentSettings = AugmentSettings()
+    loss: LossSettings = LossSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+    precision: Precision = "auto"
+    device: Device = "auto"
+    workers: Annotated[int, Field(ge=0, le=64)] = 0
+    """Processes that augment frames beside the training; 0 does it in between, best on few cores."""
+
+    @model_validator(mode="after")
+    def _check(self) -> "DetectConfig":
+        if self.strides not in ((8, 16, 32), (4, 8, 16)):
+            raise ValueError("strides 8, 16, 32 or 4, 8, 16")
+        if self.frozen_epochs >= self.epochs:
+            raise ValueError("fewer frozen_epochs than epochs")
+        return self

@@ -1,0 +1,218 @@
+"""Frames and labels for the detector: what to find, what to ignore, augmentation, batches."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils import data as torch_data
+
+from perilune_shared.camera import Camera, camera_from_site
+from perilune_shared.ellipse import project_circles
+from perilune_shared.errors import UserError
+from perilune_shared.frames import matrix_from_quaternion
+from perilune_shared.manifest import Dataset
+from perilune_train.data.frames import FrameStore, load_frames, normalised
+from perilune_train.detect.assign import Targets
+from perilune_train.detect.config import AugmentSettings, DetectConfig, LabelSettings
+
+Array = NDArray[np.float64]
+_BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
+_CRATER = ["scene_id", "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "depth_m", "diameter_m"]
+_ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
+
+
+@dataclass(frozen=True)
+class FrameLabels:
+    """Labels of one frame."""
+
+    boxes: Array
+    """Tight on the whole ellipse: x0, y0, x1, y1 in pixels (M, 4)."""
+    radius_px: Array
+    """Radius of the circle of equal area, pixels (M,)."""
+    ellipses: Array
+    """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5), for drawing."""
+    wanted: NDArray[np.bool_]
+    """False for a crater that is ignored: hardly visible, or not labelled (M,)."""
+    labelled: NDArray[np.bool_]
+    """False for a crater that is not in the manifest's labels: a little too small, too large, or off the image (M,)."""
+
+
+@dataclass(frozen=True)
+class DetectSplit:
+    """One split in memory."""
+
+    frames: FrameStore
+    """Pixels and poses."""
+    labels: list[FrameLabels]
+    """One entry a frame."""
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
+def load_split(dataset: Dataset, split: str, settings: LabelSettings) -> DetectSplit:
+    """Frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take."""
+    camera = dataset.info.camera
+    for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
+        if size % 32:
+            raise UserError(dataset.root, field, size, "a multiple of 32, the network's coarsest stride")
+    frames = load_frames(dataset, split)
+    columns = ["frame_id", "crater_id", *_BOX, *_ELLIPSE, "radius_px", "visible_fraction", "sunlit_fraction"]
+    labels = dataset.table("labels", columns).to_pandas()
+    labels = labels.merge(frames.table[["frame_id", "scene_id"]], on="frame_id")
+    craters = dataset.table("craters", _CRATER).to_pandas()
+    depths = craters[["scene_id", "crater_id", "depth_m", "diameter_m"]]
+    labels = labels.merge(depths, on=["scene_id", "crater_id"], how="left", validate="many_to_one")
+    labels["labelled"] = True
+    labels["wanted"] = (
+        (labels["depth_m"] >= settings.min_depth_ratio * labels["diameter_m"])
+        & (labels["visible_fraction"] >= settings.min_visible_fraction)
+        & (labels["sunlit_fraction"] >= settings.min_sunlit_fraction)
+        & labels["radius_px"].between(*settings.radius_px)
+    )
+    by_frame = {str(name): part for name, part in labels.groupby("frame_id")}
+    by_scene = {str(name): part for name, part in craters.groupby("scene_id")}
+    parts = []
+    for frame in frames.table.to_dict("records"):
+        known = by_frame.get(frame["frame_id"], labels.iloc[:0])
+        others = by_scene.get(frame["scene_id"], craters.iloc[:0])
+        others = others[~others["crater_id"].isin(known["crater_id"])]
+        rows = unlabelled_craters(others, camera.pinhole(), frame, settings.radius_px)
+        part = pd.concat([known, rows]) if len(rows) else known
+        parts.append(
+            FrameLabels(
+                part[_BOX].to_numpy(np.float64),
+                part["radius_px"].to_numpy(np.float64),
+                part[_ELLIPSE].to_numpy(np.float64),
+                part["wanted"].to_numpy(np.bool_),
+                part["labelled"].to_numpy(np.bool_),
+            )
+        )
+    return DetectSplit(frames, parts)
+
+
+def unlabelled_craters(
+    craters: pd.DataFrame, camera: Camera, frame: dict[Any, Any], radius_px: tuple[float, float]
+) -> pd.DataFrame:
+    """Craters of the scene that a frame shows just outside what is labelled, as rows to be ignored.
+
+    A crater of 1.9 px looks like one of 2.1 px: with only the second in the table, half of what is labelled near the
+    limit would be trained away as background, and finding the first would count as false. So, as COCO does with
+    objects outside its area range, craters within a factor of sqrt(2) of the range (beyond that no box within the
+    range overlaps them by half) and those whose centre is off the image are ignored. `frame` is a row of the table.
+    """
+    low, high = radius_px[0] / np.sqrt(2), radius_px[1] * np.sqrt(2)
+    rotation = matrix_from_quaternion(frame["rotation_wxyz"])
+    centre = camera_from_site(craters[["x_m", "y_m", "z_m"]].to_numpy(np.float64), frame["position_m"], rotation)
+    radius_m = craters["diameter_m"].to_numpy(np.float64) / 2
+    middle = camera.project(centre)
+    with np.errstate(divide="ignore"):
+        rough_px = camera.fx_px * radius_m / np.abs(centre[:, 2])
+    # Exact for level ground under a level camera; what a tilt changes stays well within the margins.
+    near = (centre[:, 2] > 0) & (rough_px > 0.8 * low) & (rough_px < 2 * high)
+    near &= (middle > -2 * rough_px[:, None]).all(1)
+    near &= (middle < np.array([camera.width_px, camera.height_px]) + 2 * rough_px[:, None]).all(1)
+    normals = craters[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float64)[near] @ rotation.T
+    shapes = project_circles(camera, centre[near], normals, radius_m[near])
+    columns = [*shapes.bounding_boxes().T, shapes.cx_px, shapes.cy_px, shapes.a_px, shapes.b_px, shapes.theta_rad]
+    rows = pd.DataFrame(dict(zip([*_BOX, *_ELLIPSE], columns, strict=True)))
+    rows["radius_px"], rows["wanted"], rows["labelled"] = shapes.radius_px(), False, False
+    box = rows[_BOX].to_numpy(np.float64)
+    seen = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
+    return rows[seen & rows["radius_px"].between(low, high).to_numpy()]
+
+
+def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
+    """One of the eight symmetries of a frame (height, width) with its boxes (M, 4): bit 0 mirrors left and right,
+    bit 1 top and bottom, bit 2 (applied last) exchanges x and y."""
+    height, width = image.shape
+    x0, y0, x1, y1 = boxes.T
+    if kind & 1:
+        image, x0, x1 = image[:, ::-1], width - x1, width - x0
+    if kind & 2:
+        image, y0, y1 = image[::-1], height - y1, height - y0
+    if kind & 4:
+        image, x0, y0, x1, y1 = image.T, y0, x0, y1, x1
+    return image, np.stack([x0, y0, x1, y1], axis=1)
+
+
+def augment(
+    image: NDArray[np.uint8], boxes: Array, settings: AugmentSettings, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], Array]:
+    """A changed frame (height, width), grey levels as float32, and its boxes (M, 4)."""
+    turned: NDArray = image
+    if settings.flips_and_turns:
+        square = image.shape[0] == image.shape[1]
+        turned, boxes = turn(image, boxes, int(rng.integers(8 if square else 4)))
+    gain = np.exp(rng.uniform(-1, 1) * np.log1p(settings.gain))
+    gamma = np.exp(rng.uniform(-1, 1) * settings.gamma)
+    levels = (255 * np.minimum(gain * (np.arange(256) / 255) ** gamma, 1)).astype(np.float32)
+    pixels = levels[turned]
+    sigma_px = rng.uniform(0, settings.blur_px)
+    if sigma_px > 0.3:
+        pixels = cv2.GaussianBlur(pixels, (0, 0), sigma_px).astype(np.float32, copy=False)
+    noise = rng.uniform(0, settings.noise)
+    if noise > 0:
+        pixels = pixels + np.float32(noise) * rng.standard_normal(pixels.shape, np.float32)
+    return pixels, boxes
+
+
+Batch = tuple[Tensor, Targets]
+
+
+class TrainingFrames(torch_data.Dataset):
+    """A split in the order and with the augmentation of one epoch, both a function of seed and epoch alone."""
+
+    def __init__(self, split: DetectSplit, settings: AugmentSettings, seed: int, epoch: int):
+        self.split, self.settings, self.key = split, settings, [seed, epoch]
+        self.order = np.random.default_rng(self.key).permutation(len(split))
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def __getitem__(self, place: int) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
+        index = int(self.order[place])
+        labels = self.split.labels[index]
+        rng = np.random.default_rng([*self.key, index])
+        pixels, boxes = augment(self.split.frames.images[index], labels.boxes, self.settings, rng)
+        return normalised(pixels), boxes, labels.wanted
+
+
+class EvaluationFrames(torch_data.Dataset):
+    """A split as it is, in order."""
+
+    def __init__(self, split: DetectSplit):
+        self.split = split
+
+    def __len__(self) -> int:
+        return len(self.split)
+
+    def __getitem__(self, index: int) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
+        labels = self.split.labels[index]
+        return normalised(self.split.frames.images[index]), labels.boxes, labels.wanted
+
+
+def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Tensor:
+    """Normalised frames (N, H, W) as the network takes them: (N, in_channels, H, W), channels last in memory."""
+    stacked = torch.as_tensor(images)[:, None].expand(-1, in_channels, -1, -1)
+    return stacked.contiguous(memory_format=torch.channels_last)
+
+
+def loader(frames: TrainingFrames | EvaluationFrames, config: DetectConfig) -> torch_data.DataLoader:
+    """Batches (images (N, in_channels, H, W), Targets) in the given order."""
+
+    def collate(samples: list) -> Batch:
+        images, boxes, wanted = zip(*samples, strict=True)
+        counts = torch.tensor([len(part) for part in boxes])
+        return network_input(np.stack(images), config.in_channels), Targets(
+            torch.as_tensor(np.concatenate(boxes), dtype=torch.float32),
+            torch.repeat_interleave(torch.arange(len(samples)), counts),
+            torch.as_tensor(np.concatenate(wanted)),
+        )
+
+    return torch_data.DataLoader(frames, config.batch_size, num_workers=config.workers, collate_fn=collate)

@@ -1,0 +1,1 @@
+"""What the attention of the trained networks looks at, in pictures and correlations."""

@@ -1,0 +1,59 @@
+"""`perilune-train explain`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.config import resolve
+from perilune_shared.progress import console
+from perilune_train.explain.config import ExplainConfig
+
+
+def explain(
+    preset: Annotated[str, typer.Option(help="tiny, small, paper or large: the settings to start from.")] = "small",
+    config: Annotated[Path | None, typer.Option(help="YAML file whose section `explain` overrides the preset.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="One setting, for example explain.n_frames=64; wins over file and preset. Repeatable."
+        ),
+    ] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="Folder that holds the datasets detect and nav. [default: data/<preset>]")
+    ] = None,
+    runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
+    name: Annotated[
+        str | None,
+        typer.Option(
+            help="Name of the run, and of the detect and navigate runs that it explains. [default: the preset]"
+        ),
+    ] = None,
+    detector: Annotated[
+        Path | None, typer.Option(help="A detector's best.ckpt. [default: runs/detect/<name>/checkpoints/best.ckpt]")
+    ] = None,
+    navigator: Annotated[
+        Path | None,
+        typer.Option(help="A stack navigator's best.ckpt. [default: runs/navigate/<name>-stack/checkpoints/best.ckpt]"),
+    ] = None,
+) -> None:
+    """Draw what the attention of both networks looks at, and correlate it: PCC1 to PCC4 of the paper.
+
+    Leaves runs/explain/<name>/ with config.yaml, masks_detect.png, masks_navigate.png, pcc_detect.png,
+    pcc_navigate.png, correlations.parquet and metrics.json. A run of the same name is replaced.
+    """
+    settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
+    # Torch and Lightning take seconds to load: not for a wrong key.
+    from perilune_train.explain.run import explain_run
+
+    name, root = name or preset, dataset or Path("data", preset)
+    run = explain_run(
+        settings,
+        root / "detect",
+        root / "nav",
+        detector or runs / "detect" / name / "checkpoints" / "best.ckpt",
+        navigator or runs / "navigate" / f"{name}-stack" / "checkpoints" / "best.ckpt",
+        runs,
+        name,
+    )
+    console.print(f"{run.root}: metrics.json, masks_detect.png, masks_navigate.png, pcc_detect.png, pcc_navigate.png")

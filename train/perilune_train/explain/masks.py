@@ -1,0 +1,96 @@
+"""Spatial attention masks of the trained networks, and their pictures."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_shared.files import write_bytes
+from perilune_train.data.frames import normalised
+from perilune_train.models.darknet import AttentionDarknet53
+from perilune_train.models.navigator import StackNavigator
+from perilune_train.models.yolo import YOLOv3
+
+Masks = dict[str, NDArray[np.float32]]
+"""Block "B_ij" to the masks (N, height, width) of N images, resized to the frames' size."""
+
+_BATCH = 8
+_CELL_PX = 160
+_COLUMNS = 8
+
+
+def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> Masks:
+    """Masks (N, height, width) that the detector lays over frames (N, height, width)."""
+    backbone = detector.backbone
+    channels = next(backbone.parameters()).shape[1]
+    device = next(backbone.parameters()).device
+
+    def seen(part: NDArray) -> torch.Tensor:
+        return torch.from_numpy(normalised(part))[:, None].expand(-1, channels, -1, -1).to(device)
+
+    return _collected(
+        backbone, [seen(images[i : i + _BATCH]) for i in range(0, len(images), _BATCH)], images.shape[1:], where
+    )
+
+
+def navigator_masks(
+    navigator: StackNavigator,
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    size: tuple[int, int],
+    where: Path,
+) -> Masks:
+    """Masks (N, 2 height, width) over stacked pairs, of normalised frames (N, h, w); `size` is height and width."""
+    device = next(navigator.parameters()).device
+    inputs = [
+        navigator.stacked(
+            torch.from_numpy(first[None, i : i + _BATCH]).to(device),
+            torch.from_numpy(second[None, i : i + _BATCH]).to(device),
+        )
+        for i in range(0, len(first), _BATCH)
+    ]
+    return _collected(navigator.backbone, inputs, (2 * size[0], size[1]), where)
+
+
+def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: tuple[int, ...], where: Path) -> Masks:
+    masks: dict[str, list[np.ndarray]] = {}
+    with torch.no_grad():
+        for batch in inputs:
+            for name, mask in backbone.attention_masks(batch).items():
+                own = mask[:, 0].float().cpu().numpy()
+                masks.setdefault(name, []).extend(cv2.resize(m, size[::-1]) for m in own)
+    if not masks:
+        raise UserError(where, "attention", "none", "a checkpoint of a network with attention, cbam or cbam_identity")
+    return {name: np.stack(found) for name, found in masks.items()}
+
+
+def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
+    """A sheet of PNG: for each image (N, height, width), the frame, then every block's mask laid over it in colour.
+
+    Each mask is stretched over its own range, written under it, since late masks vary little.
+    """
+    sheet = []
+    for n, image in enumerate(images):
+        height = round(_CELL_PX * image.shape[0] / image.shape[1])
+        grey = np.clip(image / max(1.0, float(np.percentile(image, 99.5))) * 255, 0, 255).astype(np.uint8)
+        frame = cv2.cvtColor(cv2.resize(grey, (_CELL_PX, height), interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+        cells = [_labelled(frame, "frame")]
+        for name, found in masks.items():
+            mask = cv2.resize(found[n], (_CELL_PX, height))
+            low, high = float(mask.min()), float(mask.max())
+            level = (255 * (mask - low) / max(high - low, 1e-9)).astype(np.uint8)
+            laid = cv2.addWeighted(frame, 0.45, cv2.applyColorMap(level, cv2.COLORMAP_TURBO), 0.55, 0)
+            cells.append(_labelled(laid, f"{name} {low:.2f}-{high:.2f}"))
+        cells += [np.full_like(cells[0], 255)] * (-len(cells) % _COLUMNS)
+        sheet += [np.hstack(cells[i : i + _COLUMNS]) for i in range(0, len(cells), _COLUMNS)]
+    write_bytes(path, cv2.imencode(".png", np.vstack(sheet))[1].tobytes())
+
+
+def _labelled(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    """The picture with a line of text below and a white margin."""
+    framed = cv2.copyMakeBorder(picture, 2, 18, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+    cv2.putText(framed, text, (4, framed.shape[0] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    return framed

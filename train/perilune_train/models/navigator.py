@@ -1,0 +1,169 @@
+"""Two networks that tell the motion between the frames of a descent."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from perilune_train.config import Attention
+from perilune_train.models.darknet import AttentionDarknet53, conv_block
+
+OUTPUTS = 9
+"""3 of the translation and 6 of the continuous rotation (see navigate/geometry.py)."""
+
+
+class Recurrent(nn.Module):
+    """Two LSTM layers (as DeepVO, Wang et al. 2017, doi 10.1109/ICRA.2017.7989236), then a linear layer to 9.
+
+    The linear layer starts at zero, so that an untrained network gives the reference motion.
+
+    Shape: features (batch, pairs, inputs) to (batch, pairs, 9).
+    """
+
+    def __init__(self, inputs: int, hidden: int):
+        super().__init__()
+        self.lstm = nn.LSTM(inputs, hidden, num_layers=2, batch_first=True)
+        self.output = nn.Linear(hidden, OUTPUTS)
+        nn.init.zeros_(self.output.weight)
+        nn.init.zeros_(self.output.bias)
+
+    def forward(self, features: Tensor) -> Tensor:
+        memory, _ = self.lstm(features)
+        return self.output(memory).float()
+
+
+class StackNavigator(nn.Module):
+    """The paper's network: the pair stacked in height, attention-Darknet53, global average pool, LSTM.
+
+    Shape: earlier and later frames (batch, pairs, height, width), normalised, to (batch, pairs, 9).
+    """
+
+    def __init__(self, in_channels: int, width: float, attention: Attention, hidden: int):
+        super().__init__()
+        self.in_channels = in_channels
+        self.backbone = AttentionDarknet53(in_channels, width, attention, stages=5)
+        self.recurrent = Recurrent(self.backbone.channels[-1], hidden)
+
+    def stacked(self, first: Tensor, second: Tensor) -> Tensor:
+        """The backbone's input (batch * pairs, in_channels, 2 height, width): the earlier frame above."""
+        both = torch.cat([first, second], dim=2).flatten(0, 1)
+        return both[:, None].expand(-1, self.in_channels, -1, -1).contiguous(memory_format=torch.channels_last)
+
+    def forward(self, first: Tensor, second: Tensor) -> Tensor:
+        features = self.backbone(self.stacked(first, second))[-1]
+        return self.recurrent(features.mean((2, 3)).unflatten(0, first.shape[:2]))
+
+
+class WarpNavigator(nn.Module):
+    """The later frame warped onto the earlier by the nominal motion, stacked in channels; layout kept to the end.
+
+    The channels are both frames and, from three blurs of them, the local shift between them after Lucas & Kanade
+    (`local_shift`): without it, hundreds of steps go into learning the product of brightness change and slope. The
+    backbone is cut at stride 8. On every place of that grid a head, which sees the mean local shifts too, tells the
+    flow that the nominal motion left over, and how far to trust it. The motion that fits the flow over the ground
+    plane best, least squares with a prior, is what the LSTM's output corrects.
+
+    Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes
+    (batch, pairs) in metres, to the motion
+    (batch, pairs, 9) in the units of navigate/task.py and the flow (batch, pairs, height / 8, width / 8, 2), pixels.
+    """
+
+    BLURS_PX = (3, 5, 9)
+    unit: Tensor
+    CHANNELS = 2 + 2 * len(BLURS_PX)
+    STRIDE = 8
+    _SUMMARY = 128
+
+    def __init__(
+        self,
+        width: float,
+        attention: Attention,
+        hidden: int,
+        focal_over_width: float,
+        spread_m: list[float],
+        rotation_rad: float,
+    ):
+        super().__init__()
+        self.focal_over_width = focal_over_width
+        self.backbone = AttentionDarknet53(self.CHANNELS, width, attention, stages=3)
+        channels = self.backbone.channels[-1]
+        self.mix = conv_block(channels, channels, 3)
+        self.place = nn.Conv2d(channels + self.CHANNELS - 2, 3, 1)
+        for parameter in self.place.parameters():
+            nn.init.zeros_(parameter)
+        self.summary = nn.Sequential(nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(16 * channels, self._SUMMARY))
+        self.log_prior = nn.Parameter(torch.zeros(6))
+        self.recurrent = Recurrent(self._SUMMARY + 6, hidden)
+        self.register_buffer("unit", torch.tensor([*spread_m, *[rotation_rad] * 3]), persistent=False)
+
+    def stacked(self, first: Tensor, second: Tensor) -> Tensor:
+        """The backbone's input (batch * pairs, 8, height, width)."""
+        pair = torch.stack([first, second], dim=2).flatten(0, 1)
+        channels = [pair, *(local_shift(blurred(pair, size)) for size in self.BLURS_PX)]
+        return torch.cat(channels, dim=1).contiguous(memory_format=torch.channels_last)
+
+    def forward(self, first: Tensor, second: Tensor, altitude_m: Tensor) -> tuple[Tensor, Tensor]:
+        stacked = self.stacked(first, second)
+        features = self.mix(self.backbone(stacked)[-1])
+        with torch.autocast(features.device.type, enabled=False):
+            shifts = functional.avg_pool2d(stacked[:, 2:], self.STRIDE)
+            places = self.place(torch.cat([features.float(), shifts], dim=1)).permute(0, 2, 3, 1)
+            flow_px, trust = places[..., :2], torch.exp(places[..., 2].clamp(-8, 8))
+            fitted = self.fitted_motion(flow_px, trust, altitude_m.flatten(), first.shape[-1])
+        summary = torch.cat([self.summary(features).float(), fitted], dim=-1)
+        correction = self.recurrent(summary.unflatten(0, first.shape[:2]))
+        turn = fitted[:, 3:]
+        zero = torch.zeros_like(turn[:, 0])
+        # A small rotation's first two columns beyond (1, 0, 0) and (0, 1, 0).
+        columns = torch.stack([zero, turn[:, 2], -turn[:, 1], -turn[:, 2], zero, turn[:, 0]], dim=-1)
+        motion = torch.cat([fitted[:, :3], columns], dim=-1).unflatten(0, first.shape[:2])
+        return motion + correction, flow_px.unflatten(0, first.shape[:2])
+
+    def fitted_motion(self, flow_px: Tensor, trust: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
+        """Translation and rotation vector (N, 6), over their spreads, of flows (N, h, w, 2) at altitudes (N,).
+
+        Minimises the sum of trust |J m - flow|^2 + prior |m|^2; trust (N, h, w) is over 1 px^2. The prior decides
+        between tilt and sideways shift, which look much alike from above. J is the flow of a
+        plane at right angles to the view (Longuet-Higgins & Prazdny 1980, doi 10.1098/rspb.1980.0057), first order
+        in the motion, with the nominal step left out beside the altitude.
+        """
+        focal_px = self.focal_over_width * width_px
+        over_altitude = torch.stack([1 / altitude_m] * 3 + [torch.ones_like(altitude_m)] * 3, dim=-1)
+        unit = focal_px * self.unit * over_altitude
+        jacobian = self.plane_flow(flow_px.shape[1], flow_px.shape[2], width_px) * unit[:, None, None, None]
+        weighted = jacobian * trust[..., None, None]
+        normal = torch.einsum("nhwij,nhwik->njk", weighted, jacobian) + torch.diag(self.log_prior.exp())
+        return torch.linalg.solve(normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px))
+
+    def plane_flow(self, rows: int, columns: int, width_px: int) -> Tensor:
+        """Flow over focal length by translation over altitude and rotation vector (rows, columns, 2, 6)."""
+        focal = self.focal_over_width * width_px / self.STRIDE
+        x = ((torch.arange(columns, device=self.unit.device) + 0.5 - columns / 2) / focal).expand(rows, columns)
+        y = ((torch.arange(rows, device=self.unit.device) + 0.5 - rows / 2) / focal)[:, None].expand(rows, columns)
+        zero, one = torch.zeros_like(x), torch.ones_like(x)
+        along_x = torch.stack([-one, zero, x, -x * y, 1 + x * x, -y], dim=-1)
+        along_y = torch.stack([zero, -one, y, -1 - y * y, x * y, x], dim=-1)
+        return torch.stack([along_x, along_y], dim=-2)
+
+
+def blurred(images: Tensor, size_px: int) -> Tensor:
+    """Means over squares `size_px` wide (odd) about each pixel of images (N, C, H, W), cut off at the edge."""
+    half = size_px // 2
+    rows = functional.avg_pool2d(images, (size_px, 1), stride=1, padding=(half, 0), count_include_pad=False)
+    return functional.avg_pool2d(rows, (1, size_px), stride=1, padding=(0, half), count_include_pad=False)
+
+
+def local_shift(pair: Tensor, window_px: int = 25) -> Tensor:
+    """Shift from the first to the second of two images (N, 2, H, W): (N, 2, H, W), pixels along x and y.
+
+    The least-squares shift of the square window about each pixel that explains the change of brightness by the
+    slope, one step (Lucas & Kanade 1981), damped where the slopes are weak; good for shifts below the width of the
+    images' finest features.
+    """
+    slope_y, slope_x = torch.gradient(pair.mean(1, keepdim=True), dim=(2, 3))
+    lost = pair[:, :1] - pair[:, 1:]
+    products = [slope_x * slope_x, slope_y * slope_y, slope_x * slope_y, slope_x * lost, slope_y * lost]
+    xx, yy, xy, x_lost, y_lost = blurred(torch.cat(products, dim=1), window_px).split(1, dim=1)
+    damping = 0.02 * (xx + yy) + 1e-4
+    xx, yy = xx + damping, yy + damping
+    shift = torch.cat([yy * x_lost - xy * y_lost, xx * y_lost - xy * x_lost], dim=1) / (xx * yy - xy * xy)
+    return shift.clamp(-8, 8)

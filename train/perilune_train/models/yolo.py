@@ -1,0 +1,128 @@
+"""YOLOv3 (Redmon & Farhadi 2018, arXiv 1804.02767) with one class, on the attention backbone."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from perilune_train.config import Attention
+from perilune_train.models.darknet import AttentionDarknet53, conv_block, scaled
+
+ANCHORS_PER_SCALE = 3
+OUTPUTS = 5
+"""x, y, width, height, objectness."""
+_STRIDES = (2, 4, 8, 16, 32)
+_LARGEST_LOG_SCALE = 4.0
+_PRIOR = 0.01
+"""Probability of a crater that every cell starts from, so that the many empty cells do not rule the first steps."""
+
+
+class YOLOv3(nn.Module):
+    """Backbone, top-down neck, and a head on each of three consecutive strides.
+
+    A cell predicts, for each of its 3 anchors, raw numbers (t_x, t_y, t_w, t_h, t_o); `decode` makes boxes of them.
+
+    Deviations from the original: no class outputs (craters are the only class, so objectness is the score); the
+    heads may lie on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than 6 px, and then
+    the neck still starts at stride 32, by one 1 x 1 convolution; `width` scales the neck too.
+    """
+
+    anchors: Tensor
+
+    def __init__(
+        self,
+        anchors: Tensor | None = None,
+        in_channels: int = 3,
+        width: float = 1.0,
+        attention: Attention = "none",
+        strides: Sequence[int] = (8, 16, 32),
+    ):
+        """Anchors are (3, 3, 2): finest stride first, width and height in pixels; without them a checkpoint's."""
+        super().__init__()
+        if tuple(strides) not in ((8, 16, 32), (4, 8, 16)):
+            raise ValueError(f"strides are {tuple(strides)}, not (8, 16, 32) or (4, 8, 16)")
+        self.strides = tuple(strides)
+        self.register_buffer("anchors", torch.ones(3, ANCHORS_PER_SCALE, 2) if anchors is None else anchors.float())
+        self.backbone = AttentionDarknet53(in_channels, width, attention)
+        self.branches, self.heads, self.laterals = nn.ModuleDict(), nn.ModuleDict(), nn.ModuleDict()
+        above = 0
+        for stride in _STRIDES[:0:-1]:
+            if stride < self.strides[0]:
+                break
+            inputs = self.backbone.channels[_STRIDES.index(stride)] + above
+            channels = scaled(16 * stride, width)
+            if stride in self.strides:
+                self.branches[str(stride)] = nn.Sequential(
+                    conv_block(inputs, channels, 1),
+                    conv_block(channels, 2 * channels, 3),
+                    conv_block(2 * channels, channels, 1),
+                    conv_block(channels, 2 * channels, 3),
+                    conv_block(2 * channels, channels, 1),
+                )
+                self.heads[str(stride)] = nn.Sequential(conv_block(channels, 2 * channels, 3), _output(2 * channels))
+                inputs = channels
+            if stride > self.strides[0]:
+                above = channels // 2
+                self.laterals[str(stride)] = nn.Sequential(conv_block(inputs, above, 1), nn.Upsample(scale_factor=2))
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """Images (N, in_channels, H, W) to raw outputs (N, 3 anchors, h, w, 5) in float32, finest stride first.
+
+        H and W are multiples of 32.
+        """
+        features = self.backbone(images)
+        outputs: list[Tensor] = []
+        above = None
+        for index in range(len(_STRIDES) - 1, _STRIDES.index(self.strides[0]) - 1, -1):
+            stride = str(_STRIDES[index])
+            x = features[index] if above is None else torch.cat([above, features[index]], dim=1)
+            if stride in self.branches:
+                x = self.branches[stride](x)
+                raw = self.heads[stride](x)
+                n, _, h, w = raw.shape
+                raw = raw.view(n, ANCHORS_PER_SCALE, OUTPUTS, h, w).permute(0, 1, 3, 4, 2)
+                outputs.insert(0, raw.float())
+            if stride in self.laterals:
+                above = self.laterals[stride](x)
+        return outputs
+
+    @torch.no_grad()
+    def detect(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Boxes (N, K, 4) as x0, y0, x1, y1 in pixels and scores (N, K) of all K predictors, before suppression."""
+        boxes, scores = [], []
+        for raw, anchors, stride in zip(self(images), self.anchors, self.strides, strict=True):
+            boxes.append(decode_grid(raw, anchors, stride).flatten(1, 3))
+            scores.append(raw[..., 4].sigmoid().flatten(1))
+        return torch.cat(boxes, 1), torch.cat(scores, 1)
+
+
+def _output(channels: int) -> nn.Conv2d:
+    """The last layer of a head: starts with all boxes at their anchors and objectness at its prior."""
+    layer = nn.Conv2d(channels, ANCHORS_PER_SCALE * OUTPUTS, 1)
+    nn.init.normal_(layer.weight, std=0.01)
+    bias = torch.zeros(ANCHORS_PER_SCALE, OUTPUTS)
+    bias[:, 4] = math.log(_PRIOR / (1 - _PRIOR))
+    layer.bias = nn.Parameter(bias.flatten())
+    return layer
+
+
+def decode(raw: Tensor, cells: Tensor, anchors: Tensor, stride: int) -> Tensor:
+    """Boxes (..., 4) as x0, y0, x1, y1 in pixels of raw outputs (..., 4 or more).
+
+    `cells` (..., 2) are column and row of the predicting cell, `anchors` (..., 2) width and height in pixels.
+    Centre: (cell + 2 s(t) - 0.5) stride; size: anchor exp(t). Deviation from YOLOv3, which has s(t) alone: the centre
+    reaches half a cell beyond the cell, because neighbouring cells are trained on a crater too (detect/assign.py).
+    """
+    centre = (cells + 2 * raw[..., :2].sigmoid() - 0.5) * stride
+    half = anchors * raw[..., 2:4].clamp(-_LARGEST_LOG_SCALE, _LARGEST_LOG_SCALE).exp() / 2
+    return torch.cat([centre - half, centre + half], dim=-1)
+
+
+def decode_grid(raw: Tensor, anchors: Tensor, stride: int) -> Tensor:
+    """Boxes (N, 3, h, w, 4) of one scale's raw outputs (N, 3, h, w, 5) with its anchors (3, 2)."""
+    h, w = raw.shape[2:4]
+    rows, columns = torch.meshgrid(
+        torch.arange(h, device=raw.device), torch.arange(w, device=raw.device), indexing="ij"
+    )
+    return decode(raw, torch.stack([columns, rows], dim=-1), anchors[:, None, None, :], stride)

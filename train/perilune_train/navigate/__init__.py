@@ -1,0 +1,1 @@
+"""Relative motion of a lander from pairs of its descent images."""

@@ -1,0 +1,44 @@
+"""`perilune-train navigate`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.config import resolve
+from perilune_shared.progress import console
+from perilune_train.navigate.config import NavigateConfig
+
+
+def navigate(
+    preset: Annotated[str, typer.Option(help="tiny, small, paper or large: the settings to start from.")] = "small",
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file whose section `navigate` overrides the preset.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="One setting, for example navigate.fusion=warp; wins over file and preset. Repeatable."
+        ),
+    ] = None,
+    dataset: Annotated[Path | None, typer.Option(help="Folder of the dataset. [default: data/<preset>/nav]")] = None,
+    runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
+    name: Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
+) -> None:
+    """Train the navigation networks and judge them beside the nominal motion, mean motions and KLT tracks.
+
+    Leaves runs/navigate/<name>/ (fusion warp) and runs/navigate/<name>-stack/ (fusion stack, the paper's form), each
+    with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, navigation.parquet (one row a method),
+    errors.parquet (one row a pair), descent.png, errors.png and TensorBoard events. The stack network starts from
+    the backbone of runs/detect/<name>, where that fits. Runs of the same names are replaced, unless --resume.
+    """
+    settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
+    # Torch and Lightning take seconds to load: not for a wrong key.
+    from perilune_train.navigate.run import navigate_run
+
+    name = name or preset
+    detector = runs / "detect" / name / "checkpoints" / "best.ckpt"
+    dataset = dataset or Path("data", preset, "nav")
+    for run in navigate_run(settings, dataset, runs, name, detector, resume):
+        console.print(f"{run.root}: metrics.json, navigation.parquet, descent.png, errors.png")

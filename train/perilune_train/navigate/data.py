@@ -1,0 +1,300 @@
+"""Descents as arrays, and the sequences of image pairs that the networks learn from."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from perilune_shared.camera import Camera
+from perilune_shared.descent import NominalDescent
+from perilune_shared.errors import UserError
+from perilune_shared.frames import Array, matrix_from_quaternion, matrix_from_rotation_vector
+from perilune_shared.manifest import Dataset
+from perilune_shared.schema import SPLITS
+from perilune_train.data.frames import load_frames, normalised
+from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography, relative_poses
+
+
+@dataclass(frozen=True, slots=True)
+class Descent:
+    """One descent of n frames, with what the guidance knew before the flight."""
+
+    trajectory: tuple[str, str]
+    """scene_id and trajectory_id."""
+    split: str
+    """train, val or test."""
+    images: np.ndarray
+    """8-bit grey frames (n, height, width)."""
+    camera: Camera
+    """Intrinsics that belong to `images`."""
+    position_m: Array
+    """True camera positions (n, 3), O_L."""
+    rotation_camera_from_site: Array
+    """True attitudes (n, 3, 3)."""
+    nominal_position_m: Array
+    """Positions (n, 3) on the nominal curve at the frames' times, O_L."""
+    nominal_rotation_camera_from_site: Array
+    """Attitude (3, 3) of the camera on a level body, the same for all frames."""
+
+    @property
+    def n_pairs(self) -> int:
+        """Pairs of consecutive frames."""
+        return len(self.images) - 1
+
+    @property
+    def motion(self) -> tuple[Array, Array]:
+        """True motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3)."""
+        return relative_poses(self.position_m, self.rotation_camera_from_site)
+
+    @property
+    def nominal_motion(self) -> tuple[Array, Array]:
+        """Nominal motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3), which is the identity."""
+        attitudes = np.broadcast_to(self.nominal_rotation_camera_from_site, (len(self.images), 3, 3))
+        return relative_poses(self.nominal_position_m, attitudes)
+
+    @property
+    def altitude_m(self) -> Array:
+        """Nominal altitude (n - 1,) above the ground plane at the earlier frame of each pair."""
+        return self.nominal_position_m[:-1, 2]
+
+    @property
+    def down_c(self) -> Array:
+        """Unit vector (3,) towards the ground in O_C of a level body."""
+        return -self.nominal_rotation_camera_from_site[:, 2]
+
+    def shrunk(self, size_px: int) -> "Descent":
+        """The same descent with images `size_px` wide, averaged over areas; itself where they are that size."""
+        height, width = self.images.shape[1:]
+        if width == size_px:
+            return self
+        scale = size_px / width
+        new_height = round(height * scale)
+        size = (size_px, new_height)
+        images = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self.images])
+        c, down = self.camera, new_height / height
+        camera = Camera(size_px, new_height, c.fx_px * scale, c.fy_px * down, c.cx_px * scale, c.cy_px * down)
+        return replace(self, images=images, camera=camera)
+
+
+def load_descents(dataset: Dataset) -> list[Descent]:
+    """All descents of a navigation dataset: those to train, then val, then test, each in the order of their ids.
+
+    Raises UserError where the dataset is of another kind, its images are distorted or a frame is missing.
+    """
+    if dataset.info.kind != "nav":
+        raise UserError(dataset.root, "kind", dataset.info.kind, "nav, a dataset of descents")
+    if any(dataset.info.camera.distortion):
+        raise UserError(dataset.root, "camera.distortion", dataset.info.camera.distortion, "zeros")
+    rows = dataset.table("trajectories").to_pylist()
+    curves = {(row["scene_id"], row["trajectory_id"]): row for row in rows}
+    descents = [descent for split in SPLITS for descent in _split_descents(dataset, split, curves)]
+    if len({descent.trajectory for descent in descents}) < len(descents):
+        raise UserError(dataset.root, "split", "a descent in two splits", "one split for each descent")
+    return descents
+
+
+def _split_descents(dataset: Dataset, split: str, curves: dict[tuple[str, str], dict]) -> list[Descent]:
+    store = load_frames(dataset, split)
+    descents = []
+    for key, rows in store.table.groupby(["scene_id", "trajectory_id"]):
+        scene_id, trajectory_id = (str(part) for part in key)
+        curve = curves[scene_id, trajectory_id]
+        nominal = NominalDescent(
+            tuple(curve["nominal_position_m"]),
+            tuple(curve["nominal_velocity_mps"]),
+            tuple(curve["nominal_acceleration_mps2"]),
+            float(curve["duration_s"]),
+        )
+        if len(rows) < 2:
+            raise UserError(dataset.root, f"{scene_id}/{trajectory_id}", "one frame", "descents of at least two frames")
+        descents.append(
+            Descent(
+                (scene_id, trajectory_id),
+                split,
+                store.images[rows.index],
+                dataset.info.camera.pinhole(),
+                np.array(rows["position_m"].tolist()),
+                matrix_from_quaternion(rows["rotation_wxyz"].tolist()),
+                nominal.position_at(rows["time_s"].to_numpy()),
+                np.array(dataset.info.camera.rotation_camera_from_body),
+            )
+        )
+    return descents
+
+
+@dataclass(frozen=True, slots=True)
+class Jitter:
+    """Sizes (standard deviations) of the extra motion drawn for each pair in training."""
+
+    translation_m: Array
+    """Shift of the second camera along x, y, z of O_C, metres (3,)."""
+    rotation_rad: float
+    """Turn of the second camera about each axis, radians."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """n pairs as a network sees them, and what is to be found."""
+
+    first: np.ndarray
+    """Earlier frames, normalised, float32 (n, height, width)."""
+    second: np.ndarray
+    """Later frames, normalised; warped onto the earlier ones where asked for, 0 where nothing was seen."""
+    translation_m: Array
+    """True translations (n, 3)."""
+    rotation_c2_from_c1: Array
+    """True rotations (n, 3, 3)."""
+    nominal_translation_m: Array
+    """Nominal translations (n, 3)."""
+    altitude_m: Array
+    """Nominal altitudes (n,) at the earlier frames."""
+    flow_px: Array | None = None
+    """Where warped: the flow that is left of the ground plane (n, height / 8, width / 8, 2), from first to second."""
+
+
+def pair_sequence(
+    descent: Descent,
+    start: int,
+    n_pairs: int,
+    *,
+    warp: bool,
+    rng: np.random.Generator | None = None,
+    jitter: Jitter | None = None,
+) -> Sequence:
+    """The pairs start .. start + n_pairs of a descent; with a generator, augmented.
+
+    Augmentation: one of the eight turns and mirrorings of the square image for the whole sequence (four where the
+    image is not square), and, with `jitter`, a new small motion of each second camera, drawn on its own: the second
+    frame is resampled over the ground plane as the moved camera would see it (exact but for the relief's
+    parallax), so that each pair shows ever new residuals.
+    """
+    span = slice(start, start + n_pairs)
+    translation, rotation = (values[span] for values in descent.motion)
+    nominal_translation, nominal_rotation = (values[span] for values in descent.nominal_motion)
+    altitude = descent.altitude_m[span]
+    images = descent.images[start : start + n_pairs + 1]
+    translation, rotation, seconds = translation.copy(), rotation.copy(), []
+    for i in range(n_pairs):
+        change = np.eye(3)
+        if rng is not None and jitter is not None:
+            shift = rng.normal(size=3) * jitter.translation_m
+            turn = matrix_from_rotation_vector(rng.normal(size=3) * jitter.rotation_rad)
+            true = _homography(descent, translation[i], rotation[i], altitude[i])
+            translation[i], rotation[i] = translation[i] + shift, turn @ rotation[i]
+            # Image 2 as moved: new image 2 -> image 1 over the plane -> old image 2.
+            change = true @ np.linalg.inv(_homography(descent, translation[i], rotation[i], altitude[i]))
+        if warp:
+            change = change @ _homography(descent, nominal_translation[i], nominal_rotation[i], altitude[i])
+        seconds.append(_normalised(images[i + 1], change))
+    sequence = Sequence(
+        np.stack([_normalised(image) for image in images[:-1]]),
+        np.stack(seconds),
+        translation,
+        rotation,
+        nominal_translation,
+        altitude,
+    )
+    if rng is not None:
+        sequence = mirrored(sequence, descent.camera, rng)
+    return replace(sequence, flow_px=_residual_flow(sequence, descent)) if warp else sequence
+
+
+def mirrored(sequence: Sequence, camera: Camera, rng: np.random.Generator) -> Sequence:
+    """The sequence under a random mirroring of left and right, up and down and, in a square image, x and y.
+
+    A mirroring D of the image about its centre makes t to D t and R to D R D, with D extended by 1 along z. Only
+    done where the principal point is the image's centre.
+    """
+    flip_x, flip_y, swap = rng.random(3) < 0.5
+    if (camera.cx_px, camera.cy_px) != (camera.width_px / 2, camera.height_px / 2):
+        return sequence
+    first, second, mirror = sequence.first, sequence.second, np.eye(3)
+    if flip_x:
+        first, second, mirror = first[:, :, ::-1], second[:, :, ::-1], np.diag([-1.0, 1, 1]) @ mirror
+    if flip_y:
+        first, second, mirror = first[:, ::-1], second[:, ::-1], np.diag([1.0, -1, 1]) @ mirror
+    if swap and camera.width_px == camera.height_px and camera.fx_px == camera.fy_px:
+        first, second, mirror = first.transpose(0, 2, 1), second.transpose(0, 2, 1), np.eye(3)[[1, 0, 2]] @ mirror
+    return replace(
+        sequence,
+        first=np.ascontiguousarray(first),
+        second=np.ascontiguousarray(second),
+        translation_m=sequence.translation_m @ mirror.T,
+        rotation_c2_from_c1=mirror @ sequence.rotation_c2_from_c1 @ mirror.T,
+        nominal_translation_m=sequence.nominal_translation_m @ mirror.T,
+    )
+
+
+class EpochBatches:
+    """One epoch of batches of sequences, each pair about once, drawn from the key (seed, epoch) alone.
+
+    Each descent is cut into runs of `n_pairs` (of the shortest descent's length, where that is less) that begin at
+    a random offset. Iterates over lists of `batch` sequences; `augmented` ones are mirrored and, with `jitter`,
+    moved (see `pair_sequence`).
+    """
+
+    def __init__(
+        self,
+        descents: list[Descent],
+        n_pairs: int,
+        batch: int,
+        *,
+        warp: bool,
+        augmented: bool,
+        jitter: Jitter | None,
+        key: tuple[int, ...],
+    ):
+        self.descents, self.batch, self.warp, self.augmented = descents, batch, warp, augmented
+        self.jitter, self.key = jitter, key
+        self.n_pairs = min(n_pairs, *(descent.n_pairs for descent in descents))
+        rng = np.random.default_rng(key)
+        self.places = [
+            (number, int(start))
+            for number, descent in enumerate(descents)
+            for start in rng.integers(0, descent.n_pairs - self.n_pairs + 1, round(descent.n_pairs / self.n_pairs))
+        ]
+        rng.shuffle(self.places)
+
+    def __len__(self) -> int:
+        return -(-len(self.places) // self.batch)
+
+    def __iter__(self) -> Iterator[list[Sequence]]:
+        for begin in range(0, len(self.places), self.batch):
+            yield [self._sequence(i) for i in range(begin, min(begin + self.batch, len(self.places)))]
+
+    def _sequence(self, i: int) -> Sequence:
+        number, start = self.places[i]
+        rng = np.random.default_rng([*self.key, i]) if self.augmented else None
+        return pair_sequence(self.descents[number], start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)
+
+
+def _homography(descent: Descent, translation_m: Array, rotation: Array, altitude_m: float) -> Array:
+    return plane_homography(descent.camera.matrix, translation_m, rotation, descent.down_c, altitude_m)
+
+
+def _residual_flow(sequence: Sequence, descent: Descent) -> Array:
+    """Flow (n, height / 8, width / 8, 2) of the ground plane after the warp, at the places' centres."""
+    height, width = sequence.first.shape[1:]
+    u, v = np.meshgrid(np.arange(4, width, 8), np.arange(4, height, 8))
+    centres, level, flows = np.stack([u, v], axis=-1), np.eye(3), []
+    for t, r, nominal, altitude in zip(
+        sequence.translation_m,
+        sequence.rotation_c2_from_c1,
+        sequence.nominal_translation_m,
+        sequence.altitude_m,
+        strict=True,
+    ):
+        back = np.linalg.inv(_homography(descent, nominal, level, altitude))
+        flows.append(apply_homography(back @ _homography(descent, t, r, altitude), centres) - centres)
+    return np.stack(flows)
+
+
+def _normalised(image: np.ndarray, homography: Array | None = None) -> np.ndarray:
+    """Mean 0 and standard deviation 1, float32; then resampled by a homography from the wanted to the given image."""
+    values = normalised(image)
+    if homography is None or np.array_equal(homography, np.eye(3)):
+        return values
+    return cv2.warpPerspective(
+        values, pixel_index_homography(homography), image.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    )

@@ -1,0 +1,112 @@
+"""Relative poses of a moving camera, the ground plane's homography, and dead reckoning.
+
+The motion from frame 1 to frame 2 is given in O_C of frame 1: `translation_m` = R1 (p2 - p1) and
+`rotation_c2_from_c1` = R2 R1^T, with R = rotation_camera_from_site and p = position_m in O_L.
+A point X1 of camera 1 is X2 = rotation_c2_from_c1 (X1 - translation_m) in camera 2.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+from torch.nn import functional
+
+from perilune_shared.frames import Array
+
+
+def relative_poses(position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> tuple[Array, Array]:
+    """Motions between consecutive frames of one descent.
+
+    Takes positions (n, 3) in metres, O_L, and rotations (n, 3, 3); gives translation_m (n - 1, 3) in O_C of the
+    earlier frame and rotation_c2_from_c1 (n - 1, 3, 3).
+    """
+    p, r = np.asarray(position_m, np.float64), np.asarray(rotation_camera_from_site, np.float64)
+    return np.einsum("nij,nj->ni", r[:-1], np.diff(p, axis=0)), r[1:] @ np.swapaxes(r[:-1], 1, 2)
+
+
+def dead_reckoning(
+    start_position_m: ArrayLike,
+    start_rotation_camera_from_site: ArrayLike,
+    translation_m: ArrayLike,
+    rotation_c2_from_c1: ArrayLike,
+) -> tuple[Array, Array]:
+    """Positions (n + 1, 3) in O_L and rotations (n + 1, 3, 3) from a known start and n motions."""
+    positions = [np.asarray(start_position_m, np.float64)]
+    rotations = [np.asarray(start_rotation_camera_from_site, np.float64)]
+    for t, r in zip(np.asarray(translation_m), np.asarray(rotation_c2_from_c1), strict=True):
+        positions.append(positions[-1] + rotations[-1].T @ t)
+        rotations.append(r @ rotations[-1])
+    return np.stack(positions), np.stack(rotations)
+
+
+def plane_homography(
+    camera_matrix: ArrayLike,
+    translation_m: ArrayLike,
+    rotation_c2_from_c1: ArrayLike,
+    plane_normal_c1: ArrayLike,
+    plane_distance_m: float,
+) -> Array:
+    """Homography (3, 3) from image coordinates of frame 1 to those of frame 2 over a plane.
+
+    The plane is all X1 with plane_normal_c1 . X1 = plane_distance_m: for the ground, the downward unit vector in
+    O_C of frame 1 and the altitude. H = K R (I - t n^T / d) K^-1 (Hartley & Zisserman, 2nd ed., section 13.1).
+    """
+    k, t, n = (np.asarray(values, np.float64) for values in (camera_matrix, translation_m, plane_normal_c1))
+    induced = np.eye(3) - np.outer(t, n) / plane_distance_m
+    return k @ np.asarray(rotation_c2_from_c1) @ induced @ np.linalg.inv(k)
+
+
+def pixel_index_homography(homography: ArrayLike) -> Array:
+    """The same homography (3, 3) for OpenCV, whose coordinates are 0 at the first pixel's centre and not 0.5."""
+    shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
+    return np.linalg.inv(shift) @ np.asarray(homography) @ shift
+
+
+def apply_homography(homography: ArrayLike, points_px: ArrayLike) -> Array:
+    """Image points (..., 2) of points (..., 2)."""
+    p, h = np.asarray(points_px, np.float64), np.asarray(homography, np.float64)
+    q = np.concatenate([p, np.ones_like(p[..., :1])], axis=-1) @ h.T
+    return q[..., :2] / q[..., 2:]
+
+
+def rotation_from_sixd(sixd: Tensor) -> Tensor:
+    """Rotation matrices (..., 3, 3) from the continuous representation (..., 6).
+
+    The six numbers are the matrix's first two columns before orthonormalisation (Zhou et al. 2019,
+    doi 10.1109/CVPR.2019.00589, equation 15).
+    """
+    a, b = sixd[..., :3], sixd[..., 3:]
+    x = functional.normalize(a, dim=-1)
+    y = functional.normalize(b - (x * b).sum(-1, keepdim=True) * x, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def sixd_from_rotation(rotation: Tensor) -> Tensor:
+    """The continuous representation (..., 6) of rotation matrices (..., 3, 3): the first two columns."""
+    return torch.cat([rotation[..., :, 0], rotation[..., :, 1]], dim=-1)
+
+
+def euler_from_rotation(rotation: Tensor) -> Tensor:
+    """Angles (..., 3) in radians about x, y, z of rotation = Rz Ry Rx (..., 3, 3); |y| below a quarter turn."""
+    cos_y = torch.hypot(rotation[..., 0, 0], rotation[..., 1, 0])
+    return torch.stack(
+        [
+            torch.atan2(rotation[..., 2, 1], rotation[..., 2, 2]),
+            torch.atan2(-rotation[..., 2, 0], cos_y),
+            torch.atan2(rotation[..., 1, 0], rotation[..., 0, 0]),
+        ],
+        dim=-1,
+    )
+
+
+def rotation_vectors(rotation: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) in radians of rotation matrices (..., 3, 3) well below half a turn.
+
+    The angle comes from sine and cosine together; the arc cosine alone loses small angles to rounding.
+    """
+    r = np.asarray(rotation, np.float64)
+    skew = r - np.swapaxes(r, -1, -2)
+    twice_sine = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+    length = np.linalg.norm(twice_sine, axis=-1, keepdims=True)
+    angle = np.arctan2(length, np.trace(r, axis1=-2, axis2=-1)[..., None] - 1)
+    return twice_sine * np.where(length > 1e-12, angle / np.where(length > 1e-12, length, 1), 0.5)

@@ -1,0 +1,149 @@
+"""The classical baseline: corners tracked from frame to frame, and a robust motion fit over the ground plane.
+
+The second frame is first warped onto the first by the nominal motion, so that the tracker (Lucas & Kanade 1981,
+pyramids after Bouguet 2001, as in OpenCV) looks for a small residual only and sees the same scale. The points of
+frame 1 are put on the ground plane at the nominal altitude; the motion is fitted to them by Gauss-Newton on the
+reprojection error with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/00401706.1974.10489171).
+"""
+
+import cv2
+import numpy as np
+
+from perilune_shared.camera import Camera
+from perilune_shared.frames import Array, matrix_from_rotation_vector
+from perilune_train.data.frames import normalised
+from perilune_train.navigate.data import Descent
+from perilune_train.navigate.geometry import (
+    apply_homography,
+    pixel_index_homography,
+    plane_homography,
+    rotation_vectors,
+)
+
+_N_CORNERS = 600
+_WINDOW_PX = 11
+_CONSISTENCY_PX = 0.5
+"""A track must return this close to its start when followed backwards."""
+_TUKEY = 4.685
+_PRIOR_TURN_RAD = np.radians(0.5)
+_PRIOR_SHIFT = 0.02
+"""Weak knowledge of the motion about the nominal one, turn and shift over altitude (standard deviations): few or
+crowded corners leave tilt and sideways shift, which look alike from above, undecided."""
+_ITERATIONS = 15
+_LEAST_TRACKS = 8
+
+
+def klt_descent(descent: Descent) -> tuple[Array, Array]:
+    """Motions of a whole descent: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3).
+
+    One pair tells the translation only over the altitude. The altitude is the true one at the first frame, carried
+    on by the motions found; the attitude is taken as level.
+    """
+    nominal_translation, nominal_rotation = descent.nominal_motion
+    # OpenCV tracks 8-bit images and rejects flat windows by a fixed threshold: dim frames are stretched first.
+    images = np.clip(110 + 45 * normalised(descent.images), 0, 255).astype(np.uint8)
+    altitude_m = float(descent.position_m[0, 2])
+    translations, rotations = [], []
+    for i in range(descent.n_pairs):
+        translation, rotation, _ = klt_motion(
+            descent.camera,
+            images[i],
+            images[i + 1],
+            nominal_translation[i],
+            nominal_rotation[i],
+            descent.down_c,
+            altitude_m,
+        )
+        altitude_m -= float(descent.down_c @ translation)
+        translations.append(translation)
+        rotations.append(rotation)
+    return np.stack(translations), np.stack(rotations)
+
+
+def klt_motion(
+    camera: Camera,
+    image_1: np.ndarray,
+    image_2: np.ndarray,
+    nominal_translation_m: Array,
+    nominal_rotation_c2_from_c1: Array,
+    plane_normal_c1: Array,
+    altitude_m: float,
+) -> tuple[Array, Array, int]:
+    """Motion between two 8-bit images: translation_m (3,), rotation_c2_from_c1 (3, 3), tracks that agree.
+
+    Where fewer than 8 corners can be followed the nominal motion is given back, with 0 tracks.
+    """
+    nominal = plane_homography(
+        camera.matrix, nominal_translation_m, nominal_rotation_c2_from_c1, plane_normal_c1, altitude_m
+    )
+    pixels_1, pixels_2 = _tracks(image_1, image_2, nominal)
+    if len(pixels_1) < _LEAST_TRACKS:
+        return nominal_translation_m, nominal_rotation_c2_from_c1, 0
+    rays = camera.rays(pixels_1)
+    points_c1 = rays * (altitude_m / (rays @ plane_normal_c1))[:, None]
+    return _fit(camera, points_c1, pixels_2, nominal_translation_m, nominal_rotation_c2_from_c1)
+
+
+def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tuple[Array, Array]:
+    """Corresponding points (N, 2) of both images, in image coordinates."""
+    size = image_1.shape[::-1]
+    warp = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP}
+    index_homography = pixel_index_homography(homography)
+    warped = cv2.warpPerspective(image_2, index_homography, size, **warp)
+    seen = cv2.warpPerspective(np.full_like(image_2, 255), index_homography, size, **warp)
+    seen = cv2.erode(seen, np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8))
+    corners = cv2.goodFeaturesToTrack(image_1, _N_CORNERS, 0.001, 5, mask=seen)
+    if corners is None:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    window = (_WINDOW_PX, _WINDOW_PX)
+    found, good, _ = cv2.calcOpticalFlowPyrLK(
+        image_1, warped, corners, corners.copy(), winSize=window, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    back, good_back, _ = cv2.calcOpticalFlowPyrLK(
+        warped, image_1, found, found.copy(), winSize=window, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    kept = (good & good_back).ravel().astype(bool)
+    kept &= np.linalg.norm(back - corners, axis=-1).ravel() < _CONSISTENCY_PX
+    pixels_1 = corners.reshape(-1, 2)[kept].astype(np.float64) + 0.5
+    return pixels_1, apply_homography(homography, found.reshape(-1, 2)[kept].astype(np.float64) + 0.5)
+
+
+def _fit(
+    camera: Camera, points_c1: Array, pixels_2: Array, translation_m: Array, rotation: Array
+) -> tuple[Array, Array, int]:
+    """Motion that carries points (N, 3) of O_C of frame 1 to pixels (N, 2) of frame 2."""
+    focal = np.array([camera.fx_px, camera.fy_px])
+    weights = np.ones(len(points_c1))
+    nominal_translation_m, nominal_rotation = translation_m, rotation
+    altitude_m = float(np.median(points_c1[:, 2]))
+    prior = 1 / np.square([_PRIOR_TURN_RAD] * 3 + [_PRIOR_SHIFT * altitude_m] * 3)
+    for _ in range(_ITERATIONS):
+        points = (points_c1 - translation_m) @ rotation.T
+        error = camera.project(points) - pixels_2
+        distance = np.linalg.norm(error, axis=1)
+        spread = max(1.4826 * float(np.median(distance)), 1e-3)
+        weights = np.clip(1 - (distance / (_TUKEY * spread)) ** 2, 0, None) ** 2
+        x, y, z = points.T
+        zero = np.zeros_like(z)
+        # Derivative of the pixel by the point in camera 2, then by a turn (left) and a shift of that point.
+        by_point = np.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], axis=1).reshape(-1, 2, 3)
+        by_point *= focal[:, None]
+        cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
+        jacobian = np.concatenate([by_point @ cross, by_point], axis=2)
+        weighted = jacobian * weights[:, None, None]
+        normal = np.einsum("nij,nik->jk", weighted, jacobian)
+        # Metres and radians differ by the altitude; a unit diagonal keeps the solution well conditioned.
+        normal += np.diag(prior) * spread**2
+        away = np.concatenate(
+            [rotation_vectors(rotation @ nominal_rotation.T), rotation @ (nominal_translation_m - translation_m)]
+        )
+        scale = 1 / np.sqrt(np.diag(normal))
+        slope = scale * (np.einsum("nij,ni->j", weighted, error) + prior * spread**2 * away)
+        step = -scale * np.linalg.lstsq(normal * np.outer(scale, scale), slope, rcond=None)[0]
+        turn = matrix_from_rotation_vector(step[:3])
+        # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
+        rotation = turn @ rotation
+        translation_m = translation_m - rotation.T @ step[3:]
+        if np.linalg.norm(step[:3]) < 1e-8 and np.linalg.norm(step[3:]) < 1e-5:
+            break
+    return translation_m, rotation, int((weights > 0).sum())

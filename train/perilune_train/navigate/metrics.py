@@ -1,0 +1,84 @@
+"""Errors of estimated motions, the baselines that know no image, and the table of all of them."""
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.frames import Array
+from perilune_train.navigate.data import Descent
+from perilune_train.navigate.geometry import dead_reckoning, rotation_vectors
+
+Motion = tuple[Array, Array]
+"""translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one descent."""
+
+
+def mean_motion(training: list[Descent], descent: Descent) -> Motion:
+    """The training set's mean motion, for every pair of the descent."""
+    translation = np.concatenate([d.motion[0] for d in training]).mean(0)
+    rotation = _mean_rotation(np.concatenate([d.motion[1] for d in training]))
+    return np.tile(translation, (descent.n_pairs, 1)), np.tile(rotation, (descent.n_pairs, 1, 1))
+
+
+def mean_motion_at_step(training: list[Descent], descent: Descent) -> Motion:
+    """The training set's mean motion at each step; beyond its longest descent, at the last step it has."""
+    translations, rotations = [], []
+    longest = max(d.n_pairs for d in training)
+    for step in range(descent.n_pairs):
+        motions = [
+            (d.motion[0][min(step, longest - 1)], d.motion[1][min(step, longest - 1)])
+            for d in training
+            if d.n_pairs > min(step, longest - 1)
+        ]
+        translations.append(np.mean([t for t, _ in motions], axis=0))
+        rotations.append(_mean_rotation(np.stack([r for _, r in motions])))
+    return np.stack(translations), np.stack(rotations)
+
+
+def motion_errors(descents: list[Descent], motions: list[Motion]) -> pd.DataFrame:
+    """One row a pair: errors of the motion, and of the position dead reckoned from the true first pose.
+
+    Columns: scene_id, trajectory_id, step, altitude_m (nominal), position_error_m (length) with its parts
+    error_x_m, error_y_m, error_z_m in O_C of the earlier frame, orientation_error_deg (angle of the rotation left
+    over) with its parts error_x_deg ... (rotation vector, O_C of the later frame), drift_m and drift_x_m ... (O_L).
+    """
+    tables = []
+    for descent, (translation, rotation) in zip(descents, motions, strict=True):
+        true_translation, true_rotation = descent.motion
+        shift = translation - true_translation
+        turn = np.degrees(rotation_vectors(rotation @ np.swapaxes(true_rotation, 1, 2)))
+        path, _ = dead_reckoning(descent.position_m[0], descent.rotation_camera_from_site[0], translation, rotation)
+        drift = (path - descent.position_m)[1:]
+        columns = {
+            "scene_id": descent.trajectory[0],
+            "trajectory_id": descent.trajectory[1],
+            "step": np.arange(descent.n_pairs),
+            "altitude_m": descent.altitude_m,
+            "position_error_m": np.linalg.norm(shift, axis=1),
+            "orientation_error_deg": np.linalg.norm(turn, axis=1),
+            "drift_m": np.linalg.norm(drift, axis=1),
+        }
+        for i, axis in enumerate("xyz"):
+            columns |= {f"error_{axis}_m": shift[:, i], f"error_{axis}_deg": turn[:, i], f"drift_{axis}_m": drift[:, i]}
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def summary(errors: pd.DataFrame) -> dict[str, float]:
+    """Root mean squares over all pairs of all descents; drift over all frames and at the last ones."""
+    ends = errors.groupby(["scene_id", "trajectory_id"])["drift_m"].last()
+    figures = {"position_rmse_m": _rms(errors["position_error_m"])}
+    figures |= {f"position_rmse_{axis}_m": _rms(errors[f"error_{axis}_m"]) for axis in "xyz"}
+    figures["orientation_rmse_deg"] = _rms(errors["orientation_error_deg"])
+    figures |= {f"orientation_rmse_{axis}_deg": _rms(errors[f"error_{axis}_deg"]) for axis in "xyz"}
+    figures["drift_rms_m"] = _rms(errors["drift_m"])
+    figures["drift_final_m"] = _rms(ends)
+    return figures
+
+
+def _rms(values: pd.Series) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _mean_rotation(rotations: Array) -> Array:
+    """The rotation nearest to the mean of the matrices (Moakher 2002, doi 10.1137/S0895479801383877)."""
+    u, _, vt = np.linalg.svd(rotations.mean(0))
+    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt

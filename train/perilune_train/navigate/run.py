@@ -1,0 +1,152 @@
+"""One navigation run: train the networks asked for, judge them beside the baselines, write tables and pictures."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning
+import pandas as pd
+from torch import Tensor
+
+from perilune_shared.files import written_aside
+from perilune_shared.manifest import open_dataset
+from perilune_shared.progress import console, progress_bar
+from perilune_train.navigate.config import NavigateConfig
+from perilune_train.navigate.data import Descent, load_descents
+from perilune_train.navigate.figures import draw_descent, draw_errors
+from perilune_train.navigate.klt import klt_descent
+from perilune_train.navigate.metrics import Motion, mean_motion, mean_motion_at_step, motion_errors, summary
+from perilune_train.navigate.task import Fusion, NavigationTask, load_navigator, predict
+from perilune_train.runs import (
+    RunFolder,
+    check_architecture,
+    choose_device,
+    fit,
+    load_weights,
+    start_run,
+    write_metrics,
+)
+
+_PREFIX = "backbone."
+
+
+def navigate_run(
+    settings: NavigateConfig, dataset: Path, runs: Path, name: str, detector: Path | None, resume: bool
+) -> list[RunFolder]:
+    """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
+
+    `detector` is the default checkpoint for the stack network's backbone, used where it exists and fits;
+    `settings.detector` must fit. Raises UserError on bad data or a checkpoint of another architecture.
+    """
+    wanted: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
+    descents = load_descents(open_dataset(dataset))
+    backbone, source = _detector_backbone(settings, detector) if "stack" in wanted else (None, "")
+    test = [descent for descent in descents if descent.split == "test"]
+    motions = _baselines([descent for descent in descents if descent.split == "train"], test)
+    folders = []
+    # stack comes first, so that the run of warp, finished last, holds the table of both.
+    for fusion in wanted:
+        run = start_run(runs, "navigate", name if fusion == "warp" else f"{name}-stack", settings, resume)
+        started = time.monotonic()
+        _train(run, settings, fusion, descents, backbone if fusion == "stack" else None, resume)
+        seconds = time.monotonic() - started
+        network, architecture = load_navigator(run.best, fusion)
+        started = time.monotonic()
+        motions = {fusion: [predict(network, architecture, descent) for descent in test], **motions}
+        pairs = sum(descent.n_pairs for descent in test)
+        details = {
+            "train/seconds": round(seconds, 1),
+            "test/pairs": pairs,
+            "test/ms_per_pair": round(1e3 * (time.monotonic() - started) / pairs, 2),
+            "network/parameters": sum(p.numel() for p in network.parameters()),
+            "network/backbone": source if fusion == "stack" else "from scratch",
+        }
+        _write(run, fusion, test, motions, details)
+        folders.append(run)
+    return folders
+
+
+def _train(
+    run: RunFolder,
+    settings: NavigateConfig,
+    fusion: Fusion,
+    descents: list[Descent],
+    backbone: dict[str, Tensor] | None,
+    resume: bool,
+) -> None:
+    lightning.seed_everything(settings.seed, verbose=False)
+    task = NavigationTask(settings, fusion, descents, backbone)
+    own = task.own
+    fit(
+        run,
+        task,
+        label=f"train {fusion}",
+        epochs=own.coarse_epochs + own.fine_epochs,
+        monitor="val/position_rmse_m",
+        mode="min",
+        resume=resume,
+        precision=settings.precision,
+        device=choose_device(settings.device),
+    )
+
+
+def _detector_backbone(settings: NavigateConfig, default: Path | None) -> tuple[dict[str, Tensor] | None, str]:
+    """A detector's backbone weights and where they are from; None where there are none that fit, and why."""
+    path = settings.detector or default
+    if path is None or (settings.detector is None and not path.is_file()):
+        why = "from scratch: no detect run to start from"
+        console.print(f"stack: backbone {why}")
+        return None, why
+    content = load_weights(path)
+    wanted = {"in_channels": settings.in_channels, "width": settings.stack.width, "attention": settings.stack.attention}
+    other = [key for key, value in wanted.items() if content["architecture"].get(key) != value]
+    if other and settings.detector is None:
+        why = f"from scratch: {path} differs in {', '.join(other)}"
+        console.print(f"stack: backbone {why}")
+        return None, why
+    check_architecture(path, content["architecture"], wanted)
+    weights = content["state_dict"].items()
+    state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
+    stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)
+    source = f"stages 1 to {stages} of 5 from {path}"
+    console.print(f"stack: backbone {source}")
+    return state, source
+
+
+def _baselines(training: list[Descent], test: list[Descent]) -> dict[str, list[Motion]]:
+    with progress_bar() as progress:
+        task = progress.add_task("KLT baseline", total=len(test), unit="descents", note="")
+        tracked = []
+        for descent in test:
+            tracked.append(klt_descent(descent))
+            progress.advance(task)
+    return {
+        "klt": tracked,
+        "nominal": [descent.nominal_motion for descent in test],
+        "mean_at_step": [mean_motion_at_step(training, descent) for descent in test],
+        "mean": [mean_motion(training, descent) for descent in test],
+    }
+
+
+def _write(
+    run: RunFolder, fusion: Fusion, test: list[Descent], motions: dict[str, list[Motion]], details: dict[str, Any]
+) -> None:
+    errors = {method: motion_errors(test, found) for method, found in motions.items()}
+    rows = {method: summary(table) for method, table in errors.items()}
+    _write_table(run.root / "navigation.parquet", pd.DataFrame([{"method": m, **row} for m, row in rows.items()]))
+    pairs = pd.concat([table.assign(method=method) for method, table in errors.items()], ignore_index=True)
+    _write_table(run.root / "errors.parquet", pairs)
+    drawn = {method: found[0] for method, found in motions.items() if method != "mean"}
+    draw_descent(run.root / "descent.png", test[0], drawn, errors)
+    draw_errors(run.root / "errors.png", errors)
+    metrics = {f"test/{key}": value for key, value in rows[fusion].items()}
+    for method, row in rows.items():
+        if method != fusion:
+            place = method if method in ("stack", "warp") else f"baseline/{method}"
+            metrics |= {f"{place}/{key}": value for key, value in row.items()}
+    write_metrics(run, metrics | details)
+
+
+def _write_table(path: Path, table: pd.DataFrame) -> None:
+    with written_aside(path) as aside:
+        table.to_parquet(aside, index=False)
