@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 
 EXIT_USER_ERROR = 2
+_EXIT_INTERRUPTED = 130
 _DISK_FAULTS = (
     errno.ENOSPC,
     errno.EDQUOT,
@@ -39,8 +40,12 @@ def run_command_line(app: Callable[[], object]) -> None:
         if error.errno not in _DISK_FAULTS:
             raise
         fail = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; what was finished stays valid"
-    except KeyboardInterrupt:
-        sys.exit("stopped; what was finished stays valid, and the same command goes on from there")
+    except (KeyboardInterrupt, SystemExit) as stop:
+        # Typer itself turns Ctrl-C into a bare exit with the shell's code for it.
+        if isinstance(stop, SystemExit) and stop.code != _EXIT_INTERRUPTED:
+            raise
+        print("stopped; what was finished stays valid and can be resumed", file=sys.stderr)
+        sys.exit(_EXIT_INTERRUPTED)
     else:
         return
     print(fail, file=sys.stderr)

@@ -102,6 +102,17 @@ def test_stopped_and_resumed_is_the_same_dataset(tmp_path):
         assert whole.table(table).equals(again.table(table))
 
 
+def test_ctrl_c_is_answered_in_one_line(tmp_path):
+    command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    deadline = time.monotonic() + 60
+    while not any(tmp_path.rglob("*.png")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    told = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and "Traceback" not in told and "can be resumed" in told
+
+
 def test_a_finished_dataset_is_reused_and_other_settings_are_refused(tmp_path):
     assert run("dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", tmp_path).returncode == 0
     stamp = (tmp_path / "detect/dataset.json").stat().st_mtime_ns
