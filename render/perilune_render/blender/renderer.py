@@ -1,8 +1,12 @@
 """Cycles on the CPU: settings, and one frame at a time through a temporary EXR."""
 
+import contextlib
 import errno
 import os
+import signal
 import tempfile
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -45,7 +49,7 @@ class Renderer:
         self.stage.render.filepath = str(path)
         path.unlink(missing_ok=True)
         try:
-            with _quiet():
+            with _quiet(), _interrupts_held():
                 bpy.ops.render.render(write_still=True)
             return _radiance(path)
         except (UserError, RuntimeError) as error:
@@ -102,6 +106,22 @@ def _radiance(path: Path) -> Radiance:
     normal = np.stack([by_pass[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     return Radiance(by_pass["Combined.R"], np.where(depth > _FAR_M, np.float32(np.inf), depth), normal)
+
+
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Answer Ctrl-C after the frame: Cycles' own Python callback would swallow it, and the rendering would go on."""
+    asked = []
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, lambda *_: asked.append(True))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if asked:
+        raise KeyboardInterrupt
 
 
 class _quiet:

@@ -1,0 +1,88 @@
+"""Time of a frame of ours against a bare Blender loop over the same scene, poses and passes; both write EXR and PNG.
+
+The bare loop is what a script without perilune would do: set the camera, render to an EXR with depth and normals, turn
+it into a PNG. Ours adds the sensor, labels, visibility, hashes and the manifest. Both run in one process, frames
+alternating, so that a noisy machine slows both alike. Writes runs/bench/render.json.
+"""
+
+import json
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import bpy
+import cv2
+import numpy as np
+
+from perilune_render import tables
+from perilune_render.blender.renderer import Renderer
+from perilune_render.blender.stage import aim
+from perilune_render.config import DatasetConfig
+from perilune_render.dataset import _write_frame
+from perilune_render.exr import read_exr
+from perilune_render.labels import label_frame
+from perilune_render.plan import make_plan
+from perilune_render.terrain.scene import grow_scene
+from perilune_shared.config import resolve
+from perilune_shared.files import write_text
+from perilune_shared.frames import sun_direction
+from perilune_shared.progress import progress_bar
+
+N_FRAMES = 38
+
+
+def main() -> None:
+    """Run the benchmark on the first scene of `small`."""
+    config = resolve(DatasetConfig, "dataset", "perilune_render", "small")
+    plan = make_plan(config, "detect")
+    scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
+    start = time.perf_counter()
+    scene = grow_scene(config, plan.camera, config.detect.flight, scene_plan.seed)
+    scene_s = time.perf_counter() - start
+    sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
+    ours, bare = [], []
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Renderer(scene, config, plan.camera, sun) as renderer,
+        progress_bar() as bar,
+    ):
+        out = Path(folder)
+        start = time.perf_counter()
+        renderer.render(trajectory.flight.position_m[0], trajectory.flight.rotation_camera_from_site[0])
+        first_frame_s = time.perf_counter() - start
+        for index in bar.track(range(N_FRAMES), description="frames"):
+            pose = trajectory.flight.position_m[index], trajectory.flight.rotation_camera_from_site[index]
+            for which in (0, 1) if index % 2 else (1, 0):
+                start = time.perf_counter()
+                if which == 0:
+                    radiance = renderer.render(*pose, seed=index)
+                    _write_frame(out, config, plan, scene, trajectory, index, radiance)
+                    found = label_frame(scene, plan.camera, *pose, radiance, 2.0, 50.0)
+                    tables.label_table(trajectory.frame_id(index), found)
+                    ours.append(time.perf_counter() - start)
+                else:
+                    aim(renderer.stage, *pose)
+                    path = out / "bare.exr"
+                    renderer.stage.render.filepath = str(path)
+                    bpy.ops.render.render(write_still=True)
+                    image = next(v for k, v in read_exr(path).items() if k.endswith("Combined.R"))
+                    cv2.imwrite(str(out / "bare.png"), np.clip(image * 1000, 0, 255).astype(np.uint8))
+                    bare.append(time.perf_counter() - start)
+    figures = {
+        "scene_s": scene_s,
+        "first_frame_s": first_frame_s,
+        "frame_s": statistics.median(ours),
+        "bare_frame_s": statistics.median(bare),
+        "ratio_to_bare": sum(ours) / sum(bare),
+        "vertices": int(scene.height_m.size),
+        "craters": len(scene.craters),
+        "boulders": len(scene.boulders),
+    }
+    path = Path("runs/bench/render.json")
+    write_text(path, json.dumps(figures, indent=2) + "\n")
+    print(path, json.dumps(figures, indent=2))
+
+
+if __name__ == "__main__":
+    main()
