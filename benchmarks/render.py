@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from perilune_render import tables
-from perilune_render.blender.renderer import Renderer
+from perilune_render.blender.renderer import Renderer, quiet
 from perilune_render.blender.stage import aim
 from perilune_render.config import DatasetConfig
-from perilune_render.dataset import _write_frame
+from perilune_render.dataset import write_frame
 from perilune_render.exr import read_exr
 from perilune_render.labels import label_frame
 from perilune_render.plan import make_plan
@@ -57,7 +57,7 @@ def main() -> None:
                 start = time.perf_counter()
                 if which == 0:
                     radiance = renderer.render(*pose, seed=index)
-                    _write_frame(out, config, plan, scene, trajectory, index, radiance)
+                    write_frame(out, config, plan, scene, trajectory, index, radiance)
                     found = label_frame(scene, plan.camera, *pose, radiance, 2.0, 50.0)
                     tables.label_table(trajectory.frame_id(index), found)
                     ours.append(time.perf_counter() - start)
@@ -65,7 +65,8 @@ def main() -> None:
                     aim(renderer.stage, *pose)
                     path = out / "bare.exr"
                     renderer.stage.render.filepath = str(path)
-                    bpy.ops.render.render(write_still=True)
+                    with quiet():
+                        bpy.ops.render.render(write_still=True)
                     image = next(v for k, v in read_exr(path).items() if k.endswith("Combined.R"))
                     cv2.imwrite(str(out / "bare.png"), np.clip(image * 1000, 0, 255).astype(np.uint8))
                     bare.append(time.perf_counter() - start)

@@ -37,8 +37,9 @@ def main() -> None:
     body = descent.position_at(30.0)
     axes(ax, body, site, ("$X_B$, $x_C$", "$Y_B$", "$Z_B$"), "tab:orange", 380)
     axes(ax, body, np.diag([0.8, -0.8, -0.8]), ("", "$y_C$", "$z_C$ view"), "tab:red", 480)
-    ax.text(*(path[0] + [0, 0, -170]), "$O_W$: first position,\n1500 m up", fontsize=11, color="tab:green", ha="center")
-    ax.text(*(body + [-420, 0, -60]), "$O_B$ and $O_C$:\nthe lander", fontsize=11, color="tab:orange", ha="center")
+    style = {"fontsize": 11, "ha": "center"}
+    ax.text(*(path[0] - np.array([0, 0, 170])), "$O_W$: first position,\n1500 m up", color="tab:green", **style)
+    ax.text(*(body - np.array([420, 0, 60])), "$O_B$ and $O_C$:\nthe lander", color="tab:orange", **style)
     ax.text(
         0,
         -700,

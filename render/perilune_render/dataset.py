@@ -24,6 +24,7 @@ from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
 from perilune_render.sensor import develop
 from perilune_render.streams import derived_seed, stream
+from perilune_render.terrain.elevation import read_elevation
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared import files
 from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
@@ -50,6 +51,9 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
 
     Raises UserError where `out` holds something else.
     """
+    if config.terrain.dem is not None:
+        # A fault in it must show before anything is written.
+        read_elevation(Path(config.terrain.dem))
     plan = make_plan(config, kind)
     info = _open_or_begin(config, kind, preset, out, plan)
     if info.complete:
@@ -176,7 +180,7 @@ def _render_trajectory(
     for index in range(len(trajectory.splits)):
         pose = flight.position_m[index], flight.rotation_camera_from_site[index]
         radiance = renderer.render(*pose, seed=derived_seed(trajectory.seed, "frame", index))
-        rows.append(_write_frame(out, config, plan, scene, trajectory, index, radiance))
+        rows.append(write_frame(out, config, plan, scene, trajectory, index, radiance))
         found = label_frame(
             scene, plan.camera, *pose, radiance, config.labels.min_radius_px, config.labels.max_radius_px
         )
@@ -189,7 +193,7 @@ def _render_trajectory(
     write_part(out, "frames", name, tables.frame_table(trajectory, plan.camera, sun, rows))
 
 
-def _write_frame(
+def write_frame(
     out: Path,
     config: DatasetConfig,
     plan: Plan,
@@ -197,7 +201,8 @@ def _write_frame(
     trajectory: TrajectoryPlan,
     index: int,
     radiance: Radiance,
-) -> dict:
+) -> dict[str, str | int]:
+    """Develop and write one frame's PNG, and its EXR where asked for; its columns png_* and exr_* of the manifest."""
     image = develop(radiance.radiance_factor, config.sensor, stream(trajectory.seed, "sensor", index))
     stem = f"frames/{trajectory.frame_id(index)}"
     paths = {"png": f"{stem}.png"}

@@ -23,6 +23,13 @@ class _Rate(ProgressColumn):
         return Text("" if speed is None else f"{speed:.1f} {unit}/s")
 
 
+class _Note(ProgressColumn):
+    """What the task is at, where it says so."""
+
+    def render(self, task) -> Text:
+        return Text(task.fields.get("note", ""))
+
+
 def progress_bar() -> Progress:
     """A progress bar on standard error; give each task `unit="frames"` for its rate."""
     return Progress(
@@ -31,7 +38,7 @@ def progress_bar() -> Progress:
         MofNCompleteColumn(),
         _Rate(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        _Note(),
         console=console,
         refresh_per_second=2,
     )

@@ -49,7 +49,7 @@ class Renderer:
         self.stage.render.filepath = str(path)
         path.unlink(missing_ok=True)
         try:
-            with _quiet(), _interrupts_held():
+            with quiet(), _interrupts_held():
                 bpy.ops.render.render(write_still=True)
             return _radiance(path)
         except (UserError, RuntimeError) as error:
@@ -124,7 +124,7 @@ def _interrupts_held() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-class _quiet:
+class quiet:
     """Send Blender's own chatter on file descriptor 1 to nowhere."""
 
     def __enter__(self) -> None:
