@@ -57,10 +57,7 @@ demo: setup ## everything: set-up, datasets, detection, navigation, explanation 
 dataset: setup ## render the preset's datasets (KIND=detect|nav for one); goes on where it was stopped
 	@$(RENDER) --kind $(KIND)
 
-$(DATA)/%/dataset.json: | setup
-	@$(RENDER) --kind $*
-
-# A dataset.json may be that of a stopped rendering: the command itself finds out and goes on.
+# A dataset.json may be that of a stopped rendering: then the command goes on where it was.
 .PHONY: detect-frames nav-frames
 detect-frames: setup
 	@grep -qs '"complete": true' $(DATA)/detect/dataset.json || $(RENDER) --kind detect

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import shutil
 import signal
 import tempfile
 import threading
@@ -23,6 +24,7 @@ from perilune_shared.frames import Array
 
 BLENDER_VERSION: str = bpy.app.version_string
 _FAR_M = 1e9
+_LEAST_FREE_BYTES = 16_000_000
 
 
 class Renderer:
@@ -54,7 +56,8 @@ class Renderer:
             return _radiance(path)
         except (UserError, RuntimeError) as error:
             # Blender tells of a failed write only in its log; the file is then missing or cut.
-            raise OSError(errno.ENOSPC, f"Blender could not write a frame ({error})", str(path.parent)) from None
+            full = shutil.disk_usage(path.parent).free < _LEAST_FREE_BYTES
+            raise OSError(errno.ENOSPC if full else errno.EIO, f"no frame ({error})", str(path.parent)) from None
 
 
 def configure(stage: bpy.types.Scene, camera: Camera, samples: int, threads: int) -> None:
