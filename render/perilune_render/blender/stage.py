@@ -11,6 +11,7 @@ from perilune_render.terrain.boulders import rock
 from perilune_render.terrain.mesh import quads, vertices
 from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera
+from perilune_shared.ellipse import plane_basis
 from perilune_shared.frames import Array
 
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
@@ -114,10 +115,8 @@ def sun_object(sun: Array, angular_diameter_deg: float) -> bpy.types.Object:
     lamp.energy = np.pi
     lamp.angle = np.radians(angular_diameter_deg)
     item = bpy.data.objects.new("Sun", lamp)
-    helper = np.array([1.0, 0, 0]) if abs(sun[0]) < 0.9 else np.array([0, 1.0, 0])
-    x = np.cross(helper, sun)
-    x /= np.linalg.norm(x)
-    item.matrix_world = Matrix(np.stack([x, np.cross(sun, x), sun], axis=1).tolist()).to_4x4()
+    x, y = plane_basis(sun)
+    item.matrix_world = Matrix(np.stack([x, y, sun], axis=1).tolist()).to_4x4()
     return item
 
 
