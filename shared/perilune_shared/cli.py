@@ -47,11 +47,14 @@ def stats(dataset: DatasetArgument) -> None:
     frame = summary(opened)
     info = opened.info
     state = "" if info.complete else ", not complete"
-    table = Table(title=f"{info.name}: {info.kind}, split by {info.split_by}, seed {info.seed}{state}")
-    for column in frame.columns:
-        table.add_column(column, justify="right")
-    for row in frame.itertuples(index=False):
-        table.add_row(*(str(value) for value in row))
+    table = Table(title=f"{info.name}{state}", caption=f"split by {info.split_by}, seed {info.seed}")
+    # A measure a row, so that the table fits a narrow terminal.
+    measures = frame.set_index("split").astype(object).T
+    table.add_column("")
+    for split in measures.columns:
+        table.add_column(str(split), justify="right")
+    for name, values in measures.iterrows():
+        table.add_row(str(name), *(str(value) for value in values))
     console = Console()
     console.print(table)
     counts = info.counts.model_dump()
