@@ -11,11 +11,11 @@ import tempfile
 import time
 from pathlib import Path
 
-import bpy
 import cv2
 import numpy as np
 
 from perilune_render import tables
+from perilune_render.blender import bpy
 from perilune_render.blender.renderer import Renderer, quiet
 from perilune_render.blender.stage import aim
 from perilune_render.config import DatasetConfig

@@ -14,12 +14,10 @@ from perilune_shared.descent import NominalDescent
 def axes(ax, origin, vectors, names, colour, length):
     """Three labelled arrows."""
     for vector, name in zip(vectors, names, strict=True):
-        tip = np.asarray(origin) + length * np.asarray(vector)
         ax.quiver(*origin, *(length * np.asarray(vector)), color=colour, arrow_length_ratio=0.15, linewidth=1.8)
         ax.text(
             *(np.asarray(origin) + 1.25 * length * np.asarray(vector)), name, color=colour, fontsize=10, ha="center"
         )
-    return tip
 
 
 def main() -> None:

@@ -34,9 +34,9 @@ class HapkeParameters:
 
 
 HIGHLAND = HapkeParameters(0.385, 0.2375, 0.325, 1.686, 0.0672)
-"""Median of latitudes within 30 degrees of the equator, 643 nm, as cited for Sato et al. 2014."""
+"""Median of latitudes within 30 degrees of the equator, 643 nm, ascribed to Sato et al. 2014, taken second hand."""
 MARE = HapkeParameters(0.222, 0.254, 0.160, 1.993, 0.0597)
-"""Tranquillitatis, 643 nm, as cited for Sato et al. 2014."""
+"""Tranquillitatis, 643 nm, ascribed to Sato et al. 2014, taken second hand."""
 
 
 def hapke(parameters: HapkeParameters, mu0: Any, mu: Any, cos_phase: Any) -> Any:

@@ -32,15 +32,23 @@ class CameraInfo(_Info):
     """The camera of all frames; pixels, metres and O_B."""
 
     width_px: Annotated[int, Field(gt=0, le=100_000)]
+    """Image width, pixels."""
     height_px: Annotated[int, Field(gt=0, le=100_000)]
+    """Image height, pixels."""
     fx_px: Annotated[float, Field(gt=0)]
+    """Focal length over the pixel's width, pixels."""
     fy_px: Annotated[float, Field(gt=0)]
+    """Focal length over the pixel's height, pixels."""
     cx_px: float
+    """Principal point, pixels right of the left edge."""
     cy_px: float
+    """Principal point, pixels below the top edge."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """Brown-Conrady k1, k2, p1, p2, k3; all zero in schema version 1's own renderer."""
     rotation_camera_from_body: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    """Rows of the matrix (3, 3)."""
     position_in_body_m: tuple[float, float, float]
+    """Centre of projection in O_B, metres."""
 
     def pinhole(self) -> Camera:
         """The intrinsics as a camera that projects."""
@@ -51,31 +59,46 @@ class Counts(_Info):
     """Rows in each table."""
 
     scenes: int = 0
+    """Terrains."""
     craters: int = 0
+    """Craters of all scenes."""
     boulders: int = 0
+    """Boulders of all scenes."""
     trajectories: int = 0
+    """Descents."""
     frames: int = 0
+    """Images."""
     labels: int = 0
+    """Craters in images."""
 
 
 class DatasetInfo(_Info):
     """Content of dataset.json."""
 
     name: str
+    """For people."""
     kind: Kind
+    """What it is for."""
     schema_version: str
+    """Of tables and files."""
     complete: bool
     """False while the renderer is still at work, or was stopped."""
     split_by: SplitUnit
+    """What no two splits share."""
     preset: str
+    """Where the settings began."""
     config: dict[str, Any]
     """The resolved `dataset` section."""
     seed: int
+    """From which every random stream is derived."""
     camera: CameraInfo
+    """Of all frames."""
     versions: dict[str, str]
     """Packages and Blender."""
     counts: Counts
+    """Rows in each table, once complete."""
     licence: str
+    """SPDX name."""
 
 
 class Dataset:

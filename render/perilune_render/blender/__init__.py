@@ -1,4 +1,4 @@
-"""Blender as a view of a scene: the only folder that imports bpy."""
+"""Blender as a view of a scene: the only folder that imports bpy, and where others take it from."""
 
 try:
     import bpy  # noqa: F401

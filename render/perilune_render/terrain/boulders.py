@@ -1,7 +1,7 @@
 """The boulder population and its set of rocks.
 
-Shapes: convex hulls of points on ellipsoids with the axis ratios of Tsuchiyama et al. 2022 (S/I 0.770, I/L 0.758, as
-measured on regolith particles), some cut by planes, as fractured rocks are.
+Shapes: convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (S/I 0.770, I/L 0.758,
+taken second hand), some cut by planes, as fractured rocks are.
 """
 
 from dataclasses import dataclass
@@ -46,8 +46,8 @@ class Boulders:
 def draw_boulders(config: BouldersConfig, grid: Grid, craters: Craters, seed: int) -> Boulders:
     """The population of a scene: part spread evenly, part around young craters.
 
-    Around a crater the density falls as exp(-x / 0.7), x = r/R, and with age as (1 - age / 4 Gyr)^3, as published for
-    the VIPER area.
+    Around a crater the density falls as exp(-x / 0.7), x = r/R, and with age as (1 - age / 4 Gyr)^3, taken
+    second hand.
     """
     rng = stream(seed, "boulders")
     smallest = config.min_diameter_spacings * float(np.diff(grid.coordinates_m).min())

@@ -55,8 +55,8 @@ class Craters:
 def diffusivity_m2_per_myr(diameter_m: Array) -> Array:
     """Topographic diffusivity at the scale of a crater, m^2/Myr.
 
-    5.5 m^2/Myr at 1 km (Fassett & Thomson 2014, doi 10.1002/2014JE004698), falling as D^0.9, a scale dependence
-    after Xie et al. 2017 (doi 10.1002/2017GL074954).
+    5.5 m^2/Myr at 1 km (Fassett & Thomson 2014, doi 10.1002/2014JE004698); its fall with size as D^0.9 is taken second
+    hand, without a primary source.
     """
     return 5.5 * (np.asarray(diameter_m) / 1000) ** 0.9
 

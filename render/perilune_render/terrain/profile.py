@@ -57,7 +57,7 @@ def fresh_bowl(x: Array) -> Array:
 
 
 def fresh_depth_ratio(diameter_m: Array) -> Array:
-    """Fresh depth over diameter: Stopar et al. 2017 (doi 10.1016/j.icarus.2016.12.017).
+    """Fresh depth over diameter: Stopar et al. 2017, taken second hand.
 
     Their steps (0.21 from 400 m, 0.17, 0.15, 0.13 from 40 m; extrapolated to 0.11 and 0.10 below) are joined by lines
     in log D through the middles of their ranges.

@@ -73,10 +73,9 @@ class TraskEquilibrium:
 
 @dataclass(frozen=True, slots=True)
 class BoulderLaw:
-    """Boulders, N(>D) = 3e-4 D^-2.482 per square metre, as used for the VIPER landing area.
+    """Boulders, N(>D) = 3e-4 D^-2.482 per square metre, in use for the VIPER landing area, taken second hand.
 
-    (As implemented in NeoGeographyToolkit/synthterrain, after the project's own counts.) Valid for some decimetres to
-    some metres.
+    Valid for some decimetres to some metres.
     """
 
     density: float = 1.0

@@ -42,7 +42,9 @@ class LossSettings(Section):
     aspect: Literal["circular", "standard"] = "circular"
     """Aspect term of CIoU: against a circle (the paper's), or against the label's own aspect ratio."""
     lambda_iou: Positive = 0.05
+    """Weight of L_ciou."""
     lambda_obj: Positive = 1.0
+    """Weight of L_obj."""
     lambda_noobj: Positive = 1.0
     """Weight of empty predictors within L_obj."""
 
@@ -64,6 +66,7 @@ class DetectConfig(Section):
     """The section `detect`."""
 
     seed: Annotated[int, Field(ge=0)] = 0
+    """Of weights, anchors, order and augmentation."""
     width: Annotated[float, Field(ge=0.125, le=2)] = 1.0
     """Factor on all channel counts; 1 is the paper's network."""
     attention: Attention = "cbam"
@@ -73,26 +76,36 @@ class DetectConfig(Section):
     strides: tuple[int, int, int] = (8, 16, 32)
     """Strides with heads: 8 16 32 (the paper's) or 4 8 16 (better for tiny craters)."""
     epochs: Count = 20
+    """Passes over the training frames."""
     frozen_epochs: Annotated[int, Field(ge=0)] = 0
     """First epochs with the backbone frozen, its attention gates excepted. They count only with `init_from`: a
     backbone of random weights, frozen, teaches nothing, so without it training starts unfrozen."""
     init_from: str | None = None
     """best.ckpt of an earlier detect run whose backbone (and gates, where both have them) to start from."""
     batch_size: Count = 8
+    """Frames in a step."""
     learning_rate: Positive = 1e-3
     """Peak of AdamW's learning rate: linear warm-up, then a cosine down to a hundredth."""
     warmup_steps: Annotated[int, Field(ge=0)] = 100
+    """Steps in which the learning rate rises."""
     weight_decay: Annotated[float, Field(ge=0)] = 0.01
+    """AdamW's, per step and learning rate."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
     """Moving average of the weights, per step; the average is what is judged and kept."""
     anchor_ratio: Annotated[float, Field(gt=1)] = 2.0
     """An anchor takes part in a label whose width and height are within this factor of its own."""
     labels: LabelSettings = LabelSettings()
+    """What is to be found."""
     augment: AugmentSettings = AugmentSettings()
+    """Random changes in training."""
     loss: LossSettings = LossSettings()
+    """What training minimises."""
     evaluation: EvaluationSettings = EvaluationSettings()
+    """How detections are judged."""
     precision: Precision = "auto"
+    """Of the arithmetic."""
     device: Device = "auto"
+    """Where it runs."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0
     """Processes that augment frames beside the training; 0 does it in between, best on few cores."""
 
