@@ -1,8 +1,10 @@
 """A dataset rendered by the command line itself, shared by all tests that read one."""
 
+import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,9 @@ from hypothesis import settings
 # A busy machine is no reason to fail.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
+# Scenes are grown anew by the tests, and the user's own cache is left alone.
+_cache = tempfile.TemporaryDirectory(prefix="perilune-test-cache-")
+os.environ["PERILUNE_CACHE"] = _cache.name
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from rich.console import Console
 from perilune_render.config import DatasetConfig
 from perilune_render.plan import make_plan
 from perilune_shared.config import resolve
-from perilune_shared.errors import run_command_line
+from perilune_shared.errors import UserError, run_command_line
 from perilune_shared.progress import progress_bar
 
 app = typer.Typer(
@@ -105,24 +105,32 @@ def preview(
 
 
 @app.command()
-def mesh(
+def export(
     preset: Preset = "small",
     config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
     kind: Annotated[Kind, typer.Option(help="Whose first scene (detect or nav).")] = Kind.DETECT,
-    step: Annotated[int, typer.Option(min=1, help="Keep every step-th vertex of the ground.")] = 4,
-    out: Annotated[Path, typer.Option(help="A .glb, .ply, .obj or .stl file.")] = Path("scene.glb"),
+    step: Annotated[int, typer.Option(min=1, help="Times the mesh's own vertex spacing.")] = 4,
+    pixel_m: Annotated[float, typer.Option(min=0.01, help="Ground size of a GeoTIFF's pixel, metres.")] = 1.0,
+    out: Annotated[Path, typer.Option(help="A .glb, .ply, .obj or .stl mesh, or a .tif of heights.")] = Path(
+        "scene.glb"
+    ),
 ) -> None:
     """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
     resolved = _resolve(preset, config, setting, dem)
-    from perilune_render.terrain.mesh import export_mesh
-    from perilune_render.terrain.scene import grow_scene
+    from perilune_render.terrain.cache import cached_scene
+    from perilune_render.terrain.export import MESH_SUFFIXES, RASTER_SUFFIXES, export_mesh, export_raster
 
+    if out.suffix not in MESH_SUFFIXES + RASTER_SUFFIXES:
+        raise UserError(out, "format", out.suffix or "none", "one of " + ", ".join(MESH_SUFFIXES + RASTER_SUFFIXES))
     name = _first(kind)
     plan = make_plan(resolved, name)
-    scene = grow_scene(resolved, plan.camera, resolved.kind(name).flight, plan.scenes[0].seed)
-    export_mesh(scene, out, step=step)
+    scene = cached_scene(resolved, plan.camera, resolved.kind(name).flight, plan.scenes[0].seed)
+    if out.suffix in RASTER_SUFFIXES:
+        export_raster(scene, out, pixel_m)
+    else:
+        export_mesh(scene, out, step=step)
     Console().print(f"{out}: {len(scene.craters)} craters, {len(scene.boulders)} boulders")
 
 

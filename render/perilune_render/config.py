@@ -27,6 +27,21 @@ class Span(Section):
         return self
 
 
+class DistortionConfig(Section):
+    """Lens distortion of Brown and Conrady, on image coordinates over the focal length, in OpenCV's form."""
+
+    k1: float = 0.0
+    """Radial, r^2."""
+    k2: float = 0.0
+    """Radial, r^4."""
+    p1: float = 0.0
+    """Tangential."""
+    p2: float = 0.0
+    """Tangential."""
+    k3: float = 0.0
+    """Radial, r^6."""
+
+
 class CameraConfig(Section):
     """The lander's camera, looking along -Z of the body."""
 
@@ -34,8 +49,16 @@ class CameraConfig(Section):
     """Image width, pixels."""
     height_px: Annotated[int, Field(ge=16, le=4096)] = 256
     """Image height, pixels."""
-    horizontal_fov_deg: Annotated[float, Field(ge=5, le=120)] = 50.0
-    """Horizontal field of view, degrees."""
+    horizontal_fov_deg: Annotated[float, Field(ge=1, le=120)] = 50.0
+    """Horizontal field of view of the whole image width without distortion, degrees."""
+    focal_length_px: Positive | None = None
+    """Focal length over the pixel's width, pixels; null takes it from horizontal_fov_deg."""
+    principal_x_px: float | None = None
+    """Principal point right of the left edge, pixels; null is the middle."""
+    principal_y_px: float | None = None
+    """Principal point below the top edge, pixels; null is the middle."""
+    distortion: DistortionConfig = DistortionConfig()
+    """Lens distortion."""
 
 
 class FlightConfig(Section):
@@ -106,27 +129,41 @@ class CratersConfig(Section):
 
     surface_age_gyr: Annotated[float, Field(gt=0, le=4.4)] = 3.5
     """Age of the surface, which sets the production of large craters, Gyr."""
-    equilibrium_share: Span = Span(low=0.5, high=1.0)
-    """Density of small craters over Trask's equilibrium, drawn for each scene."""
-    min_diameter_spacings: Annotated[float, Field(ge=2)] = 3.0
+    equilibrium: Literal["trask", "minton", "viper", "chang_e_4"] = "chang_e_4"
+    """Law at which small craters are erased as fast as they form."""
+    equilibrium_share: Span = Span(low=0.9, high=1.7)
+    """Density of small craters over the equilibrium law, drawn for each scene."""
+    min_diameter_spacings: Annotated[float, Field(ge=1.5)] = 2.2
     """Smallest crater over the local vertex spacing."""
     max_diameter_m: Positive = 800.0
     """Largest crater, metres."""
+    profile: Literal["fassett_thomson", "pangu"] = "fassett_thomson"
+    """Shape of a fresh crater."""
+    depth: Literal["stopar", "pike"] = "stopar"
+    """Law of a fresh crater's depth."""
+    irregularity: Annotated[float, Field(ge=0, le=1)] = 1.0
+    """Departure of outline and rim height from a circle; at 1 the outline strays by about one percent of the radius."""
+    flat_floor_share: Share = 0.15
+    """Share of the craters that form with a flat floor, as in thin regolith over rock."""
+    secondary_share: Share = 0.08
+    """Share of the craters under 30 m that lie in clusters of secondaries."""
+    n_rayed: Annotated[int, Field(ge=0, le=100)] = 4
+    """How many of the freshest large craters have bright rays."""
 
 
 class BouldersConfig(Section):
     """The boulder population."""
 
-    density: NotNegative = 1.0
-    """Times the published size-frequency law."""
-    min_diameter_spacings: Annotated[float, Field(ge=0.5)] = 1.5
+    density: NotNegative = 0.1
+    """Times the published size-frequency law, on the plain."""
+    field_density: NotNegative = 200.0
+    """Density at the rim of a newly formed crater over that of the plain."""
+    min_diameter_spacings: Annotated[float, Field(ge=0.3)] = 0.7
     """Smallest boulder over the local vertex spacing."""
     max_diameter_m: Positive = 5.0
     """Largest boulder, metres."""
     n_shapes: Annotated[int, Field(ge=1, le=100)] = 12
     """Different rocks in a scene."""
-    clustered_share: Share = 0.6
-    """Share of the boulders that lie around young craters."""
 
 
 class ReliefConfig(Section):
@@ -134,8 +171,8 @@ class ReliefConfig(Section):
 
     hurst_exponent: Annotated[float, Field(gt=0, lt=1)] = 0.9
     """How slopes fall with wavelength, L^(H-1)."""
-    rms_slope_deg: Annotated[float, Field(ge=0, le=30)] = 5.0
-    """Root mean square slope of all waves down to a metre, without craters, degrees (mare about 3, highland 7)."""
+    rms_slope_deg: Annotated[float, Field(ge=0, le=30)] = 3.0
+    """Root mean square slope of all waves down to a metre, without craters, degrees (mare about 1.5, highland 3.5)."""
     longest_wavelength_m: Positive = 1600.0
     """Longest wave, metres."""
 
@@ -147,10 +184,10 @@ class TerrainConfig(Section):
     """Latitude of the site, degrees."""
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
     """Longitude of the site, degrees."""
-    spacing_px: Annotated[float, Field(gt=0, le=4)] = 0.75
+    spacing_px: Annotated[float, Field(gt=0, le=4)] = 0.5
     """Vertex spacing over the smallest ground pixel from which a place is seen."""
-    max_vertices: Annotated[int, Field(ge=10_000, le=20_000_000)] = 4_000_000
-    """Most vertices of the height field; a wider spacing is taken where spacing_px would need more."""
+    max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
+    """Most vertices of the ground; a camera and flight that need more are refused."""
     craters: CratersConfig = CratersConfig()
     """Craters."""
     boulders: BouldersConfig = BouldersConfig()
@@ -159,32 +196,66 @@ class TerrainConfig(Section):
     """Relief."""
     dem: str | None = None
     """A GeoTIFF elevation model as the base, or null."""
+    catalogue: str | None = None
+    """A CSV of the model's own craters (longitude_deg, latitude_deg, diameter_m), which become labels, or null."""
 
 
 class LightConfig(Section):
-    """How the ground reflects."""
+    """How the ground reflects, and what lights it."""
 
-    photometry: Literal["hapke_highland", "hapke_mare", "lommel_seeliger", "lambert"] = "hapke_highland"
+    photometry: Literal["hapke_highland", "hapke_mare", "hapke_mean", "lommel_seeliger", "lunar_lambert", "lambert"] = (
+        "hapke_highland"
+    )
     """Reflectance law and parameter set."""
     sun_angular_diameter_deg: Annotated[float, Field(ge=0, le=5)] = 0.533
     """The Sun's disc, degrees."""
     albedo_variation: NotNegative = 1.0
-    """Strength of bright young ejecta and of albedo patches; 0 for an even ground."""
+    """Strength of bright young ejecta, of rays and of albedo patches; 0 for an even ground."""
+    bounce: bool = False
+    """Whether light that the ground scatters once reaches other ground: shadows are then not quite black."""
+    earthshine: bool = False
+    """Whether the Earth, where it stands above the horizon, lights the ground too."""
 
 
 class SensorConfig(Section):
     """From radiance factor to grey values (EMVA 1288)."""
 
+    exposure: Literal["automatic", "fixed"] = "automatic"
+    """Automatic puts exposure_percentile of each frame at exposure_level; fixed takes exposure_time_s."""
+    exposure_percentile: Annotated[float, Field(gt=0, le=100)] = 99.0
+    """Percentile of a frame that automatic exposure looks at."""
+    exposure_level: Annotated[float, Field(gt=0, le=1)] = 0.8
+    """Share of the largest grey value at which automatic exposure puts it."""
+    exposure_time_s: Positive = 0.002
+    """Fixed exposure, seconds."""
+    longest_exposure_s: Positive = 0.02
+    """Longest automatic exposure, seconds."""
+    responsivity_e_per_s: Positive = 2e8
+    """Electrons per second in a pixel that sees a radiance factor of 1."""
     full_well_e: Positive = 30_000.0
     """Electrons at saturation."""
+    gain: Positive = 1.0
+    """Over the gain at which the full well is the largest grey value."""
+    bits: Annotated[int, Field(ge=8, le=16)] = 8
+    """Of a grey value; above 8 the PNG holds 16-bit numbers."""
+    black_level_share: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
+    """Offset added before quantisation, share of the largest grey value."""
     read_noise_e: NotNegative = 15.0
     """Standard deviation of the dark signal, electrons."""
-    psf_sigma_px: NotNegative = 0.5
+    dark_current_e_per_s: NotNegative = 50.0
+    """Mean dark current, electrons per second."""
+    dark_nonuniformity_e: NotNegative = 3.0
+    """Fixed pattern: standard deviation of the pixels' offsets (DSNU), electrons."""
+    gain_nonuniformity: Annotated[float, Field(ge=0, le=0.5)] = 0.005
+    """Fixed pattern: standard deviation of the pixels' relative response (PRNU)."""
+    hot_pixel_share: Share = 2e-5
+    """Share of the pixels that are hot."""
+    hot_pixel_e: NotNegative = 6_000.0
+    """Mean of the hot pixels' exponentially distributed extra signal, electrons."""
+    psf_sigma_px: NotNegative = 0.35
     """Standard deviation of the Gaussian point spread, pixels."""
-    exposure_percentile: Annotated[float, Field(gt=0, le=100)] = 99.0
-    """Automatic exposure puts this percentile of a frame at exposure_level."""
-    exposure_level: Annotated[float, Field(gt=0, le=1)] = 0.8
-    """Share of the full well."""
+    motion_blur: bool = True
+    """Whether the camera's velocity during the exposure blurs the frame."""
 
 
 class RenderConfig(Section):
@@ -196,6 +267,8 @@ class RenderConfig(Section):
     """Threads; 0 takes every core."""
     exr: bool = False
     """Whether to keep an EXR (radiance factor, depth, normals, crater index) beside each PNG."""
+    cache_gib: NotNegative = 4.0
+    """Most that grown scenes may occupy in the cache folder, GiB; 0 keeps none."""
 
 
 class LabelsConfig(Section):

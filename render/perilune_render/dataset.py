@@ -24,8 +24,9 @@ from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
 from perilune_render.sensor import develop
 from perilune_render.streams import derived_seed, stream
+from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation import read_elevation
-from perilune_render.terrain.scene import Scene, grow_scene
+from perilune_render.terrain.scene import Scene
 from perilune_shared import files
 from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.errors import UserError
@@ -68,7 +69,7 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
         if not waiting:
             continue
         progress.update(task, note=f"{scene_plan.scene_id}: growing")
-        scene = grow_scene(config, plan.camera, config.kind(kind).flight, scene_plan.seed)
+        scene = cached_scene(config, plan.camera, config.kind(kind).flight, scene_plan.seed)
         _write_scene(out, scene_plan, scene, config, trajectories)
         progress.update(task, note=scene_plan.scene_id)
         sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)

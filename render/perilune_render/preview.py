@@ -11,7 +11,7 @@ from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_render.plan import make_plan
 from perilune_render.sensor import develop
 from perilune_render.streams import stream
-from perilune_render.terrain.scene import grow_scene
+from perilune_render.terrain.cache import cached_scene
 from perilune_shared.frames import sun_direction
 
 
@@ -19,7 +19,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     """The first scene from the first descent, evenly spaced in time: frames above, the same with labels below."""
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
-    scene = grow_scene(config, plan.camera, config.kind(kind).flight, scene_plan.seed)
+    scene = cached_scene(config, plan.camera, config.kind(kind).flight, scene_plan.seed)
     ratio = scene.rims.depth_m / scene.craters.diameter_m
     plain, drawn = [], []
     with Renderer(

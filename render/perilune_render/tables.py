@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 from perilune_render.config import DatasetConfig
 from perilune_render.labels import Labels
 from perilune_render.plan import ScenePlan, TrajectoryPlan
+from perilune_render.terrain.craters import ORIGINS
 from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera
 from perilune_shared.frames import Array, quaternion_from_matrix, selenographic_from_site
@@ -54,8 +55,9 @@ def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig) -> dict[s
                 "normal_z": rims.normal[:, 2],
                 "diameter_m": craters.diameter_m,
                 "depth_m": rims.depth_m,
-                "fresh_depth_m": craters.fresh_depth_m,
-                "age_myr": craters.age_myr,
+                "fresh_depth_m": pa.array(craters.fresh_depth_m, from_pandas=True),
+                "age_myr": pa.array(craters.age_myr, from_pandas=True),
+                "origin": np.array(ORIGINS)[craters.origin],
                 "latitude_deg": latitude,
                 "longitude_deg": longitude,
             },

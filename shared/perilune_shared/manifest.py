@@ -44,7 +44,7 @@ class CameraInfo(_Info):
     cy_px: float
     """Principal point, pixels below the top edge."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """Brown-Conrady k1, k2, p1, p2, k3; all zero in schema version 1's own renderer."""
+    """Brown-Conrady k1, k2, p1, p2, k3; in OpenCV's form."""
     rotation_camera_from_body: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
     """Rows of the matrix (3, 3)."""
     position_in_body_m: tuple[float, float, float]
@@ -152,7 +152,7 @@ def read_part(part: Path, table: str, columns: Sequence[str] | None = None) -> p
             raise UserError(part, "perilune.table", found, table)
         missing = [name for name in columns or TABLES[table].names if name not in parquet.schema_arrow.names]
         if missing:
-            raise UserError(part, "columns", f"no {missing[0]}", "every column of schema version 1")
+            raise UserError(part, "columns", f"no {missing[0]}", f"every column of schema version {SCHEMA_VERSION}")
         return parquet.read(columns=list(columns) if columns is not None else None)
     except (pa.ArrowException, OSError) as error:
         raise UserError(part, "content", error, "a whole Parquet file") from None

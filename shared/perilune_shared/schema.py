@@ -1,4 +1,4 @@
-"""The tables of a dataset: every column with its type, unit and frame of reference (schema version 1).
+"""The tables of a dataset: every column with its type, unit and frame of reference (schema version 2).
 
 The same text stands in the metadata of every Parquet file, so that a file found alone still says what it holds.
 """
@@ -7,7 +7,7 @@ from typing import Literal
 
 import pyarrow as pa
 
-SCHEMA_VERSION = "1"
+SCHEMA_VERSION = "2"
 _TEXT, _REAL, _INTEGER = pa.string(), pa.float64(), pa.int64()
 
 
@@ -53,8 +53,11 @@ TABLES: dict[str, pa.Schema] = {
         _column("normal_z", _REAL, "", "rim circle's unit normal, O_L"),
         _column("diameter_m", _REAL, "m", "rim crest to rim crest"),
         _column("depth_m", _REAL, "m", "rim to floor on the finished height field, less the sag of older ground"),
-        _column("fresh_depth_m", _REAL, "m", "rim to floor when it formed"),
-        _column("age_myr", _REAL, "Myr", "time since it formed"),
+        _column("fresh_depth_m", _REAL, "m", "rim to floor when it formed; null where not known", optional=True),
+        _column("age_myr", _REAL, "Myr", "time since it formed; null where not known", optional=True),
+        _column(
+            "origin", _TEXT, "", "primary, secondary (drawn in a cluster), or elevation model (real, from a catalogue)"
+        ),
         _column("latitude_deg", _REAL, "deg", "O_S"),
         _column("longitude_deg", _REAL, "deg", "O_S"),
     ),

@@ -14,7 +14,7 @@ from perilune_shared.ellipse import project_circles
 from perilune_shared.errors import UserError
 from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.manifest import Dataset, read_part
-from perilune_shared.schema import SPLITS, TABLES
+from perilune_shared.schema import SCHEMA_VERSION, SPLITS, TABLES
 
 _KEYS = {
     "scenes": ["scene_id"],
@@ -81,7 +81,9 @@ def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
                 faults.append(Fault(where, None, "part", str(error), "a readable part of this schema"))
                 continue
             if not piece.schema.equals(TABLES[name]):
-                faults.append(Fault(where, None, "schema", str(piece.schema)[:80], "the schema of version 1"))
+                faults.append(
+                    Fault(where, None, "schema", str(piece.schema)[:80], f"the schema of version {SCHEMA_VERSION}")
+                )
                 continue
             pieces.append(piece)
             faults += _values(where, piece)

@@ -20,13 +20,21 @@ def config_with(**changes) -> DatasetConfig:
     return DatasetConfig(**{"detect": kind, "nav": kind, **changes})
 
 
+def round_craters(rows, wear=1e-3) -> Craters:
+    """Craters in order, from rows of x, y, diameter, depth / diameter and, unless `wear` serves for all, wear K/R^2."""
+    columns = np.atleast_2d(np.asarray(rows, float)).T
+    x, y, diameter, ratio = columns[:4]
+    ratio_k = columns[4] if len(columns) > 4 else np.full_like(x, wear)
+    return Craters.round(x, y, diameter, ratio * diameter, np.zeros_like(x), ratio_k * (diameter / 2) ** 2)
+
+
 def flat_scene(extent_m: float, n: int, craters: Craters | None = None, height_m: np.ndarray | None = None) -> Scene:
-    """A scene on an even grid, flat unless a height field is given."""
-    grid = Grid(np.linspace(-extent_m / 2, extent_m / 2, n))
-    height = np.zeros((n, n)) if height_m is None else height_m
-    none = craters if craters is not None else Craters(*(np.empty(0) for _ in range(6)))
+    """A scene on an even grid of n x n vertices (n odd), flat unless heights (n, n; rows are y) are given."""
+    grid = Grid.even(extent_m / 2, (n - 1) // 2)
+    height = np.zeros(n * n) if height_m is None else np.ravel(height_m)
+    none = craters if craters is not None else round_craters(np.empty((0, 4)))
     rims = measure_rims(height, grid, none) if len(none) else Rims(np.empty(0), np.empty((0, 3)), np.empty(0))
-    return Scene(1, 0.0, 0.0, grid, height, np.ones((n, n)), none, rims, NO_BOULDERS, np.empty(0), "procedural")
+    return Scene(1, 0.0, 0.0, grid, height, np.ones(n * n), none, rims, NO_BOULDERS, np.empty(0), "procedural")
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +44,7 @@ def camera() -> Camera:
 
 @pytest.fixture(scope="session")
 def small_config() -> DatasetConfig:
-    return config_with(terrain=TerrainConfig(max_vertices=300_000, boulders=BouldersConfig(density=0.0)))
+    return config_with(terrain=TerrainConfig(spacing_px=1.0, boulders=BouldersConfig(density=0.0)))
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ import pytest
 
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import count_rows, open_dataset, read_part, write_part
-from perilune_shared.schema import TABLES
+from perilune_shared.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.stats import summary
 from perilune_shared.validate import validate
 
@@ -154,6 +154,6 @@ def test_command_line(tiny, tiny_detect):
     next(tiny_detect.rglob("000000.png")).write_bytes(b"")
     broken = subprocess.run([MANIFEST, "validate", str(tiny_detect)], capture_output=True, text=True)
     assert broken.returncode == 2 and "png_bytes" in broken.stdout
-    (tiny_detect / "dataset.json").write_text(json.dumps({"schema_version": "1"}))
+    (tiny_detect / "dataset.json").write_text(json.dumps({"schema_version": SCHEMA_VERSION}))
     bad = subprocess.run([MANIFEST, "stats", str(tiny_detect)], capture_output=True, text=True)
     assert bad.returncode == 2 and len(bad.stderr.strip().splitlines()) == 1 and "name" in bad.stderr

@@ -200,6 +200,7 @@ def _add_scene(rows: dict[str, list[dict]], scene: str, ground: _Ground) -> None
                 "depth_m": depth,
                 "fresh_depth_m": 0.2 * diameter,
                 "age_myr": 1.0,
+                "origin": "primary",
                 "latitude_deg": -80.0,
                 "longitude_deg": 0.0,
             }

@@ -2,13 +2,13 @@
 
 import bpy
 import numpy as np
-from mathutils import Matrix, Quaternion
+from mathutils import Matrix
 
 from perilune_render.blender.nodes import Symbol, at_least, dot
 from perilune_render.config import DatasetConfig
 from perilune_render.photometry import radiance_factor
-from perilune_render.terrain.boulders import rock
-from perilune_render.terrain.mesh import quads, vertices
+from perilune_render.terrain.boulders import boulder_mesh
+from perilune_render.terrain.export import vertices
 from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera
 from perilune_shared.ellipse import plane_basis
@@ -34,8 +34,10 @@ def build(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> bp
     ground.data.materials.append(surface_material("ground", config.light.photometry, sun, albedo_attribute="albedo"))
     stage.collection.objects.link(ground)
     stone = surface_material("rock", config.light.photometry, sun)
-    for item in boulder_objects(scene, stone):
-        stage.collection.objects.link(item)
+    if len(scene.boulders):
+        boulders = boulders_object(scene)
+        boulders.data.materials.append(stone)
+        stage.collection.objects.link(boulders)
     stage.collection.objects.link(sun_object(sun, config.light.sun_angular_diameter_deg))
     stage.camera = camera_object(camera)
     stage.collection.objects.link(stage.camera)
@@ -56,31 +58,18 @@ def mesh_from_arrays(name: str, points: np.ndarray, faces: np.ndarray) -> bpy.ty
 
 
 def ground_object(scene: Scene) -> bpy.types.Object:
-    """The height field as one smooth mesh with its albedo as a vertex attribute."""
-    mesh = mesh_from_arrays("ground", vertices(scene), quads(scene.height_m.shape[0]))
+    """The ground as one smooth mesh with its albedo as a vertex attribute."""
+    mesh = mesh_from_arrays("ground", vertices(scene.grid, scene.height_m), scene.grid.quads())
     albedo = mesh.attributes.new("albedo", "FLOAT", "POINT")
-    albedo.data.foreach_set("value", np.ascontiguousarray(scene.albedo, np.float32).ravel())
+    albedo.data.foreach_set("value", np.ascontiguousarray(scene.albedo, np.float32))
     return bpy.data.objects.new("ground", mesh)
 
 
-def boulder_objects(scene: Scene, material: bpy.types.Material) -> list[bpy.types.Object]:
-    """Every boulder as an instance of one of the scene's rocks."""
-    shapes = {}
-    for shape_id in np.unique(scene.boulders.shape_id):
-        solid = rock(int(shape_id), scene.seed)
-        mesh = mesh_from_arrays(f"rock {shape_id}", solid.vertices, solid.faces)
-        mesh.shade_flat()
-        mesh.materials.append(material)
-        shapes[int(shape_id)] = mesh
-    objects = []
-    for k in range(len(scene.boulders)):
-        item = bpy.data.objects.new(f"boulder {k}", shapes[int(scene.boulders.shape_id[k])])
-        place = (scene.boulders.x_m[k], scene.boulders.y_m[k], scene.boulder_z_m[k])
-        item.matrix_world = Matrix.LocRotScale(
-            place, Quaternion(scene.boulders.rotation_wxyz[k]), [scene.boulders.diameter_m[k]] * 3
-        )
-        objects.append(item)
-    return objects
+def boulders_object(scene: Scene) -> bpy.types.Object:
+    """All boulders as one mesh of flat faces."""
+    mesh = mesh_from_arrays("boulders", *boulder_mesh(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed))
+    mesh.shade_flat()
+    return bpy.data.objects.new("boulders", mesh)
 
 
 def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | None = None) -> bpy.types.Material:

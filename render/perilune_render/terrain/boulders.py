@@ -14,10 +14,14 @@ from perilune_render.streams import stream
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.size_frequency import BoulderLaw, draw_diameters, log_bins
-from perilune_shared.frames import Array
+from perilune_shared.frames import Array, matrix_from_quaternion
 
 _BURIED_SHARE = 0.3
 """Share of a boulder's height that lies below the ground."""
+_FIELD_DECAY = 0.7
+"""Length over which a boulder field thins out from its crater's rim, radii."""
+_FULL_SPACINGS = 5.0
+"""Boulders of at least this many vertex spacings are drawn with all their faces."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,47 +48,71 @@ class Boulders:
 
 
 def draw_boulders(config: BouldersConfig, grid: Grid, craters: Craters, seed: int) -> Boulders:
-    """The population of a scene: part spread evenly, part around young craters.
+    """The population of a scene: some everywhere on the plain, more around young craters.
 
-    Around a crater the density falls as exp(-x / 0.7), x = r/R, and with age as (1 - age / 4 Gyr)^3, taken
-    second hand.
+    Around a crater of at least ten metres the density is `field_density` times the plain's at the rim of a newly formed
+    one and falls as exp(-(x - 1) / 0.7), x = r/R, and with age as (1 - age / 4 Gyr)^3, both taken second hand; a field
+    goes under with its crater, as exp(-K / 0.05 R^2), which is a choice of ours.
     """
     rng = stream(seed, "boulders")
-    smallest = config.min_diameter_spacings * float(np.diff(grid.coordinates_m).min())
+    smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
     if config.density == 0 or smallest >= config.max_diameter_m:
         none = np.empty(0)
         return Boulders(none, none, none, np.empty(0, np.int64), np.empty((0, 4)))
+    law = BoulderLaw(density=config.density)
     edges = log_bins(smallest, config.max_diameter_m, 20)
     half = np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
-    diameter = draw_diameters(BoulderLaw(config.density), edges, np.square(2 * half), rng)
-    bins = np.clip(np.searchsorted(edges, diameter, side="right") - 1, 0, len(half) - 1)
-    reach = half[bins]
-    x, y = rng.uniform(-1, 1, (2, len(diameter))) * reach
-    weight = craters.diameter_m**2 * np.clip(1 - craters.age_myr / 4000, 0, 1) ** 3 * (craters.diameter_m > 10)
-    weight = weight * np.exp(-craters.wear_m2 / (0.05 * (craters.diameter_m / 2) ** 2))
-    if len(craters) and weight.sum() > 0:
-        host = rng.choice(len(craters), len(diameter), p=weight / weight.sum())
-        distance = craters.diameter_m[host] / 2 * (1 + rng.exponential(0.7, len(diameter)))
-        angle = rng.uniform(0, 2 * np.pi, len(diameter))
-        near_x = craters.x_m[host] + distance * np.cos(angle)
-        near_y = craters.y_m[host] + distance * np.sin(angle)
-        moved = (rng.random(len(diameter)) < config.clustered_share) & (diameter < craters.diameter_m[host] / 6)
-        moved &= (np.abs(near_x) < reach) & (np.abs(near_y) < reach)
-        x, y = np.where(moved, near_x, x), np.where(moved, near_y, y)
+    plain = draw_diameters(law, edges, np.square(2 * half), rng)
+    reach = half[np.clip(np.searchsorted(edges, plain, side="right") - 1, 0, len(half) - 1)]
+    x, y = rng.uniform(-1, 1, (2, len(plain))) * reach
+    field_x, field_y, field = _fields(config, law, grid, craters, rng)
+    x, y, diameter = np.concatenate([x, field_x]), np.concatenate([y, field_y]), np.concatenate([plain, field])
     shape = rng.integers(0, config.n_shapes, len(diameter))
     turn = rng.normal(size=(len(diameter), 4))
     turn /= np.linalg.norm(turn, axis=1, keepdims=True)
     return Boulders(x, y, diameter, shape, np.where(turn[:, :1] < 0, -turn, turn))
 
 
-def rock(shape_id: int, seed: int) -> trimesh.Trimesh:
-    """A rock of mean diameter 1 centred on the origin: convex, every third one with fracture faces."""
+def _fields(
+    config: BouldersConfig, law: BoulderLaw, grid: Grid, craters: Craters, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """x, y and diameters of the boulders around young craters."""
+    radius = craters.diameter_m / 2
+    age = np.nan_to_num(craters.age_myr, nan=4000.0)
+    young = np.clip(1 - age / 4000, 0, 1) ** 3 * np.exp(-craters.wear_m2 / (0.05 * radius**2))
+    young = np.where((craters.diameter_m >= 10) & (craters.origin == 0), young, 0.0)
+    local = config.min_diameter_spacings * grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
+    # No boulder is larger than a twentieth of its crater.
+    largest = np.minimum(config.max_diameter_m, craters.diameter_m / 20)
+    per_area = np.where(largest > local, law.csfd(local) - law.csfd(np.maximum(largest, local)), 0.0)
+    # The integral of exp(-(x - 1) / a) over the plane outside the rim is 2 pi R^2 (a + a^2).
+    area = 2 * np.pi * radius**2 * (_FIELD_DECAY + _FIELD_DECAY**2)
+    number = rng.poisson(config.field_density * young * per_area * area)
+    host = np.repeat(np.arange(len(craters)), number)
+    n_small, n_large = law.csfd(local[host]), law.csfd(largest[host])
+    share = rng.random(len(host))
+    diameter = ((n_small - share * (n_small - n_large)) / law.csfd(1.0)) ** (1 / -2.482)
+    # Density exp(-(x - 1) / a) per area: x - 1 is a mixture of Gamma laws of orders 1 and 2.
+    order = np.where(rng.random(len(host)) < 1 / (1 + _FIELD_DECAY), 1, 2)
+    distance = radius[host] * (1 + _FIELD_DECAY * rng.gamma(order))
+    angle = rng.uniform(0, 2 * np.pi, len(host))
+    x, y = craters.x_m[host] + distance * np.cos(angle), craters.y_m[host] + distance * np.sin(angle)
+    outermost = np.maximum(np.abs(x), np.abs(y))
+    held = (diameter >= config.min_diameter_spacings * grid.spacing_at(outermost)) & (outermost < grid.extent_m / 2)
+    return x[held], y[held], diameter[held]
+
+
+def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:
+    """A rock of mean diameter 1 centred on the origin: convex, every third one with fracture faces.
+
+    Fewer points make the same kind of rock with fewer faces, for boulders that are but a few pixels wide.
+    """
     rng = stream(seed, "rock", shape_id)
-    points = rng.normal(size=(60, 3))
+    points = rng.normal(size=(60, 3))[:n_points]
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     intermediate = np.clip(rng.normal(0.758, 0.08), 0.5, 1.0)
     short = intermediate * np.clip(rng.normal(0.770, 0.08), 0.5, 1.0)
-    points *= np.array([1.0, intermediate, short]) * rng.uniform(0.88, 1.0, (60, 1))
+    points *= np.array([1.0, intermediate, short]) * rng.uniform(0.88, 1.0, (len(points), 1))
     mesh = trimesh.convex.convex_hull(points)
     if shape_id % 3 == 2:
         for _ in range(2):
@@ -97,3 +125,29 @@ def rock(shape_id: int, seed: int) -> trimesh.Trimesh:
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     mesh.apply_scale(1.0 / float(mesh.extents.mean()))
     return mesh
+
+
+def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """All boulders as one mesh: vertices (V, 3) float32 in O_L, metres, and triangles (F, 3) int32.
+
+    Every boulder is an instance of one of the seed's rocks; small ones (beside the vertex spacing where they lie) take
+    the rock with fewer faces. One mesh, since Cycles pays for every object in every frame.
+    """
+    local = grid.spacing_at(np.maximum(np.abs(boulders.x_m), np.abs(boulders.y_m)))
+    full = boulders.diameter_m >= _FULL_SPACINGS * local
+    rotations = matrix_from_quaternion(boulders.rotation_wxyz.reshape(-1, 4))
+    centres = np.stack([boulders.x_m, boulders.y_m, z_m], axis=-1)
+    vertices, faces, n_before = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.int32)], 0
+    for shape_id in np.unique(boulders.shape_id):
+        for n_points, which in ((60, full), (14, ~full)):
+            chosen = np.flatnonzero((boulders.shape_id == shape_id) & which)
+            if not len(chosen):
+                continue
+            solid = rock(int(shape_id), seed, n_points)
+            scaled = solid.vertices[None] * boulders.diameter_m[chosen, None, None]
+            placed = np.einsum("nij,nkj->nki", rotations[chosen], scaled) + centres[chosen, None]
+            shift = n_before + len(solid.vertices) * np.arange(len(chosen))
+            vertices.append(placed.reshape(-1, 3).astype(np.float32))
+            faces.append((solid.faces[None] + shift[:, None, None]).reshape(-1, 3).astype(np.int32))
+            n_before += placed.shape[0] * placed.shape[1]
+    return np.concatenate(vertices), np.concatenate(faces)

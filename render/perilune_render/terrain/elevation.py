@@ -81,27 +81,27 @@ def read_elevation(path: Path) -> ElevationModel:
 
 
 def base_heights(model: ElevationModel, grid: Grid) -> tuple[Array, Array]:
-    """Heights (n, n; rows are y) of the model on the grid in metres, site at 0, and the share (n, n) that is real.
+    """Heights (n_vertices,) of the model on the grid in metres, site at 0, and the share (n_vertices,) that is real.
 
     Bicubic inside. Beyond the model the ground is continued (see `_continued`) and the share falls to 0: what lies
     there looks alike but is no measurement.
     """
     rows, columns = model.height_m.shape
     # Pixel coordinates vary slowly over a site: project a coarse net and interpolate.
-    net = np.linspace(grid.coordinates_m[0], grid.coordinates_m[-1], 65)
+    net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 65)
     x, y = np.meshgrid(net, net)
     lat, lon = selenographic_from_site(x, y, model.latitude_deg, model.longitude_deg)
     east, north = rasterio.warp.transform(_MOON, model.crs, lon.ravel(), lat.ravel())
     column, row = ~model.transform @ (np.array(east), np.array(north))
-    c = grid.coordinates_m
-    column = RectBivariateSpline(net, net, column.reshape(x.shape))(c, c)
-    row = RectBivariateSpline(net, net, row.reshape(x.shape))(c, c)
+    x, y = grid.vertices_xy()
+    column = RectBivariateSpline(net, net, column.reshape(65, 65)).ev(y, x)
+    row = RectBivariateSpline(net, net, row.reshape(65, 65)).ev(y, x)
     outside = np.maximum.reduce([-row, row - rows, -column, column - columns, np.zeros_like(row)])
     margin = int(np.ceil(outside.max())) + 2
     padded = _continued(model.height_m, margin, model.pixel_m)
     height = ndimage.map_coordinates(padded, [row - 0.5 + margin, column - 0.5 + margin], order=3, mode="nearest")
-    middle = len(c) // 2
-    return height - height[middle, middle], np.clip(1 - outside / 4, 0, 1)
+    middle = grid.n_half * (2 * grid.n_half + 2)
+    return height - height[middle], np.clip(1 - outside / 4, 0, 1)
 
 
 def _continued(height_m: Array, margin: int, pixel_m: float) -> Array:

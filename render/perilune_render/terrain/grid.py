@@ -1,69 +1,183 @@
-"""The graded grid: fine where the lander ends, wider where it is only seen from high up.
+"""The graded grid: an even square about the site, and square rings about it that widen with distance.
 
-The grid is rectilinear: one list of coordinates serves for x and for y, so the mesh has no hanging vertices and
-stays watertight. Each place gets the spacing that the lowest altitude needs from which any descent can see it.
+Every ring has as many vertices as the inner square's edge, so that a ring of twice the half-width has twice the
+spacing; the rings' distances grow with it. Ring after ring joins vertex to vertex: the mesh has no hanging vertex and
+is watertight. Each place gets the spacing that the lowest altitude needs from which any descent can see it.
+
+Vertices are kept in one list: the inner square row by row (y, then x), then ring by ring, each from its corner at -x,
+-y counter-clockwise. `lines_in` finds those in a window as straight lines of evenly spaced vertices, which is all that
+laying craters and waves needs to know.
 """
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_shared.camera import Camera
+from perilune_shared.errors import UserError
 from perilune_shared.frames import Array
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Coordinates of the vertices in O_L, the same for x and y."""
+    """Where the vertices stand in O_L."""
 
-    coordinates_m: Array
-    """Ascending, symmetric about 0, metres (n,)."""
+    n_half: int
+    """Steps from the middle of the inner square to its edge."""
+    half_widths_m: Array
+    """Half-widths of the inner square and of every ring, ascending, metres (n_rings + 1,)."""
+
+    @classmethod
+    def even(cls, half_width_m: float, n_half: int) -> "Grid":
+        """A grid of one spacing, without rings."""
+        return cls(n_half, np.array([half_width_m]))
 
     @property
     def extent_m(self) -> float:
         """Side of the square, metres."""
-        return float(self.coordinates_m[-1] - self.coordinates_m[0])
+        return 2 * float(self.half_widths_m[-1])
 
-    def spacing_at(self, distance_m: Array) -> Array:
-        """Vertex spacing in metres at distances from the site along an axis."""
-        steps = np.diff(self.coordinates_m)
-        centres = (self.coordinates_m[1:] + self.coordinates_m[:-1]) / 2
-        return np.interp(np.abs(distance_m), centres[centres >= 0], steps[centres >= 0])
+    @property
+    def n_vertices(self) -> int:
+        """Vertices of inner square and rings."""
+        return (2 * self.n_half + 1) ** 2 + 8 * self.n_half * (len(self.half_widths_m) - 1)
+
+    @property
+    def spacings_m(self) -> Array:
+        """Larger of the spacings along and across, of the inner square and of every ring, metres (n_rings + 1,)."""
+        across = np.diff(self.half_widths_m, prepend=self.half_widths_m[0] * (1 - 1 / self.n_half))
+        return np.maximum(self.half_widths_m / self.n_half, across)
+
+    def spacing_at(self, distance_m: Array | float) -> Array:
+        """Vertex spacing in metres at distances max(|x|, |y|) from the site."""
+        ring = np.searchsorted(self.half_widths_m, distance_m)
+        return self.spacings_m[np.minimum(ring, len(self.half_widths_m) - 1)]
 
     def half_width_for(self, spacing_m: float) -> float:
         """Half side in metres of the square in which the spacing is at most `spacing_m`; 0 where it nowhere is."""
-        positive = self.coordinates_m[self.coordinates_m > 0]
-        steps = np.diff(positive, prepend=-positive[0])
-        fine = steps <= spacing_m * (1 + 1e-9)
-        return float(positive[fine].max()) if fine.any() else 0.0
+        fine = self.spacings_m <= spacing_m * (1 + 1e-9)
+        return float(self.half_widths_m[fine].max()) if fine.any() else 0.0
+
+    def vertices_xy(self) -> tuple[Array, Array]:
+        """x and y of all vertices in metres (n_vertices,) each."""
+        even = np.linspace(-1, 1, 2 * self.n_half + 1) * self.half_widths_m[0]
+        up = -1 + np.arange(2 * self.n_half) / self.n_half
+        one = np.ones_like(up)
+        round_x = np.concatenate([up, one, -up, -one])
+        round_y = np.concatenate([-one, up, one, -up])
+        rings = self.half_widths_m[1:, None]
+        x = np.concatenate([np.tile(even, len(even)), (rings * round_x).ravel()])
+        y = np.concatenate([np.repeat(even, len(even)), (rings * round_y).ravel()])
+        return x, y
+
+    def quads(self) -> np.ndarray:
+        """Faces (n_faces, 4) int32, counter-clockwise from above."""
+        side = 2 * self.n_half + 1
+        index = np.arange(side * side, dtype=np.int32).reshape(side, side)
+        inner = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
+        edge = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
+        n_rings = len(self.half_widths_m) - 1
+        outer = side * side + np.arange(n_rings * len(edge), dtype=np.int32).reshape(n_rings, len(edge))
+        rings = np.concatenate([edge[None], outer])
+        following = np.roll(rings, -1, axis=1)
+        joined = np.stack([rings[:-1], rings[1:], following[1:], following[:-1]], axis=-1).reshape(-1, 4)
+        return np.concatenate([inner, joined])
 
 
 def reach_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
-    """Largest horizontal distance from the site that a frame at this nominal altitude can see, metres.
+    """Largest |x| or |y| from the site that a frame at this nominal altitude can see, metres.
 
-    Counts the image's corner, three standard deviations of tilt and of position, and a twentieth for relief.
+    The camera's axes follow those of O_L up to its small turns, so that a frame covers a square along the axes. Counts
+    three standard deviations of tilt, of turn and of position, and a twentieth for relief.
     """
-    half_diagonal = np.hypot(
+    half_view = max(
         max(camera.cx_px, camera.width_px - camera.cx_px) / camera.fx_px,
         max(camera.cy_px, camera.height_px - camera.cy_px) / camera.fy_px,
     )
-    tilt = 3 * np.radians(flight.attitude_sigma_deg) * np.sqrt(2)
+    turn = min(3 * np.radians(flight.attitude_sigma_deg), np.pi / 4)
     share = (altitude_m - flight.end_altitude_m) / (flight.start_altitude_m - flight.end_altitude_m)
-    altitude = altitude_m + 3 * flight.position_sigma_m
-    view = altitude * np.tan(np.minimum(np.arctan(half_diagonal) + tilt, np.radians(80)))
-    return flight.downrange_m * share**2 + 3 * np.sqrt(2) * flight.position_sigma_m + 1.05 * view
+    slope = np.tan(np.minimum(np.arctan(half_view) + turn, np.radians(80))) * (np.cos(turn) + np.sin(turn))
+    view = (altitude_m + 3 * flight.position_sigma_m) * slope
+    return flight.downrange_m * share**2 + 3 * flight.position_sigma_m + 1.05 * view
 
 
 def graded_grid(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> Grid:
-    """The grid for a camera and a flight, with at most `terrain.max_vertices` vertices."""
+    """The grid for a camera and a flight: spacing at most `terrain.spacing_px` of the smallest pixel at every place.
+
+    Raises UserError where that needs more than `terrain.max_vertices`.
+    """
     altitude = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, 400)
     reach = np.maximum.accumulate(reach_m(camera, flight, altitude))
-    lowest = np.maximum(altitude - 3 * flight.position_sigma_m, 0.2 * altitude)
-    pixel = lowest / max(camera.fx_px, camera.fy_px)
-    distance = np.linspace(0, reach[-1], 20_000)
-    spacing = config.terrain.spacing_px * np.interp(distance, reach, pixel)
-    steps = np.concatenate([[0], np.cumsum(np.diff(distance) / ((spacing[1:] + spacing[:-1]) / 2))])
-    n_half = min(int(np.ceil(steps[-1])), (int(np.sqrt(config.terrain.max_vertices)) - 1) // 2)
-    half = np.interp(np.linspace(0, steps[-1], n_half + 1), steps, distance)
-    return Grid(np.concatenate([-half[:0:-1], half]))
+    # The ground may rise towards the camera by a twentieth of the altitude too.
+    lowest = np.maximum(0.95 * altitude - 3 * flight.position_sigma_m, 0.2 * altitude)
+    spacing = config.terrain.spacing_px * lowest / max(camera.fx_px, camera.fy_px)
+    n_half = int(np.ceil((reach / spacing).max()))
+    inner = min(n_half * spacing[0], reach[-1])
+    distance = np.linspace(inner, max(reach[-1], inner + spacing[0]), 20_000)
+    allowed = np.interp(distance, reach, spacing)
+    steps = np.concatenate([[0], np.cumsum(np.diff(distance) / allowed[:-1])])
+    n_rings = int(np.ceil(steps[-1]))
+    grid = Grid(n_half, np.interp(np.linspace(0, steps[-1], n_rings + 1), steps, distance))
+    if grid.n_vertices > config.terrain.max_vertices:
+        wider = config.terrain.spacing_px * np.sqrt(grid.n_vertices / config.terrain.max_vertices)
+        raise UserError(
+            "configuration",
+            "dataset.terrain.spacing_px",
+            f"{config.terrain.spacing_px} needs {grid.n_vertices:,} vertices",
+            f"at least {wider:.2f}, or a larger dataset.terrain.max_vertices (now {config.terrain.max_vertices:,})",
+        )
+    return grid
+
+
+@numba.njit(cache=True, inline="always")
+def _put(lines, row, x, y, dx, dy, first, number, ring):
+    lines[row, 0], lines[row, 1], lines[row, 2], lines[row, 3] = x, y, dx, dy
+    lines[row, 4], lines[row, 5], lines[row, 6] = first, number, ring
+
+
+@numba.njit(cache=True)
+def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
+    """Write the vertices within a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns their number.
+
+    A line is x, y of its first vertex, the step in x and in y, the first vertex, their number, and the ring (0 is the
+    inner square).
+    """
+    count = 0
+    n = n_half
+    step = half_widths[0] / n
+    i_low, i_high = max(int(np.ceil(x_low / step)), -n), min(int(np.floor(x_high / step)), n)
+    j_low, j_high = max(int(np.ceil(y_low / step)), -n), min(int(np.floor(y_high / step)), n)
+    if i_low <= i_high:
+        for j in range(j_low, j_high + 1):
+            first = (j + n) * (2 * n + 1) + i_low + n
+            _put(lines, count, i_low * step, j * step, step, 0.0, first, i_high - i_low + 1, 0)
+            count += 1
+    nearest = max(max(x_low, -x_high), max(y_low, -y_high))
+    farthest = max(max(x_high, -x_low), max(y_high, -y_low))
+    for ring in range(max(np.searchsorted(half_widths, nearest), 1), len(half_widths)):
+        d = half_widths[ring]
+        if d > farthest:
+            break
+        step = d / n
+        for side in range(4):
+            # The four sides run along +x, +y, -x, -y at y = -d, x = d, y = d, x = -d.
+            across = -d if side == 0 or side == 3 else d
+            along_x = side == 0 or side == 2
+            sign = 1.0 if side < 2 else -1.0
+            if not (y_low <= across <= y_high if along_x else x_low <= across <= x_high):
+                continue
+            low, high = (x_low, x_high) if along_x else (y_low, y_high)
+            if side >= 2:
+                low, high = -high, -low
+            t_low, t_high = max(int(np.ceil((low + d) / step)), 0), min(int(np.floor((high + d) / step)), 2 * n - 1)
+            if t_low > t_high:
+                continue
+            start = sign * (t_low * step - d)
+            first = (2 * n + 1) ** 2 + (ring - 1) * 8 * n + side * 2 * n + t_low
+            x, y = (start, across) if along_x else (across, start)
+            dx, dy = (sign * step, 0.0) if along_x else (0.0, sign * step)
+            _put(lines, count, x, y, dx, dy, first, t_high - t_low + 1, ring)
+            count += 1
+    return count

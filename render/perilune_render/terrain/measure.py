@@ -1,9 +1,9 @@
-"""What became of each crater on the finished height field: rim plane and depth."""
+"""What became of each crater on the finished ground: rim plane and depth."""
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
-from scipy import ndimage
 
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid
@@ -24,12 +24,11 @@ class Rims:
     """Mean height of the rim less that of the floor (the inner fifth), less the older ground's sag, at least 0 (N,)."""
 
 
-def height_at(height_m: Array, grid: Grid, x_m: Array, y_m: Array) -> Array:
-    """Ground height in metres at places (...), bilinear between vertices; the edge's height outside."""
-    index = np.arange(len(grid.coordinates_m))
-    row = np.interp(y_m, grid.coordinates_m, index)
-    column = np.interp(x_m, grid.coordinates_m, index)
-    return ndimage.map_coordinates(height_m, [row, column], order=1, mode="nearest")
+def value_at(field: Array, grid: Grid, x_m: Array | float, y_m: Array | float) -> Array:
+    """Values of a field (n_vertices,) at places of any shape, bilinear between vertices; the edge's value outside."""
+    x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
+    found = _values_at(field, grid.n_half, grid.half_widths_m, np.ravel(x), np.ravel(y))
+    return found.reshape(x.shape)
 
 
 def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | float = 0.0) -> Rims:
@@ -41,13 +40,70 @@ def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | f
     cos, sin = np.cos(angle), np.sin(angle)
     radius = craters.diameter_m[:, None] / 2
     x, y = craters.x_m[:, None], craters.y_m[:, None]
-    rim = height_at(height_m, grid, x + radius * cos, y + radius * sin)
+    rim = value_at(height_m, grid, x + radius * cos, y + radius * sin)
     # On a full circle the three unknowns of a plane decouple into Fourier sums.
     level = rim.mean(axis=1)
     slope_x = 2 * (rim * cos).mean(axis=1) / radius[:, 0]
     slope_y = 2 * (rim * sin).mean(axis=1) / radius[:, 0]
     normal = np.stack([-slope_x, -slope_y, np.ones_like(level)], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    floor = height_at(height_m, grid, x + 0.2 * radius * cos[::2], y + 0.2 * radius * sin[::2]).mean(axis=1)
-    centre = height_at(height_m, grid, craters.x_m, craters.y_m)
+    floor = value_at(height_m, grid, x + 0.2 * radius * cos[::2], y + 0.2 * radius * sin[::2]).mean(axis=1)
+    centre = value_at(height_m, grid, craters.x_m, craters.y_m)
     return Rims(level, normal, np.maximum(level - (floor + centre) / 2 - sag_m, 0))
+
+
+@numba.njit(cache=True)
+def vertex_of_ring(ring, place, n_half):
+    """Index of a vertex by its ring (0 is the inner square's edge) and its place in it from the corner at -x, -y."""
+    n = n_half
+    place %= 8 * n
+    if ring > 0:
+        return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place
+    side, t = place // (2 * n), place % (2 * n)
+    if side == 0:
+        i, j = t, 0
+    elif side == 1:
+        i, j = 2 * n, t
+    elif side == 2:
+        i, j = 2 * n - t, 2 * n
+    else:
+        i, j = 0, 2 * n - t
+    return j * (2 * n + 1) + i
+
+
+@numba.njit(cache=True)
+def _values_at(field, n_half, half_widths, x, y):
+    n = n_half
+    step = half_widths[0] / n
+    values = np.empty(len(x))
+    for k in range(len(x)):
+        distance = max(abs(x[k]), abs(y[k]))
+        if distance < half_widths[0]:
+            u, v = x[k] / step + n, y[k] / step + n
+            i, j = min(int(u), 2 * n - 1), min(int(v), 2 * n - 1)
+            f, g = u - i, v - j
+            first = j * (2 * n + 1) + i
+            low = field[first] * (1 - f) + field[first + 1] * f
+            high = field[first + 2 * n + 1] * (1 - f) + field[first + 2 * n + 2] * f
+            values[k] = low * (1 - g) + high * g
+            continue
+        ring = min(np.searchsorted(half_widths, distance), len(half_widths) - 1)
+        inner = max(ring - 1, 0)
+        width = half_widths[ring] - half_widths[inner]
+        g = min((distance - half_widths[inner]) / width, 1.0) if width > 0 else 0.0
+        if y[k] <= -distance:
+            side, along = 0, x[k]
+        elif x[k] >= distance:
+            side, along = 1, y[k]
+        elif y[k] >= distance:
+            side, along = 2, -x[k]
+        else:
+            side, along = 3, -y[k]
+        t = (along / distance + 1) * n
+        place = min(int(t), 2 * n - 1)
+        f = t - place
+        place += side * 2 * n
+        low = field[vertex_of_ring(inner, place, n)] * (1 - f) + field[vertex_of_ring(inner, place + 1, n)] * f
+        high = field[vertex_of_ring(ring, place, n)] * (1 - f) + field[vertex_of_ring(ring, place + 1, n)] * f
+        values[k] = low * (1 - g) + high * g
+    return values

@@ -1,28 +1,42 @@
 """Crater profiles, fresh and worn, as tables over distance and wear.
 
-Fresh shape: Fassett & Thomson 2014, eq. 4 (doi 10.1002/2014JE004698). Deviations: the outer polynomial is scaled by
-13 % so that it meets the rim at x = 1.02 (as printed it leaves a step of 0.004 D, which renders as a ring); the bowl
-is scaled to the wanted depth and its floor rounded by a soft minimum, where the source cuts it flat; every profile is
-at least slightly worn (K/R^2 = 0.001), so that no crest is sharper than a few hundredths of the radius.
+With x = r/R a fresh profile is h = h_rim rim(x) + d bowl(x): rim and ejecta of height 1 at the crest, and a bowl of
+depth 1 below it. Both parts are smooth to first order everywhere: a kink at the crest or at the blanket's end renders
+as a ring.
 
-Wear: topographic diffusion dh/dt = kappa laplacian h (same source), solved exactly on a radial grid. With x = r/R it
-depends on K/R^2 alone, K = kappa t. A fresh profile is linear in the depth-to-diameter ratio d/D,
-h/D = rim(x) + d/D bowl(x), and diffusion is linear too, so that two tables serve all craters. A third holds how much of
-the older ground the crater has removed, diffused likewise: its edge widens with wear and leaves no ridge.
+- `fassett_thomson`: Fassett & Thomson 2014, eq. 4 (doi 10.1002/2014JE004698). Deviations: the outer polynomial is
+  scaled by 13 % so that it meets the crest (as printed it leaves a step of 0.004 D); crest and blanket's end are
+  rounded by cubics, where the source has a flat crest and ends at x = 1.5 with a slope; the bowl is scaled to the
+  wanted depth and its floor rounded by a soft minimum, where the source cuts it flat. `flat` keeps that cut, softened.
+- `pangu`: a parabolic bowl, a cubic flank and ejecta that thin as x^-3, as the simulator PANGU has it (Martin, Parkes
+  & Dunstan 2014, doi 10.1109/TAES.2014.120282, taken second hand). Deviations: its printed constants beta and h3 are
+  not used, since they give unrealistic shapes; the crest is rounded, and the ejecta end at REACH.
+
+Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solved exactly on a radial grid; with x =
+r/R it depends on K/R^2 alone, K = kappa t. The profile is linear in h_rim and d and diffusion is linear too, so that a
+table for each part serves all craters. One more holds how much of the older ground the crater has removed, diffused
+likewise: its edge widens with wear and leaves no ridge. As a bowl is steeper than its flank, wear drives the crest
+outwards: `crest` says how far, so that a crater can be laid with its crest, as it is today, on the circle that its
+label says.
 """
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from perilune_shared.frames import Array
 
 REACH = 3.0
 """Profiles are cut at this distance over the radius."""
+DEPTH_OVER_RIM = np.linspace(1.5, 9.0, 16)
+"""Fresh depths over the fresh rim's height for which the crest's place is tabulated."""
+_FARTHEST_CREST = 1.3
 _DOMAIN, _N_RADIAL = 6.0, 600
-_RIM = 0.036822
-LEAST_WEAR, MOST_WEAR, N_WEAR = 1e-3, 0.6, 48
+_CREST = 0.036822
+LEAST_WEAR, MOST_WEAR, N_WEAR = 2e-4, 0.6, 56
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,44 +44,105 @@ class ProfileTables:
     """Tables over wear (rows, even in log K/R^2) and distance (columns, even in x from 0 to REACH)."""
 
     rim: Array
-    """Height over D of rim and ejecta (N_WEAR, n_x)."""
+    """Rim and ejecta over the fresh rim's height (N_WEAR, n_x)."""
     bowl: Array
-    """Height over D for d/D = 1 (N_WEAR, n_x)."""
+    """Bowl over the fresh depth (N_WEAR, n_x)."""
+    flat_bowl: Array
+    """The same of a crater with a flat floor (N_WEAR, n_x)."""
     removed: Array
     """Share of the older ground that is gone (N_WEAR, n_x)."""
+    crest: Array
+    """Where the crest has moved to, over the first radius, for DEPTH_OVER_RIM (N_WEAR, len(DEPTH_OVER_RIM))."""
 
 
-def fresh_rim(x: Array) -> Array:
-    """Height over D of rim and ejecta blanket at x = r/R; inside the rim the level of its crest."""
-    outer = 0.188253307 - 0.187050452 * x + 0.01844746 * x**2 + 0.01505647 * x**3
-    at_crest = 0.188253307 - 0.187050452 * 1.02 + 0.01844746 * 1.02**2 + 0.01505647 * 1.02**3
-    return np.select([x <= 1.02, x < 1.5], [np.full_like(x, _RIM), outer * _RIM / at_crest])
+def fresh_rim(x: Array, profile: str = "fassett_thomson") -> Array:
+    """Rim and ejecta at x = r/R over the crest's height; inside the crest 1."""
+    x = np.asarray(x, np.float64)
+    if profile == "pangu":
+        flank = _cubic(x, 1.0, 1.5, 1.0, 0.0, 1.5**-3, -3 * 1.5**-4)
+        far = _cubic(x, 2.2, REACH, 2.2**-3, -3 * 2.2**-4, 0.0, 0.0)
+        return np.select([x <= 1, x < 1.5, x < 2.2, x < REACH], [np.ones_like(x), flank, np.maximum(x, 1) ** -3.0, far])
+    scale = 1 / _outer(1.02)
+    flank = _cubic(x, 1.0, 1.08, 1.0, 0.0, scale * _outer(1.08), scale * _outer_slope(1.08))
+    tail = _cubic(x, 1.4, 1.6, scale * _outer(1.4), scale * _outer_slope(1.4), 0.0, 0.0)
+    return np.select([x <= 1, x < 1.08, x < 1.4, x < 1.6], [np.ones_like(x), flank, scale * _outer(x), tail])
 
 
-def fresh_bowl(x: Array) -> Array:
-    """Depth below the crest at x = r/R for a depth of 1: -1 at the centre, 0 from the rim on."""
-    inner = np.minimum(x, 0.98)
-    poly = -0.228809953 + 0.227533882 * inner + 0.083116795 * inner**2 - 0.039499407 * inner**3
-    sunk = 1.25 * np.maximum(_RIM - poly, 0) / (_RIM + 0.228809953)
-    soft = 0.08
-    floor = -soft * np.log(np.exp(-sunk / soft) + np.exp(-1 / soft))
-    level = -soft * np.log(1 + np.exp(-1 / soft))
-    deepest = -soft * np.log(np.exp(-1.25 / soft) + np.exp(-1 / soft))
-    return -(floor - level) / (deepest - level)
+def fresh_bowl(x: Array, profile: str = "fassett_thomson", *, flat: bool = False) -> Array:
+    """Depth below the crest at x = r/R for a depth of 1: -1 at the centre, 0 from the crest on."""
+    x = np.asarray(x, np.float64)
+    deepest = _sunk(np.zeros(1), profile, flat)
+    inside = -_sunk(x, profile, flat) / deepest
+    edge = 0.94
+    step = 1e-5
+    value, after = (float(-_sunk(np.array([at]), profile, flat)[0] / deepest[0]) for at in (edge, edge + step))
+    return np.select([x < edge, x < 1], [inside, _cubic(x, edge, 1.0, value, (after - value) / step, 0.0, 0.0)])
 
 
-def fresh_depth_ratio(diameter_m: Array) -> Array:
-    """Fresh depth over diameter: Stopar et al. 2017, taken second hand.
+def _outer(x: Any) -> Any:
+    return 0.188253307 - 0.187050452 * x + 0.01844746 * x**2 + 0.01505647 * x**3
 
-    Their steps (0.21 from 400 m, 0.17, 0.15, 0.13 from 40 m; extrapolated to 0.11 and 0.10 below) are joined by lines
-    in log D through the middles of their ranges.
+
+def _outer_slope(x: float) -> float:
+    return -0.187050452 + 2 * 0.01844746 * x + 3 * 0.01505647 * x**2
+
+
+def _cubic(x: Array, low: float, high: float, y0: float, slope0: float, y1: float, slope1: float) -> Array:
+    """The cubic with given values and slopes at both ends (Hermite)."""
+    width = high - low
+    t = np.clip((x - low) / width, 0, 1)
+    return (
+        (2 * t**3 - 3 * t**2 + 1) * y0
+        + (t**3 - 2 * t**2 + t) * width * slope0
+        + (3 * t**2 - 2 * t**3) * y1
+        + (t**3 - t**2) * width * slope1
+    )
+
+
+def _sunk(x: Array, profile: str, flat: bool) -> Array:
+    """Depth below the crest, not yet scaled to 1 at the centre."""
+    inner = np.clip(x, 0, 0.98)
+    if profile == "pangu":
+        shape = 1 - inner**2
+        if not flat:
+            return shape
+    else:
+        polynomial = -0.228809953 + 0.227533882 * inner + 0.083116795 * inner**2 - 0.039499407 * inner**3
+        shape = (_CREST - polynomial) / (_CREST + 0.228809953)
+    steep, soft = (1.9, 0.07) if flat else (1.2, 0.1)
+    return soft * (np.logaddexp(0, 1 / soft) - np.logaddexp(0, (1 - steep * shape) / soft))
+
+
+def fresh_depth_m(diameter_m: Array, law: str = "stopar") -> Array:
+    """Rim to floor of a newly formed crater, metres.
+
+    `stopar`: Stopar et al. 2017, taken second hand; their steps of d/D (0.21 from 400 m, 0.17, 0.15, 0.13 from 40 m;
+    extrapolated to 0.11 and 0.10 below) are joined by lines in log D through the middles of their ranges.
+    `pike`: Pike 1977, taken second hand, 0.196 D^1.01 km with D in km; made for larger craters.
     """
-    return np.interp(np.log10(diameter_m), np.log10([5, 20, 63, 141, 283, 500]), [0.10, 0.11, 0.13, 0.15, 0.17, 0.21])
+    d = np.asarray(diameter_m, np.float64)
+    if law == "pike":
+        return 196 * (d / 1000) ** 1.01
+    return d * np.interp(np.log10(d), np.log10([5, 20, 63, 141, 283, 500]), [0.10, 0.11, 0.13, 0.15, 0.17, 0.21])
+
+
+def fresh_rim_height_m(diameter_m: Array, depth_m: Array, profile: str = "fassett_thomson") -> Array:
+    """Crest over the plain around a newly formed crater, metres.
+
+    `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to his depth, which at 1 km is the source's
+    0.0368 D; the source gives that share of D for craters of a kilometre, and with it shallow small craters would be
+    all rim. `pangu`: the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), where that is below
+    Pike's rim height, 0.036 D^1.014 km with D in km; both taken second hand.
+    """
+    if profile == "pangu":
+        d = np.asarray(diameter_m, np.float64)
+        return np.minimum(0.14 * (d / 2) ** 0.74, 36 * (d / 1000) ** 1.014)
+    return 0.184 * np.asarray(depth_m, np.float64)
 
 
 @functools.cache
-def profile_tables() -> ProfileTables:
-    """The tables, computed once."""
+def profile_tables(profile: str = "fassett_thomson") -> ProfileTables:
+    """The tables of a profile, computed once."""
     step = _DOMAIN / _N_RADIAL
     x = (np.arange(_N_RADIAL) + 0.5) * step
     edges = np.arange(1, _N_RADIAL) * step
@@ -95,4 +170,38 @@ def profile_tables() -> ProfileTables:
         rows = (decay * amplitudes) @ modes.T / root
         return np.array([np.interp(columns, x, row) for row in rows], np.float64) * taper
 
-    return ProfileTables(worn(fresh_rim(x)), worn(fresh_bowl(x)), worn((x < 1.08).astype(np.float64)))
+    rim, bowl = worn(fresh_rim(x, profile)), worn(fresh_bowl(x, profile))
+    return ProfileTables(
+        rim,
+        bowl,
+        worn(fresh_bowl(x, profile, flat=True)),
+        worn(_cubic(x, 1.0, 1.2, 1.0, 0.0, 0.0, 0.0)),
+        _crests(columns, rim, bowl),
+    )
+
+
+def _crests(x: Array, rim: Array, bowl: Array) -> Array:
+    """Highest place of rim + depth bowl for every wear and depth, refined by a parabola through three columns."""
+    shape = rim[:, None] + DEPTH_OVER_RIM[None, :, None] * bowl[:, None]
+    top = np.clip(shape.argmax(axis=2), 1, len(x) - 2)
+    left, here, right = (np.take_along_axis(shape, (top + k)[..., None], axis=2)[..., 0] for k in (-1, 0, 1))
+    bend = left - 2 * here + right
+    crest = x[top] + np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, 1), 0) * (x[1] - x[0])
+    return np.clip(crest, 1.0, _FARTHEST_CREST)
+
+
+def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_thomson") -> Array:
+    """Where the crest of craters (N,) has moved to, over their first radius, for their wear K/R^2 and fresh shape.
+
+    At most 1.3: beyond that there is hardly a crest left.
+    """
+    tables = profile_tables(profile)
+    row = wear_row(wear)
+    column = np.interp(depth_over_rim, DEPTH_OVER_RIM, np.arange(len(DEPTH_OVER_RIM)))
+    return ndimage.map_coordinates(tables.crest, [row, column], order=1, mode="nearest")
+
+
+def wear_row(wear: Array) -> Array:
+    """Place of wears K/R^2 among the tables' rows, with fractions."""
+    within = np.clip(wear, LEAST_WEAR, MOST_WEAR)
+    return np.log(within / LEAST_WEAR) / np.log(MOST_WEAR / LEAST_WEAR) * (N_WEAR - 1)

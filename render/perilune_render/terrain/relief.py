@@ -8,7 +8,7 @@ octaves whose amplitudes fall as L^H, from the longest wave down to the shortest
 import numpy as np
 
 from perilune_render.config import ReliefConfig
-from perilune_render.streams import derived_seed, stream
+from perilune_render.streams import stream
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.noise import RMS_SLOPE, add_waves
 from perilune_shared.frames import Array
@@ -17,20 +17,17 @@ from perilune_shared.frames import Array
 def add_relief(
     height_m: Array, grid: Grid, config: ReliefConfig, seed: int, shortest_m: float, longest_m: float
 ) -> None:
-    """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n, n; rows are y), in place.
+    """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
     `config.rms_slope_deg` is that of all octaves down to a metre. Long waves are laid before the craters, which cut
     them; short ones after, since a worn crater is as rough as the ground about it.
     """
-    rng = stream(seed, "relief")
-    finest = 3 * float(np.diff(grid.coordinates_m).min())
+    finest = 3 * float(grid.spacings_m.min())
     n_octaves = int(np.ceil(np.log2(config.longest_wavelength_m / min(finest, 1.0))))
     lengths = config.longest_wavelength_m / 2.0 ** np.arange(n_octaves)
     slopes = lengths ** (config.hurst_exponent - 1)
     slopes *= np.tan(np.radians(config.rms_slope_deg)) / np.sqrt(np.sum(slopes[lengths >= 1] ** 2))
     for length, slope in zip(lengths, slopes, strict=True):
-        # Each octave is shifted, since gradient noise is zero on its own lattice.
-        shifted = grid.coordinates_m + rng.uniform(0, length)
         if max(finest, shortest_m) <= length < longest_m:
-            own = derived_seed(seed, "relief", length)
-            add_waves(height_m, shifted, float(length), float(slope * length / RMS_SLOPE), own)
+            rng = stream(seed, "relief", length)
+            add_waves(height_m, grid, float(length), float(slope * length / RMS_SLOPE), rng)

@@ -1,156 +1,241 @@
-"""Laying craters on the height field, each in its own window, strictly in order (compiled by numba)."""
+"""Laying craters on the ground, each in its own window, strictly oldest first (compiled by numba)."""
+
+from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.spatial import KDTree
 
 from perilune_render.terrain.craters import Craters
-from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.profile import LEAST_WEAR, MOST_WEAR, N_WEAR, REACH, profile_tables
+from perilune_render.terrain.grid import Grid, lines_in
+from perilune_render.terrain.profile import REACH, crest_radius, profile_tables, wear_row
 from perilune_shared.frames import Array
 
+_N_RIM = 16
 
-def stamp_craters(height_m: Array, albedo: Array, grid: Grid, craters: Craters, brightness: Array) -> Array:
-    """Lay `craters` on height_m (n, n; rows are y) and brighten albedo (n, n), both in place.
+
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """What laying N craters did."""
+
+    sag_m: Array
+    """How much lower the older ground that shows through each crater is left at its centre than at its rim, which is no
+    depth of its own, metres (N,)."""
+    rim_left: Array
+    """Share of each crater's rim that no younger crater has removed (N,)."""
+
+
+def stamp_craters(
+    height_m: Array, albedo: Array, grid: Grid, craters: Craters, brightness: Array, profile: str = "fassett_thomson"
+) -> Laid:
+    """Lay `craters` on height_m (n_vertices,) and brighten albedo (n_vertices,), both in place.
 
     A crater first replaces what it overlies by the plane through it (as far as its wear has left that removal
-    visible), then adds its own profile. `brightness` (N,) is the relative brightening at the rim.
-
-    Returns the sag (N,) in metres: by how much the older ground that shows through each crater was already lower at the
-    crater's centre than at its rim, which is no depth of its own.
+    visible), then adds its own profile. `brightness` (N,) is the relative brightening within the rim.
     """
-    tables = profile_tables()
-    radius = craters.diameter_m / 2
-    wear = np.clip(craters.wear_m2 / radius**2, LEAST_WEAR, MOST_WEAR)
-    row = np.log(wear / LEAST_WEAR) / np.log(MOST_WEAR / LEAST_WEAR) * (N_WEAR - 1)
-    low = np.searchsorted(grid.coordinates_m, np.stack([craters.x_m, craters.y_m]) - REACH * radius)
-    high = np.searchsorted(grid.coordinates_m, np.stack([craters.x_m, craters.y_m]) + REACH * radius)
-    return _stamp(
+    tables = profile_tables(profile)
+    wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
+    # The label's circle is the crest as it is today; the profile is laid about the one that it began with.
+    grown = crest_radius(wear, craters.fresh_depth_m / craters.rim_height_m, profile)
+    sag, rim_left = _stamp(
         height_m,
         albedo,
-        grid.coordinates_m,
+        grid.n_half,
+        grid.half_widths_m,
         craters.x_m,
         craters.y_m,
-        radius,
-        craters.fresh_depth_m / craters.diameter_m,
-        row,
+        craters.diameter_m / 2 / grown,
+        craters.diameter_m / 2,
+        craters.fresh_depth_m,
+        craters.rim_height_m,
+        wear_row(wear),
+        craters.flat_floor,
+        craters.outline,
+        craters.crest,
         brightness,
-        low[0],
-        high[0],
-        low[1],
-        high[1],
         tables.rim,
-        tables.bowl,
+        np.stack([tables.bowl, tables.flat_bowl]),
         tables.removed,
     )
+    return Laid(sag, rim_left)
 
 
-def rim_left(craters: Craters) -> Array:
-    """Share (N,) of each crater's rim that no younger crater has removed, from 16 points of the rim."""
-    n_rim = 16
-    angle = 2 * np.pi * np.arange(n_rim) / n_rim
-    rim_x = craters.x_m[:, None] + craters.diameter_m[:, None] / 2 * np.cos(angle)
-    rim_y = craters.y_m[:, None] + craters.diameter_m[:, None] / 2 * np.sin(angle)
-    points = np.stack([rim_x.ravel(), rim_y.ravel()], axis=1)
-    radius = craters.diameter_m / 2
-    wear = np.clip(craters.wear_m2 / radius**2, LEAST_WEAR, MOST_WEAR)
-    grid = np.geomspace(LEAST_WEAR, MOST_WEAR, N_WEAR)
-    gone_inside = np.interp(np.log(wear), np.log(grid), profile_tables().removed[:, : int(100 * 0.9)].mean(axis=1))
-    covered = KDTree(points).query_ball_point(np.stack([craters.x_m, craters.y_m], axis=1), radius)
-    left = np.ones(len(points))
-    for k, found in enumerate(covered):
-        older = np.asarray(found, np.int64)
-        older = older[older < k * n_rim]
-        left[older] *= 1 - gone_inside[k]
-    return left.reshape(-1, n_rim).mean(axis=1)
+@numba.njit(cache=True)
+def _nearest(x, y, n_half, half_widths):
+    """Index of a vertex near a place; -1 outside the grid."""
+    n = n_half
+    distance = max(abs(x), abs(y))
+    if distance > half_widths[-1]:
+        return -1
+    if distance <= half_widths[0]:
+        step = half_widths[0] / n
+        return (int(np.rint(y / step)) + n) * (2 * n + 1) + int(np.rint(x / step)) + n
+    ring = np.searchsorted(half_widths, distance)
+    if y <= -distance:
+        side, along = 0, x
+    elif x >= distance:
+        side, along = 1, y
+    elif y >= distance:
+        side, along = 2, -x
+    else:
+        side, along = 3, -y
+    t = int(np.rint((along / distance + 1) * n))
+    return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + (side * 2 * n + t) % (8 * n)
 
 
 @numba.njit(cache=True)
 def _stamp(
     height,
     albedo,
-    coordinates,
+    n_half,
+    half_widths,
     x,
     y,
     radius,
-    ratio,
+    label_radius,
+    depth,
+    rim_height,
     wear_row,
+    flat_floor,
+    outline,
+    crest,
     brightness,
-    x_low,
-    x_high,
-    y_low,
-    y_high,
     rim,
-    bowl,
+    bowls,
     removed,
 ):
     columns = rim.shape[1]
     per_radius = (columns - 1) / REACH
-    profile = np.empty(columns)
-    gone = np.empty(columns)
+    own_rim, own_bowl, gone = np.empty(columns), np.empty(columns), np.empty(columns)
+    lines = np.empty((2 * n_half + 1 + 4 * len(half_widths), 7))
     sag = np.zeros(len(x))
+    # Logarithm of the share of the first ground that is left, vertex by vertex: what a rim has lost since it was laid
+    # is the difference of two readings.
+    log_left = np.zeros(len(height))
+    rim_vertex = np.full((len(x), _N_RIM), -1)
+    rim_before = np.zeros((len(x), _N_RIM))
     for k in range(len(x)):
         upper = min(int(wear_row[k]), rim.shape[0] - 2)
         share = wear_row[k] - upper
+        bowl = bowls[1] if flat_floor[k] else bowls[0]
         for c in range(columns):
-            rim_c = rim[upper, c] * (1 - share) + rim[upper + 1, c] * share
-            bowl_c = bowl[upper, c] * (1 - share) + bowl[upper + 1, c] * share
-            profile[c] = 2 * radius[k] * (rim_c + ratio[k] * bowl_c)
+            own_rim[c] = rim_height[k] * (rim[upper, c] * (1 - share) + rim[upper + 1, c] * share)
+            own_bowl[c] = depth[k] * (bowl[upper, c] * (1 - share) + bowl[upper + 1, c] * share)
             gone[c] = removed[upper, c] * (1 - share) + removed[upper + 1, c] * share
+        reach = REACH * radius[k]
+        count = lines_in(x[k] - reach, x[k] + reach, y[k] - reach, y[k] + reach, n_half, half_widths, lines)
         # The plane through the ground within 1.3 radii: least squares about the crater's centre.
         s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
         n_rim = n_floor = h_rim = h_floor = 0.0
-        limit = (1.3 * radius[k]) ** 2
-        for j in range(y_low[k], y_high[k]):
-            dy = coordinates[j] - y[k]
-            for i in range(x_low[k], x_high[k]):
-                dx = coordinates[i] - x[k]
-                square = dx * dx + dy * dy
-                if square <= limit:
-                    h = height[j, i]
-                    if square < 0.0625 * radius[k] ** 2:
-                        n_floor += 1.0
-                        h_floor += h
-                    elif 0.81 * radius[k] ** 2 < square < 1.21 * radius[k] ** 2:
-                        n_rim += 1.0
-                        h_rim += h
-                    s0 += 1.0
-                    sx += dx
-                    sy += dy
-                    sxx += dx * dx
-                    sxy += dx * dy
-                    syy += dy * dy
-                    sh += h
-                    sxh += dx * h
-                    syh += dy * h
-        if s0 < 6:
+        square_r = radius[k] ** 2
+        for line in range(count):
+            dx, dy = lines[line, 0] - x[k], lines[line, 1] - y[k]
+            step_x, step_y = lines[line, 2], lines[line, 3]
+            first, number = int(lines[line, 4]), int(lines[line, 5])
+            # Only the part of the line within 1.3 radii.
+            along, across = (dx, dy) if step_y == 0 else (dy, dx)
+            step = step_x + step_y
+            chord = 1.69 * square_r - across * across
+            if chord < 0:
+                continue
+            half = np.sqrt(chord)
+            low, high = (-half - along) / step, (half - along) / step
+            if low > high:
+                low, high = high, low
+            for p in range(max(int(np.ceil(low)), 0), min(int(np.floor(high)) + 1, number)):
+                px, py = dx + p * step_x, dy + p * step_y
+                square = px * px + py * py
+                h = height[first + p]
+                if square < 0.0625 * square_r:
+                    n_floor += 1.0
+                    h_floor += h
+                elif 0.81 * square_r < square < 1.21 * square_r:
+                    n_rim += 1.0
+                    h_rim += h
+                s0 += 1.0
+                sx += px
+                sy += py
+                sxx += px * px
+                sxy += px * py
+                syy += py * py
+                sh += h
+                sxh += px * h
+                syh += py * h
+        if s0 < 3:
             continue
         cxx, cxy, cyy = sxx - sx * sx / s0, sxy - sx * sy / s0, syy - sy * sy / s0
         cxh, cyh = sxh - sx * sh / s0, syh - sy * sh / s0
         determinant = cxx * cyy - cxy * cxy
-        if determinant <= 1e-12 * cxx * cyy:
-            continue
-        slope_x = (cxh * cyy - cyh * cxy) / determinant
-        slope_y = (cyh * cxx - cxh * cxy) / determinant
+        slope_x = slope_y = 0.0
+        if determinant > 1e-9 * cxx * cyy:
+            slope_x = (cxh * cyy - cyh * cxy) / determinant
+            slope_y = (cyh * cxx - cxh * cxy) / determinant
         level = (sh - slope_x * sx - slope_y * sy) / s0
         if n_rim > 0 and n_floor > 0:
-            sag[k] = max(h_rim / n_rim - h_floor / n_floor, 0.0) * (1 - gone[0])
-        reach = (REACH * radius[k]) ** 2
-        for j in range(y_low[k], y_high[k]):
-            dy = coordinates[j] - y[k]
-            for i in range(x_low[k], x_high[k]):
-                dx = coordinates[i] - x[k]
-                square = dx * dx + dy * dy
-                if square >= reach:
-                    continue
-                r = np.sqrt(square) / radius[k]
+            # What is left of the older ground at the rim and at the centre, over the plane that replaced the rest.
+            rim_share, floor_share = 1 - gone[int(per_radius)], 1 - gone[0]
+            sag[k] = max((h_rim / n_rim - level) * rim_share - (h_floor / n_floor - level) * floor_share, 0.0)
+        for line in range(count):
+            dx, dy = lines[line, 0] - x[k], lines[line, 1] - y[k]
+            step_x, step_y = lines[line, 2], lines[line, 3]
+            first, number = int(lines[line, 4]), int(lines[line, 5])
+            along, across = (dx, dy) if step_y == 0 else (dy, dx)
+            step = step_x + step_y
+            chord = reach * reach - across * across
+            if chord < 0:
+                continue
+            half = np.sqrt(chord)
+            low, high = (-half - along) / step, (half - along) / step
+            if low > high:
+                low, high = high, low
+            for p in range(max(int(np.ceil(low)), 0), min(int(np.floor(high)) + 1, number)):
+                px, py = dx + p * step_x, dy + p * step_y
+                distance = np.sqrt(px * px + py * py)
+                if distance > 0:
+                    c1, s1 = px / distance, py / distance
+                else:
+                    c1, s1 = 1.0, 0.0
+                c2, s2 = c1 * c1 - s1 * s1, 2 * c1 * s1
+                c3, s3 = c2 * c1 - s2 * s1, s2 * c1 + c2 * s1
+                c4, s4 = c2 * c2 - s2 * s2, 2 * c2 * s2
+                stray = outline[k, 0] * c2 + outline[k, 1] * s2 + outline[k, 2] * c3 + outline[k, 3] * s3
+                stray += outline[k, 4] * c4 + outline[k, 5] * s4
+                uneven = crest[k, 0] * c1 + crest[k, 1] * s1 + crest[k, 2] * c2 + crest[k, 3] * s2
+                uneven += crest[k, 4] * c3 + crest[k, 5] * s3
+                r = distance / (radius[k] * (1 + stray))
                 position = r * per_radius
                 c = int(position)
+                if c >= columns - 1:
+                    continue
                 f = position - c
-                plane = level + slope_x * dx + slope_y * dy
+                # The rim is uneven, the floor within is not.
+                inner = min(r, 1.0)
+                uneven *= inner * inner * (3 - 2 * inner)
                 lost = gone[c] * (1 - f) + gone[c + 1] * f
-                height[j, i] += lost * (plane - height[j, i]) + profile[c] * (1 - f) + profile[c + 1] * f
+                crest_here = (own_rim[c] * (1 - f) + own_rim[c + 1] * f) * (1 + uneven)
+                here = first + p
+                old = height[here]
+                plane = level + slope_x * px + slope_y * py
+                height[here] = old + lost * (plane - old) + crest_here + own_bowl[c] * (1 - f) + own_bowl[c + 1] * f
+                if lost > 1e-3:
+                    log_left[here] += np.log1p(-0.999999 * lost)
                 if brightness[k] > 0:
                     fade = 1.0 if r < 1 else np.exp(-(r - 1) / 0.5) * (1 - r / REACH)
-                    albedo[j, i] += brightness[k] * fade
-    return sag
+                    albedo[here] += brightness[k] * fade
+        for p in range(_N_RIM):
+            angle = 2 * np.pi * p / _N_RIM
+            vertex = _nearest(
+                x[k] + label_radius[k] * np.cos(angle), y[k] + label_radius[k] * np.sin(angle), n_half, half_widths
+            )
+            rim_vertex[k, p] = vertex
+            if vertex >= 0:
+                rim_before[k, p] = log_left[vertex]
+    rim_left = np.ones(len(x))
+    for k in range(len(x)):
+        total = on_grid = 0.0
+        for p in range(_N_RIM):
+            if rim_vertex[k, p] >= 0:
+                on_grid += 1.0
+                total += np.exp(log_left[rim_vertex[k, p]] - rim_before[k, p])
+        if on_grid > 0:
+            rim_left[k] = total / on_grid
+    return sag, rim_left

@@ -11,12 +11,13 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig
 from perilune_render.labels import crater_index, label_frame
 from perilune_render.photometry import radiance_factor
-from perilune_render.terrain.craters import Craters
-from perilune_render.terrain.measure import height_at
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.camera import Camera
 from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.frames import matrix_from_rotation_vector, sun_direction
-from tests.render.conftest import config_with, flat_scene
+from tests.render.conftest import config_with, flat_scene, round_craters
 
 CAMERA = Camera(96, 64, 110.0, 110.0, 50.0, 30.0)
 TILTED = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector(np.radians([12, -20, 30]))
@@ -65,7 +66,7 @@ def test_rendered_pixels_lie_on_the_height_field(scene, small_config, camera):
     with Renderer(scene, small_config, camera, sun_direction(90, 40)) as renderer:
         radiance = renderer.render(position, rotation)
     points = position + (camera.rays(camera.pixel_centres()) * radiance.depth_m[..., None]) @ rotation
-    error = points[..., 2] - height_at(scene.height_m, scene.grid, points[..., 0], points[..., 1])
+    error = points[..., 2] - value_at(scene.height_m, scene.grid, points[..., 0], points[..., 1])
     assert np.isfinite(radiance.depth_m).all()
     assert np.median(np.abs(error)) < 0.5 and np.quantile(np.abs(error), 0.99) < 2.5
 
@@ -85,11 +86,8 @@ def test_the_sun_casts_shadows_away_from_itself():
 def test_label_ellipses_lie_on_rendered_rims():
     """A fresh crater's crest is where the normal turns: fit its pixels and compare with the label."""
     x, y, d = np.array([-25.0, 75.0, 20.0]), np.array([20.0, -50.0, 70.0]), np.array([80.0, 60.0, 45.0])
-    craters = Craters(x, y, d, 0.15 * d, np.zeros(3), 1e-3 * (d / 2) ** 2)
-    from perilune_render.terrain.grid import Grid
-    from perilune_render.terrain.stamp import stamp_craters
-
-    height, grid = np.zeros((1001, 1001)), Grid(np.linspace(-200, 200, 1001))
+    craters = round_craters(np.stack([x, y, d, np.full(3, 0.15)], axis=1))
+    height, grid = np.zeros(1001 * 1001), Grid.even(200, 500)
     stamp_craters(height, np.ones_like(height), grid, craters, np.zeros(3))
     scene = flat_scene(400, 1001, craters, height)
     camera = Camera.from_field_of_view(512, 512, 50.0)
@@ -126,9 +124,7 @@ def test_a_hidden_rim_and_a_dark_crater_are_told():
     n = 401
     height = np.zeros((n, n))
     height[:, 150:160] = 60.0
-    craters = Craters(
-        np.array([-5.0]), np.array([0.0]), np.array([30.0]), np.array([3.0]), np.zeros(1), np.array([0.2])
-    )
+    craters = round_craters([(-5, 0, 30, 0.1)])
     scene = flat_scene(200, n, craters, height)
     camera = Camera.from_field_of_view(256, 256, 50.0)
     sun = sun_direction(90, 20)

@@ -3,32 +3,77 @@ import pytest
 
 from perilune_render.terrain import profile
 
-
-def test_the_fresh_profile_has_no_step():
-    x = np.linspace(0, 3, 30_001)
-    for shape in (profile.fresh_rim(x), profile.fresh_bowl(x)):
-        assert np.abs(np.diff(shape)).max() < 1e-3
+PROFILES = ["fassett_thomson", "pangu"]
 
 
-def test_the_bowl_is_one_deep_and_ends_at_the_rim():
-    assert profile.fresh_bowl(np.array([0.0]))[0] == pytest.approx(-1)
-    assert profile.fresh_bowl(np.array([0.98, 1.0, 2.0])) == pytest.approx([0, 0, 0], abs=1e-3)
+@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("flat", [False, True])
+def test_no_ring_second_differences_stay_bounded_as_the_step_shrinks(name, flat):
+    """As dx shrinks, the second difference of a step stays, of a kink falls as dx, of a smooth curve as dx^2."""
+    worst = []
+    for n in (30_001, 300_001):
+        x = np.linspace(0, 3.2, n)
+        shape = 0.0368 * profile.fresh_rim(x, name) + 0.15 * profile.fresh_bowl(x, name, flat=flat)
+        worst.append(np.abs(np.diff(shape, 2)).max() * (n - 1) ** 2)
+    assert worst[1] < 1.1 * worst[0]
 
 
-def test_the_rim_stands_0_037_diameters_above_the_plain_and_the_blanket_ends():
-    assert profile.fresh_rim(np.array([1.0, 1.02, 1.5, 2.5])) == pytest.approx([0.036822, 0.036822, 0, 0], abs=1e-4)
+@pytest.mark.parametrize("name", PROFILES)
+def test_the_finished_tables_have_no_ring_either(name):
+    tables = profile.profile_tables(name)
+    for shape in (0.0368 * tables.rim + 0.15 * tables.bowl, 0.0368 * tables.rim + 0.15 * tables.flat_bowl):
+        bend = np.abs(np.diff(shape[0], 2))
+        # Beyond the blanket's end, and at the tables' own end, nothing bends as the crest does.
+        assert bend[115:].max() < 0.35 * bend.max()
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_the_bowl_is_one_deep_and_ends_at_the_rim(name):
+    assert profile.fresh_bowl(np.array([0.0]), name)[0] == pytest.approx(-1)
+    assert profile.fresh_bowl(np.array([1.0, 1.02, 2.0]), name) == pytest.approx([0, 0, 0], abs=1e-9)
+    x = np.linspace(0, 3, 3001)
+    assert (np.diff(profile.fresh_bowl(x, name)) >= -1e-12).all() and (
+        np.diff(profile.fresh_rim(x, name)) <= 1e-12
+    ).all()
+
+
+def test_fassett_and_thomsons_flank_is_kept_where_it_is_not_rounded():
+    # Eq. 4's outer polynomial over its value at 1.02, at places between the two roundings.
+    x = np.array([1.1, 1.2, 1.3])
+    outer = 0.188253307 - 0.187050452 * x + 0.01844746 * x**2 + 0.01505647 * x**3
+    assert profile.fresh_rim(x) == pytest.approx(outer / 0.0325, rel=0.005)
+    assert profile.fresh_rim(np.array([1.6, 2.5])) == pytest.approx([0, 0])
+
+
+def test_pangus_bowl_is_a_parabola_and_its_ejecta_thin_as_the_cube():
+    x = np.array([0.0, 0.3, 0.6, 0.8])
+    assert profile.fresh_bowl(x, "pangu") == pytest.approx(x**2 - 1)
+    assert profile.fresh_rim(np.array([1.5, 2.0]), "pangu") == pytest.approx([1.5**-3, 2.0**-3])
+
+
+def test_a_flat_floor_is_flat():
+    x = np.linspace(0, 0.35, 50)
+    assert np.ptp(profile.fresh_bowl(x, flat=True)) < 0.02 < 0.1 < np.ptp(profile.fresh_bowl(x))
 
 
 @pytest.mark.parametrize(("diameter_m", "ratio"), [(3, 0.10), (63, 0.13), (1000, 0.21)])
 def test_fresh_depth_by_size(diameter_m, ratio):
-    assert profile.fresh_depth_ratio(np.array([diameter_m]))[0] == pytest.approx(ratio)
+    assert profile.fresh_depth_m(np.array([diameter_m]))[0] / diameter_m == pytest.approx(ratio)
+
+
+def test_pikes_depth_and_the_rims():
+    assert profile.fresh_depth_m(1000.0, "pike") == pytest.approx(196)
+    assert profile.fresh_rim_height_m(1000.0, 200.0) == pytest.approx(36.8, rel=0.01)
+    # McGetchin's ejecta exceed Pike's rim below 26 m and are capped there.
+    assert profile.fresh_rim_height_m(10.0, 1.0, "pangu") == pytest.approx(36 * 0.01**1.014)
+    assert profile.fresh_rim_height_m(200.0, 30.0, "pangu") == pytest.approx(0.14 * 100**0.74)
 
 
 def test_wear_lowers_rim_and_fills_bowl():
     tables = profile.profile_tables()
     centre = -tables.bowl[:, 0]
     assert (np.diff(centre) < 0).all() and centre[0] > 0.95 and centre[-1] < 0.2
-    crest = (tables.rim + 0.15 * tables.bowl).max(axis=1)
+    crest = (0.0368 * tables.rim + 0.15 * tables.bowl).max(axis=1)
     assert (np.diff(crest) < 0).all() and crest[0] > 0.03 > 0.01 > crest[-1]
 
 
@@ -37,8 +82,8 @@ def test_depth_left_agrees_with_published_degradation(wear, low, high):
     # Bounds: the fit of cratermaker and Gaussian blurring of the profile, which differ by about a tenth.
     tables = profile.profile_tables()
     row = np.log(wear / profile.LEAST_WEAR) / np.log(profile.MOST_WEAR / profile.LEAST_WEAR) * (profile.N_WEAR - 1)
-    shape = (tables.rim + 0.2 * tables.bowl)[round(row)]
-    fresh = (tables.rim + 0.2 * tables.bowl)[0]
+    shape = (0.0368 * tables.rim + 0.2 * tables.bowl)[round(row)]
+    fresh = (0.0368 * tables.rim + 0.2 * tables.bowl)[0]
     at_rim = round(1 / (profile.REACH / 300))
     assert low < (shape[at_rim] - shape[0]) / (fresh[at_rim] - fresh[0]) < high
 

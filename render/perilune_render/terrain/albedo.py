@@ -1,0 +1,82 @@
+"""Albedo of the ground: patches, bright young craters with their ejecta, rays of the freshest.
+
+Fresh material is brighter than the mature soil about it and darkens as it weathers. How much, and how far, is a choice
+of ours by eye beside NAC images, since published maturity trends are for far larger craters.
+"""
+
+import numba
+import numpy as np
+
+from perilune_render.streams import stream
+from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.grid import Grid, lines_in
+from perilune_render.terrain.noise import add_waves
+from perilune_shared.frames import Array
+
+_PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03))
+"""Wavelengths in metres and amplitudes of the patches."""
+_RAYS_REACH = 9.0
+_RAYED_WEAR = 0.004
+"""Rays are gone where a crater has worn to this K/R^2."""
+
+
+def add_patches(albedo: Array, grid: Grid, strength: float, seed: int) -> None:
+    """Add smooth patches to albedo (n_vertices,), in place."""
+    for length, amplitude in _PATCHES:
+        if length >= 3 * grid.spacings_m.min():
+            add_waves(albedo, grid, length, amplitude * strength, stream(seed, "albedo", length))
+
+
+def brightness(craters: Craters) -> Array:
+    """Relative brightening (N,) of a crater and its ejecta: highest when new, gone once it has worn noticeably."""
+    wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
+    return 0.5 * np.exp(-wear / 0.004) * (craters.origin != 2)
+
+
+def add_rays(albedo: Array, grid: Grid, craters: Craters, n_rayed: int, strength: float, seed: int) -> None:
+    """Brighten albedo (n_vertices,) along the rays of the `n_rayed` largest among the fresh craters, in place."""
+    rng = stream(seed, "rays")
+    wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
+    local = grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
+    able = np.flatnonzero((wear < _RAYED_WEAR) & (craters.diameter_m > 12 * local) & (craters.origin == 0))
+    # Among the fresh ones the largest: rays of a small crater are gone within few pixels.
+    for k in able[np.argsort(-craters.diameter_m[able], kind="stable")][:n_rayed]:
+        n_rays = int(rng.integers(7, 15))
+        direction = rng.uniform(0, 2 * np.pi, n_rays)
+        width = rng.uniform(0.05, 0.16, n_rays)
+        length = rng.uniform(3.0, _RAYS_REACH, n_rays)
+        fresh = strength * 0.35 * (1 - wear[k] / _RAYED_WEAR)
+        _add_rays(
+            albedo,
+            grid.n_half,
+            grid.half_widths_m,
+            craters.x_m[k],
+            craters.y_m[k],
+            craters.diameter_m[k] / 2,
+            direction,
+            width,
+            length,
+            fresh,
+        )
+
+
+@numba.njit(cache=True)
+def _add_rays(albedo, n_half, half_widths, x, y, radius, direction, width, length, fresh):
+    lines = np.empty((2 * n_half + 1 + 4 * len(half_widths), 7))
+    reach = length.max() * radius
+    count = lines_in(x - reach, x + reach, y - reach, y + reach, n_half, half_widths, lines)
+    for line in range(count):
+        first, number = int(lines[line, 4]), int(lines[line, 5])
+        for p in range(number):
+            px = lines[line, 0] + p * lines[line, 2] - x
+            py = lines[line, 1] + p * lines[line, 3] - y
+            r = np.sqrt(px * px + py * py) / radius
+            if r < 1 or r > reach / radius:
+                continue
+            angle = np.arctan2(py, px)
+            light = 0.0
+            for j in range(len(direction)):
+                if r < length[j]:
+                    turn = (angle - direction[j] + np.pi) % (2 * np.pi) - np.pi
+                    light += np.exp(-0.5 * (turn / width[j]) ** 2) * (1 - r / length[j])
+            albedo[first + p] += fresh * min(light, 1.0)

@@ -1,0 +1,106 @@
+"""Grown scenes kept by content, so that a second descent over the same ground starts at once.
+
+A scene's file is named by the hash of everything that it follows from. The folder is `$PERILUNE_CACHE`, or
+`perilune/scenes` in the user's cache folder; the least recently used files go first once it grows too large. A cache
+that cannot be written, or a damaged file in it, only costs the time to grow the scene.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.terrain.boulders import Boulders
+from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.measure import Rims
+from perilune_render.terrain.scene import GENERATOR_VERSION, Scene, grow_scene
+from perilune_shared.camera import Camera
+from perilune_shared.files import sha256_of, written_aside
+
+_PARTS: dict[str, type] = {"grid": Grid, "craters": Craters, "rims": Rims, "boulders": Boulders}
+
+
+def cache_folder() -> Path:
+    """Where scenes are kept."""
+    if "PERILUNE_CACHE" in os.environ:
+        return Path(os.environ["PERILUNE_CACHE"])
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "perilune" / "scenes"
+
+
+def scene_key(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> str:
+    """Hash of all that a scene follows from: generator, settings of the ground, view, seed, files it reads."""
+    terrain = config.terrain.model_dump(mode="json")
+    for name in ("dem", "catalogue"):
+        if terrain[name] is not None and Path(terrain[name]).is_file():
+            terrain[name] = [Path(terrain[name]).name, sha256_of(Path(terrain[name]))]
+    content = {
+        "generator": GENERATOR_VERSION,
+        "numpy": np.__version__,
+        "terrain": terrain,
+        "albedo_variation": config.light.albedo_variation,
+        "camera": dataclasses.asdict(camera),
+        "flight": flight.model_dump(mode="json"),
+        "seed": seed,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def cached_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> Scene:
+    """The scene of a seed, read from the cache or grown and kept there."""
+    if config.render.cache_gib == 0:
+        return grow_scene(config, camera, flight, seed)
+    path = cache_folder() / f"{scene_key(config, camera, flight, seed)}.npz"
+    scene = _read(path)
+    if scene is None:
+        scene = grow_scene(config, camera, flight, seed)
+        with contextlib.suppress(OSError):
+            _write(path, scene)
+            _make_room(path.parent, config.render.cache_gib * 2**30)
+    return scene
+
+
+def _write(path: Path, scene: Scene) -> None:
+    arrays: dict[str, Any] = {}
+    for field in dataclasses.fields(scene):
+        value = getattr(scene, field.name)
+        if field.name in _PARTS:
+            for part in dataclasses.fields(value):
+                arrays[f"{field.name}.{part.name}"] = getattr(value, part.name)
+        else:
+            arrays[field.name] = value
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_aside(path) as aside, aside.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def _read(path: Path) -> Scene | None:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        os.utime(path)
+        values = {name: array if array.ndim else array.item() for name, array in arrays.items()}
+        parts = {
+            name: kind(**{part.name: values.pop(f"{name}.{part.name}") for part in dataclasses.fields(kind)})
+            for name, kind in _PARTS.items()
+        }
+        return Scene(**values, **parts)
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _make_room(folder: Path, most_bytes: float) -> None:
+    kept = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
+    total = 0
+    for place, path in enumerate(kept):
+        total += path.stat().st_size
+        # The newest stays, however large.
+        if total > most_bytes and place > 0:
+            path.unlink(missing_ok=True)

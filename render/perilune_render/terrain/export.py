@@ -1,0 +1,76 @@
+"""Export of a scene for other tools: meshes (GLB, PLY, OBJ, STL) and a height raster (GeoTIFF)."""
+
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import trimesh
+
+from perilune_render.terrain.boulders import boulder_mesh
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.scene import Scene
+from perilune_shared.errors import UserError
+from perilune_shared.files import written_aside
+from perilune_shared.frames import MOON_RADIUS_M
+
+MESH_SUFFIXES = (".glb", ".ply", ".obj", ".stl")
+RASTER_SUFFIXES = (".tif", ".tiff")
+_LARGEST_SIDE = 20_000
+
+
+def vertices(grid: Grid, height_m: np.ndarray) -> np.ndarray:
+    """Vertices (n_vertices, 3) float32 in O_L, metres."""
+    xyz = np.empty((grid.n_vertices, 3), np.float32)
+    xyz[:, 0], xyz[:, 1] = grid.vertices_xy()
+    xyz[:, 2] = height_m
+    return xyz
+
+
+def coarser(grid: Grid, step: int) -> Grid:
+    """A grid with every `step`-th ring of about 1 / step as many vertices each, over the same ground."""
+    n_half = max(grid.n_half // step, 1)
+    rings = grid.half_widths_m[::-step][::-1] if len(grid.half_widths_m) > 1 else grid.half_widths_m
+    return Grid(n_half, np.unique(np.concatenate([grid.half_widths_m[:1], rings])))
+
+
+def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = True) -> None:
+    """Write ground and boulders, in O_L and metres; `step` widens the ground's spacing by so much."""
+    grid = scene.grid if step == 1 else coarser(scene.grid, step)
+    height = scene.height_m if step == 1 else value_at(scene.height_m, scene.grid, *grid.vertices_xy())
+    faces = grid.quads()
+    triangles = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
+    parts = [trimesh.Trimesh(vertices(grid, height), triangles, process=False)]
+    if boulders and len(scene.boulders):
+        solid = boulder_mesh(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed)
+        parts.append(trimesh.Trimesh(*solid, process=False))
+    with written_aside(path) as aside:
+        trimesh.util.concatenate(parts).export(aside)
+
+
+def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
+    """Write the heights as a float32 GeoTIFF of square pixels, north up, azimuthal equidistant about the site.
+
+    The site is at height 0. Raises UserError where that makes more than 20,000 pixels a side.
+    """
+    n = int(np.floor(scene.grid.extent_m / pixel_m))
+    if not 1 <= n <= _LARGEST_SIDE:
+        raise UserError(path, "pixel size", f"{pixel_m} m makes {n} pixels a side", f"1 to {_LARGEST_SIDE}")
+    centre = (np.arange(n) + 0.5 - n / 2) * pixel_m
+    # O_L's x points west and y south; a raster's columns go east and its rows south.
+    height = value_at(scene.height_m, scene.grid, -centre[None, :], centre[:, None]).astype(np.float32)
+    place = f"+lat_0={scene.latitude_deg!r} +lon_0={scene.longitude_deg!r}"
+    profile = {
+        "driver": "GTiff",
+        "width": n,
+        "height": n,
+        "count": 1,
+        "dtype": "float32",
+        "crs": f"+proj=aeqd {place} +R={MOON_RADIUS_M:.0f} +units=m +no_defs",
+        "transform": rasterio.Affine(pixel_m, 0, -n / 2 * pixel_m, 0, -pixel_m, n / 2 * pixel_m),
+        "compress": "deflate",
+        "predictor": 3,
+    }
+    with written_aside(path) as aside, rasterio.open(aside, "w", **profile) as raster:
+        raster.write(height, 1)
+        raster.set_band_description(1, "height above the site, m")

@@ -1,0 +1,86 @@
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+
+from perilune_render.config import FlightConfig
+from perilune_render.terrain import cache
+from perilune_render.terrain.scene import grow_scene
+from perilune_shared.camera import Camera
+from tests.render.conftest import config_with
+
+CAMERA = Camera.from_field_of_view(32, 32, 50.0)
+FLIGHT = FlightConfig()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("PERILUNE_CACHE", str(tmp_path / "scenes"))
+    return tmp_path / "scenes"
+
+
+def same(first, second):
+    for field in dataclasses.fields(first):
+        a, b = getattr(first, field.name), getattr(second, field.name)
+        if dataclasses.is_dataclass(a):
+            same(a, b)
+        else:
+            assert type(a) is type(b) and np.array_equal(a, b), field.name
+            assert not isinstance(a, np.ndarray) or a.dtype == b.dtype, field.name
+
+
+def test_a_cached_scene_is_the_grown_one(folder):
+    grown = grow_scene(config_with(), CAMERA, FLIGHT, 3)
+    same(cache.cached_scene(config_with(), CAMERA, FLIGHT, 3), grown)
+    assert len(list(folder.iterdir())) == 1
+    same(cache.cached_scene(config_with(), CAMERA, FLIGHT, 3), grown)
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_whatever_changes_the_ground_changes_the_key(tmp_path):
+    base = cache.scene_key(config_with(), CAMERA, FLIGHT, 3)
+    assert base == cache.scene_key(config_with(sensor={"bits": 12}, render={"samples": 9}), CAMERA, FLIGHT, 3)
+    dem = tmp_path / "a.tif"
+    dem.write_bytes(b"one")
+    with_dem = cache.scene_key(config_with(terrain={"dem": str(dem)}), CAMERA, FLIGHT, 3)
+    dem.write_bytes(b"two")
+    others = [
+        cache.scene_key(config_with(), CAMERA, FLIGHT, 4),
+        cache.scene_key(config_with(), CAMERA, FlightConfig(downrange_m=400.0), 3),
+        cache.scene_key(config_with(), dataclasses.replace(CAMERA, fx_px=30.0), FLIGHT, 3),
+        cache.scene_key(config_with(terrain={"relief": {"rms_slope_deg": 1.0}}), CAMERA, FLIGHT, 3),
+        cache.scene_key(config_with(light={"albedo_variation": 0.5}), CAMERA, FLIGHT, 3),
+        with_dem,
+        cache.scene_key(config_with(terrain={"dem": str(dem)}), CAMERA, FLIGHT, 3),
+    ]
+    assert len({base, *others}) == 8
+
+
+def test_a_damaged_file_is_grown_again_and_no_cache_keeps_nothing(folder):
+    cache.cached_scene(config_with(render={"cache_gib": 0.0}), CAMERA, FLIGHT, 3)
+    assert not folder.exists()
+    grown = cache.cached_scene(config_with(), CAMERA, FLIGHT, 3)
+    path = next(folder.iterdir())
+    for content in (path.read_bytes()[:5000], b"", b"rubbish"):
+        path.write_bytes(content)
+        same(cache.cached_scene(config_with(), CAMERA, FLIGHT, 3), grown)
+    assert path.stat().st_size > 5000
+
+
+def test_the_least_recently_used_goes_first(folder):
+    config = config_with()
+    for seed in (1, 2):
+        cache.cached_scene(config, CAMERA, FLIGHT, seed)
+    time.sleep(0.02)
+    cache.cached_scene(config, CAMERA, FLIGHT, 1)
+    size = max(path.stat().st_size for path in folder.iterdir())
+    cache.cached_scene(config_with(render={"cache_gib": 2.3 * size / 2**30}), CAMERA, FLIGHT, 3)
+    kept = {path.stem for path in folder.iterdir()}
+    assert kept == {cache.scene_key(config, CAMERA, FLIGHT, seed) for seed in (1, 3)}
+
+
+def test_a_folder_that_cannot_be_written_is_no_failure(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("PERILUNE_CACHE", str(tmp_path / "file" / "scenes"))
+    assert cache.cached_scene(config_with(), CAMERA, FLIGHT, 3).seed == 3

@@ -1,0 +1,38 @@
+"""The mesh is fine enough: no facet covers more than a pixel in any frame of the presets' descents."""
+
+import numpy as np
+import pytest
+
+from perilune_render.config import DatasetConfig
+from perilune_render.plan import make_plan
+from perilune_render.terrain.scene import grow_scene
+from perilune_shared.camera import camera_from_site
+from perilune_shared.config import resolve
+
+
+def largest_facet_px(vertices, faces, camera, position_m, rotation):
+    """Longest side or diagonal of any facet with a corner in the image, pixels; and the number of such facets."""
+    with np.errstate(invalid="ignore"):
+        pixels = camera.project(camera_from_site(vertices, position_m, rotation)).astype(np.float32)
+    seen = camera.inside(pixels)
+    corners = pixels[faces[seen[faces].any(axis=1)]]
+    pairs = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)]
+    longest = max(np.hypot(*(corners[:, a] - corners[:, b]).T).max() for a, b in pairs)
+    return float(longest), len(corners)
+
+
+@pytest.mark.parametrize(
+    ("preset", "kind", "n_frames"), [("tiny", "detect", 8), ("tiny", "nav", 9), ("small", "detect", 4)]
+)
+def test_no_facet_is_over_a_pixel_in_any_frame(preset, kind, n_frames):
+    config = resolve(DatasetConfig, "dataset", "perilune_render", preset)
+    plan = make_plan(config, kind)
+    scene = grow_scene(config, plan.camera, config.kind(kind).flight, plan.scenes[0].seed)
+    x, y = scene.grid.vertices_xy()
+    vertices, faces = np.stack([x, y, scene.height_m], axis=1), scene.grid.quads()
+    for trajectory in plan.of_scene(plan.scenes[0].scene_id)[:2]:
+        flight = trajectory.flight
+        for index in np.unique(np.linspace(0, len(trajectory.splits) - 1, n_frames).astype(int)):
+            pose = flight.position_m[index], flight.rotation_camera_from_site[index]
+            longest, count = largest_facet_px(vertices, faces, plan.camera, *pose)
+            assert longest <= 1.0 and count > 3 * plan.camera.width_px * plan.camera.height_px
