@@ -26,12 +26,12 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
 	@echo
-	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  KIND=detect|nav  NAME=run'
+	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  NAC=folder  KIND=detect|nav  NAME=run'
 
 setup: $(VENV)/.ready ## make the environment (.venv) with everything in it
 
@@ -90,6 +90,9 @@ lint: setup ## ruff and mypy
 
 bench-render: setup ## time of a frame against a bare Blender loop; writes runs/bench/render.json
 	@$(BIN)/python benchmarks/render.py
+
+compare-nac: setup ## rendered frames beside real NAC crops (NAC=folder); writes runs/nac/
+	@$(BIN)/python benchmarks/nac.py "$(NAC)" $(COMMON) --out $(RUNS)/nac
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

@@ -1,0 +1,102 @@
+"""Statistics of grey images of the Moon and of the craters in them. Images are divided by their own mean first."""
+
+from pathlib import Path
+
+import numpy as np
+
+from perilune_shared.errors import UserError
+from perilune_shared.frames import Array
+
+FREQUENCY_EDGES = np.geomspace(0.01, 0.5, 17)
+"""Of the power spectra's bands, cycles per pixel."""
+FREQUENCY = np.sqrt(FREQUENCY_EDGES[1:] * FREQUENCY_EDGES[:-1])
+GRADIENT_EDGES = np.linspace(-3, 0.5, 71)
+"""Of the gradients' histogram, log10 of the change of brightness over its mean per pixel."""
+BRIGHTNESS_EDGES = np.linspace(0, 3, 76)
+"""Of the brightness' histogram, over its mean."""
+DARK = 0.2
+"""Darker than this share of the mean counts as shadow."""
+
+
+def read_boxes(path: Path) -> Array:
+    """Crater boxes (N, 4) as left, top, width, height in pixels; columns ID, X, Y, W, H, ... by commas or tabs."""
+    boxes = []
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
+        fields = line.replace("\t", ",").split(",")
+        if not line.strip() or fields[0].strip().upper() == "ID":
+            continue
+        try:
+            boxes.append([float(field) for field in fields[1:5]])
+            if len(boxes[-1]) < 4:
+                raise ValueError
+        except ValueError:
+            raise UserError(path, f"line {number}", line, "ID, X, Y, W, H by commas or tabs") from None
+    return np.array(boxes, np.float64).reshape(-1, 4)
+
+
+def box_diameters(boxes: Array, width_px: int, height_px: int) -> Array:
+    """Diameters (M,) in pixels, mean of width and height, of the boxes (N, 4) whose centre lies in the image."""
+    x, y = boxes[:, 0] + boxes[:, 2] / 2, boxes[:, 1] + boxes[:, 3] / 2
+    return boxes[(x >= 0) & (y >= 0) & (x < width_px) & (y < height_px), 2:].mean(axis=1)
+
+
+def cumulative_counts(diameters_px: Array, area_px: float, thresholds_px: Array) -> Array:
+    """Craters of at least each threshold in a million pixels."""
+    return (diameters_px[:, None] >= np.asarray(thresholds_px)).sum(axis=0) * 1e6 / area_px
+
+
+def power_spectrum(image: np.ndarray, tile_px: int = 200) -> Array:
+    """Radially averaged power spectral density (FREQUENCY,) of an image (h, w) over its mean.
+
+    The mean of the logarithm over Hann-windowed tiles; white noise of variance v has the density v. Bands that hold
+    no frequency of a tile are NaN.
+    """
+    relative = image / image.mean()
+    window = np.outer(np.hanning(tile_px), np.hanning(tile_px))
+    axis = np.fft.fftfreq(tile_px)
+    band = np.digitize(np.hypot(axis[:, None], axis[None, :]).ravel(), FREQUENCY_EDGES) - 1
+    used = (band >= 0) & (band < len(FREQUENCY))
+    number = np.bincount(band[used], minlength=len(FREQUENCY))
+    logs = []
+    for top in range(0, image.shape[0] - tile_px + 1, tile_px):
+        for left in range(0, image.shape[1] - tile_px + 1, tile_px):
+            tile = relative[top : top + tile_px, left : left + tile_px]
+            level = (tile * window).sum() / window.sum()
+            power = np.abs(np.fft.fft2((tile - level) * window)).ravel() ** 2 / (window**2).sum()
+            total = np.bincount(band[used], power[used], len(FREQUENCY))
+            with np.errstate(invalid="ignore", divide="ignore"):
+                logs.append(np.log10(total / number))
+    return 10 ** np.mean(logs, axis=0)
+
+
+def gradients(image: np.ndarray) -> np.ndarray:
+    """Size of the gradient (h, w), central differences of the image over its mean, per pixel."""
+    down, right = np.gradient(image / image.mean())
+    return np.hypot(down, right)
+
+
+def histogram(values: np.ndarray, edges: Array) -> Array:
+    """Density over the bins; what lies outside counts in the first or last."""
+    inside = np.clip(values.ravel(), edges[0], edges[-1])
+    return np.histogram(inside, edges)[0] / (inside.size * np.diff(edges))
+
+
+def summary(image: np.ndarray) -> dict[str, float]:
+    """Figures of one image (h, w): brightness over its mean, and gradients."""
+    relative = image / image.mean()
+    gradient = gradients(image)
+    return {
+        "std": float(relative.std()),
+        "skewness": float(((relative - 1) ** 3).mean() / relative.std() ** 3),
+        "p1": float(np.percentile(relative, 1)),
+        "p99": float(np.percentile(relative, 99)),
+        "shadow_share": float((relative < DARK).mean()),
+        "gradient_median": float(np.median(gradient)),
+        "gradient_p99": float(np.percentile(gradient, 99)),
+    }
+
+
+def log_difference(ours: Array, real: Array, low: float, high: float) -> Array:
+    """log10 of the ratio of two spectra in the bands between two frequencies."""
+    wanted = np.isfinite(ours * real) & np.less_equal(low, FREQUENCY) & np.less_equal(FREQUENCY, high)
+    return np.log10(ours[wanted] / real[wanted])
