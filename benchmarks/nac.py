@@ -145,12 +145,12 @@ def take_frames(config: DatasetConfig, crops: list[Picture], n_scenes: int, samp
 
 
 def figures_of(pictures: list[Picture], least_depth_ratio: float | None = None) -> dict:
-    """Statistics of pictures taken together: medians of each figure, the pooled count, and the mean log spectrum."""
+    """Statistics of pictures taken together: medians of each figure and of the spectrum, and the pooled count."""
     single = [st.summary(picture.image) for picture in pictures]
     area = sum(picture.image.size for picture in pictures)
     return {
         **{name: float(np.median([figures[name] for figures in single])) for name in single[0]},
-        "spectrum": (10 ** np.mean([np.log10(st.power_spectrum(p.image)) for p in pictures], axis=0)).tolist(),
+        "spectrum": np.median([st.power_spectrum(picture.image) for picture in pictures], axis=0).tolist(),
         "craters": st.cumulative_counts(_diameters(pictures, least_depth_ratio), area, THRESHOLDS_PX).tolist(),
     }
 
@@ -164,10 +164,12 @@ def _diameters(pictures: list[Picture], least_depth_ratio: float | None) -> Arra
 def distances(ours: dict, real: dict) -> dict[str, float]:
     """How far ours are from the real ones: 0 everywhere is alike. Logarithms are to base 10."""
     spectra = np.array(ours["spectrum"]), np.array(real["spectrum"])
-    found = {"spectrum_rms_0.02_0.4": float(np.sqrt(np.mean(st.log_difference(*spectra, 0.02, 0.4) ** 2)))}
+    apart = st.log_difference(*spectra, 0.02, 0.4)
+    # A crop's contrast may have been stretched: the shape of its spectrum is what no stretch changes.
+    found = {"spectrum_rms_0.02_0.4": float(np.sqrt(np.mean(apart**2))), "spectrum_shape_rms": float(apart.std())}
     for low, high in ((0.01, 0.03), (0.03, 0.1), (0.1, 0.25), (0.25, 0.5)):
         found[f"spectrum_log_{low}_{high}"] = float(np.mean(st.log_difference(*spectra, low, high)))
-    for name in ("std", "gradient_median", "gradient_p99"):
+    for name in ("std", "gradient_median", "gradient_p99", "gradient_tail"):
         found[f"{name}_log"] = float(np.log10(ours[name] / real[name]))
     for name in ("skewness", "p1", "p99", "shadow_share"):
         found[f"{name}_difference"] = ours[name] - real[name]

@@ -14,6 +14,8 @@ GRADIENT_EDGES = np.linspace(-3, 0.5, 71)
 """Of the gradients' histogram, log10 of the change of brightness over its mean per pixel."""
 BRIGHTNESS_EDGES = np.linspace(0, 3, 76)
 """Of the brightness' histogram, over its mean."""
+LEAST_POWER = 1e-9
+"""Of a spectrum: a tile that is black all over has none."""
 DARK = 0.2
 """Darker than this share of the mean counts as shadow."""
 
@@ -48,8 +50,8 @@ def cumulative_counts(diameters_px: Array, area_px: float, thresholds_px: Array)
 def power_spectrum(image: np.ndarray, tile_px: int = 200) -> Array:
     """Radially averaged power spectral density (FREQUENCY,) of an image (h, w) over its mean.
 
-    The mean of the logarithm over Hann-windowed tiles; white noise of variance v has the density v. Bands that hold
-    no frequency of a tile are NaN.
+    The median over Hann-windowed tiles, which one tile in shadow does not move; white noise of variance v has the
+    density v. Bands that hold no frequency of a tile are NaN.
     """
     relative = image / image.mean()
     window = np.outer(np.hanning(tile_px), np.hanning(tile_px))
@@ -64,9 +66,9 @@ def power_spectrum(image: np.ndarray, tile_px: int = 200) -> Array:
             level = (tile * window).sum() / window.sum()
             power = np.abs(np.fft.fft2((tile - level) * window)).ravel() ** 2 / (window**2).sum()
             total = np.bincount(band[used], power[used], len(FREQUENCY))
-            with np.errstate(invalid="ignore", divide="ignore"):
-                logs.append(np.log10(total / number))
-    return 10 ** np.mean(logs, axis=0)
+            with np.errstate(invalid="ignore"):
+                logs.append(np.log10(np.maximum(total / number, LEAST_POWER)))
+    return 10 ** np.median(logs, axis=0)
 
 
 def gradients(image: np.ndarray) -> np.ndarray:
@@ -93,6 +95,7 @@ def summary(image: np.ndarray) -> dict[str, float]:
         "shadow_share": float((relative < DARK).mean()),
         "gradient_median": float(np.median(gradient)),
         "gradient_p99": float(np.percentile(gradient, 99)),
+        "gradient_tail": float(np.percentile(gradient, 99) / max(np.median(gradient), 1e-9)),
     }
 
 

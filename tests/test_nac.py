@@ -9,7 +9,7 @@ import nac_statistics as st
 from nac_sun import subsolar_point, sun_over, time_of
 from perilune_shared.errors import UserError
 
-SHAPE = (400, 400)
+SHAPE = (800, 800)
 
 
 def noise(slope: float) -> np.ndarray:
@@ -43,7 +43,7 @@ def test_gradient_of_a_ramp_is_its_slope_over_its_mean():
 
 def test_summary_sees_shadow_and_skewness():
     image = np.full(SHAPE, 100.0)
-    image[:40] = 0
+    image[: SHAPE[0] // 10] = 0
     figures = st.summary(image)
     assert figures["shadow_share"] == pytest.approx(0.1)
     assert figures["std"] == pytest.approx(np.sqrt(0.1 / 0.9))
