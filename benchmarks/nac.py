@@ -37,6 +37,8 @@ from perilune_shared.progress import progress_bar
 FRAME_PX, FOV_DEG = 400, 12.0
 THRESHOLDS_PX = (8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)
 DEPTH_RATIOS = (0.02, 0.03, 0.04, 0.05, 0.06)
+CLEAR = 0.04
+"""Depth over diameter from which a crater of ours counts as one that people would mark."""
 LEAST_PX = 8.0
 """Smaller craters were not marked."""
 HIGHEST_ABOVE = 3.0
@@ -55,8 +57,8 @@ class Picture:
     """Of the Sun, clockwise from north."""
     elevation_deg: float
     """Of the Sun."""
-    diameter_px: Array
-    """Craters whose centre is in the image (N,)."""
+    circles: Array
+    """Centre x, y and diameter in pixels of the craters that are centred in the image (N, 3)."""
     depth_ratio: Array
     """Their depth over diameter (N,); NaN for real ones."""
 
@@ -76,12 +78,12 @@ def read_crops(folder: Path, latitude_deg: float, longitude_deg: float) -> list[
         boxes_path = path.with_suffix(".txt")
         if not boxes_path.is_file():
             raise UserError(boxes_path, "boxes", "no such file", "a text file of crater boxes beside each PNG")
-        diameter = st.box_diameters(st.read_boxes(boxes_path), image.shape[1], image.shape[0])
+        circles = st.box_circles(st.read_boxes(boxes_path), image.shape[1], image.shape[0])
         azimuth, elevation = sun_over(latitude_deg, longitude_deg, time)
         if elevation <= 0:
             raise UserError(path, "Sun", f"{elevation:.1f} degrees", "a crop of the site by day (dataset.terrain)")
         crops.append(
-            Picture(path.name.split("_")[0], image, azimuth, elevation, diameter, np.full(len(diameter), np.nan))
+            Picture(path.name.split("_")[0], image, azimuth, elevation, circles, np.full(len(circles), np.nan))
         )
     if not crops:
         raise UserError(folder, "NAC", "no PNG", "a folder of NAC crops (make compare-nac NAC=folder)")
@@ -111,14 +113,14 @@ def take_frame(
     with Renderer(scene, config, camera, sun_direction(azimuth_deg, elevation_deg)) as renderer:
         radiance = renderer.render(*pose)
     labels = label_frame(scene, camera, *pose, radiance, LEAST_PX / 2, 1e4)
-    ratio = scene.rims.depth_m / scene.craters.diameter_m
+    e, ratio = labels.ellipses, scene.rims.depth_m / scene.craters.diameter_m
     # X_L is west and Y_L south: half a turn brings north up.
     return Picture(
         f"scene {scene.seed % 10000:04d}",
         np.rot90(_developed(radiance, config, camera, scene.seed), 2),
         azimuth_deg,
         elevation_deg,
-        2 * labels.ellipses.radius_px(),
+        np.stack([FRAME_PX - e.cx_px, FRAME_PX - e.cy_px, 2 * e.radius_px()], axis=1),
         ratio[labels.crater_id],
     )
 
@@ -148,17 +150,30 @@ def figures_of(pictures: list[Picture], least_depth_ratio: float | None = None) 
     """Statistics of pictures taken together: medians of each figure and of the spectrum, and the pooled count."""
     single = [st.summary(picture.image) for picture in pictures]
     area = sum(picture.image.size for picture in pictures)
+    diameter = np.concatenate([_circles(picture, least_depth_ratio)[:, 2] for picture in pictures])
     return {
         **{name: float(np.median([figures[name] for figures in single])) for name in single[0]},
         "spectrum": np.median([st.power_spectrum(picture.image) for picture in pictures], axis=0).tolist(),
-        "craters": st.cumulative_counts(_diameters(pictures, least_depth_ratio), area, THRESHOLDS_PX).tolist(),
+        "craters": st.cumulative_counts(diameter, area, THRESHOLDS_PX).tolist(),
     }
 
 
-def _diameters(pictures: list[Picture], least_depth_ratio: float | None) -> Array:
+def _circles(picture: Picture, least_depth_ratio: float | None) -> Array:
     if least_depth_ratio is None:
-        return np.concatenate([picture.diameter_px for picture in pictures])
-    return np.concatenate([picture.diameter_px[picture.depth_ratio >= least_depth_ratio] for picture in pictures])
+        return picture.circles
+    return picture.circles[picture.depth_ratio >= least_depth_ratio]
+
+
+def contrasts(pictures: list[Picture], least_depth_ratio: float | None = None) -> dict[str, float | None]:
+    """Median contrast of the craters between two diameters; null where fewer than five are seen."""
+    chosen = [_circles(picture, least_depth_ratio) for picture in pictures]
+    contrast = np.concatenate([st.crater_contrast(p.image, c) for p, c in zip(pictures, chosen, strict=True)])
+    diameter = np.concatenate(chosen)[:, 2]
+    found: dict[str, float | None] = {}
+    for low, high in ((8, 12), (12, 24), (24, 48)):
+        values = contrast[(diameter >= low) & (diameter < high) & np.isfinite(contrast)]
+        found[f"{low}_{high}_px"] = float(np.median(values)) if len(values) >= 5 else None
+    return found
 
 
 def distances(ours: dict, real: dict) -> dict[str, float]:
@@ -191,6 +206,7 @@ def compare(crops: list[Picture], frames: list[list[Picture]]) -> dict:
     for crop, taken in zip(crops, frames, strict=True):
         ours, real = figures_of(taken), figures_of([crop])
         sun = {"azimuth_deg": crop.azimuth_deg, "elevation_deg": crop.elevation_deg}
+        ours["crater_contrast"], real["crater_contrast"] = contrasts(taken, CLEAR), contrasts([crop])
         rows.append({"crop": crop.name, "sun": sun, "real": real, "ours": ours, "distances": distances(ours, real)})
     everything = [frame for taken in frames for frame in taken]
     real_counts = figures_of(crops)["craters"]

@@ -36,10 +36,24 @@ def read_boxes(path: Path) -> Array:
     return np.array(boxes, np.float64).reshape(-1, 4)
 
 
-def box_diameters(boxes: Array, width_px: int, height_px: int) -> Array:
-    """Diameters (M,) in pixels, mean of width and height, of the boxes (N, 4) whose centre lies in the image."""
+def box_circles(boxes: Array, width_px: int, height_px: int) -> Array:
+    """Centre x, y and diameter, mean of width and height (M, 3), of the boxes (N, 4) that are centred in the image."""
     x, y = boxes[:, 0] + boxes[:, 2] / 2, boxes[:, 1] + boxes[:, 3] / 2
-    return boxes[(x >= 0) & (y >= 0) & (x < width_px) & (y < height_px), 2:].mean(axis=1)
+    inside = (x >= 0) & (y >= 0) & (x < width_px) & (y < height_px)
+    return np.stack([x, y, boxes[:, 2:].mean(axis=1)], axis=1)[inside]
+
+
+def crater_contrast(image: np.ndarray, circles: Array) -> Array:
+    """Standard deviation of brightness over its mean within each circle x, y, diameter (N, 3); NaN at the edge."""
+    height, width = image.shape
+    contrast = np.full(len(circles), np.nan)
+    for k, (x, y, diameter) in enumerate(circles):
+        left, top, n = round(x - diameter / 2), round(y - diameter / 2), max(round(diameter), 2)
+        if left >= 0 and top >= 0 and left + n <= width and top + n <= height:
+            axis = (np.arange(n) + 0.5) * 2 / n - 1
+            inside = image[top : top + n, left : left + n][np.hypot(axis[:, None], axis) <= 1]
+            contrast[k] = inside.std() / max(inside.mean(), 1e-9)
+    return contrast
 
 
 def cumulative_counts(diameters_px: Array, area_px: float, thresholds_px: Array) -> Array:

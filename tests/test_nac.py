@@ -63,7 +63,7 @@ def test_boxes_are_read_by_comma_and_by_tab(tmp_path, comma):
     boxes = st.read_boxes(path)
     assert boxes.tolist() == [[10, 20, 8, 10], [-3, 5, 10, 10], [-9, 5, 10, 10]]
     # The second begins off the image and is centred in it; the third's centre lies outside.
-    assert st.box_diameters(boxes, 100, 100).tolist() == [9, 10]
+    assert st.box_circles(boxes, 100, 100).tolist() == [[14, 25, 9], [2, 10, 10]]
 
 
 @pytest.mark.parametrize("row", ["4,10,20,wide,8,1,1", "4,10,20"])
@@ -72,6 +72,14 @@ def test_a_broken_row_is_named(tmp_path, row):
     path.write_text("ID,X,Y,W,H,C_X,CY\n" + row)
     with pytest.raises(UserError, match="line 2"):
         st.read_boxes(path)
+
+
+def test_contrast_is_that_inside_the_circle():
+    image = np.full((60, 60), 100.0)
+    image[20:40, 20:30], image[20:40, 30:40] = 50, 150
+    found = st.crater_contrast(image, np.array([[30.0, 30.0, 16.0], [10.0, 10.0, 8.0], [2.0, 10.0, 10.0]]))
+    assert found[:2].tolist() == [0.5, 0]
+    assert np.isnan(found[2])
 
 
 def test_counts_are_cumulative_and_for_a_million_pixels():
