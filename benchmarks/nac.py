@@ -41,8 +41,8 @@ CLEAR = 0.04
 """Depth over diameter from which a crater of ours counts as one that people would mark."""
 LEAST_PX = 8.0
 """Smaller craters were not marked."""
-HIGHEST_ABOVE = 3.0
-"""Start of the flight over the frame's altitude: ground and craters go on beyond the frame's edge."""
+HIGHEST_ABOVE = 1.6
+"""Start of the flight over the frame's altitude: ground and craters go on beyond the frame, within the vertices allowed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +245,7 @@ def main(
     preset: str = "small",
     config: Annotated[Path | None, typer.Option()] = None,
     setting: Annotated[list[str] | None, typer.Option("--set")] = None,
-    scenes: Annotated[int, typer.Option(min=1, help="How many terrains.")] = 4,
+    scenes: Annotated[int, typer.Option(min=1, help="How many terrains.")] = 2,
     sampling: Annotated[float, typer.Option(min=0.05, help="Metres per pixel of the crops.")] = 0.75,
     out: Path = Path("runs/nac"),
 ) -> None:
