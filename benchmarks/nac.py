@@ -42,7 +42,7 @@ CLEAR = 0.04
 LEAST_PX = 8.0
 """Smaller craters were not marked."""
 HIGHEST_ABOVE = 1.6
-"""Start of the flight over the frame's altitude: ground and craters go on beyond the frame, within the vertices allowed."""
+"""Start of the flight over the frame's altitude: ground goes on beyond the frame, within the vertices allowed."""
 
 
 @dataclass(frozen=True, slots=True)
