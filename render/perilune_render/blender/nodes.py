@@ -1,6 +1,7 @@
 """Arithmetic that builds shader nodes: the same Python formula that computes with NumPy arrays draws the shader.
 
-A `Symbol` answers operators and NumPy's ufuncs by adding a Math node to the tree.
+A `Symbol` answers operators and NumPy's ufuncs by adding a Math node to the tree. A sum with a product becomes one
+node, since a shader's time goes by its nodes; those that nothing reads cost nothing.
 """
 
 import numbers
@@ -31,15 +32,21 @@ _OPERATIONS = {
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
     """A float value inside a shader: the output socket of a node."""
 
-    def __init__(self, tree: bpy.types.NodeTree, socket: bpy.types.NodeSocket):
+    def __init__(self, tree: bpy.types.NodeTree, socket: bpy.types.NodeSocket, factors: tuple[Any, ...] = ()):
         self.tree = tree
         self.socket = socket
+        self.factors = factors
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> "Symbol":
         if method != "__call__" or kwargs or ufunc not in _OPERATIONS:
             return NotImplemented
+        operation = _OPERATIONS[ufunc]
+        if operation == "ADD":
+            first, second = inputs if isinstance(inputs[0], Symbol) and inputs[0].factors else inputs[::-1]
+            if isinstance(first, Symbol) and first.factors:
+                operation, inputs = "MULTIPLY_ADD", (*first.factors, second)
         node = self.tree.nodes.new("ShaderNodeMath")
-        node.operation = _OPERATIONS[ufunc]
+        node.operation = operation
         for place, value in zip(node.inputs, inputs, strict=False):
             if isinstance(value, Symbol):
                 self.tree.links.new(value.socket, place)
@@ -47,7 +54,7 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
                 place.default_value = float(value)
             else:
                 return NotImplemented
-        return Symbol(self.tree, node.outputs[0])
+        return Symbol(self.tree, node.outputs[0], inputs if operation == "MULTIPLY" else ())
 
 
 def at_least(value: Symbol, least: float) -> Symbol:
