@@ -23,6 +23,8 @@ class Radiance:
     """Along the camera's axis, metres; infinite where nothing is hit (h, w) float32."""
     normal: np.ndarray
     """Unit normal in O_L (h, w, 3) float32."""
+    sunlit: np.ndarray
+    """Whether the Sun reaches the pixel (h, w) bool."""
 
 
 def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:

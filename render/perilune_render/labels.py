@@ -12,8 +12,6 @@ from perilune_shared.ellipse import Ellipses, project_circles, rim_points
 from perilune_shared.frames import Array
 
 _N_RIM = 48
-_LIT = 1e-4
-"""Radiance factor above which the Sun reaches a pixel: with no bounces a shadow is exactly 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +75,7 @@ def label_frame(
         ellipses.theta_rad[kept],
     )
     visible = _visible_fraction(scene, camera, position_m, rotation_camera_from_site, radiance.depth_m, ids)
-    return Labels(ids, ellipses, visible, _sunlit_fraction(ellipses, radiance.radiance_factor))
+    return Labels(ids, ellipses, visible, _sunlit_fraction(ellipses, radiance.sunlit))
 
 
 def _visible_fraction(
@@ -101,9 +99,9 @@ def _visible_fraction(
     return (inside & (points[..., 2] <= depth_m[row, column] + slack[:, None])).mean(axis=1)
 
 
-def _sunlit_fraction(ellipses: Ellipses, radiance_factor: np.ndarray) -> Array:
+def _sunlit_fraction(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
     """Share of lit pixels among those whose centre lies in each ellipse and in the image."""
-    height, width = radiance_factor.shape
+    height, width = sunlit.shape
     boxes = ellipses.bounding_boxes()
     lit = np.zeros(len(boxes))
     x0, y0 = (
@@ -117,7 +115,7 @@ def _sunlit_fraction(ellipses: Ellipses, radiance_factor: np.ndarray) -> Array:
     for k in range(len(boxes)):
         inside = _inside_ellipse(ellipses, k, x0[k], y0[k], x1[k], y1[k])
         if inside.any():
-            lit[k] = float((radiance_factor[y0[k] : y1[k], x0[k] : x1[k]][inside] > _LIT).mean())
+            lit[k] = float(sunlit[y0[k] : y1[k], x0[k] : x1[k]][inside].mean())
     return lit
 
 

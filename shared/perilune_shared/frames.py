@@ -71,6 +71,16 @@ def sun_direction(azimuth_deg: float, elevation_deg: float) -> Array:
     return np.array([-east, -north, np.sin(elevation)])
 
 
+def earth_direction(latitude_deg: float, longitude_deg: float) -> Array:
+    """Unit vector (3,) in O_L from a site towards the Earth's mean place, above latitude 0 and longitude 0.
+
+    Deviation: libration, up to about 8 degrees, and the parallax of the site, up to 0.3 degrees, are left out.
+    """
+    latitude, longitude = np.radians([latitude_deg, longitude_deg])
+    west, south = np.sin(longitude), np.sin(latitude) * np.cos(longitude)
+    return np.array([west, south, np.cos(latitude) * np.cos(longitude)])
+
+
 def selenographic_from_site(
     x_m: ArrayLike, y_m: ArrayLike, latitude_deg: float, longitude_deg: float
 ) -> tuple[Array, Array]:

@@ -41,6 +41,15 @@ def test_sun_in_the_zenith():
     assert np.allclose(frames.sun_direction(123, 90), [0, 0, 1], atol=1e-12)
 
 
+@pytest.mark.parametrize(("latitude", "longitude"), [(0, 30), (40, 0), (-45.5, 177.6), (60, -100), (-20, -70)])
+def test_the_earth_stands_over_the_middle_of_the_near_side(latitude, longitude):
+    x, y = frames.site_from_selenographic(0.0, 0.0, latitude, longitude)
+    angle = np.hypot(x, y) / frames.MOON_RADIUS_M
+    expected = np.array([*(np.array([x, y]) / np.hypot(x, y) * np.sin(angle)), np.cos(angle)])
+    assert frames.earth_direction(latitude, longitude) == pytest.approx(expected, abs=1e-9)
+    assert frames.earth_direction(0, 0) == pytest.approx([0, 0, 1])
+
+
 def test_a_degree_south_of_the_site():
     metres = frames.MOON_RADIUS_M * np.pi / 180
     latitude, longitude = frames.selenographic_from_site(0.0, metres, -45.0, 10.0)

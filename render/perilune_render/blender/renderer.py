@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 
 from perilune_render.blender import stage as blender_stage
-from perilune_render.config import DatasetConfig
+from perilune_render.config import DatasetConfig, LightConfig, RenderConfig
 from perilune_render.exr import Radiance, read_exr
 from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera
@@ -25,6 +25,8 @@ from perilune_shared.frames import Array
 BLENDER_VERSION: str = bpy.app.version_string
 _FAR_M = 1e9
 _LEAST_FREE_BYTES = 16_000_000
+_LIT = 1e-4
+"""Sunlight above which a pixel counts as lit: a shadow has none, and the Earth gives less."""
 
 
 class Renderer:
@@ -32,7 +34,7 @@ class Renderer:
 
     def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array):
         self.stage = blender_stage.build(scene, config, camera, sun)
-        configure(self.stage, camera, config.render.samples, config.render.threads)
+        configure(self.stage, camera, config.render, config.light)
         self._folder = tempfile.TemporaryDirectory(prefix="perilune-")
 
     def __enter__(self) -> "Renderer":
@@ -46,22 +48,28 @@ class Renderer:
     def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0) -> Radiance:
         """One frame as the radiance factor averaged over each pixel, with depth and normal of one point in it."""
         blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
-        self.stage.cycles.seed = seed & 0x7FFFFFFF
         path = Path(self._folder.name) / "frame.exr"
-        self.stage.render.filepath = str(path)
-        path.unlink(missing_ok=True)
         try:
-            with quiet(), _interrupts_held():
-                bpy.ops.render.render(write_still=True)
-            return _radiance(path)
+            with _interrupts_held():
+                return render_through(path, self.stage, seed)
         except (UserError, RuntimeError) as error:
             # Blender tells of a failed write only in its log; the file is then missing or cut.
             full = shutil.disk_usage(path.parent).free < _LEAST_FREE_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, f"no frame ({error})", str(path.parent)) from None
 
 
-def configure(stage: bpy.types.Scene, camera: Camera, samples: int, threads: int) -> None:
-    """Direct Sunlight alone, linear float32 output, the acceleration structure kept from frame to frame."""
+def render_through(path: Path, stage: bpy.types.Scene, seed: int) -> Radiance:
+    """Render a configured stage into an EXR file and read it."""
+    stage.cycles.seed = seed & 0x7FFFFFFF
+    stage.render.filepath = str(path)
+    path.unlink(missing_ok=True)
+    with quiet():
+        bpy.ops.render.render(write_still=True)
+    return _radiance(path)
+
+
+def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, light: LightConfig) -> None:
+    """Direct light and at most one bounce, linear float32, the acceleration structure kept from frame to frame."""
     render, cycles = stage.render, stage.cycles
     render.engine = "CYCLES"
     render.resolution_x, render.resolution_y, render.resolution_percentage = (
@@ -72,18 +80,18 @@ def configure(stage: bpy.types.Scene, camera: Camera, samples: int, threads: int
     render.pixel_aspect_x, render.pixel_aspect_y = _pixel_aspect(camera)
     render.use_persistent_data = True
     render.use_file_extension = False
-    render.threads_mode = "FIXED" if threads else "AUTO"
-    if threads:
-        render.threads = threads
+    render.threads_mode = "FIXED" if settings.threads else "AUTO"
+    if settings.threads:
+        render.threads = settings.threads
     render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
     render.image_settings.color_depth = "32"
     render.image_settings.exr_codec = "NONE"
     render.film_transparent = False
     cycles.device = "CPU"
-    cycles.samples = samples
+    cycles.samples = settings.samples
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = False
-    cycles.max_bounces = 0
+    cycles.max_bounces = cycles.diffuse_bounces = int(light.bounce)
     cycles.use_light_tree = False
     # Cycles would drop faint contributions at random: below 0.01 that is most of the Moon at low Sun.
     cycles.light_sampling_threshold = 0.0
@@ -94,6 +102,7 @@ def configure(stage: bpy.types.Scene, camera: Camera, samples: int, threads: int
     layer = stage.view_layers[0]
     layer.use_pass_z = True
     layer.use_pass_normal = True
+    layer.use_pass_diffuse_direct = light.bounce or light.earthshine
 
 
 def _pixel_aspect(camera: Camera) -> tuple[float, float]:
@@ -108,7 +117,10 @@ def _radiance(path: Path) -> Radiance:
     # Normals are averaged over the pixel's samples, which shortens them at edges; the sky has none.
     normal = np.stack([by_pass[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
-    return Radiance(by_pass["Combined.R"], np.where(depth > _FAR_M, np.float32(np.inf), depth), normal)
+    radiance_factor = by_pass["Combined.R"]
+    # Where light comes from elsewhere too, the pass of direct light over colour tells where the Sun reaches.
+    sunlit = by_pass.get("DiffDir.R", radiance_factor) > _LIT
+    return Radiance(radiance_factor, np.where(depth > _FAR_M, np.float32(np.inf), depth), normal, sunlit)
 
 
 @contextlib.contextmanager

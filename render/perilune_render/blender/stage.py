@@ -5,17 +5,21 @@ import numpy as np
 from mathutils import Matrix
 
 from perilune_render.blender.nodes import Symbol, at_least, dot
-from perilune_render.config import DatasetConfig
-from perilune_render.photometry import radiance_factor
+from perilune_render.config import DatasetConfig, LightConfig
+from perilune_render.photometry import reflectance_factor
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.export import vertices
 from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera
 from perilune_shared.ellipse import plane_basis
-from perilune_shared.frames import Array
+from perilune_shared.frames import Array, earth_direction
 
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Blender's camera has y up and looks along -z."""
+_EARTH_ANGULAR_DIAMETER_DEG = 1.9
+"""The Earth's disc from the Moon's mean distance."""
+_EARTHSHINE = 0.1 / 1361
+"""Irradiance of the full Earth over the Sun's, taken second hand."""
 
 
 def clear() -> bpy.types.Scene:
@@ -26,10 +30,7 @@ def clear() -> bpy.types.Scene:
 
 def build(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> bpy.types.Scene:
     """Build a scene with its Sun in the direction `sun` (3,) of O_L; the camera is placed by `aim`."""
-    stage = clear()
-    stage.world = bpy.data.worlds.new("sky")
-    stage.world.use_nodes = True
-    stage.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0
+    stage = sunlit_stage(config.light, camera, sun)
     ground = ground_object(scene)
     ground.data.materials.append(surface_material("ground", config.light.photometry, sun, albedo_attribute="albedo"))
     stage.collection.objects.link(ground)
@@ -38,7 +39,19 @@ def build(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> bp
         boulders = boulders_object(scene)
         boulders.data.materials.append(stone)
         stage.collection.objects.link(boulders)
-    stage.collection.objects.link(sun_object(sun, config.light.sun_angular_diameter_deg))
+    earth = earth_direction(scene.latitude_deg, scene.longitude_deg)
+    if config.light.earthshine and earth[2] > 0:
+        stage.collection.objects.link(lamp_object("Earth", earth, _EARTH_ANGULAR_DIAMETER_DEG, _EARTHSHINE))
+    return stage
+
+
+def sunlit_stage(light: LightConfig, camera: Camera, sun: Array) -> bpy.types.Scene:
+    """A black sky, the Sun in the direction `sun` (3,) and the camera; no ground yet."""
+    stage = clear()
+    stage.world = bpy.data.worlds.new("sky")
+    stage.world.use_nodes = True
+    stage.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0
+    stage.collection.objects.link(lamp_object("Sun", sun, light.sun_angular_diameter_deg))
     stage.camera = camera_object(camera)
     stage.collection.objects.link(stage.camera)
     return stage
@@ -73,10 +86,11 @@ def boulders_object(scene: Scene) -> bpy.types.Object:
 
 
 def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | None = None) -> bpy.types.Material:
-    """A material whose radiance under `sun_object` is the radiance factor of a law.
+    """A material whose radiance under the lamp "Sun" is the radiance factor of a law.
 
     Cycles multiplies a diffuse colour by mu0 / pi and by the Sun's irradiance, here pi: the colour that gives the
-    radiance I/F is therefore I/F over mu0, evaluated at the shading point.
+    radiance I/F is therefore I/F over mu0, evaluated at the shading point. Approximation: other light, from the Earth
+    or from other ground, meets that same colour, the one for the Sun's direction, as a diffuse albedo.
     """
     material = bpy.data.materials.new(name)
     material.use_nodes = True
@@ -86,7 +100,7 @@ def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | No
     mu0 = at_least(dot(tree, geometry.outputs["Normal"], tuple(sun)), 1e-4)
     mu = at_least(dot(tree, geometry.outputs["Normal"], geometry.outputs["Incoming"]), 1e-4)
     cos_phase = dot(tree, geometry.outputs["Incoming"], tuple(sun))
-    colour = radiance_factor(law, mu0, mu, cos_phase) / mu0
+    colour = reflectance_factor(law, mu0, mu, cos_phase)
     if albedo_attribute is not None:
         attribute = tree.nodes.new("ShaderNodeAttribute")
         attribute.attribute_name = albedo_attribute
@@ -98,14 +112,14 @@ def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | No
     return material
 
 
-def sun_object(sun: Array, angular_diameter_deg: float) -> bpy.types.Object:
-    """The Sun with irradiance pi, so that radiance is the radiance factor."""
-    lamp = bpy.data.lights.new("Sun", "SUN")
-    lamp.energy = np.pi
+def lamp_object(name: str, towards: Array, angular_diameter_deg: float, suns: float = 1.0) -> bpy.types.Object:
+    """A lamp at infinity; the Sun's irradiance is pi, so that radiance is the radiance factor."""
+    lamp = bpy.data.lights.new(name, "SUN")
+    lamp.energy = suns * np.pi
     lamp.angle = np.radians(angular_diameter_deg)
-    item = bpy.data.objects.new("Sun", lamp)
-    x, y = plane_basis(sun)
-    item.matrix_world = Matrix(np.stack([x, y, sun], axis=1).tolist()).to_4x4()
+    item = bpy.data.objects.new(name, lamp)
+    x, y = plane_basis(towards)
+    item.matrix_world = Matrix(np.stack([x, y, towards], axis=1).tolist()).to_4x4()
     return item
 
 

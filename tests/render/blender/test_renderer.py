@@ -1,5 +1,6 @@
 """What Blender renders against what the formulas say: photometry, depth, pixels of rims, shadows."""
 
+import dataclasses
 import os
 import signal
 import threading
@@ -10,7 +11,7 @@ import pytest
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig
 from perilune_render.labels import crater_index, label_frame
-from perilune_render.photometry import radiance_factor
+from perilune_render.photometry import LAWS, radiance_factor
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import value_at
 from perilune_render.terrain.stamp import stamp_craters
@@ -31,7 +32,7 @@ def ground_points(camera, position, rotation):
     return position + rays * depth[..., None], depth, -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("law", ["hapke_highland", "hapke_mare", "lommel_seeliger", "lambert"])
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(("azimuth", "elevation"), [(70, 25), (200, 80), (310, 6)])
 def test_radiance_is_the_formulas(law, azimuth, elevation):
     sun = sun_direction(azimuth, elevation)
@@ -81,6 +82,41 @@ def test_the_sun_casts_shadows_away_from_itself():
     dark = np.argwhere(image < 1e-6)
     # East is -X, left in the image: the shadow falls to the right, about as long as the block is high.
     assert 120 < len(dark) < 400 and dark[:, 1].min() > 100 and dark[:, 1].max() < 140
+
+
+def test_one_bounce_lights_shadows_that_still_count_as_shadows():
+    x = np.linspace(-50, 50, 201)
+    bowl = np.minimum((np.hypot(x[None, :], x[:, None]) / 40) ** 2 - 1, 0) * 15
+    above, camera = np.array([0, 0, 100.0]), Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
+    frames = {}
+    for bounce in (False, True):
+        light = LightConfig(bounce=bounce, sun_angular_diameter_deg=0.0)
+        config = config_with(light=light, render=RenderConfig(samples=64))
+        with Renderer(flat_scene(100, 201, height_m=bowl), config, camera, sun_direction(90, 15)) as renderer:
+            frames[bounce] = renderer.render(above, ROTATION_CAMERA_FROM_BODY)
+    dark = frames[False].radiance_factor == 0
+    lit = frames[False].radiance_factor[~dark].mean()
+    assert dark.sum() > 500 and np.median(frames[True].radiance_factor[dark]) > 1e-3 * lit
+    assert frames[True].radiance_factor[dark].mean() < 0.1 * lit
+    assert not frames[True].sunlit[dark].any()
+    assert (frames[True].sunlit == frames[False].sunlit).mean() > 0.995
+
+
+@pytest.mark.parametrize(("longitude_deg", "earth_sine"), [(60.0, 0.5), (-120.0, 0.0)])
+@pytest.mark.parametrize("bounce", [False, True])
+def test_earthshine_lights_the_near_side_only(longitude_deg, earth_sine, bounce):
+    height = np.zeros((201, 201))
+    height[95:106, 95:106] = 10.0
+    scene = dataclasses.replace(flat_scene(100, 201, height_m=height), longitude_deg=longitude_deg)
+    light = LightConfig(photometry="lambert", earthshine=True, bounce=bounce)
+    camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
+    with Renderer(scene, config_with(light=light), camera, sun_direction(90, 45)) as renderer:
+        frame = renderer.render(np.array([0, 0, 100.0]), ROTATION_CAMERA_FROM_BODY)
+    # The block's shadow, on flat ground west of it; the Earth stands in the west.
+    shadow = np.s_[49:52, 56:60]
+    assert not frame.sunlit[shadow].any() and frame.sunlit.mean() > 0.9
+    expected = 0.12 * 0.1 / 1361 * earth_sine
+    assert np.median(frame.radiance_factor[shadow]) == pytest.approx(expected, rel=0.02, abs=1e-12)
 
 
 def test_label_ellipses_lie_on_rendered_rims():
