@@ -26,7 +26,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-photometry clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -93,6 +93,9 @@ bench-render: setup ## time of a frame against a bare Blender loop; writes runs/
 
 compare-nac: setup ## rendered frames beside real NAC crops (NAC=folder); writes runs/nac/
 	@$(BIN)/python benchmarks/nac.py "$(NAC)" $(COMMON) --out $(RUNS)/nac
+
+bench-photometry: setup ## rendered radiance against the formulas; writes runs/bench/photometry.json
+	@$(BIN)/python benchmarks/photometry.py
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)
