@@ -69,7 +69,10 @@ def render_through(path: Path, stage: bpy.types.Scene, seed: int) -> Radiance:
 
 
 def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, light: LightConfig) -> None:
-    """Direct light and at most one bounce, linear float32, the acceleration structure kept from frame to frame."""
+    """Direct light and at most one bounce, linear float32, the acceleration structure kept from frame to frame.
+
+    A bounce follows one random ray from each sample: with few samples it is a sprinkle of noise in the shadows.
+    """
     render, cycles = stage.render, stage.cycles
     render.engine = "CYCLES"
     render.resolution_x, render.resolution_y, render.resolution_percentage = (
