@@ -21,8 +21,9 @@ from perilune_render.blender.stage import aim
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import write_frame
 from perilune_render.exr import read_exr
-from perilune_render.labels import label_frame
+from perilune_render.labels import RimCircles, label_frame
 from perilune_render.plan import make_plan
+from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import resolve
 from perilune_shared.files import write_text
@@ -41,6 +42,8 @@ def main() -> None:
     scene = grow_scene(config, plan.camera, config.detect.flight, scene_plan.seed)
     scene_s = time.perf_counter() - start
     sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
+    circles = RimCircles.of_scene(scene)
+    pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
     ours, bare = [], []
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -57,8 +60,8 @@ def main() -> None:
                 start = time.perf_counter()
                 if which == 0:
                     radiance = renderer.render(*pose, seed=index)
-                    write_frame(out, config, plan, scene, trajectory, index, radiance)
-                    found = label_frame(scene, plan.camera, *pose, radiance, 2.0, 50.0)
+                    write_frame(out, config, plan, circles, pattern, trajectory, index, radiance)
+                    found = label_frame(circles, plan.camera, *pose, radiance, 2.0, 50.0)
                     tables.label_table(trajectory.frame_id(index), found)
                     ours.append(time.perf_counter() - start)
                 else:

@@ -11,6 +11,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.plan import make_plan
 from perilune_shared.config import resolve
 from perilune_shared.errors import UserError, run_command_line
+from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
 
 app = typer.Typer(
@@ -88,6 +89,26 @@ def dataset(
 
 
 @app.command()
+def develop(
+    dataset: Annotated[Path, typer.Option(help="Folder of a dataset with EXRs (dataset.render.exr=true).")],
+    out: Annotated[Path, typer.Option(help="Folder of the new dataset.")],
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file whose dataset.sensor and dataset.camera override the source's.")
+    ] = None,
+    setting: Setting = None,
+) -> None:
+    """Make a dataset from another one's EXRs, with another sensor or camera, without Blender."""
+    from perilune_render.develop import develop_dataset
+
+    with progress_bar() as progress:
+        made = develop_dataset(open_dataset(dataset), out, progress, config, tuple(setting or ()))
+    counts = made.info.counts
+    Console().print(
+        f"{out}: {counts.frames} frames, {counts.labels} labels; look at {out / 'overview.png'}", soft_wrap=True
+    )
+
+
+@app.command()
 def preview(
     preset: Preset = "small",
     config: Config = None,
@@ -126,7 +147,7 @@ def export(
         raise UserError(out, "format", out.suffix or "none", "one of " + ", ".join(MESH_SUFFIXES + RASTER_SUFFIXES))
     name = _first(kind)
     plan = make_plan(resolved, name)
-    scene = cached_scene(resolved, plan.camera, resolved.kind(name).flight, plan.scenes[0].seed)
+    scene = cached_scene(resolved, plan.exr_camera, resolved.kind(name).flight, plan.scenes[0].seed)
     if out.suffix in RASTER_SUFFIXES:
         export_raster(scene, out, pixel_m)
     else:

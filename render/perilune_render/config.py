@@ -257,6 +257,12 @@ class SensorConfig(Section):
     motion_blur: bool = True
     """Whether the camera's velocity during the exposure blurs the frame."""
 
+    @model_validator(mode="after")
+    def _above_black(self) -> "SensorConfig":
+        if self.exposure_level <= self.black_level_share:
+            raise ValueError(f"exposure_level above black_level_share, {self.black_level_share}")
+        return self
+
 
 class RenderConfig(Section):
     """How Blender renders."""

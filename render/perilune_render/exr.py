@@ -48,3 +48,13 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
             return {name: channel.pixels for name, channel in image.channels().items()}
     except (RuntimeError, ValueError) as error:
         raise UserError(path, "exr", error, "a whole EXR file") from None
+
+
+def read_radiance(path: Path) -> Radiance:
+    """A frame as it was before the sensor. Raises UserError where the file is missing, damaged or lacks a channel."""
+    channels = read_exr(path)
+    missing = [name for name in CHANNELS if name not in channels]
+    if missing:
+        raise UserError(path, "channels", f"no {missing[0]}", ", ".join(CHANNELS))
+    normal = np.stack([channels[name] for name in ("N.X", "N.Y", "N.Z")], axis=-1)
+    return Radiance(channels["R"], channels["Z"], normal)

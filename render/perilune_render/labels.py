@@ -1,4 +1,4 @@
-"""Crater labels of a frame: exact ellipses, how much of each rim is seen, how much of each crater is lit."""
+"""Crater labels of a frame: ellipses, how much of each rim is seen, how much of each crater is lit."""
 
 from dataclasses import dataclass
 
@@ -41,14 +41,38 @@ class Labels:
         )
 
 
-def crater_circles(scene: Scene) -> tuple[Array, Array, Array]:
-    """Centres (N, 3) metres, normals (N, 3) and radii (N,) of all rim circles in O_L."""
-    centres = np.stack([scene.craters.x_m, scene.craters.y_m, scene.rims.z_m], axis=1)
-    return centres, scene.rims.normal, scene.craters.diameter_m / 2
+@dataclass(frozen=True, slots=True)
+class RimCircles:
+    """The rim circles of N craters of a scene, O_L."""
+
+    crater_id: np.ndarray
+    """Unique in the scene (N,)."""
+    centre_m: Array
+    """(N, 3)."""
+    normal: Array
+    """Unit normals (N, 3)."""
+    radius_m: Array
+    """(N,)."""
+
+    @classmethod
+    def of_scene(cls, scene: Scene) -> "RimCircles":
+        """All craters of a scene that was grown."""
+        centres = np.stack([scene.craters.x_m, scene.craters.y_m, scene.rims.z_m], axis=1)
+        return cls(np.arange(len(scene.craters)), centres, scene.rims.normal, scene.craters.diameter_m / 2)
+
+    @classmethod
+    def from_table(cls, rows: pd.DataFrame) -> "RimCircles":
+        """Rows of the manifest's table `craters`, of one scene."""
+        return cls(
+            rows["crater_id"].to_numpy(),
+            rows[["x_m", "y_m", "z_m"]].to_numpy(),
+            rows[["normal_x", "normal_y", "normal_z"]].to_numpy(),
+            rows["diameter_m"].to_numpy() / 2,
+        )
 
 
 def label_frame(
-    scene: Scene,
+    circles: RimCircles,
     camera: Camera,
     position_m: Array,
     rotation_camera_from_site: Array,
@@ -56,17 +80,22 @@ def label_frame(
     min_radius_px: float,
     max_radius_px: float,
 ) -> Labels:
-    """Labels by the paper's rule: centre in the frame, radius within bounds; visibility from the rendered depth."""
-    centres, normals, radii = crater_circles(scene)
-    in_camera = camera_from_site(centres, position_m, rotation_camera_from_site)
-    rough = camera.fx_px * radii / np.maximum(in_camera[:, 2], 1e-9)
+    """Labels by the paper's rule: centre in the frame, radius within bounds; visibility from the rendered depth.
+
+    `radiance` is in the pixels of `camera` (`perilune_render.resample.seen_by`).
+    """
+    in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
+    rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
     candidate = np.flatnonzero(camera.inside(camera.project(in_camera)) & (rough > 0.5 * min_radius_px))
     ellipses = project_circles(
-        camera, in_camera[candidate], normals[candidate] @ rotation_camera_from_site.T, radii[candidate]
+        camera,
+        in_camera[candidate],
+        circles.normal[candidate] @ rotation_camera_from_site.T,
+        circles.radius_m[candidate],
     )
     radius = ellipses.radius_px()
     kept = (radius >= min_radius_px) & (radius <= max_radius_px)
-    ids = candidate[kept]
+    rows = candidate[kept]
     ellipses = Ellipses(
         ellipses.cx_px[kept],
         ellipses.cy_px[kept],
@@ -74,12 +103,12 @@ def label_frame(
         ellipses.b_px[kept],
         ellipses.theta_rad[kept],
     )
-    visible = _visible_fraction(scene, camera, position_m, rotation_camera_from_site, radiance.depth_m, ids)
-    return Labels(ids, ellipses, visible, _sunlit_fraction(ellipses, radiance.sunlit))
+    visible = _visible_fraction(circles, camera, position_m, rotation_camera_from_site, radiance.depth_m, rows)
+    return Labels(circles.crater_id[rows], ellipses, visible, _sunlit_fraction(ellipses, radiance.sunlit))
 
 
 def _visible_fraction(
-    scene: Scene, camera: Camera, position_m: Array, rotation: Array, depth_m: np.ndarray, ids: np.ndarray
+    circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, depth_m: np.ndarray, rows: np.ndarray
 ) -> Array:
     """Compare the rim's depth with the rendered depth.
 
@@ -87,15 +116,16 @@ def _visible_fraction(
     height: it counts as hidden only where the ground in front is nearer by more than a tenth of the radius and
     two pixels' width.
     """
-    if not len(ids):
+    if not len(rows):
         return np.empty(0)
-    centres, normals, radii = crater_circles(scene)
-    points = camera_from_site(rim_points(centres[ids], normals[ids], radii[ids], _N_RIM), position_m, rotation)
+    radii = circles.radius_m[rows]
+    rims = rim_points(circles.centre_m[rows], circles.normal[rows], radii, _N_RIM)
+    points = camera_from_site(rims, position_m, rotation)
     pixels = camera.project(points)
     inside = camera.inside(pixels)
     column = np.where(inside, pixels[..., 0], 0).astype(int)
     row = np.where(inside, pixels[..., 1], 0).astype(int)
-    slack = np.maximum(0.1 * radii[ids], 2 * points[:, 0, 2] / camera.fx_px)
+    slack = np.maximum(0.1 * radii, 2 * points[:, 0, 2] / camera.fx_px)
     return (inside & (points[..., 2] <= depth_m[row, column] + slack[:, None])).mean(axis=1)
 
 
@@ -126,18 +156,22 @@ def _inside_ellipse(ellipses: Ellipses, k: int, x0: int, y0: int, x1: int, y1: i
     return ((dx * cos + dy * sin) / ellipses.a_px[k]) ** 2 + ((dy * cos - dx * sin) / ellipses.b_px[k]) ** 2 <= 1
 
 
-def crater_index(scene: Scene, camera: Camera, position_m: Array, rotation_camera_from_site: Array) -> np.ndarray:
+def crater_index(
+    circles: RimCircles, camera: Camera, position_m: Array, rotation_camera_from_site: Array
+) -> np.ndarray:
     """Index image (h, w) float32 of the smallest crater whose rim each pixel's centre lies in; -1 none.
 
     Every crater of at least a pixel across counts, also those that become no labels.
     """
-    centres, normals, radii = crater_circles(scene)
-    in_camera = camera_from_site(centres, position_m, rotation_camera_from_site)
-    rough = camera.fx_px * radii / np.maximum(in_camera[:, 2], 1e-9)
+    in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
+    rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
     candidate = np.flatnonzero((rough > 0.5) & (in_camera[:, 2] > 0))
-    candidate = candidate[np.argsort(-radii[candidate], kind="stable")]
+    candidate = candidate[np.argsort(-circles.radius_m[candidate], kind="stable")]
     ellipses = project_circles(
-        camera, in_camera[candidate], normals[candidate] @ rotation_camera_from_site.T, radii[candidate]
+        camera,
+        in_camera[candidate],
+        circles.normal[candidate] @ rotation_camera_from_site.T,
+        circles.radius_m[candidate],
     )
     image = np.full((camera.height_px, camera.width_px), -1, np.float32)
     boxes = ellipses.bounding_boxes()
@@ -147,5 +181,5 @@ def crater_index(scene: Scene, camera: Camera, position_m: Array, rotation_camer
         x0, y0 = (int(np.clip(np.floor(boxes[k, i]), 0, size[i])) for i in (0, 1))
         x1, y1 = (int(np.clip(np.ceil(boxes[k, 2 + i]), 0, size[i])) for i in (0, 1))
         if x1 > x0 and y1 > y0:
-            image[y0:y1, x0:x1][_inside_ellipse(ellipses, k, x0, y0, x1, y1)] = candidate[k]
+            image[y0:y1, x0:x1][_inside_ellipse(ellipses, k, x0, y0, x1, y1)] = circles.crater_id[candidate[k]]
     return image

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig, KindConfig
+from perilune_render.config import CameraConfig, DatasetConfig, KindConfig
 from perilune_render.flight import Flight, fly
 from perilune_render.streams import derived_seed, stream
 from perilune_shared.camera import Camera
+from perilune_shared.errors import UserError
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +60,8 @@ class Plan:
 
     camera: Camera
     """Of all frames."""
+    exr_camera: Camera
+    """What Blender renders and the EXRs hold: a pinhole that sees all that `camera` sees."""
     scenes: tuple[ScenePlan, ...]
     """Terrains."""
     trajectories: tuple[TrajectoryPlan, ...]
@@ -69,12 +72,33 @@ class Plan:
         return [trajectory for trajectory in self.trajectories if trajectory.scene_id == scene_id]
 
 
-def make_plan(config: DatasetConfig, kind: str) -> Plan:
-    """The plan of the dataset `detect` or `nav`."""
-    settings = config.kind(kind)
-    camera = Camera.from_field_of_view(
-        config.camera.width_px, config.camera.height_px, config.camera.horizontal_fov_deg
+def camera_of(config: CameraConfig) -> Camera:
+    """The camera of a configuration. Raises UserError where the distortion folds back within the image."""
+    width, height, lens = config.width_px, config.height_px, config.distortion
+    focal = config.focal_length_px or width / 2 / np.tan(np.radians(config.horizontal_fov_deg) / 2)
+    camera = Camera(
+        width,
+        height,
+        float(focal),
+        float(focal),
+        width / 2 if config.principal_x_px is None else config.principal_x_px,
+        height / 2 if config.principal_y_px is None else config.principal_y_px,
+        (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3),
     )
+    if camera.folds_back():
+        raise UserError(
+            "configuration",
+            "dataset.camera.distortion",
+            camera.distortion,
+            "a distortion that does not fold back within the image: weaker, or a narrower view",
+        )
+    return camera
+
+
+def make_plan(config: DatasetConfig, kind: str) -> Plan:
+    """The plan of the dataset `detect` or `nav`. Raises UserError on a camera that cannot be."""
+    settings = config.kind(kind)
+    camera = camera_of(config.camera)
     splits = _splits(settings, stream(config.seed, kind, "splits"))
     scenes, trajectories = [], []
     for s in range(settings.n_scenes):
@@ -89,7 +113,7 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
             trajectories.append(
                 TrajectoryPlan(scenes[-1].scene_id, f"trajectory-{t:04d}", own, tuple(splits[s, t]), flight)
             )
-    return Plan(camera, tuple(scenes), tuple(trajectories))
+    return Plan(camera, camera.covering_pinhole(), tuple(scenes), tuple(trajectories))
 
 
 def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:

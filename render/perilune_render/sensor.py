@@ -1,25 +1,149 @@
-"""From radiance factor to grey values: point spread, exposure, shot and read noise, quantisation (EMVA 1288)."""
+"""From radiance factor to grey values, as EMVA 1288 (release 4.0, linear) models a camera.
+
+Symbols: mu_p photons and eta mu_p electrons of a pixel in the exposure time t, here responsivity x t x I/F; mu_d and
+sigma_d mean and standard deviation of the dark signal, electrons; K grey values (DN) per electron; mu_y mean and
+sigma_y^2 variance of the grey value in time:
+
+    mu_y = K (eta mu_p + mu_d) + black level,    mu_d = dark current x t
+    sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark),    sigma_d^2 = read noise^2 + mu_d
+
+Over the pixels, eta varies by the PRNU and mu_d by the DSNU and the hot pixels: the same in every frame of a dataset.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from perilune_render.config import SensorConfig
+from perilune_render.exr import Radiance
+from perilune_render.resample import resample, resample_nearest
+from perilune_render.streams import stream
+from perilune_shared.camera import Camera
+from perilune_shared.frames import Array
+
+_LEAST_MOTION_PX = 0.05
+"""Motion during the exposure below which it is not worth the blurring."""
+_FAINT_E = 100.0
+"""Above it a rounded Gaussian stands for the Poisson law, ten times faster."""
 
 
-def develop(radiance_factor: np.ndarray, config: SensorConfig, rng: np.random.Generator) -> np.ndarray:
-    """An 8-bit image (h, w) of a radiance factor (h, w).
+@dataclass(frozen=True, slots=True)
+class FixedPattern:
+    """What is the same in all frames of one sensor."""
 
-    Exposure is automatic: a percentile of the blurred image lands at a share of the full well. Shot noise is Poisson in
-    electrons, read noise Gaussian; the rest is clipped and rounded. Black stays black: no offset is added.
+    response: np.ndarray
+    """Relative response of each pixel, mean 1 (h, w) float32."""
+    offset_e: np.ndarray
+    """Offset of each pixel, mean 0, electrons (h, w) float32."""
+    hot_e: np.ndarray
+    """Extra dark signal of the hot pixels, 0 elsewhere, electrons (h, w) float32."""
+
+    @classmethod
+    def draw(cls, config: SensorConfig, camera: Camera, seed: int) -> "FixedPattern":
+        """The one sensor of a dataset with this seed."""
+        rng = stream(seed, "sensor")
+        shape = camera.height_px, camera.width_px
+        response = 1 + config.gain_nonuniformity * rng.standard_normal(shape, np.float32)
+        offset = config.dark_nonuniformity_e * rng.standard_normal(shape, np.float32)
+        hot = rng.random(shape, np.float32) < config.hot_pixel_share
+        extra = config.hot_pixel_e * rng.standard_exponential(shape, np.float32)
+        return cls(np.maximum(response, 0), offset, np.where(hot, extra, np.float32(0)))
+
+
+def develop(
+    radiance: Radiance,
+    config: SensorConfig,
+    camera: Camera,
+    exr_camera: Camera,
+    velocity_camera_mps: Array,
+    pattern: FixedPattern,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """The grey image (h, w) of `camera`, in DN from 0 to 2^bits - 1: uint8, or uint16 above 8 bits.
+
+    `radiance` is as `exr_camera` sees it, in the middle of the exposure; the velocity (3,) of the camera is along its
+    own axes O_C. In this order: resampling to `camera`, point spread, exposure, motion blur, electrons with PRNU, dark
+    current and hot pixels, Poisson noise, read noise, DSNU, full well, gain, black level, rounding and clipping. `rng`
+    draws the noise in time alone.
     """
-    light = np.maximum(radiance_factor.astype(np.float32), 0)
+    light = np.maximum(resample(radiance.radiance_factor.astype(np.float32, copy=False), camera, exr_camera), 0)
     if config.psf_sigma_px > 0:
         light = cv2.GaussianBlur(light, (0, 0), config.psf_sigma_px, borderType=cv2.BORDER_REFLECT)
+    exposure_s = exposure_time_s(light, config)
+    way_m = np.asarray(velocity_camera_mps) * exposure_s
+    if config.motion_blur and _fastest_px(radiance.depth_m, exr_camera, way_m) >= _LEAST_MOTION_PX:
+        depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
+        light = _blurred(light, motion_px(depth_m, camera, way_m))
+    electrons = light * pattern.response
+    electrons *= config.responsivity_e_per_s * exposure_s
+    electrons += config.dark_current_e_per_s * exposure_s
+    electrons += pattern.hot_e
+    normal = rng.standard_normal(electrons.shape, np.float32)
+    noisy = electrons + np.sqrt(electrons + np.float32(config.read_noise_e**2)) * normal
+    faint = electrons < _FAINT_E
+    noisy[faint] = rng.poisson(electrons[faint]) + config.read_noise_e * normal[faint]
+    noisy += pattern.offset_e
+    largest = 2**config.bits - 1
+    grey = np.minimum(noisy, config.full_well_e) * (config.gain * largest / config.full_well_e)
+    grey += config.black_level_share * largest
+    return np.clip(np.rint(grey), 0, largest).astype(np.uint8 if config.bits == 8 else np.uint16)
+
+
+def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
+    """Exposure time, seconds, for a radiance factor (h, w).
+
+    Automatic exposure brings the chosen percentile to its grey level, but no pixel of it over that share of the full
+    well, and takes no longer than it may.
+    """
+    if config.exposure == "fixed":
+        return config.exposure_time_s
     bright = float(np.percentile(light, config.exposure_percentile))
-    electrons = light * (config.exposure_level * config.full_well_e / max(bright, 1e-6))
-    # Above a hundred electrons a rounded Gaussian stands for the Poisson law, ten times faster; below, it is drawn.
-    noisy = electrons + np.sqrt(electrons) * rng.standard_normal(electrons.shape, np.float32)
-    faint = electrons < 100
-    noisy[faint] = rng.poisson(electrons[faint])
-    noisy += config.read_noise_e * rng.standard_normal(electrons.shape, np.float32)
-    return np.clip(np.rint(noisy * (255 / config.full_well_e)), 0, 255).astype(np.uint8)
+    share = min((config.exposure_level - config.black_level_share) / config.gain, config.exposure_level)
+    rate = config.responsivity_e_per_s * bright + config.dark_current_e_per_s
+    return min(share * config.full_well_e / max(rate, 1e-30), config.longest_exposure_s)
+
+
+def motion_px(depth_m: np.ndarray, camera: Camera, way_camera_m: Array) -> np.ndarray:
+    """How far the ground at a depth (h, w) along the axis moves in the image, pixels (h, w, 2), float32.
+
+    The camera moves by `way_camera_m` (3,) along its own axes O_C, without turning. To first order in way over depth;
+    0 where nothing is hit.
+    """
+    rays = _rays(camera)
+    way = np.asarray(way_camera_m, np.float32)
+    move = (rays * way[2] - way[:2]) / depth_m[..., None]
+    if not any(camera.distortion):
+        return move * np.array([camera.fx_px, camera.fy_px], np.float32)
+    moved = np.concatenate([rays + move, np.ones_like(depth_m)[..., None]], axis=-1)
+    start = np.concatenate([rays, np.ones_like(depth_m)[..., None]], axis=-1)
+    # At the very edge of what the distortion allows, the end of the way may have no image.
+    return np.nan_to_num(camera.project(moved) - camera.project(start)).astype(np.float32)
+
+
+def _fastest_px(depth_m: np.ndarray, pinhole: Camera, way_camera_m: Array) -> float:
+    """An upper bound of the motion of any pixel, pixels."""
+    corners = [[u, v] for u in (0, pinhole.width_px) for v in (0, pinhole.height_px)]
+    widest = np.linalg.norm(pinhole.rays(corners), axis=-1).max()
+    nearest_m = max(float(depth_m.min()), 1e-9)
+    return float(np.linalg.norm(way_camera_m) / nearest_m * widest * max(pinhole.fx_px, pinhole.fy_px))
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: Camera) -> np.ndarray:
+    """Direction (h, w, 2) of each pixel centre over the axis, float32."""
+    return camera.rays(camera.pixel_centres())[..., :2].astype(np.float32)
+
+
+def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """The mean of an image over an exposure about its own time, while its content moves by `motion` (h, w, 2)."""
+    longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
+    # Gauss-Legendre nodes: two already give the blur of a short motion its true width.
+    times, weights = np.polynomial.legendre.leggauss(min(int(2 * longest) + 2, 128))
+    column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in light.shape[::-1]))
+    mean = np.zeros_like(light)
+    for time, weight in zip(times / 2, weights / 2, strict=True):
+        place = column - np.float32(time) * motion[..., 0], row - np.float32(time) * motion[..., 1]
+        mean += np.float32(weight) * cv2.remap(light, *place, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.maximum(mean, 0)

@@ -13,6 +13,9 @@ from perilune_shared.camera import Camera
 from perilune_shared.frames import Array, quaternion_from_matrix, selenographic_from_site
 from perilune_shared.schema import TABLES
 
+_CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
+_FILES = ("png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
+
 
 def _table(name: str, columns: dict) -> pa.Table:
     return pa.table(columns, schema=TABLES[name])
@@ -100,22 +103,27 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
     """Part of the table frames: one descent. `files` holds the columns png_* and exr_* of each frame."""
     flight, n = trajectory.flight, len(trajectory.splits)
-    columns = {
+    columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],
         "scene_id": [trajectory.scene_id] * n,
         "trajectory_id": [trajectory.trajectory_id] * n,
         "frame_index": np.arange(n),
         "time_s": flight.time_s,
         "split": list(trajectory.splits),
-        **{name: [getattr(camera, name)] * n for name in ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")},
+        **{name: [getattr(camera, name)] * n for name in _CAMERA},
         "position_m": _vectors(flight.position_m),
         "rotation_wxyz": _vectors([quaternion_from_matrix(r) for r in flight.rotation_camera_from_site]),
         "velocity_mps": _vectors(flight.velocity_mps),
         "sun_direction": _vectors(np.tile(sun, (n, 1))),
     }
-    for name in ("png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes"):
-        columns[name] = [row.get(name) for row in files]
-    return _table("frames", columns)
+    return _table("frames", columns | {name: [row.get(name) for row in files] for name in _FILES})
+
+
+def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) -> pa.Table:
+    """Part of the table frames as in `table`, with another camera and other files (see `frame_table`)."""
+    columns = {name: table[name] for name in table.column_names}
+    columns |= {name: [getattr(camera, name)] * len(table) for name in _CAMERA}
+    return _table("frames", columns | {name: [row.get(name) for row in files] for name in _FILES})
 
 
 def label_table(frame_id: str, labels: Labels) -> pa.Table:

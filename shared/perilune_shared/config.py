@@ -103,7 +103,20 @@ def resolve(
     if preset not in PRESETS:
         raise UserError("--preset", "preset", preset, _nearest(preset, PRESETS))
     preset_text = resources.files(package).joinpath("presets", f"{preset}.yaml").read_text(encoding="utf-8")
-    sources: list[tuple[str, dict]] = [(f"preset {preset}", parse_yaml(preset_text, preset).get(section, {}))]
+    base = parse_yaml(preset_text, preset).get(section, {})
+    return resolve_over(model, section, f"preset {preset}", base, config_file, settings)
+
+
+def resolve_over(
+    model: type[SectionType],
+    section: str,
+    base_name: str,
+    base: dict,
+    config_file: Path | None = None,
+    settings: tuple[str, ...] = (),
+) -> SectionType:
+    """As `resolve`, from the plain data `base` in place of a preset; errors name it `base_name`."""
+    sources: list[tuple[str, dict]] = [(base_name, base)]
     if config_file is not None:
         sources.append((str(config_file), read_config_file(config_file).get(section, {})))
     for text in settings:

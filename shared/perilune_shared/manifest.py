@@ -8,6 +8,7 @@ Parts are written once, aside and renamed, and never rewritten. Use::
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from perilune_shared import files
 from perilune_shared.camera import Camera
+from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.errors import UserError
 from perilune_shared.schema import SCHEMA_VERSION, TABLES, Kind, SplitUnit
 
@@ -44,15 +46,22 @@ class CameraInfo(_Info):
     cy_px: float
     """Principal point, pixels below the top edge."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """Brown-Conrady k1, k2, p1, p2, k3; in OpenCV's form."""
+    """Brown-Conrady k1, k2, p1, p2, k3, on coordinates over the focal length."""
     rotation_camera_from_body: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
     """Rows of the matrix (3, 3)."""
     position_in_body_m: tuple[float, float, float]
     """Centre of projection in O_B, metres."""
 
-    def pinhole(self) -> Camera:
-        """The intrinsics as a camera that projects."""
-        return Camera(self.width_px, self.height_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+    @classmethod
+    def of(cls, camera: Camera) -> "CameraInfo":
+        """A camera at the body's origin that looks down on a level flight."""
+        x, y, z = ROTATION_CAMERA_FROM_BODY.tolist()
+        rows = tuple(x), tuple(y), tuple(z)
+        return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=(0.0, 0.0, 0.0))
+
+    def intrinsics(self) -> Camera:
+        """The camera that projects, with its distortion."""
+        return Camera(self.width_px, self.height_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion)
 
 
 class Counts(_Info):
@@ -70,6 +79,15 @@ class Counts(_Info):
     """Images."""
     labels: int = 0
     """Craters in images."""
+
+
+class Origin(_Info):
+    """The dataset from whose EXRs another was developed."""
+
+    name: str
+    """Its name."""
+    sha256: str
+    """Of its dataset.json."""
 
 
 class DatasetInfo(_Info):
@@ -93,6 +111,10 @@ class DatasetInfo(_Info):
     """From which every random stream is derived."""
     camera: CameraInfo
     """Of all frames."""
+    exr_camera: CameraInfo | None = None
+    """Of the EXRs: a camera without distortion that sees all that `camera` sees; null where there are none."""
+    developed_from: Origin | None = None
+    """Where the frames were developed again from; null where they were rendered."""
     versions: dict[str, str]
     """Packages and Blender."""
     counts: Counts

@@ -206,8 +206,9 @@ def _splits(dataset: Dataset, tables: dict[str, pd.DataFrame]) -> Iterator[Fault
 def _labels(dataset: Dataset, tables: dict[str, pd.DataFrame], n_sampled: int = 2000) -> Iterator[Fault]:
     """Ellipses of a sample of labels, projected again from crater and pose."""
     labels = tables["labels"]
-    if any(dataset.info.camera.distortion) or labels.empty:
+    if labels.empty:
         return
+    camera = dataset.info.camera.intrinsics()
     rows = np.unique(np.linspace(0, len(labels) - 1, n_sampled).astype(int))
     sample = labels.iloc[rows].assign(row=rows).merge(tables["frames"], on="frame_id")
     sample = sample.merge(tables["craters"], on=["scene_id", "crater_id"])
@@ -215,7 +216,7 @@ def _labels(dataset: Dataset, tables: dict[str, pd.DataFrame], n_sampled: int = 
         rotation = matrix_from_quaternion(group["rotation_wxyz"].iloc[0])
         centres = camera_from_site(group[["x_m", "y_m", "z_m"]].to_numpy(), group["position_m"].iloc[0], rotation)
         normals = group[["normal_x", "normal_y", "normal_z"]].to_numpy() @ rotation.T
-        ellipses = project_circles(dataset.info.camera.pinhole(), centres, normals, group["diameter_m"].to_numpy() / 2)
+        ellipses = project_circles(camera, centres, normals, group["diameter_m"].to_numpy() / 2)
         again = np.stack([ellipses.cx_px, ellipses.cy_px, ellipses.a_px, ellipses.b_px], axis=1)
         again = np.concatenate([again, ellipses.bounding_boxes()], axis=1)
         names = [

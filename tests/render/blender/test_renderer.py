@@ -10,7 +10,7 @@ import pytest
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig
-from perilune_render.labels import crater_index, label_frame
+from perilune_render.labels import RimCircles, crater_index, label_frame
 from perilune_render.photometry import LAWS, radiance_factor
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import value_at
@@ -134,7 +134,7 @@ def test_label_ellipses_lie_on_rendered_rims():
     )
     with Renderer(scene, config_with(), camera, sun_direction(90, 60)) as renderer:
         radiance = renderer.render(position, rotation)
-    labels = label_frame(scene, camera, position, rotation, radiance, 2, 150)
+    labels = label_frame(RimCircles.of_scene(scene), camera, position, rotation, radiance, 2, 150)
     assert labels.crater_id.tolist() == [0, 1, 2]
     assert (labels.visible_fraction > 0.95).all() and (labels.sunlit_fraction > 0.95).all()
     # The tilted view passes the small ground's edge: there is no depth.
@@ -149,7 +149,7 @@ def test_label_ellipses_lie_on_rendered_rims():
         cos, sin = np.cos(e.theta_rad[k]), np.sin(e.theta_rad[k])
         radial = np.sqrt(((du * cos + dv * sin) / e.a_px[k]) ** 2 + ((dv * cos - du * sin) / e.b_px[k]) ** 2)
         assert len(radial) > 50 and abs(radial.mean() - 1) * e.a_px[k] < 0.3
-    index = crater_index(scene, camera, position, rotation)
+    index = crater_index(RimCircles.of_scene(scene), camera, position, rotation)
     # Each crater's floor carries its own index, the ground between none.
     floor = np.hypot(points[..., 0] - x[1], points[..., 1] - y[1]) < 20
     between = np.min([np.hypot(points[..., 0] - x[k], points[..., 1] - y[k]) / d[k] for k in range(3)], axis=0) > 0.55
@@ -169,14 +169,22 @@ def test_a_hidden_rim_and_a_dark_crater_are_told():
     with Renderer(scene, config_with(), camera, sun) as renderer:
         above = np.array([0, 0, 180.0])
         lit = label_frame(
-            scene, camera, above, ROTATION_CAMERA_FROM_BODY, renderer.render(above, ROTATION_CAMERA_FROM_BODY), 2, 90
+            RimCircles.of_scene(scene),
+            camera,
+            above,
+            ROTATION_CAMERA_FROM_BODY,
+            renderer.render(above, ROTATION_CAMERA_FROM_BODY),
+            2,
+            90,
         )
         assert lit.visible_fraction[0] > 0.9 and lit.sunlit_fraction[0] < 0.1
         aside = np.array([-150.0, 0, 100.0])
-        hidden = label_frame(scene, camera, aside, slanted, renderer.render(aside, slanted), 2, 90)
+        hidden = label_frame(RimCircles.of_scene(scene), camera, aside, slanted, renderer.render(aside, slanted), 2, 90)
         if len(hidden.crater_id) == 0:
             slanted = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector([0, np.radians(-50), 0])
-            hidden = label_frame(scene, camera, aside, slanted, renderer.render(aside, slanted), 2, 90)
+            hidden = label_frame(
+                RimCircles.of_scene(scene), camera, aside, slanted, renderer.render(aside, slanted), 2, 90
+            )
     assert hidden.visible_fraction[0] < 0.6
 
 

@@ -82,7 +82,7 @@ def load_split(dataset: Dataset, split: str, settings: LabelSettings) -> DetectS
         known = by_frame.get(frame["frame_id"], labels.iloc[:0])
         others = by_scene.get(frame["scene_id"], craters.iloc[:0])
         others = others[~others["crater_id"].isin(known["crater_id"])]
-        rows = unlabelled_craters(others, camera.pinhole(), frame, settings.radius_px)
+        rows = unlabelled_craters(others, camera.intrinsics(), frame, settings.radius_px)
         part = pd.concat([known, rows]) if len(rows) else known
         parts.append(
             FrameLabels(

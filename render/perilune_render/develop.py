@@ -1,0 +1,172 @@
+"""Develop a dataset's frames again from their EXRs, with another sensor or another camera at the same place.
+
+Nothing is rendered, so Blender is not needed. What a stop leaves goes on like a rendering: a descent's part of `frames`
+is written last.
+"""
+
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+import pyarrow as pa
+from rich.progress import Progress
+
+import perilune_render
+import perilune_shared
+from perilune_render import tables
+from perilune_render.config import DatasetConfig
+from perilune_render.exr import read_radiance
+from perilune_render.labels import RimCircles, label_frame
+from perilune_render.output import begin_or_go_on, write_overview, write_png
+from perilune_render.plan import camera_of
+from perilune_render.resample import seen_by
+from perilune_render.sensor import FixedPattern, develop
+from perilune_render.streams import stream
+from perilune_shared import files
+from perilune_shared.camera import Camera
+from perilune_shared.config import resolve_over
+from perilune_shared.errors import UserError
+from perilune_shared.frames import matrix_from_quaternion
+from perilune_shared.manifest import (
+    Counts,
+    Dataset,
+    Origin,
+    count_rows,
+    open_dataset,
+    read_part,
+    write_info,
+    write_part,
+)
+
+_CHANGEABLE = ("sensor", "camera")
+
+
+def develop_dataset(
+    source: Dataset, out: Path, progress: Progress, config_file: Path | None = None, settings: tuple[str, ...] = ()
+) -> Dataset:
+    """Make a dataset in `out` from the EXRs of another; its settings are those of `source`, with changes.
+
+    A file and single settings may change `dataset.sensor` and `dataset.camera`. Scenes, craters, boulders and descents
+    are the source's; so are the labels where the camera is the same, else they are made again. Raises UserError where
+    another setting is changed, the source is incomplete or lacks EXRs, or those do not show all that the camera sees.
+    """
+    config = _changed(source, config_file, settings)
+    camera, exr_camera = _cameras(source, config)
+    info = source.info.model_copy(
+        update={
+            "name": f"{source.info.name}-developed",
+            "complete": False,
+            "config": json.loads(config.model_dump_json()),
+            "camera": source.info.camera.model_copy(update=asdict(camera)),
+            "exr_camera": None,
+            "developed_from": Origin(name=source.info.name, sha256=files.sha256_of(source.root / "dataset.json")),
+            "versions": {
+                **source.info.versions,
+                "perilune_render": perilune_render.__version__,
+                "perilune_shared": perilune_shared.__version__,
+            },
+            "counts": Counts(),
+        }
+    )
+    parts = source.parts("frames")
+    rows = [read_part(part, "frames") for part in parts]
+    for part, table in zip(parts, rows, strict=True):
+        if table["exr_path"].null_count:
+            raise UserError(part, "exr_path", "null", "a dataset rendered with dataset.render.exr=true")
+    info = begin_or_go_on(out, info)
+    if info.complete:
+        return open_dataset(out)
+    for name in ("scenes", "craters", "boulders", "trajectories"):
+        for part in source.parts(name):
+            _copy(part, out / "manifest" / name / part.name)
+    task = progress.add_task("develop", total=sum(len(table) for table in rows), unit="frames", note="")
+    pattern = FixedPattern.draw(config.sensor, camera, config.seed)
+    for part, table in zip(parts, rows, strict=True):
+        if not (out / "manifest" / "frames" / part.name).exists():
+            _develop_descent(source, out, config, camera, exr_camera, pattern, part.stem, table)
+        progress.advance(task, len(table))
+    dataset = Dataset(out, info)
+    write_overview(dataset)
+    write_info(out, info.model_copy(update={"counts": count_rows(dataset), "complete": True}))
+    return open_dataset(out)
+
+
+def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
+    """The source's settings with the user's changes, all of which must be of the sensor or the camera."""
+    where = str(source.root / "dataset.json")
+    before = resolve_over(DatasetConfig, "dataset", where, source.info.config)
+    after = resolve_over(DatasetConfig, "dataset", where, source.info.config, config_file, settings)
+    for name in DatasetConfig.model_fields:
+        if name not in _CHANGEABLE and getattr(after, name) != getattr(before, name):
+            raise UserError(
+                "--set or --config",
+                f"dataset.{name}",
+                f"another value than in {where}",
+                "changes of dataset.sensor and dataset.camera; all else needs a new rendering",
+            )
+    return after
+
+
+def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
+    """The camera to develop for, and that of the EXRs, which must show all that the first sees."""
+    if not source.info.complete:
+        raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
+    camera = camera_of(config.camera)
+    exr_camera = (source.info.exr_camera or source.info.camera).intrinsics()
+    if not exr_camera.covers(camera):
+        raise UserError(
+            "--set or --config",
+            "dataset.camera",
+            f"a view that leaves the EXRs' {exr_camera.width_px} x {exr_camera.height_px} px of {exr_camera.fx_px:.6g}"
+            " px focal length",
+            "a camera whose every pixel the EXRs show",
+        )
+    return camera, exr_camera
+
+
+def _develop_descent(
+    source: Dataset,
+    out: Path,
+    config: DatasetConfig,
+    camera: Camera,
+    exr_camera: Camera,
+    pattern: FixedPattern,
+    name: str,
+    table: pa.Table,
+) -> None:
+    """One part of `frames`, with its images and labels."""
+    rows = table.to_pylist()
+    scene_id = rows[0]["scene_id"]
+    same = camera == source.info.camera.intrinsics()
+    circles = None if same else RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
+    descents = source.table("trajectories", scene_id=scene_id).to_pylist()
+    seeds = {descent["trajectory_id"]: descent["seed"] for descent in descents}
+    written, labels = [], []
+    for row in rows:
+        radiance = read_radiance(source.file(row["exr_path"]))
+        rotation = matrix_from_quaternion(row["rotation_wxyz"])
+        velocity = rotation @ row["velocity_mps"]
+        rng = stream(seeds[row["trajectory_id"]], "sensor", row["frame_index"])
+        image = develop(radiance, config.sensor, camera, exr_camera, velocity, pattern, rng)
+        written.append(write_png(out, row["frame_id"], image, config.sensor.bits))
+        if circles is not None:
+            pose = row["position_m"], rotation
+            seen = seen_by(radiance, camera, exr_camera)
+            limits = config.labels.min_radius_px, config.labels.max_radius_px
+            labels.append(tables.label_table(row["frame_id"], label_frame(circles, camera, *pose, seen, *limits)))
+    label_part = out / "manifest" / "labels" / f"{name}.parquet"
+    # A labels part without its frames part is left from a stop between the two.
+    label_part.unlink(missing_ok=True)
+    if circles is None:
+        _copy(source.root / "manifest" / "labels" / f"{name}.parquet", label_part)
+    else:
+        write_part(out, "labels", name, pa.concat_tables(labels))
+    write_part(out, "frames", name, tables.developed_frame_table(table, camera, written))
+
+
+def _copy(part: Path, to: Path) -> None:
+    """Copy a part, whole or not at all; one that is there is left."""
+    if not to.exists():
+        with files.written_aside(to) as aside:
+            shutil.copyfile(part, aside)

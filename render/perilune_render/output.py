@@ -1,0 +1,93 @@
+"""What every command that makes a dataset does alike: begin or go on, write a PNG, draw the overview."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from perilune_render.labels import Labels
+from perilune_render.picture import draw_labels, enlarge, write_sheet
+from perilune_shared import files
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import Dataset, DatasetInfo, open_dataset, write_info
+
+_SHEET_FRAMES = 12
+
+
+def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
+    """Write the dataset.json of a new dataset, or read that of one that was begun with the same settings.
+
+    Raises UserError where `out` holds something else.
+    """
+    if not (out / "dataset.json").exists():
+        if out.exists() and any(out.iterdir()):
+            raise UserError(
+                out,
+                "--out",
+                "a folder with other content",
+                "an empty or new folder, or a dataset to go on with",
+            )
+        write_info(out, info)
+        return info
+    existing = open_dataset(out).info
+    for name in ("kind", "config", "versions", "developed_from"):
+        theirs, ours = getattr(existing, name), getattr(info, name)
+        if name == "config":
+            theirs, ours = _without_threads(theirs), _without_threads(ours)
+        if theirs != ours:
+            raise UserError(
+                out / "dataset.json",
+                name,
+                _first_difference(theirs, ours),
+                "the settings that this dataset was begun with, or another --out",
+            )
+    return existing
+
+
+def _without_threads(config: dict) -> dict:
+    return {**config, "render": {k: v for k, v in config.get("render", {}).items() if k != "threads"}}
+
+
+def _first_difference(theirs: object, ours: object, path: str = "") -> str:
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        for key in sorted({*theirs, *ours}):
+            if theirs.get(key) != ours.get(key):
+                return _first_difference(theirs.get(key), ours.get(key), f"{path}.{key}".lstrip("."))
+    return f"{path} {theirs!r} there, {ours!r} asked for".strip()
+
+
+def write_png(root: Path, frame_id: str, image: np.ndarray, bits: int) -> dict[str, str | int]:
+    """Write a frame's PNG; its columns png_* of the manifest.
+
+    Above 8 bits a grey value stands in the upper bits of a 16-bit number, as the PNG standard asks for.
+    """
+    path = f"frames/{frame_id}.png"
+    stored = image if bits == 8 else image << (16 - bits)
+    files.write_bytes(root / path, cv2.imencode(".png", stored)[1].tobytes())
+    return file_columns(root, "png", path)
+
+
+def file_columns(root: Path, kind: str, path: str) -> dict[str, str | int]:
+    """The columns png_* or exr_* of a file that was written."""
+    whole = root / path
+    return {
+        f"{kind}_path": path,
+        f"{kind}_bytes": whole.stat().st_size,
+        f"{kind}_sha256": files.sha256_of(whole),
+    }
+
+
+def write_overview(dataset: Dataset) -> None:
+    """overview.png: frames from the whole dataset, each beside itself with its labels drawn."""
+    frames = dataset.table("frames", ["frame_id", "scene_id", "png_path"]).to_pandas()
+    chosen = frames.iloc[np.unique(np.linspace(0, len(frames) - 1, _SHEET_FRAMES).astype(int))]
+    labels = dataset.table("labels").to_pandas()
+    craters = dataset.table("craters", ["scene_id", "crater_id", "depth_m", "diameter_m"]).to_pandas()
+    pictures = []
+    for frame in chosen.itertuples():
+        image = cv2.imread(str(dataset.file(frame.png_path)), cv2.IMREAD_GRAYSCALE)
+        own = labels[labels["frame_id"] == frame.frame_id]
+        own = own.merge(craters[craters["scene_id"] == frame.scene_id], on="crater_id")
+        drawn = draw_labels(image, Labels.from_table(own), (own["depth_m"] / own["diameter_m"]).to_numpy())
+        pictures += [enlarge(image, 2), drawn]
+    write_sheet(dataset.root / "overview.png", pictures, 6)
