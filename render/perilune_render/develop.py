@@ -18,7 +18,7 @@ from perilune_render import tables
 from perilune_render.config import DatasetConfig
 from perilune_render.exr import read_radiance
 from perilune_render.labels import RimCircles, label_frame
-from perilune_render.output import begin_or_go_on, write_overview, write_png
+from perilune_render.output import begin_or_go_on, first_difference, write_overview, write_png
 from perilune_render.plan import camera_of
 from perilune_render.resample import seen_by
 from perilune_render.sensor import FixedPattern, develop
@@ -38,8 +38,6 @@ from perilune_shared.manifest import (
     write_info,
     write_part,
 )
-
-_CHANGEABLE = ("sensor", "camera")
 
 
 def develop_dataset(
@@ -97,14 +95,15 @@ def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...
     where = str(source.root / "dataset.json")
     before = resolve_over(DatasetConfig, "dataset", where, source.info.config)
     after = resolve_over(DatasetConfig, "dataset", where, source.info.config, config_file, settings)
-    for name in DatasetConfig.model_fields:
-        if name not in _CHANGEABLE and getattr(after, name) != getattr(before, name):
-            raise UserError(
-                "--set or --config",
-                f"dataset.{name}",
-                f"another value than in {where}",
-                "changes of dataset.sensor and dataset.camera; all else needs a new rendering",
-            )
+    kept = set(DatasetConfig.model_fields) - {"sensor", "camera"}
+    theirs, ours = before.model_dump(include=kept), after.model_dump(include=kept)
+    if theirs != ours:
+        raise UserError(
+            "--set or --config",
+            "dataset",
+            first_difference(theirs, ours),
+            "changes of dataset.sensor and dataset.camera alone; all else needs a new rendering",
+        )
     return after
 
 

@@ -38,7 +38,7 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
             raise UserError(
                 out / "dataset.json",
                 name,
-                _first_difference(theirs, ours),
+                first_difference(theirs, ours),
                 "the settings that this dataset was begun with, or another --out",
             )
     return existing
@@ -48,11 +48,12 @@ def _without_threads(config: dict) -> dict:
     return {**config, "render": {k: v for k, v in config.get("render", {}).items() if k != "threads"}}
 
 
-def _first_difference(theirs: object, ours: object, path: str = "") -> str:
+def first_difference(theirs: object, ours: object, path: str = "") -> str:
+    """The first setting, by name, in which two trees of plain data differ, with both values."""
     if isinstance(theirs, dict) and isinstance(ours, dict):
         for key in sorted({*theirs, *ours}):
             if theirs.get(key) != ours.get(key):
-                return _first_difference(theirs.get(key), ours.get(key), f"{path}.{key}".lstrip("."))
+                return first_difference(theirs.get(key), ours.get(key), f"{path}.{key}".lstrip("."))
     return f"{path} {theirs!r} there, {ours!r} asked for".strip()
 
 

@@ -11,7 +11,7 @@ from perilune_shared.camera import Camera
 
 
 def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
-    """An image (h, w) of the camera `source` as `camera` sees it, bicubic; the image itself where they are the same.
+    """An image (h, w) of the camera `source` as `camera` sees it (Lanczos, 8 x 8 px); itself where they are the same.
 
     `source` must cover `camera`. OpenCV places samples to 1/32 px. Where `source` is finer by a factor or more, the
     rays of a pixel are averaged, so that nothing aliases.
@@ -19,7 +19,9 @@ def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
     if camera == source:
         return image
     finer = max(1, round(source.fx_px / camera.fx_px))
-    seen = cv2.remap(image, *_places(_refined(camera, finer), source), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.remap(
+        image, *_places(_refined(camera, finer), source), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
+    )
     return seen if finer == 1 else cv2.resize(seen, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
 
 

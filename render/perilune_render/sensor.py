@@ -139,11 +139,13 @@ def _rays(camera: Camera) -> np.ndarray:
 def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
     """The mean of an image over an exposure about its own time, while its content moves by `motion` (h, w, 2)."""
     longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
+    if longest < _LEAST_MOTION_PX:
+        return light
     # Gauss-Legendre nodes: two already give the blur of a short motion its true width.
     times, weights = np.polynomial.legendre.leggauss(min(int(2 * longest) + 2, 128))
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in light.shape[::-1]))
     mean = np.zeros_like(light)
     for time, weight in zip(times / 2, weights / 2, strict=True):
         place = column - np.float32(time) * motion[..., 0], row - np.float32(time) * motion[..., 1]
-        mean += np.float32(weight) * cv2.remap(light, *place, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        mean += np.float32(weight) * cv2.remap(light, *place, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     return np.maximum(mean, 0)

@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
 
-from perilune_render.config import KindConfig
-from perilune_render.plan import make_plan
+from perilune_render.config import CameraConfig, DistortionConfig, KindConfig
+from perilune_render.plan import camera_of, make_plan
 from perilune_render.streams import derived_seed, stream
+from perilune_shared.camera import Camera
+from perilune_shared.errors import UserError
 from tests.render.conftest import config_with
 
 
@@ -64,3 +66,20 @@ def test_the_papers_protocol_has_its_numbers():
 def test_streams_are_named_and_independent():
     assert derived_seed(1, "a", "b") != derived_seed(1, "ab") != derived_seed(2, "ab")
     assert stream(1, "a").random() == stream(1, "a").random() != stream(1, "b").random()
+
+
+def test_the_camera_is_as_configured():
+    assert camera_of(CameraConfig(width_px=128, height_px=96)) == Camera.from_field_of_view(128, 96, 50.0)
+    settings = CameraConfig(
+        focal_length_px=300.0, principal_x_px=100.5, principal_y_px=90.0, distortion=DistortionConfig(k1=-0.1, p2=0.002)
+    )
+    camera = camera_of(settings)
+    assert camera == Camera(256, 256, 300.0, 300.0, 100.5, 90.0, (-0.1, 0.0, 0.0, 0.002, 0.0))
+    made = plan("scene", camera=settings)
+    assert made.camera == camera and made.exr_camera == camera.covering_pinhole() != camera
+    assert plan("scene").exr_camera == plan("scene").camera
+
+
+def test_a_distortion_that_folds_back_is_refused():
+    with pytest.raises(UserError, match=r"dataset\.camera\.distortion.*folds? back"):
+        camera_of(CameraConfig(distortion=DistortionConfig(k1=-1.5)))

@@ -1,4 +1,8 @@
+from dataclasses import replace
+
+import cv2
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -46,3 +50,74 @@ def test_points_are_seen_from_the_camera():
     # Looking down from 10 m: the ground point below and 2 m along X lies right of the axis, at depth 10.
     down = np.diag([1.0, -1.0, -1.0])
     assert np.allclose(camera_from_site([2.0, 1.0, 0.0], [0, 0, 10.0], down), [2, -1, 10])
+
+
+LENSES = [
+    (-0.2, 0.05, 0.001, -0.002, -0.01),
+    (0.3, 0.0, 0.0, 0.0, 0.0),
+    (-0.3, 0.0, 0.0, 0.0, 0.0),
+    (0, 0, 0.01, 0.02, 0),
+]
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_distortion_is_opencvs(lens):
+    camera = replace(CAMERA, distortion=lens)
+    rng = np.random.default_rng(1)
+    points = np.append(rng.uniform(-0.4, 0.4, (500, 2)), np.ones((500, 1)), axis=1) * rng.uniform(1, 900, (500, 1))
+    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), CAMERA.matrix, np.array(lens))[0][:, 0]
+    pixels = camera.project(points)
+    assert np.abs(pixels - theirs).max() < 1e-9
+    assert np.abs(pixels - CAMERA.project(points)).max() > 1
+    exact = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 1000, 1e-14)
+    rays = cv2.undistortPointsIter(pixels[:, None], CAMERA.matrix, np.array(lens), np.eye(3), np.eye(3), exact)[:, 0]
+    assert np.abs(camera.rays(pixels)[:, :2] - rays).max() < 1e-9
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_rays_undo_distortion_in_every_pixel(lens):
+    camera = replace(CAMERA, distortion=lens)
+    pixels = camera.pixel_centres()
+    assert np.abs(camera.project(camera.rays(pixels) * 70.0) - pixels).max() < 1e-7
+
+
+def test_without_distortion_the_covering_pinhole_is_the_camera():
+    assert CAMERA.covering_pinhole() == CAMERA
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_covering_pinhole_sees_every_ray_and_little_more(lens):
+    camera = replace(CAMERA, distortion=lens)
+    pinhole = camera.covering_pinhole()
+    assert not any(pinhole.distortion) and (pinhole.fx_px, pinhole.fy_px) == (camera.fx_px, camera.fy_px)
+    seen = pinhole.project(camera.rays(camera.outline()))
+    assert pinhole.covers(camera) and (seen >= 0).all() and (seen <= [pinhole.width_px, pinhole.height_px]).all()
+    # Whole pixels on each side, and not one too many where the image grew.
+    left, top = pinhole.cx_px - camera.cx_px, pinhole.cy_px - camera.cy_px
+    right, bottom = pinhole.width_px - camera.width_px - left, pinhole.height_px - camera.height_px - top
+    spare = [*seen.min(axis=0), *(np.array([pinhole.width_px, pinhole.height_px]) - seen.max(axis=0))]
+    for grown, left_over in zip((left, top, right, bottom), spare, strict=True):
+        assert grown == int(grown) >= 0 and (grown == 0 or left_over < 1)
+
+
+def test_a_camera_covers_its_own_view_and_no_wider_one():
+    assert CAMERA.covers(CAMERA) and CAMERA.covers(replace(CAMERA, width_px=200))
+    assert not CAMERA.covers(replace(CAMERA, width_px=257)) and not CAMERA.covers(replace(CAMERA, fx_px=290.0))
+
+
+def test_beyond_the_fold_there_is_no_pixel():
+    # r (1 - 0.3 r^2) turns back at r = 1 / sqrt(0.9).
+    camera = replace(CAMERA, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))
+    fold = 1 / np.sqrt(0.9)
+    pixels = camera.project([[0.999 * fold, 0, 1], [1.001 * fold, 0, 1], [3.0, 0, 1]])
+    assert np.isfinite(pixels[0]).all() and np.isnan(pixels[1:]).all()
+    farthest = camera.fx_px * fold * (1 - 0.3 * fold**2) + camera.cx_px
+    assert np.isfinite(camera.rays([farthest - 0.1, camera.cy_px])).all()
+    assert np.isnan(camera.rays([farthest + 0.1, camera.cy_px])[:2]).all()
+
+
+def test_a_distortion_that_folds_back_in_the_image_has_no_covering_pinhole():
+    camera = replace(CAMERA, distortion=(-1.5, 0.0, 0.0, 0.0, 0.0))
+    assert camera.folds_back() and not CAMERA.folds_back()
+    with pytest.raises(ValueError, match="folds back"):
+        camera.covering_pinhole()

@@ -15,7 +15,7 @@ from perilune_render.photometry import LAWS, radiance_factor
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import value_at
 from perilune_render.terrain.stamp import stamp_craters
-from perilune_shared.camera import Camera
+from perilune_shared.camera import Camera, camera_from_site
 from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.frames import matrix_from_rotation_vector, sun_direction
 from tests.render.conftest import config_with, flat_scene, round_craters
@@ -199,3 +199,27 @@ def test_ctrl_c_during_a_frame_is_not_swallowed():
                 renderer.render(POSITION, TILTED)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         assert renderer.render(POSITION, TILTED).radiance_factor.mean() > 0.01
+
+
+@pytest.mark.parametrize("camera", [Camera(90, 70, 100.0, 100.0, 12.0, 61.0), Camera(90, 70, 100.0, 120.0, 70.0, 10.0)])
+def test_a_point_lands_where_the_camera_projects_it(camera):
+    """Small blocks on flat ground, seen by a camera whose principal point is far off the middle."""
+    position = np.array([5.0, -3.0, 60.0])
+    ground, _, _ = ground_points(camera, position, TILTED)
+    # On the grid of half a metre, near three places in the image.
+    place = np.round(2 * ground[[12, 35, 58], [15, 80, 30], :2]) / 2
+    height = np.zeros((601, 601))
+    for x, y in place:
+        row, column = round(2 * y) + 300, round(2 * x) + 300
+        height[row - 2 : row + 3, column - 2 : column + 3] = 1.0
+    with Renderer(flat_scene(300, 601, height_m=height), config_with(), camera, sun_direction(0, 60)) as renderer:
+        radiance = renderer.render(position, TILTED)
+    pixels = camera.project(camera_from_site(np.column_stack([place, np.full(3, 1.0)]), position, TILTED))
+    rays = camera.rays(camera.pixel_centres()) @ TILTED
+    high = position[2] + rays[..., 2] * radiance.depth_m > 0.4
+    assert camera.inside(pixels).all()
+    seen = np.argwhere(high)[:, ::-1] + 0.5
+    own = np.argmin(np.linalg.norm(seen[:, None] - pixels, axis=2), axis=1)
+    for k in range(3):
+        assert (own == k).sum() >= 3
+        assert np.allclose(seen[own == k].mean(axis=0), pixels[k], atol=0.7)

@@ -27,7 +27,7 @@ class FrameStore:
 
 
 def read_image(path: Path, height_px: int, width_px: int, size_bytes: int | None = None) -> NDArray[np.uint8]:
-    """One frame (height, width), 8-bit grey.
+    """One frame (height, width), 8-bit grey; of a 16-bit PNG the upper eight bits.
 
     Raises UserError where the file is missing, is not `size_bytes` long as the manifest says, is no image, or has
     another size in pixels.
@@ -37,9 +37,11 @@ def read_image(path: Path, height_px: int, width_px: int, size_bytes: int | None
     # A decoder may fill the missing rows of a truncated file without a word; its length tells.
     if size_bytes is not None and path.stat().st_size != size_bytes:
         raise UserError(path, "png_bytes", f"{path.stat().st_size} bytes", f"{size_bytes} bytes; the file is damaged")
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise UserError(path, "frame", "a file that does not decode", "an 8-bit grey PNG")
+        raise UserError(path, "frame", "a file that does not decode", "a grey PNG")
+    if image.dtype == np.uint16:
+        image = image >> 8
     if image.shape != (height_px, width_px):
         raise UserError(path, "size", f"{image.shape[1]} x {image.shape[0]}", f"{width_px} x {height_px} pixels")
     return image.astype(np.uint8, copy=False)
