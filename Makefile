@@ -26,7 +26,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-photometry clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-photometry bench-develop clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -96,6 +96,9 @@ compare-nac: setup ## rendered frames beside real NAC crops (NAC=folder); writes
 
 bench-photometry: setup ## rendered radiance against the formulas; writes runs/bench/photometry.json
 	@$(BIN)/python benchmarks/photometry.py
+
+bench-develop: setup ## frames a second of developing on one core; writes runs/bench/develop.json
+	@$(BIN)/python benchmarks/develop.py
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

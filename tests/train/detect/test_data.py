@@ -1,5 +1,7 @@
 """Labels that are wanted, augmentation, order, batches."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -63,6 +65,18 @@ def test_craters_just_outside_the_labelled_range_are_ignored():
     np.testing.assert_allclose(rows[["ellipse_cx_px", "ellipse_cy_px"]], [[70, 50], [30, 50], [102, 50]], atol=1e-6)
     np.testing.assert_allclose(rows["bbox_x0_px"], [68.2, -35, 92], atol=1e-6)
     assert not rows["wanted"].any() and not rows["labelled"].any()
+
+
+def test_a_distorted_camera_ignores_craters_where_it_sees_them():
+    """Barrel distortion draws a crater off the image into it; one beyond the fold of the distortion is nowhere."""
+    plain = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
+    barrel = replace(plain, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))
+    frame = {"position_m": [0.0, 0.0, 100.0], "rotation_wxyz": quaternion_from_matrix(np.diag([1.0, -1.0, -1.0]))}
+    row = {"y_m": 0.0, "z_m": 0.0, "normal_x": 0.0, "normal_y": 0.0, "normal_z": 1.0}
+    craters = pd.DataFrame([{"x_m": 53.0, "diameter_m": 3.6, **row}, {"x_m": 300.0, "diameter_m": 3.6, **row}])
+    assert len(unlabelled_craters(craters, plain, frame, (2.0, 50.0))) == 0
+    rows = unlabelled_craters(craters, barrel, frame, (2.0, 50.0))
+    np.testing.assert_allclose(rows["ellipse_cx_px"], [50 + 53 * (1 - 0.3 * 0.53**2)], atol=0.02)
 
 
 def test_frames_that_do_not_divide_by_32_are_refused(tmp_path, make_dataset):

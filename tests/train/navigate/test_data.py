@@ -1,4 +1,7 @@
+import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,6 +37,16 @@ def _misfit(sequence, descent, pair):
     )
     middle = (slice(20, -20), slice(20, -20))
     return float(np.sqrt(np.mean((laid - sequence.first[pair])[middle] ** 2)))
+
+
+def test_distorted_images_are_refused(dataset_nav, tmp_path):
+    """Its warp is a homography, which distorted images do not follow."""
+    root = Path(shutil.copytree(dataset_nav, tmp_path / "nav"))
+    info = json.loads((root / "dataset.json").read_text())
+    info["camera"]["distortion"][0] = -0.1
+    (root / "dataset.json").write_text(json.dumps(info))
+    with pytest.raises(UserError, match=r"camera\.distortion.*wanted zeros"):
+        load_descents(open_dataset(root))
 
 
 def test_descents_hold_poses_and_nominal_motion(descents):

@@ -1,0 +1,73 @@
+"""Frames a second of `perilune-render develop` on one core: EXR read, sensor, PNG, hash, manifest.
+
+Renders a dataset with EXRs first (256 x 256 px, small ground, half a minute), then develops it in this process, held to
+one core, as it is and for a distorted camera, whose labels are made again. Writes runs/bench/develop.json.
+"""
+
+import json
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from perilune_render.config import DatasetConfig
+from perilune_render.dataset import make_dataset
+from perilune_render.develop import develop_dataset
+from perilune_shared.config import resolve
+from perilune_shared.files import write_text
+from perilune_shared.progress import progress_bar
+
+SETTINGS = (
+    "dataset.render.exr=true",
+    "dataset.terrain.max_vertices=200000",
+    "dataset.detect.n_scenes=1",
+    "dataset.detect.trajectories_per_scene=3",
+    "dataset.detect.n_frames=50",
+)
+DISTORTED = (
+    "dataset.camera.width_px=200",
+    "dataset.camera.height_px=200",
+    "dataset.camera.focal_length_px=275.0",
+    "dataset.camera.distortion.k1=-0.1",
+)
+N_RUNS = 3
+
+
+def main() -> None:
+    """Run the benchmark on 150 frames."""
+    config = resolve(DatasetConfig, "dataset", "perilune_render", "small", None, SETTINGS)
+    with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
+        source = make_dataset(config, "detect", "small", Path(folder) / "source", bar)
+        core = min(os.sched_getaffinity(0))
+        for thread in Path("/proc/self/task").iterdir():
+            os.sched_setaffinity(int(thread.name), {core})
+        n = source.info.counts.frames
+        seconds: dict[str, list[float]] = {"as it is": [], "distorted": []}
+        cpu_s: dict[str, list[float]] = {"as it is": [], "distorted": []}
+        for run in range(N_RUNS):
+            for name, settings in (("as it is", ()), ("distorted", DISTORTED)):
+                start, cpu_start = time.perf_counter(), time.process_time()
+                made = develop_dataset(source, Path(folder) / f"{name} {run}", bar, None, settings)
+                seconds[name].append(time.perf_counter() - start)
+                cpu_s[name].append(time.process_time() - cpu_start)
+                assert made.info.counts.frames == n
+        png_bytes = made.table("frames", ["png_bytes"])["png_bytes"].to_numpy()
+        exr_bytes = source.table("frames", ["exr_bytes"])["exr_bytes"].to_numpy()
+    figures = {
+        "frames": n,
+        "frames_per_s": n / statistics.median(seconds["as it is"]),
+        "frames_per_s_with_new_labels": n / statistics.median(seconds["distorted"]),
+        # What a core gives when no other program takes it.
+        "frames_per_cpu_s": n / statistics.median(cpu_s["as it is"]),
+        "frames_per_cpu_s_with_new_labels": n / statistics.median(cpu_s["distorted"]),
+        "exr_bytes": float(exr_bytes.mean()),
+        "png_bytes": float(png_bytes.mean()),
+    }
+    path = Path("runs/bench/develop.json")
+    write_text(path, json.dumps(figures, indent=2) + "\n")
+    print(path, json.dumps(figures, indent=2))
+
+
+if __name__ == "__main__":
+    main()
