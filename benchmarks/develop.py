@@ -20,7 +20,7 @@ from perilune_shared.progress import progress_bar
 
 SETTINGS = (
     "dataset.render.exr=true",
-    "dataset.terrain.max_vertices=200000",
+    "dataset.terrain.spacing_px=1.5",
     "dataset.detect.n_scenes=1",
     "dataset.detect.trajectories_per_scene=3",
     "dataset.detect.n_frames=50",

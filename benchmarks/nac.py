@@ -21,9 +21,9 @@ from nac_sun import sun_over, time_of
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig
 from perilune_render.exr import Radiance
-from perilune_render.labels import label_frame
+from perilune_render.labels import RimCircles, label_frame
 from perilune_render.picture import write_sheet
-from perilune_render.sensor import develop
+from perilune_render.sensor import FixedPattern, develop
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.camera import Camera
@@ -112,7 +112,7 @@ def take_frame(
     pose = np.array([0.0, 0.0, altitude_m]), ROTATION_CAMERA_FROM_BODY
     with Renderer(scene, config, camera, sun_direction(azimuth_deg, elevation_deg)) as renderer:
         radiance = renderer.render(*pose)
-    labels = label_frame(scene, camera, *pose, radiance, LEAST_PX / 2, 1e4)
+    labels = label_frame(RimCircles.of_scene(scene), camera, *pose, radiance, LEAST_PX / 2, 1e4)
     e, ratio = labels.ellipses, scene.rims.depth_m / scene.craters.diameter_m
     # X_L is west and Y_L south: half a turn brings north up.
     return Picture(
@@ -127,7 +127,8 @@ def take_frame(
 
 def _developed(radiance: Radiance, config: DatasetConfig, camera: Camera, seed: int) -> np.ndarray:
     """Grey values; the camera hangs still."""
-    return develop(radiance.radiance_factor, config.sensor, stream(seed, "nac"))
+    pattern = FixedPattern.draw(config.sensor, camera, seed)
+    return develop(radiance, config.sensor, camera, camera, np.zeros(3), pattern, stream(seed, "nac"))
 
 
 def take_frames(config: DatasetConfig, crops: list[Picture], n_scenes: int, sampling_m: float) -> list[list[Picture]]:

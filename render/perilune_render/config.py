@@ -156,7 +156,7 @@ class BouldersConfig(Section):
 
     density: NotNegative = 0.1
     """Times the published size-frequency law, on the plain."""
-    field_density: NotNegative = 200.0
+    field_density: NotNegative = 100.0
     """Density at the rim of a newly formed crater over that of the plain."""
     min_diameter_spacings: Annotated[float, Field(ge=0.3)] = 0.7
     """Smallest boulder over the local vertex spacing."""
@@ -171,8 +171,8 @@ class ReliefConfig(Section):
 
     hurst_exponent: Annotated[float, Field(gt=0, lt=1)] = 0.9
     """How slopes fall with wavelength, L^(H-1)."""
-    rms_slope_deg: Annotated[float, Field(ge=0, le=30)] = 3.0
-    """Root mean square slope of all waves down to a metre, without craters, degrees (mare about 1.5, highland 3.5)."""
+    rms_slope_deg: Annotated[float, Field(ge=0, le=30)] = 2.5
+    """Root mean square slope of all waves down to a metre, without craters, degrees (mare about 1.2, highland 3)."""
     longest_wavelength_m: Positive = 1600.0
     """Longest wave, metres."""
 
@@ -252,7 +252,7 @@ class SensorConfig(Section):
     """Share of the pixels that are hot."""
     hot_pixel_e: NotNegative = 6_000.0
     """Mean of the hot pixels' exponentially distributed extra signal, electrons."""
-    psf_sigma_px: NotNegative = 0.35
+    psf_sigma_px: NotNegative = 0.45
     """Standard deviation of the Gaussian point spread, pixels."""
     motion_blur: bool = True
     """Whether the camera's velocity during the exposure blurs the frame."""

@@ -10,7 +10,7 @@ import OpenEXR
 from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
 
-CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "crater")
+CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +28,8 @@ class Radiance:
 
 
 def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:
-    """Write a frame's EXR: float32 channels R, Z, N.X, N.Y, N.Z and crater (h, w; -1 none), losslessly compressed."""
-    values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), crater)
+    """Write a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), losslessly compressed."""
+    values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), radiance.sunlit, crater)
     channels = {name: np.ascontiguousarray(value, np.float32) for name, value in zip(CHANNELS, values, strict=True)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with written_aside(path) as aside:
@@ -57,4 +57,4 @@ def read_radiance(path: Path) -> Radiance:
     if missing:
         raise UserError(path, "channels", f"no {missing[0]}", ", ".join(CHANNELS))
     normal = np.stack([channels[name] for name in ("N.X", "N.Y", "N.Z")], axis=-1)
-    return Radiance(channels["R"], channels["Z"], normal)
+    return Radiance(channels["R"], channels["Z"], normal, channels["sunlit"] > 0.5)

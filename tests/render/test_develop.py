@@ -66,7 +66,7 @@ def test_another_sensor_changes_the_pixels_and_keeps_the_labels(tiny, tmp_path):
     for old, image in zip(images(tiny / "detect"), images(tmp_path / "new"), strict=True):
         # Twelve bits in the upper bits of sixteen.
         assert image.dtype == np.uint16 and (image & 0xF == 0).all() and len(np.unique(image)) > 300
-        assert np.corrcoef(old.ravel(), image.ravel())[0, 1] > 0.9
+        assert np.corrcoef(old.ravel(), image.ravel())[0, 1] > 0.8
         assert np.percentile(image, 99) / 65535 == pytest.approx(0.8, abs=0.05)
 
 
@@ -169,7 +169,7 @@ def test_blender_is_not_loaded(tiny, tmp_path):
 def test_a_distorted_dataset_is_rendered_labelled_and_developed(tmp_path):
     """From the lens to the label: an EXR of the wider pinhole, frames and ellipses of the distorted camera."""
     lens = settings("camera.distortion.k1=-0.2", "camera.distortion.p2=0.003", "camera.principal_y_px=60")
-    quick = settings("terrain.max_vertices=40000", "detect.n_scenes=1", "detect.val_share=0", "detect.test_share=0")
+    quick = settings("terrain.spacing_px=2", "detect.n_scenes=1", "detect.val_share=0", "detect.test_share=0")
     command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", "--out", str(tmp_path), *lens, *quick]
     subprocess.run(command, check=True, capture_output=True)
     dataset = open_dataset(tmp_path / "detect")

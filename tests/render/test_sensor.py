@@ -35,9 +35,8 @@ def sensor(**changes) -> SensorConfig:
 
 def scene(light, camera=CAMERA, depth_m=500.0) -> Radiance:
     shape = camera.height_px, camera.width_px
-    return Radiance(
-        np.broadcast_to(np.float32(light), shape), np.full(shape, depth_m, np.float32), np.zeros((*shape, 3))
-    )
+    factor = np.broadcast_to(np.float32(light), shape)
+    return Radiance(factor, np.full(shape, depth_m, np.float32), np.zeros((*shape, 3)), factor > 0)
 
 
 def photograph(light, config, frame=0, camera=CAMERA, exr_camera=None, velocity=(0, 0, 0), seed=1):
