@@ -19,14 +19,14 @@ endif
 
 COMMON := --preset $(PRESET) $(if $(CONFIG),--config $(CONFIG)) $(foreach setting,$(SET),--set $(setting))
 TRAIN := $(COMMON) --out $(RUNS) --name $(NAME)
-RENDER = $(BIN)/perilune-render dataset $(COMMON) $(if $(DEM),--dem $(DEM)) --out $(DATA)
+RENDER = $(BIN)/perilune-render dataset $(COMMON) $(if $(DEM),--dem $(DEM)) $(if $(CATALOGUE),--catalogue $(CATALOGUE)) --out $(DATA)
 
 DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-photometry bench-develop clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -93,6 +93,9 @@ bench-render: setup ## time of a frame against a bare Blender loop; writes runs/
 
 compare-nac: setup ## rendered frames beside real NAC crops (NAC=folder); writes runs/nac/
 	@$(BIN)/python benchmarks/nac.py "$(NAC)" $(COMMON) --out $(RUNS)/nac
+
+bench-terrain: setup ## speed of growing the ground on one core; writes runs/bench/terrain.json
+	@$(BIN)/python benchmarks/terrain.py
 
 bench-photometry: setup ## rendered radiance against the formulas; writes runs/bench/photometry.json
 	@$(BIN)/python benchmarks/photometry.py

@@ -46,15 +46,25 @@ Dem = Annotated[
 ]
 
 
+Catalogue = Annotated[
+    Path | None,
+    typer.Option(help="CSV of the elevation model's own craters (longitude_deg, latitude_deg, diameter_m)."),
+]
+
+
 def _first(kind: Kind) -> Literal["detect", "nav"]:
     return "nav" if kind is Kind.NAV else "detect"
 
 
-def _resolve(preset: str, config: Path | None, setting: list[str] | None, dem: Path | None) -> DatasetConfig:
+def _resolve(
+    preset: str, config: Path | None, setting: list[str] | None, dem: Path | None, catalogue: Path | None
+) -> DatasetConfig:
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
-    if dem is None:
-        return resolved
-    return resolved.model_copy(update={"terrain": resolved.terrain.model_copy(update={"dem": str(dem)})})
+    paths = {name: str(path) for name, path in (("dem", dem), ("catalogue", catalogue)) if path is not None}
+    terrain = resolved.terrain.model_copy(update=paths)
+    if terrain.catalogue is not None and terrain.dem is None:
+        raise UserError("--catalogue", "catalogue", terrain.catalogue, "--dem with the elevation model that it is of")
+    return resolved.model_copy(update={"terrain": terrain})
 
 
 @app.command()
@@ -63,6 +73,7 @@ def dataset(
     config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
+    catalogue: Catalogue = None,
     kind: Annotated[Kind, typer.Option(help="Crater detection, navigation, or both.")] = Kind.BOTH,
     out: Annotated[
         Path | None,
@@ -70,7 +81,7 @@ def dataset(
     ] = None,
 ) -> None:
     """Render a preset's datasets. Stopped at any moment, the same command goes on where it was."""
-    resolved = _resolve(preset, config, setting, dem)
+    resolved = _resolve(preset, config, setting, dem, catalogue)
     folder = out or Path("data") / preset
     from perilune_render.dataset import (
         make_dataset,
@@ -110,15 +121,18 @@ def develop(
 
 @app.command()
 def preview(
+    config: Annotated[
+        Path | None, typer.Argument(help="YAML file whose section `dataset` overrides the preset.")
+    ] = None,
     preset: Preset = "small",
-    config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
+    catalogue: Catalogue = None,
     kind: Annotated[Kind, typer.Option(help="Whose first scene and descent (detect or nav).")] = Kind.DETECT,
     out: Annotated[Path, typer.Option(help="Where the picture goes.")] = Path("preview.png"),
 ) -> None:
     """Make one contact sheet of a configuration, with and without labels, in seconds."""
-    resolved = _resolve(preset, config, setting, dem)
+    resolved = _resolve(preset, config, setting, dem, catalogue)
     from perilune_render.preview import write_preview
 
     write_preview(resolved, _first(kind), out)
@@ -131,6 +145,7 @@ def export(
     config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
+    catalogue: Catalogue = None,
     kind: Annotated[Kind, typer.Option(help="Whose first scene (detect or nav).")] = Kind.DETECT,
     step: Annotated[int, typer.Option(min=1, help="Times the mesh's own vertex spacing.")] = 4,
     pixel_m: Annotated[float, typer.Option(min=0.01, help="Ground size of a GeoTIFF's pixel, metres.")] = 1.0,
@@ -139,7 +154,7 @@ def export(
     ),
 ) -> None:
     """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
-    resolved = _resolve(preset, config, setting, dem)
+    resolved = _resolve(preset, config, setting, dem, catalogue)
     from perilune_render.terrain.cache import cached_scene
     from perilune_render.terrain.export import MESH_SUFFIXES, RASTER_SUFFIXES, export_mesh, export_raster
 

@@ -171,10 +171,16 @@ class ReliefConfig(Section):
 
     hurst_exponent: Annotated[float, Field(gt=0, lt=1)] = 0.9
     """How slopes fall with wavelength, L^(H-1)."""
-    rms_slope_deg: Annotated[float, Field(ge=0, le=30)] = 2.5
-    """Root mean square slope of all waves down to a metre, without craters, degrees (mare about 1.2, highland 3)."""
+    rms_slope_deg: Span = Span(low=2.0, high=4.5)
+    """Root mean square slope of all waves down to a metre, without craters, drawn for each scene, degrees."""
     longest_wavelength_m: Positive = 1600.0
     """Longest wave, metres."""
+
+    @model_validator(mode="after")
+    def _gentle(self) -> "ReliefConfig":
+        if not 0 <= self.rms_slope_deg.low <= self.rms_slope_deg.high <= 30:
+            raise ValueError("rms_slope_deg from 0 to 30")
+        return self
 
 
 class TerrainConfig(Section):

@@ -24,7 +24,9 @@ from perilune_render.resample import seen_by
 from perilune_render.sensor import FixedPattern, develop
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.catalogue import read_catalogue
 from perilune_render.terrain.elevation import read_elevation
+from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.scene import Scene
 from perilune_shared.frames import Array, sun_direction
 from perilune_shared.manifest import (
@@ -47,10 +49,8 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
 
     Raises UserError where `out` holds something else.
     """
-    if config.terrain.dem is not None:
-        # A fault in it must show before anything is written.
-        read_elevation(Path(config.terrain.dem))
     plan = make_plan(config, kind)
+    _check_ground(config, graded_grid(config, plan.exr_camera, config.kind(kind).flight))
     info = _open_or_begin(config, kind, preset, out, plan)
     if info.complete:
         return open_dataset(out)
@@ -80,6 +80,14 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
     write_overview(dataset)
     write_info(out, finished)
     return open_dataset(out)
+
+
+def _check_ground(config: DatasetConfig, grid: Grid) -> None:
+    """Faults of the files that the ground is made from must show before anything is written."""
+    if config.terrain.dem is not None:
+        model = read_elevation(Path(config.terrain.dem))
+        if config.terrain.catalogue is not None:
+            read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters)
 
 
 def _open_or_begin(config: DatasetConfig, kind: Kind, preset: str, out: Path, plan: Plan) -> DatasetInfo:

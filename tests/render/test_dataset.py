@@ -130,6 +130,8 @@ def test_a_finished_dataset_is_reused_and_other_settings_are_refused(tmp_path):
         (["--config", "nowhere.yaml"], ["nowhere.yaml", "no such file"]),
         (["--preset", "tinny"], ["tinny", "tiny (nearest known)"]),
         (["--dem", "nowhere.tif"], ["nowhere.tif", "GeoTIFF"]),
+        (["--catalogue", "craters.csv"], ["craters.csv", "--dem"]),
+        (["--set", "dataset.camera.width_px=2000"], ["dataset.terrain.spacing_px", "vertices"]),
     ],
 )
 def test_faults_of_the_user_end_with_one_line_and_code_2(tmp_path, arguments, parts):

@@ -19,14 +19,15 @@ def add_relief(
 ) -> None:
     """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
-    `config.rms_slope_deg` is that of all octaves down to a metre. Long waves are laid before the craters, which cut
-    them; short ones after, since a worn crater is as rough as the ground about it.
+    `config.rms_slope_deg`, of which the seed draws one value, is that of all octaves down to a metre. Long waves are
+    laid before the craters, which cut them; short ones after, since a worn crater is as rough as the ground about it.
     """
     finest = 3 * float(grid.spacings_m.min())
     n_octaves = int(np.ceil(np.log2(config.longest_wavelength_m / min(finest, 1.0))))
     lengths = config.longest_wavelength_m / 2.0 ** np.arange(n_octaves)
     slopes = lengths ** (config.hurst_exponent - 1)
-    slopes *= np.tan(np.radians(config.rms_slope_deg)) / np.sqrt(np.sum(slopes[lengths >= 1] ** 2))
+    rms_slope_deg = stream(seed, "relief").uniform(config.rms_slope_deg.low, config.rms_slope_deg.high)
+    slopes *= np.tan(np.radians(rms_slope_deg)) / np.sqrt(np.sum(slopes[lengths >= 1] ** 2))
     for length, slope in zip(lengths, slopes, strict=True):
         if max(finest, shortest_m) <= length < longest_m:
             rng = stream(seed, "relief", length)

@@ -49,7 +49,9 @@ def test_whatever_changes_the_ground_changes_the_key(tmp_path):
         cache.scene_key(config_with(), CAMERA, FLIGHT, 4),
         cache.scene_key(config_with(), CAMERA, FlightConfig(downrange_m=400.0), 3),
         cache.scene_key(config_with(), dataclasses.replace(CAMERA, fx_px=30.0), FLIGHT, 3),
-        cache.scene_key(config_with(terrain={"relief": {"rms_slope_deg": 1.0}}), CAMERA, FLIGHT, 3),
+        cache.scene_key(
+            config_with(terrain={"relief": {"rms_slope_deg": {"low": 1.0, "high": 1.0}}}), CAMERA, FLIGHT, 3
+        ),
         cache.scene_key(config_with(light={"albedo_variation": 0.5}), CAMERA, FLIGHT, 3),
         with_dem,
         cache.scene_key(config_with(terrain={"dem": str(dem)}), CAMERA, FLIGHT, 3),

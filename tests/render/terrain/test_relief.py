@@ -29,7 +29,14 @@ def test_noise_fades_where_the_grid_cannot_hold_it():
 def test_relief_has_the_asked_slope_and_is_seeded():
     fields = [np.zeros(GRID.n_vertices) for _ in range(3)]
     for field, seed in zip(fields, (1, 1, 2), strict=True):
-        add_relief(field, GRID, ReliefConfig(rms_slope_deg=5.0, longest_wavelength_m=256.0), seed, 0.0, np.inf)
+        add_relief(
+            field,
+            GRID,
+            ReliefConfig(rms_slope_deg={"low": 5.0, "high": 5.0}, longest_wavelength_m=256.0),
+            seed,
+            0.0,
+            np.inf,
+        )
     assert np.array_equal(fields[0], fields[1]) and not np.array_equal(fields[0], fields[2])
     # The two octaves below 3 m that the grid cannot hold carry about a quarter of the variance.
     assert 3.5 < np.degrees(np.arctan(slope_rms(fields[0], 1.0))) < 5.5

@@ -1,0 +1,115 @@
+"""Speed and size of growing the ground, on one core: a 4 km scene, laying craters, a second descent from the cache.
+
+Run on one core by itself (it gives up the others). Compilation by numba is done once and kept, so everything is warmed
+up on a small scene first. Writes runs/bench/terrain.json.
+"""
+
+import json
+import os
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from perilune_render.blender.renderer import Renderer
+from perilune_render.config import CratersConfig, DatasetConfig, FlightConfig, Span
+from perilune_render.plan import camera_of, make_plan
+from perilune_render.terrain.boulders import boulder_mesh
+from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.craters import Craters, draw_craters
+from perilune_render.terrain.export import vertices
+from perilune_render.terrain.grid import Grid, graded_grid
+from perilune_render.terrain.scene import Scene, grow_scene
+from perilune_render.terrain.stamp import stamp_craters
+from perilune_shared.config import resolve
+from perilune_shared.files import write_text
+from perilune_shared.frames import sun_direction
+from perilune_shared.progress import progress_bar
+
+COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000)
+
+
+def mesh_of(scene: Scene) -> int:
+    """Vertices and faces of ground and boulders in memory; their number of bytes."""
+    ground = vertices(scene.grid, scene.height_m), scene.grid.quads()
+    stones = boulder_mesh(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed)
+    return sum(array.nbytes for array in (*ground, *stones))
+
+
+def lay(grid: Grid, craters: Craters) -> float:
+    """Seconds to lay craters on flat ground."""
+    height, albedo = np.zeros(grid.n_vertices), np.ones(grid.n_vertices)
+    start = time.perf_counter()
+    stamp_craters(height, albedo, grid, craters, np.zeros(len(craters)))
+    return time.perf_counter() - start
+
+
+def numbered(grid: Grid, n: int, seed: int) -> Craters:
+    """n craters of the default law, oldest first, whatever density that takes."""
+    config = CratersConfig(equilibrium_share=Span(low=1.0, high=1.0))
+    drawn = draw_craters(config, grid, seed)
+    share = 1.3 * n / len(drawn)
+    dense = draw_craters(config.model_copy(update={"equilibrium_share": Span(low=share, high=share)}), grid, seed)
+    chosen = np.random.default_rng(seed).choice(len(dense), n, replace=False)
+    return dense.chosen(np.sort(chosen))
+
+
+def main() -> None:
+    """Run the benchmark."""
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    config = resolve(DatasetConfig, "dataset", "perilune_render", "small")
+    camera = camera_of(config.camera)
+    tiny = resolve(DatasetConfig, "dataset", "perilune_render", "tiny")
+    grow_scene(config, camera_of(tiny.camera), FlightConfig(), 1)
+    flight = config.detect.flight.model_copy(update={"downrange_m": 1090.0})
+    start = time.perf_counter()
+    scene = grow_scene(config, camera, flight, 7)
+    grown_s = time.perf_counter() - start
+    mesh_bytes = mesh_of(scene)
+    scene_s = time.perf_counter() - start
+    peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    grid = graded_grid(config, camera, config.detect.flight)
+    times = []
+    with progress_bar() as bar:
+        for n in bar.track(COUNTS, description="laying craters"):
+            craters = numbered(grid, n, 3)
+            times.append(min(lay(grid, craters) for _ in range(3)))
+    figures = {
+        "scene_s": scene_s,
+        "grown_s": grown_s,
+        "extent_m": scene.grid.extent_m,
+        "vertices": scene.grid.n_vertices,
+        "craters": len(scene.craters),
+        "boulders": len(scene.boulders),
+        "mesh_gib": mesh_bytes / 2**30,
+        "peak_gib": peak_gib,
+        "craters_per_s": COUNTS[-2] / times[-2],
+        "slope": float(np.polyfit(np.log(COUNTS), np.log(times), 1)[0]),
+        "laying_s": dict(zip(map(str, COUNTS), times, strict=True)),
+        **second_descent(config),
+    }
+    path = Path("runs/bench/terrain.json")
+    write_text(path, json.dumps(figures, indent=2) + "\n")
+    print(path, json.dumps(figures, indent=2))
+
+
+def second_descent(config: DatasetConfig) -> dict[str, float]:
+    """Seconds from the settings to the first rendered frame, without and with the scene in the cache."""
+    os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    plan = make_plan(config, "detect")
+    times = []
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["PERILUNE_CACHE"] = folder
+        for trajectory in plan.trajectories[:2]:
+            start = time.perf_counter()
+            scene = cached_scene(config, plan.exr_camera, config.detect.flight, plan.scenes[0].seed)
+            with Renderer(scene, config, plan.exr_camera, sun_direction(90, 30)) as renderer:
+                renderer.render(trajectory.flight.position_m[0], trajectory.flight.rotation_camera_from_site[0])
+            times.append(time.perf_counter() - start)
+    return {"first_descent_s": times[0], "second_descent_s": times[1]}
+
+
+if __name__ == "__main__":
+    main()
