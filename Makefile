@@ -31,7 +31,7 @@ EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
 	@echo
-	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  NAC=folder  KIND=detect|nav  NAME=run'
+	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run'
 
 setup: $(VENV)/.ready ## make the environment (.venv) with everything in it
 

@@ -12,6 +12,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset, DatasetInfo, open_dataset, write_info
 
 _SHEET_FRAMES = 12
+_MEANS = ("threads", "cache_gib")
 
 
 def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
@@ -33,7 +34,7 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
     for name in ("kind", "config", "versions", "developed_from"):
         theirs, ours = getattr(existing, name), getattr(info, name)
         if name == "config":
-            theirs, ours = _without_threads(theirs), _without_threads(ours)
+            theirs, ours = _without_means(theirs), _without_means(ours)
         if theirs != ours:
             raise UserError(
                 out / "dataset.json",
@@ -44,8 +45,9 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
     return existing
 
 
-def _without_threads(config: dict) -> dict:
-    return {**config, "render": {k: v for k, v in config.get("render", {}).items() if k != "threads"}}
+def _without_means(config: dict) -> dict:
+    """Settings that change how fast, not what."""
+    return {**config, "render": {k: v for k, v in config.get("render", {}).items() if k not in _MEANS}}
 
 
 def first_difference(theirs: object, ours: object, path: str = "") -> str:

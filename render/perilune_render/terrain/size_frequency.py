@@ -124,9 +124,9 @@ class TraskEquilibrium(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MintonEquilibrium(SizeFrequency):
-    """Equilibrium counted on a mare, N(>D) = 0.0336 D^-2 per square metre: ascribed to Minton et al. 2019.
+    """Equilibrium of small craters on a mare, N(>D) = 0.0336 D^-2 per square metre.
 
-    The constant is taken second hand. Support as for Trask's law.
+    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021, the constant taken second hand. Support as for Trask's law.
     """
 
     share: float = 1.0

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from perilune_render.config import ReliefConfig
 from perilune_render.terrain.grid import Grid
@@ -6,6 +7,7 @@ from perilune_render.terrain.noise import RMS_SLOPE, add_waves
 from perilune_render.terrain.relief import add_relief
 
 GRID = Grid.even(512, 512)
+FIVE = {"low": 5.0, "high": 5.0}
 
 
 def slope_rms(height, step):
@@ -32,7 +34,7 @@ def test_relief_has_the_asked_slope_and_is_seeded():
         add_relief(
             field,
             GRID,
-            ReliefConfig(rms_slope_deg={"low": 5.0, "high": 5.0}, longest_wavelength_m=256.0),
+            ReliefConfig(rms_slope_deg=FIVE, longest_wavelength_m=256.0),
             seed,
             0.0,
             np.inf,
@@ -49,3 +51,15 @@ def test_relief_is_self_affine():
     lags = np.array([8, 16, 32, 64])
     deviations = [np.sqrt(np.mean((height[:, lag:] - height[:, :-lag]) ** 2)) for lag in lags]
     assert abs(np.polyfit(np.log(lags), np.log(deviations), 1)[0] - 0.8) < 0.1
+
+
+def test_slopes_are_spread_as_a_normal_law():
+    height = np.zeros(GRID.n_vertices)
+    for seed in (3, 4, 5):
+        add_relief(height, GRID, ReliefConfig(rms_slope_deg=FIVE, longest_wavelength_m=128.0), seed, 0.0, np.inf)
+    slope = np.diff(height.reshape(1025, 1025), axis=1).ravel()
+    slope = (slope - slope.mean()) / slope.std()
+    # Shares within one, two and three standard deviations: 0.683, 0.954, 0.997.
+    shares = [np.mean(np.abs(slope) < k) for k in (1, 2, 3)]
+    assert shares[0] == pytest.approx(0.683, abs=0.02) and shares[1] == pytest.approx(0.954, abs=0.01)
+    assert shares[2] == pytest.approx(0.997, abs=0.003)
