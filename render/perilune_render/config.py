@@ -1,6 +1,6 @@
 """Settings of a dataset: the `dataset` section of a configuration file."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -13,12 +13,17 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class Span(Section):
-    """A range from which a value is drawn evenly."""
+    """A range from which a value is drawn evenly; in a configuration a single number stands for itself."""
 
     low: float
     """Least value."""
     high: float
     """Largest value."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_one_number(cls, value: Any) -> Any:
+        return {"low": value, "high": value} if isinstance(value, int | float) else value
 
     @model_validator(mode="after")
     def _ordered(self) -> "Span":
@@ -148,7 +153,7 @@ class CratersConfig(Section):
     secondary_share: Share = 0.08
     """Share of the craters under 30 m that lie in clusters of secondaries."""
     n_rayed: Annotated[int, Field(ge=0, le=100)] = 4
-    """How many of the freshest large craters have bright rays."""
+    """How many craters have bright rays: the largest among the fresh ones."""
 
 
 class BouldersConfig(Section):
@@ -187,9 +192,9 @@ class TerrainConfig(Section):
     """The ground."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] = -45.5
-    """Latitude of the site, degrees."""
+    """Latitude of the site, degrees; an elevation model has its own."""
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
-    """Longitude of the site, degrees."""
+    """Longitude of the site, degrees; an elevation model has its own."""
     spacing_px: Annotated[float, Field(gt=0, le=4)] = 0.5
     """Vertex spacing over the smallest ground pixel from which a place is seen."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000

@@ -27,7 +27,8 @@ from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.catalogue import read_catalogue
 from perilune_render.terrain.elevation import read_elevation
 from perilune_render.terrain.grid import Grid, graded_grid
-from perilune_render.terrain.scene import Scene
+from perilune_render.terrain.scene import Scene, resolved_m
+from perilune_shared.errors import UserError
 from perilune_shared.frames import Array, sun_direction
 from perilune_shared.manifest import (
     CameraInfo,
@@ -36,6 +37,7 @@ from perilune_shared.manifest import (
     DatasetInfo,
     count_rows,
     open_dataset,
+    read_part,
     write_info,
     write_part,
 )
@@ -87,7 +89,7 @@ def _check_ground(config: DatasetConfig, grid: Grid) -> None:
     if config.terrain.dem is not None:
         model = read_elevation(Path(config.terrain.dem))
         if config.terrain.catalogue is not None:
-            read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters)
+            read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters, resolved_m(model))
 
 
 def _open_or_begin(config: DatasetConfig, kind: Kind, preset: str, out: Path, plan: Plan) -> DatasetInfo:
@@ -126,8 +128,11 @@ def _write_scene(
         "trajectories": tables.trajectory_table(trajectories),
     }
     for name, rows in parts.items():
-        if not (out / "manifest" / name / f"{plan.scene_id}.parquet").exists():
+        part = out / "manifest" / name / f"{plan.scene_id}.parquet"
+        if not part.exists():
             write_part(out, name, plan.scene_id, rows)
+        elif name == "craters" and not read_part(part, name).equals(rows):
+            raise UserError(part, name, "other craters", "the elevation model and catalogue that it was begun with")
 
 
 def _render_trajectory(

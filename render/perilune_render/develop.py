@@ -144,6 +144,10 @@ def _develop_descent(
     written, labels = [], []
     for row in rows:
         radiance = read_radiance(source.file(row["exr_path"]))
+        size = radiance.depth_m.shape[::-1]
+        if size != (exr_camera.width_px, exr_camera.height_px):
+            wanted = f"{exr_camera.width_px} x {exr_camera.height_px}, as dataset.json says"
+            raise UserError(row["exr_path"], "size", f"{size[0]} x {size[1]} pixels", wanted)
         rotation = matrix_from_quaternion(row["rotation_wxyz"])
         velocity = rotation @ row["velocity_mps"]
         rng = stream(seeds[row["trajectory_id"]], "sensor", row["frame_index"])

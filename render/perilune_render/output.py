@@ -62,7 +62,7 @@ def first_difference(theirs: object, ours: object, path: str = "") -> str:
 def write_png(root: Path, frame_id: str, image: np.ndarray, bits: int) -> dict[str, str | int]:
     """Write a frame's PNG; its columns png_* of the manifest.
 
-    Above 8 bits a grey value stands in the upper bits of a 16-bit number, as the PNG standard asks for.
+    Above 8 bits a grey value stands in the upper bits of a 16-bit number, with zeros below.
     """
     path = f"frames/{frame_id}.png"
     stored = image if bits == 8 else image << (16 - bits)

@@ -14,6 +14,9 @@ from perilune_render.streams import derived_seed, stream
 from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
 
+_LARGEST_COVER = 9
+"""Pixels rendered over pixels wanted, at most."""
+
 
 @dataclass(frozen=True, slots=True)
 class ScenePlan:
@@ -91,6 +94,14 @@ def camera_of(config: CameraConfig) -> Camera:
             "dataset.camera.distortion",
             camera.distortion,
             "a distortion that does not fold back within the image: weaker, or a narrower view",
+        )
+    covering = camera.covering_pinhole()
+    if covering.width_px * covering.height_px > _LARGEST_COVER * width * height:
+        raise UserError(
+            "configuration",
+            "dataset.camera.distortion",
+            camera.distortion,
+            f"a weaker one: it needs a rendering of {covering.width_px} x {covering.height_px} pixels",
         )
     return camera
 

@@ -18,7 +18,7 @@ def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
     """
     if camera == source:
         return image
-    finer = max(1, round(source.fx_px / camera.fx_px))
+    finer = max(1, int(np.ceil(source.fx_px / camera.fx_px - 0.01)))
     seen = cv2.remap(
         image, *_places(_refined(camera, finer), source), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
     )

@@ -23,6 +23,8 @@ from perilune_render.streams import stream
 from perilune_shared.camera import Camera
 from perilune_shared.frames import Array
 
+_STRETCH = 1.5
+"""Distortion may widen motion at the edges by about so much."""
 _LEAST_MOTION_PX = 0.05
 """Motion during the exposure below which it is not worth the blurring."""
 _FAINT_E = 100.0
@@ -73,7 +75,7 @@ def develop(
         light = cv2.GaussianBlur(light, (0, 0), config.psf_sigma_px, borderType=cv2.BORDER_REFLECT)
     exposure_s = exposure_time_s(light, config)
     way_m = np.asarray(velocity_camera_mps) * exposure_s
-    if config.motion_blur and _fastest_px(radiance.depth_m, exr_camera, way_m) >= _LEAST_MOTION_PX:
+    if config.motion_blur and _fastest_px(radiance.depth_m, camera, exr_camera, way_m) >= _LEAST_MOTION_PX:
         depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
         light = _blurred(light, motion_px(depth_m, camera, way_m))
     electrons = light * pattern.response
@@ -122,12 +124,12 @@ def motion_px(depth_m: np.ndarray, camera: Camera, way_camera_m: Array) -> np.nd
     return np.nan_to_num(camera.project(moved) - camera.project(start)).astype(np.float32)
 
 
-def _fastest_px(depth_m: np.ndarray, pinhole: Camera, way_camera_m: Array) -> float:
-    """An upper bound of the motion of any pixel, pixels."""
+def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, way_camera_m: Array) -> float:
+    """About the fastest motion of any pixel of `camera`, pixels, rather more than less; `pinhole` covers its view."""
     corners = [[u, v] for u in (0, pinhole.width_px) for v in (0, pinhole.height_px)]
     widest = np.linalg.norm(pinhole.rays(corners), axis=-1).max()
     nearest_m = max(float(depth_m.min()), 1e-9)
-    return float(np.linalg.norm(way_camera_m) / nearest_m * widest * max(pinhole.fx_px, pinhole.fy_px))
+    return float(np.linalg.norm(way_camera_m) / nearest_m * widest * max(camera.fx_px, camera.fy_px) * _STRETCH)
 
 
 @lru_cache(maxsize=4)

@@ -22,7 +22,7 @@ def test_later_sources_win(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text("dataset: {seed: 5, terrain: {relief: {rms_slope_deg: 1}}}")
     config = dataset(config_file=file, settings=("dataset.seed=7", "dataset.camera.width_px=64"))
-    assert config.seed == 7 and config.terrain.relief.rms_slope_deg == 1.0
+    assert config.seed == 7 and config.terrain.relief.rms_slope_deg.high == 1.0
     assert config.camera.width_px == 64 and config.camera.height_px == 128
 
 

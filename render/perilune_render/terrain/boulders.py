@@ -1,7 +1,9 @@
 """The boulder population and its set of rocks.
 
 Shapes: convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (S/I 0.770, I/L 0.758,
-taken second hand), some cut by planes, as fractured rocks are.
+taken second hand), some cut by planes, as fractured rocks are. Deviation: near fresh craters counts above 4.4 m have
+been seen to fall more steeply (exponent -4, second hand); one exponent serves everywhere here, and no boulder is
+larger than a twentieth of its crater.
 """
 
 from dataclasses import dataclass

@@ -97,7 +97,7 @@ def _read(path: Path) -> Scene | None:
 
 
 def _make_room(folder: Path, most_bytes: float) -> None:
-    kept = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
+    kept = sorted(folder.glob("[0-9a-f]*.npz"), key=lambda path: path.stat().st_mtime, reverse=True)
     total = 0
     for place, path in enumerate(kept):
         total += path.stat().st_size

@@ -7,17 +7,20 @@ import numpy as np
 
 from perilune_render.config import CratersConfig
 from perilune_render.terrain.craters import Craters
-from perilune_render.terrain.elevation import ElevationModel
+from perilune_render.terrain.elevation import ElevationModel, raster_places
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
-from perilune_shared.frames import site_from_selenographic
+from perilune_shared.frames import Array, site_from_selenographic
 
 _LARGEST_BYTES = 500_000_000
 _COLUMNS = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0), "diameter_m": (0.0, 1e7)}
 
 
-def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: CratersConfig) -> Craters:
-    """The catalogue's craters whose centre lies on the grid, largest first, with origin 'elevation model'.
+def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: CratersConfig, smallest_m: float) -> Craters:
+    """The catalogue's craters that the model shows, largest first, with origin 'elevation model'.
+
+    Those are the ones whose centre and rim lie on the grid and on measured pixels of the model, and which are larger
+    than `smallest_m`: smaller ones the generator draws itself.
 
     The file needs a header with longitude_deg (east), latitude_deg (north) and diameter_m; other columns are ignored.
     Age and fresh depth are not known (NaN), wear is 0. Raises UserError with the line of a fault.
@@ -40,8 +43,9 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Crater
         raise UserError(path, "catalogue", error, "a CSV file in UTF-8") from None
     longitude, latitude, diameter = np.array(rows, np.float64).reshape(-1, 3).T
     x, y = site_from_selenographic(latitude, longitude, model.latitude_deg, model.longitude_deg)
-    on_grid = (np.maximum(np.abs(x), np.abs(y)) < grid.extent_m / 2) & (diameter < grid.extent_m)
-    chosen = np.flatnonzero(on_grid)[np.argsort(-diameter[on_grid], kind="stable")]
+    wanted = (np.maximum(np.abs(x), np.abs(y)) + diameter / 2 < grid.extent_m / 2) & (diameter > smallest_m)
+    wanted[wanted] = _measured(model, x[wanted], y[wanted], diameter[wanted])
+    chosen = np.flatnonzero(wanted)[np.argsort(-diameter[wanted], kind="stable")]
     unknown = np.full(len(chosen), np.nan)
     return Craters.round(
         x[chosen],
@@ -53,6 +57,17 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Crater
         config.profile,
         "elevation model",
     )
+
+
+def _measured(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) -> np.ndarray:
+    """Whether centre and 16 points of each rim (N,) lie on pixels whose height the model knows."""
+    angle = np.append(2 * np.pi * np.arange(16) / 16, 0)
+    reach = np.append(np.ones(16), 0) * diameter_m[:, None] / 2
+    column, row = raster_places(model, x_m[:, None] + reach * np.cos(angle), y_m[:, None] + reach * np.sin(angle))
+    n_rows, n_columns = model.known.shape
+    inside = (column >= 0) & (column < n_columns) & (row >= 0) & (row < n_rows)
+    known = model.known[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
+    return (inside & known).all(axis=1)
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:

@@ -1,8 +1,13 @@
 """The crater population of a scene: where, how large, how old, how worn. Plain data, before any height is known.
 
 Each crater's age is uniform between now and the time in which production fills the equilibrium of its size, so that
-fresh, worn and nearly erased craters stand together, as in real images. Equilibrium densities are counts of craters
-that people could still see, so no crater in equilibrium is drawn more worn than `_LAST_SEEN_WEAR`.
+fresh, worn and nearly erased craters stand together, as in real images; where production has not filled it yet,
+between now and the age of the surface (our simplification: production before 3 Gyr ago fell fast). Equilibrium
+densities are counts of craters that people could still see, so no crater in equilibrium is drawn more worn than
+`_LAST_SEEN_WEAR`.
+
+Craters are ordered by age. As diffusivity grows with size as D^0.9, an order by wear would differ: it would lay a large
+young crater before a small old one, which it has in truth removed.
 """
 
 import dataclasses
@@ -129,7 +134,7 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
     age = rng.random(n) * oldest
     fresh = fresh_depth_m(diameter, config.depth)
     depth = np.maximum(fresh + 0.02 * diameter * np.clip(rng.normal(size=n), -2, 2), 0.08 * diameter)
-    x, y, age, clustered = _cluster(x, y, age, diameter, reach, config.secondary_share, rng)
+    x, y, age, clustered = _cluster(x, y, age, oldest, diameter, reach, config.secondary_share, rng)
     depth = np.where(clustered, 0.7 * depth, depth)
     craters = Craters(
         x,
@@ -148,7 +153,14 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
 
 
 def _cluster(
-    x: Array, y: Array, age: Array, diameter: Array, reach: Array, share: float, rng: np.random.Generator
+    x: Array,
+    y: Array,
+    age: Array,
+    oldest: Array,
+    diameter: Array,
+    reach: Array,
+    share: float,
+    rng: np.random.Generator,
 ) -> tuple[Array, Array, Array, np.ndarray]:
     """Move a share of the small craters into elongated clusters of one age each, as secondaries lie.
 
@@ -174,7 +186,9 @@ def _cluster(
     moved = chosen[held]
     x, y, age = x.copy(), y.copy(), age.copy()
     x[moved], y[moved] = new_x[held], new_y[held]
-    age[moved] = np.minimum(age[chosen[first]][cluster], age.max())[held]
+    # One age for all, at which the smallest of them is not yet gone.
+    youngest = np.minimum.reduceat(oldest[chosen], first) * rng.random(n_clusters)
+    age[moved] = youngest[cluster][held]
     clustered[moved] = True
     return x, y, age, clustered
 

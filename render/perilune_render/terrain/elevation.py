@@ -29,6 +29,8 @@ class ElevationModel:
 
     height_m: Array
     """Rows from the raster's top (rows, columns), metres, holes filled."""
+    known: np.ndarray
+    """Where the raster has a height of its own (rows, columns)."""
     transform: rasterio.Affine
     """Projected coordinates from (column, row), raster corners."""
     crs: rasterio.crs.CRS
@@ -56,6 +58,8 @@ def read_elevation(path: Path) -> ElevationModel:
             if raster.width * raster.height > _LARGEST_PIXELS:
                 raise UserError(path, "size", f"{raster.width} x {raster.height}", f"at most {_LARGEST_PIXELS} pixels")
             height = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+            # Some products hold integers and say what they stand for.
+            height = height * raster.scales[0] + raster.offsets[0]
             transform, crs = raster.transform, raster.crs
     except RasterioError as error:
         raise UserError(path, "dem", error, "a readable GeoTIFF") from None
@@ -75,9 +79,20 @@ def read_elevation(path: Path) -> ElevationModel:
     except RasterioError as error:
         raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
     pixel = _pixel_m(transform, crs, middle, lat[0], lon[0])
-    return ElevationModel(
-        height, transform, crs, float(lat[0]), float(lon[0]), pixel, f"{path.name} sha256:{sha256_of(path)}"
-    )
+    source = f"{path.name} sha256:{sha256_of(path)}"
+    return ElevationModel(height, known, transform, crs, float(lat[0]), float(lon[0]), pixel, source)
+
+
+def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+    """Column and row, counted from the raster's top left corner, of places (...) of O_L's plane."""
+    lat, lon = selenographic_from_site(x_m, y_m, model.latitude_deg, model.longitude_deg)
+    east, north = (np.array(v) for v in rasterio.warp.transform(_MOON, model.crs, np.ravel(lon), np.ravel(lat)))
+    if model.crs.is_geographic:
+        # A raster may count longitudes from 0 or from -180, and may lie across either.
+        middle = (model.transform @ (model.height_m.shape[1] / 2, model.height_m.shape[0] / 2))[0]
+        east += 360 * np.round((middle - east) / 360)
+    column, row = ~model.transform @ (east, north)
+    return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
 
 
 def base_heights(model: ElevationModel, grid: Grid) -> tuple[Array, Array]:
@@ -89,15 +104,14 @@ def base_heights(model: ElevationModel, grid: Grid) -> tuple[Array, Array]:
     rows, columns = model.height_m.shape
     # Pixel coordinates vary slowly over a site: project a coarse net and interpolate.
     net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 65)
-    x, y = np.meshgrid(net, net)
-    lat, lon = selenographic_from_site(x, y, model.latitude_deg, model.longitude_deg)
-    east, north = rasterio.warp.transform(_MOON, model.crs, lon.ravel(), lat.ravel())
-    column, row = ~model.transform @ (np.array(east), np.array(north))
+    column, row = raster_places(model, *np.meshgrid(net, net))
     x, y = grid.vertices_xy()
-    column = RectBivariateSpline(net, net, column.reshape(65, 65)).ev(y, x)
-    row = RectBivariateSpline(net, net, row.reshape(65, 65)).ev(y, x)
+    column, row = (RectBivariateSpline(net, net, place).ev(y, x) for place in (column, row))
     outside = np.maximum.reduce([-row, row - rows, -column, column - columns, np.zeros_like(row)])
     margin = int(np.ceil(outside.max())) + 2
+    if (rows + 2 * margin) * (columns + 2 * margin) > _LARGEST_PIXELS:
+        ground = f"{grid.extent_m:.0f} m of ground"
+        raise UserError(model.source, "dem", f"{rows} x {columns} pixels for {ground}", "a model of like extent")
     padded = _continued(model.height_m, margin, model.pixel_m)
     height = ndimage.map_coordinates(padded, [row - 0.5 + margin, column - 0.5 + margin], order=3, mode="nearest")
     middle = grid.n_half * (2 * grid.n_half + 2)

@@ -17,6 +17,7 @@ from perilune_shared.frames import MOON_RADIUS_M
 MESH_SUFFIXES = (".glb", ".ply", ".obj", ".stl")
 RASTER_SUFFIXES = (".tif", ".tiff")
 _LARGEST_SIDE = 20_000
+_ROWS_AT_ONCE = 256
 
 
 def vertices(grid: Grid, height_m: np.ndarray) -> np.ndarray:
@@ -58,7 +59,6 @@ def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
         raise UserError(path, "pixel size", f"{pixel_m} m makes {n} pixels a side", f"1 to {_LARGEST_SIDE}")
     centre = (np.arange(n) + 0.5 - n / 2) * pixel_m
     # O_L's x points west and y south; a raster's columns go east and its rows south.
-    height = value_at(scene.height_m, scene.grid, -centre[None, :], centre[:, None]).astype(np.float32)
     place = f"+lat_0={scene.latitude_deg!r} +lon_0={scene.longitude_deg!r}"
     profile = {
         "driver": "GTiff",
@@ -72,5 +72,8 @@ def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
         "predictor": 3,
     }
     with written_aside(path) as aside, rasterio.open(aside, "w", **profile) as raster:
-        raster.write(height, 1)
+        for top in range(0, n, _ROWS_AT_ONCE):
+            rows = centre[top : top + _ROWS_AT_ONCE]
+            height = value_at(scene.height_m, scene.grid, -centre[None, :], rows[:, None])
+            raster.write(height.astype(np.float32), 1, window=rasterio.windows.Window(0, top, n, len(rows)))
         raster.set_band_description(1, "height above the site, m")

@@ -19,6 +19,8 @@ from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
 from perilune_shared.frames import Array
 
+_WIDEST_RAD = np.radians(80)
+
 
 @dataclass(frozen=True, slots=True)
 class Grid:
@@ -86,19 +88,24 @@ class Grid:
         return np.concatenate([inner, joined])
 
 
+def view_angle(camera: Camera, flight: FlightConfig) -> float:
+    """Largest angle from straight down, along either axis, under which a frame sees the ground, radians."""
+    half_view = max(
+        max(camera.cx_px, camera.width_px - camera.cx_px) / camera.fx_px,
+        max(camera.cy_px, camera.height_px - camera.cy_px) / camera.fy_px,
+    )
+    return float(np.arctan(half_view) + 3 * np.radians(flight.attitude_sigma_deg))
+
+
 def reach_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
     """Largest |x| or |y| from the site that a frame at this nominal altitude can see, metres.
 
     The camera's axes follow those of O_L up to its small turns, so that a frame covers a square along the axes. Counts
     three standard deviations of tilt, of turn and of position, and a twentieth for relief.
     """
-    half_view = max(
-        max(camera.cx_px, camera.width_px - camera.cx_px) / camera.fx_px,
-        max(camera.cy_px, camera.height_px - camera.cy_px) / camera.fy_px,
-    )
     turn = min(3 * np.radians(flight.attitude_sigma_deg), np.pi / 4)
     share = (altitude_m - flight.end_altitude_m) / (flight.start_altitude_m - flight.end_altitude_m)
-    slope = np.tan(np.minimum(np.arctan(half_view) + turn, np.radians(80))) * (np.cos(turn) + np.sin(turn))
+    slope = np.tan(min(view_angle(camera, flight), _WIDEST_RAD)) * (np.cos(turn) + np.sin(turn))
     view = (altitude_m + 3 * flight.position_sigma_m) * slope
     return flight.downrange_m * share**2 + 3 * flight.position_sigma_m + 1.05 * view
 
@@ -106,8 +113,11 @@ def reach_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
 def graded_grid(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> Grid:
     """The grid for a camera and a flight: spacing at most `terrain.spacing_px` of the smallest pixel at every place.
 
-    Raises UserError where that needs more than `terrain.max_vertices`.
+    Raises UserError where that needs more than `terrain.max_vertices`, or where frames could see the horizon.
     """
+    if view_angle(camera, flight) > _WIDEST_RAD:
+        wide = f"frames reach {np.degrees(view_angle(camera, flight)):.0f} degrees from straight down"
+        raise UserError("configuration", "dataset.camera", wide, f"at most {np.degrees(_WIDEST_RAD):.0f}")
     altitude = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, 400)
     reach = np.maximum.accumulate(reach_m(camera, flight, altitude))
     # The ground may rise towards the camera by a twentieth of the altitude too.

@@ -15,8 +15,8 @@ def add_waves(
 ) -> None:
     """Add amplitude times gradient noise of a wavelength to field (n_vertices,), in place.
 
-    Where the grid is too wide to hold the wave (spacing above a third of it) the wave fades out. `finest_m` widens
-    every spacing to at least itself.
+    Where the grid is too wide to hold the wave it fades out: whole up to a spacing of a sixth of it, half at a third,
+    gone at a half. `finest_m` widens every spacing to at least itself.
     """
     held = np.clip(1.5 - 3 * np.maximum(grid.spacings_m, finest_m) / wavelength_m, 0, 1)
     if not held.any():

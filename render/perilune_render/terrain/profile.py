@@ -33,7 +33,7 @@ REACH = 3.0
 """Profiles are cut at this distance over the radius."""
 DEPTH_OVER_RIM = np.linspace(1.5, 9.0, 16)
 """Fresh depths over the fresh rim's height for which the crest's place is tabulated."""
-_FARTHEST_CREST = 1.3
+_FARTHEST_CREST = 1.5
 _DOMAIN, _N_RADIAL = 6.0, 600
 _CREST = 0.036822
 LEAST_WEAR, MOST_WEAR, N_WEAR = 2e-4, 0.6, 56
@@ -193,7 +193,7 @@ def _crests(x: Array, rim: Array, bowl: Array) -> Array:
 def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_thomson") -> Array:
     """Where the crest of craters (N,) has moved to, over their first radius, for their wear K/R^2 and fresh shape.
 
-    At most 1.3: beyond that there is hardly a crest left.
+    At most 1.5: beyond that there is hardly a crest left.
     """
     tables = profile_tables(profile)
     row = wear_row(wear)

@@ -21,7 +21,6 @@ from perilune_shared.frames import Array
 GENERATOR_VERSION = 2
 """Goes up with every change after which a seed grows another scene."""
 _RESOLVED_PIXELS = 4.0
-"""An elevation model shows craters of at least this many pixels across; smaller ones are added."""
 _ROUGHNESS_M = 100.0
 """Shorter waves lie on top of the craters."""
 _LEAST_RIM = 0.3
@@ -45,7 +44,7 @@ class Scene:
     albedo: np.ndarray
     """Factor on the reflectance (n_vertices,) float32, about 1."""
     craters: Craters
-    """Those that younger ones have not removed, in the order in which they were laid; crater_id is the place in it."""
+    """Real ones of a catalogue, then those that younger ones have not removed, oldest first; crater_id is the place."""
     rims: Rims
     """The same craters as found on the finished ground."""
     boulders: Boulders
@@ -62,7 +61,7 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
     grid = graded_grid(config, camera, flight)
     model = read_elevation(Path(terrain.dem)) if terrain.dem is not None else None
     height = np.zeros(grid.n_vertices) if model is None else base_heights(model, grid)[0]
-    resolved = None if model is None else _RESOLVED_PIXELS * model.pixel_m
+    resolved = None if model is None else resolved_m(model)
     longest = np.inf if resolved is None else resolved
     add_relief(height, grid, terrain.relief, seed, _ROUGHNESS_M, longest)
     craters = draw_craters(terrain.craters, grid, seed, resolved)
@@ -76,7 +75,7 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
     kept = laid.rim_left >= _LEAST_RIM
     craters, sag = craters.chosen(kept), laid.sag_m[kept]
     if model is not None and terrain.catalogue is not None:
-        real = read_catalogue(Path(terrain.catalogue), model, grid, terrain.craters)
+        real = read_catalogue(Path(terrain.catalogue), model, grid, terrain.craters, resolved_m(model))
         craters, sag = real.joined(craters), np.concatenate([np.zeros(len(real)), sag])
     height -= value_at(height, grid, 0.0, 0.0)
     boulders = draw_boulders(terrain.boulders, grid, craters, seed)
@@ -92,6 +91,11 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
         boulders.centre_height_m(value_at(height, grid, boulders.x_m, boulders.y_m)),
         "procedural" if model is None else model.source,
     )
+
+
+def resolved_m(model: ElevationModel) -> float:
+    """Diameter in metres from which an elevation model shows a crater: four pixels. Smaller ones are added."""
+    return _RESOLVED_PIXELS * model.pixel_m
 
 
 def _place(config: DatasetConfig, model: ElevationModel | None) -> tuple[float, float]:

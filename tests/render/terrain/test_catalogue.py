@@ -1,10 +1,12 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import rasterio
 
 from perilune_render.terrain.catalogue import read_catalogue
 from perilune_render.terrain.craters import ORIGINS
-from perilune_render.terrain.elevation import read_elevation
+from perilune_render.terrain.elevation import raster_places, read_elevation
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.errors import UserError
@@ -49,9 +51,20 @@ def written(path, model, rows, header="longitude_deg,latitude_deg,diameter_m,nam
 
 def test_places_and_sizes_come_back_largest_first(tmp_path, model):
     rows = [*CRATERS[::-1], (5000.0, 0.0, 300.0)]
-    craters = read_catalogue(written(tmp_path / "c.csv", model, rows), model, GRID, config_with().terrain.craters)
+    craters = read_catalogue(written(tmp_path / "c.csv", model, rows), model, GRID, config_with().terrain.craters, 20.0)
     assert np.allclose(np.stack([craters.x_m, craters.y_m, craters.diameter_m], axis=1), CRATERS, atol=0.05)
     assert [ORIGINS[k] for k in craters.origin] == ["elevation model"] * 2 and np.isnan(craters.age_myr).all()
+
+
+def test_only_what_the_model_itself_shows_is_taken(tmp_path, model):
+    # Below what it resolves; on a hole; beyond the raster, where the ground is invented; with a rim off the grid.
+    unfit = [(50.0, 60.0, 15.0), (300.0, 300.0, 80.0), (-1100.0, 0.0, 150.0), (0.0, 870.0, 100.0)]
+    holed = dataclasses.replace(model, known=model.known.copy())
+    column, row = raster_places(model, np.array([300.0]), np.array([300.0]))
+    holed.known[int(row[0]), int(column[0])] = False
+    path = written(tmp_path / "c.csv", model, [*CRATERS, *unfit])
+    assert len(read_catalogue(path, holed, Grid.even(1500, 90), config_with().terrain.craters, 20.0)) == 3
+    assert len(read_catalogue(path, holed, GRID, config_with().terrain.craters, 20.0)) == 2
 
 
 def test_real_craters_are_measured_on_the_model_and_kept_beside_ours(tmp_path, model, camera):
@@ -96,4 +109,4 @@ def test_faults_are_told_with_their_line(tmp_path, model, text, part):
     if text is not None:
         path.write_text(text)
     with pytest.raises(UserError, match=part):
-        read_catalogue(path, model, GRID, config_with().terrain.craters)
+        read_catalogue(path, model, GRID, config_with().terrain.craters, 20.0)

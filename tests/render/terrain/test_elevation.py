@@ -59,6 +59,35 @@ def test_polar_stereographic_near_the_south_pole(tmp_path):
     assert height[-1, 15] - height[0, 15] == pytest.approx(-60, rel=0.02)
 
 
+@pytest.mark.parametrize("middle_deg", [200.0, 359.99, 180.0, -179.995])
+def test_rasters_that_count_longitudes_from_0_or_lie_across_180(tmp_path, middle_deg):
+    # 100 x 100 pixels of 20 m that rise to the east by one metre a pixel.
+    degree = 20 / METRES_PER_DEGREE
+    height = np.tile(np.arange(100.0), (100, 1))
+    transform = rasterio.Affine(degree, 0, middle_deg - 50 * degree, 0, -degree, 50 * degree)
+    model = read_elevation(write(tmp_path / "a.tif", height, LONLAT, transform))
+    base, share = base_heights(model, Grid.even(600, 30))
+    assert (share == 1).all()
+    base = base.reshape(61, 61)
+    assert base[30, 0] - base[30, -1] == pytest.approx(60, rel=0.01)
+
+
+def test_stored_integers_are_scaled(tmp_path):
+    path = ramp_to_the_north(tmp_path / "a.tif")
+    plain = read_elevation(path).height_m
+    with rasterio.open(path, "r+") as raster:
+        raster.scales, raster.offsets = (0.5,), (1000.0,)
+    assert np.allclose(read_elevation(path).height_m, 0.5 * plain + 1000)
+
+
+def test_a_model_far_smaller_than_the_ground_is_refused(tmp_path):
+    model = read_elevation(
+        write(tmp_path / "a.tif", np.ones((20, 20)), POLAR, rasterio.Affine(0.05, 0, 1e5, 0, -0.05, 0))
+    )
+    with pytest.raises(UserError, match="like extent"):
+        base_heights(model, Grid.even(600, 30))
+
+
 def test_holes_are_filled_and_the_outside_is_marked(tmp_path):
     height = np.full((60, 60), 5.0)
     height[20:25, 20:25] = -9999

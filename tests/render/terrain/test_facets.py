@@ -1,5 +1,7 @@
 """The mesh is fine enough: no facet covers more than a pixel in any frame of the presets' descents."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -21,11 +23,21 @@ def largest_facet_px(vertices, faces, camera, position_m, rotation):
     return float(longest), len(corners)
 
 
+HIGHLAND = Path(__file__).parents[3] / "configs" / "highland.yaml"
+
+
 @pytest.mark.parametrize(
-    ("preset", "kind", "n_frames"), [("tiny", "detect", 8), ("tiny", "nav", 9), ("small", "detect", 4)]
+    ("preset", "kind", "n_frames", "config_file"),
+    [
+        ("tiny", "detect", 8, None),
+        ("tiny", "nav", 9, None),
+        ("tiny", "detect", 8, HIGHLAND),
+        ("small", "detect", 4, None),
+        ("small", "nav", 3, None),
+    ],
 )
-def test_no_facet_is_over_a_pixel_in_any_frame(preset, kind, n_frames):
-    config = resolve(DatasetConfig, "dataset", "perilune_render", preset)
+def test_no_facet_is_over_a_pixel_in_any_frame(preset, kind, n_frames, config_file):
+    config = resolve(DatasetConfig, "dataset", "perilune_render", preset, config_file)
     plan = make_plan(config, kind)
     scene = grow_scene(config, plan.camera, config.kind(kind).flight, plan.scenes[0].seed)
     x, y = scene.grid.vertices_xy()

@@ -35,6 +35,24 @@ def test_a_fresh_crater_on_a_plain():
     assert value_at(albedo, GRID, np.array([20.0]), np.array([-30.0]))[0] > 1.15
 
 
+@pytest.mark.parametrize("profile", ["fassett_thomson", "pangu"])
+@pytest.mark.parametrize("ratio", [0.1, 0.15, 0.2])
+@pytest.mark.parametrize("wear", [0.001, 0.005, 0.02, 0.05])
+def test_the_crest_lies_on_the_labels_circle_however_worn(profile, ratio, wear):
+    """On a plain: highest points along 64 rays, a circle with free centre through them by least squares."""
+    craters = round_craters([(12.3, -7.7, 120, ratio, wear)])
+    height = np.zeros(GRID.n_vertices)
+    stamp_craters(height, np.ones_like(height), GRID, craters, np.zeros(1), profile)
+    angle = 2 * np.pi * np.arange(64) / 64
+    r = np.linspace(40, 80, 401)
+    x, y = 12.3 + r * np.cos(angle)[:, None], -7.7 + r * np.sin(angle)[:, None]
+    crest = r[value_at(height, GRID, x, y).argmax(axis=1)]
+    px, py = crest * np.cos(angle), crest * np.sin(angle)
+    system = np.stack([2 * px, 2 * py, np.ones(64)], axis=1)
+    a, b, rest = np.linalg.lstsq(system, px**2 + py**2, rcond=None)[0]
+    assert np.sqrt(rest + a**2 + b**2) == pytest.approx(60, rel=0.015) and np.hypot(a, b) < 0.5
+
+
 def test_a_younger_crater_removes_the_older_rim():
     alone, _, _, _ = laid([(40, 0, 60, 0.15, 0.001)])
     both, _, _, _ = laid([(0, 0, 80, 0.15, 0.001), (40, 0, 60, 0.15, 0.001)])
