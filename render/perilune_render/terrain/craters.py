@@ -135,7 +135,9 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
     fresh = fresh_depth_m(diameter, config.depth)
     depth = np.maximum(fresh + 0.02 * diameter * np.clip(rng.normal(size=n), -2, 2), 0.08 * diameter)
     x, y, age, clustered = _cluster(x, y, age, oldest, diameter, reach, config.secondary_share, rng)
-    depth = np.where(clustered, 0.7 * depth, depth)
+    flat_floor = rng.random(n) < config.flat_floor_share
+    # Slow impacts and floors of rock make shallower craters; by how much is a choice of ours.
+    depth = np.where(clustered | flat_floor, 0.75 * depth, depth)
     craters = Craters(
         x,
         y,
@@ -144,7 +146,7 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
         fresh_rim_height_m(diameter, depth, config.profile),
         age,
         diffusivity_m2_per_myr(diameter) * age,
-        rng.random(n) < config.flat_floor_share,
+        flat_floor,
         config.irregularity * np.clip(rng.normal(0, 0.0035, (n, 6)), -0.008, 0.008),
         config.irregularity * rng.normal(0, 0.06, (n, 6)),
         np.where(clustered, ORIGINS.index("secondary"), ORIGINS.index("primary")),

@@ -109,7 +109,7 @@ def _sunk(x: Array, profile: str, flat: bool) -> Array:
     else:
         polynomial = -0.228809953 + 0.227533882 * inner + 0.083116795 * inner**2 - 0.039499407 * inner**3
         shape = (_CREST - polynomial) / (_CREST + 0.228809953)
-    steep, soft = (1.9, 0.07) if flat else (1.2, 0.1)
+    steep, soft = (1.2, 0.1) if not flat else (1.35, 0.07) if profile == "pangu" else (1.9, 0.07)
     return soft * (np.logaddexp(0, 1 / soft) - np.logaddexp(0, (1 - steep * shape) / soft))
 
 

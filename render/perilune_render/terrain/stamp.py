@@ -166,7 +166,8 @@ def _stamp(
         cxh, cyh = sxh - sx * sh / s0, syh - sy * sh / s0
         determinant = cxx * cyy - cxy * cxy
         slope_x = slope_y = 0.0
-        if determinant > 1e-9 * cxx * cyy:
+        # A few vertices nearly in line say nothing of the slope across: the plane would stand up as a spike.
+        if s0 >= 6 and determinant > 0.05 * cxx * cyy:
             slope_x = (cxh * cyy - cyh * cxy) / determinant
             slope_y = (cyh * cxx - cxh * cxy) / determinant
         level = (sh - slope_x * sx - slope_y * sy) / s0
