@@ -7,6 +7,7 @@ that cannot be written, or a damaged file in it, only costs the time to grow the
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -21,7 +22,7 @@ from perilune_render.terrain.boulders import Boulders
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import Rims
-from perilune_render.terrain.scene import GENERATOR_VERSION, Scene, grow_scene
+from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.camera import Camera
 from perilune_shared.files import sha256_of, written_aside
 
@@ -35,14 +36,22 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "perilune" / "scenes"
 
 
+@functools.cache
+def _generator() -> str:
+    """Hash of the code that grows scenes: whatever changes it makes other files."""
+    package = Path(__file__).parent
+    sources = [*sorted(package.glob("*.py")), package.parent / "streams.py", package.parent / "config.py"]
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
+
+
 def scene_key(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> str:
-    """Hash of all that a scene follows from: generator, settings of the ground, view, seed, files it reads."""
+    """Hash of all that a scene follows from: the code, settings of the ground, view, seed, files it reads."""
     terrain = config.terrain.model_dump(mode="json")
     for name in ("dem", "catalogue"):
         if terrain[name] is not None and Path(terrain[name]).is_file():
             terrain[name] = [Path(terrain[name]).name, sha256_of(Path(terrain[name]))]
     content = {
-        "generator": GENERATOR_VERSION,
+        "generator": _generator(),
         "numpy": np.__version__,
         "terrain": terrain,
         "albedo_variation": config.light.albedo_variation,

@@ -18,8 +18,6 @@ from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.camera import Camera
 from perilune_shared.frames import Array
 
-GENERATOR_VERSION = 2
-"""Goes up with every change after which a seed grows another scene."""
 _RESOLVED_PIXELS = 4.0
 _ROUGHNESS_M = 100.0
 """Shorter waves lie on top of the craters."""
