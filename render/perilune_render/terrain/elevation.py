@@ -62,7 +62,7 @@ def read_elevation(path: Path) -> ElevationModel:
             height = height * raster.scales[0] + raster.offsets[0]
             transform, crs = raster.transform, raster.crs
     except RasterioError as error:
-        raise UserError(path, "dem", error, "a readable GeoTIFF") from None
+        raise UserError(path, "dem", error.__cause__ or error, "a readable GeoTIFF") from None
     if transform.is_identity or transform.determinant == 0:
         raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
     if crs is None:
