@@ -191,3 +191,37 @@ def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
             _put(lines, count, x, y, dx, dy, first, t_high - t_low + 1, ring)
             count += 1
     return count
+
+
+@numba.njit(cache=True)
+def place_in_ring(x, y, n_half):
+    """Place along the square ring through (x, y), counted in vertices from the corner at -x, -y, with fractions."""
+    distance = max(abs(x), abs(y))
+    if y <= -distance:
+        side, along = 0, x
+    elif x >= distance:
+        side, along = 1, y
+    elif y >= distance:
+        side, along = 2, -x
+    else:
+        side, along = 3, -y
+    return (2 * side + along / distance + 1) * n_half
+
+
+@numba.njit(cache=True)
+def vertex_of_ring(ring, place, n_half):
+    """Index of a vertex by its ring (0 is the inner square's edge) and its place in it from the corner at -x, -y."""
+    n = n_half
+    place %= 8 * n
+    if ring > 0:
+        return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place
+    side, t = place // (2 * n), place % (2 * n)
+    if side == 0:
+        i, j = t, 0
+    elif side == 1:
+        i, j = 2 * n, t
+    elif side == 2:
+        i, j = 2 * n - t, 2 * n
+    else:
+        i, j = 0, 2 * n - t
+    return j * (2 * n + 1) + i

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from perilune_render.terrain.craters import Craters
-from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.grid import Grid, place_in_ring, vertex_of_ring
 from perilune_shared.frames import Array
 
 _N_RIM = 16
@@ -53,25 +53,6 @@ def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | f
 
 
 @numba.njit(cache=True)
-def vertex_of_ring(ring, place, n_half):
-    """Index of a vertex by its ring (0 is the inner square's edge) and its place in it from the corner at -x, -y."""
-    n = n_half
-    place %= 8 * n
-    if ring > 0:
-        return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place
-    side, t = place // (2 * n), place % (2 * n)
-    if side == 0:
-        i, j = t, 0
-    elif side == 1:
-        i, j = 2 * n, t
-    elif side == 2:
-        i, j = 2 * n - t, 2 * n
-    else:
-        i, j = 0, 2 * n - t
-    return j * (2 * n + 1) + i
-
-
-@numba.njit(cache=True)
 def _values_at(field, n_half, half_widths, x, y):
     n = n_half
     step = half_widths[0] / n
@@ -91,18 +72,9 @@ def _values_at(field, n_half, half_widths, x, y):
         inner = max(ring - 1, 0)
         width = half_widths[ring] - half_widths[inner]
         g = min((distance - half_widths[inner]) / width, 1.0) if width > 0 else 0.0
-        if y[k] <= -distance:
-            side, along = 0, x[k]
-        elif x[k] >= distance:
-            side, along = 1, y[k]
-        elif y[k] >= distance:
-            side, along = 2, -x[k]
-        else:
-            side, along = 3, -y[k]
-        t = (along / distance + 1) * n
-        place = min(int(t), 2 * n - 1)
-        f = t - place
-        place += side * 2 * n
+        along = place_in_ring(x[k], y[k], n)
+        place = int(along)
+        f = along - place
         low = field[vertex_of_ring(inner, place, n)] * (1 - f) + field[vertex_of_ring(inner, place + 1, n)] * f
         high = field[vertex_of_ring(ring, place, n)] * (1 - f) + field[vertex_of_ring(ring, place + 1, n)] * f
         values[k] = low * (1 - g) + high * g

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from perilune_render.terrain.craters import Craters
-from perilune_render.terrain.grid import Grid, lines_in
+from perilune_render.terrain.grid import Grid, lines_in, place_in_ring, vertex_of_ring
 from perilune_render.terrain.profile import REACH, crest_radius, profile_tables, wear_row
 from perilune_shared.frames import Array
 
@@ -69,17 +69,22 @@ def _nearest(x, y, n_half, half_widths):
     if distance <= half_widths[0]:
         step = half_widths[0] / n
         return (int(np.rint(y / step)) + n) * (2 * n + 1) + int(np.rint(x / step)) + n
-    ring = np.searchsorted(half_widths, distance)
-    if y <= -distance:
-        side, along = 0, x
-    elif x >= distance:
-        side, along = 1, y
-    elif y >= distance:
-        side, along = 2, -x
-    else:
-        side, along = 3, -y
-    t = int(np.rint((along / distance + 1) * n))
-    return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + (side * 2 * n + t) % (8 * n)
+    return vertex_of_ring(np.searchsorted(half_widths, distance), int(np.rint(place_in_ring(x, y, n))), n)
+
+
+@numba.njit(cache=True)
+def _chord(lines, line, x, y, reach):
+    """The part of a line within `reach` of (x, y): its start from there, its steps, its first vertex, from and to."""
+    dx, dy = lines[line, 0] - x, lines[line, 1] - y
+    step_x, step_y = lines[line, 2], lines[line, 3]
+    along, across = (dx, dy) if step_y == 0 else (dy, dx)
+    square = reach * reach - across * across
+    if square < 0:
+        return dx, dy, step_x, step_y, 0, 0, 0
+    half, step = np.sqrt(square), step_x + step_y
+    low, high = min((-half - along) / step, (half - along) / step), max((-half - along) / step, (half - along) / step)
+    last = min(int(np.floor(high)) + 1, int(lines[line, 5]))
+    return dx, dy, step_x, step_y, int(lines[line, 4]), max(int(np.ceil(low)), 0), last
 
 
 @numba.njit(cache=True)
@@ -128,20 +133,8 @@ def _stamp(
         n_rim = n_floor = h_rim = h_floor = 0.0
         square_r = radius[k] ** 2
         for line in range(count):
-            dx, dy = lines[line, 0] - x[k], lines[line, 1] - y[k]
-            step_x, step_y = lines[line, 2], lines[line, 3]
-            first, number = int(lines[line, 4]), int(lines[line, 5])
-            # Only the part of the line within 1.3 radii.
-            along, across = (dx, dy) if step_y == 0 else (dy, dx)
-            step = step_x + step_y
-            chord = 1.69 * square_r - across * across
-            if chord < 0:
-                continue
-            half = np.sqrt(chord)
-            low, high = (-half - along) / step, (half - along) / step
-            if low > high:
-                low, high = high, low
-            for p in range(max(int(np.ceil(low)), 0), min(int(np.floor(high)) + 1, number)):
+            dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x[k], y[k], 1.3 * radius[k])
+            for p in range(start, stop):
                 px, py = dx + p * step_x, dy + p * step_y
                 square = px * px + py * py
                 h = height[first + p]
@@ -176,19 +169,8 @@ def _stamp(
             rim_share, floor_share = 1 - gone[int(per_radius)], 1 - gone[0]
             sag[k] = max((h_rim / n_rim - level) * rim_share - (h_floor / n_floor - level) * floor_share, 0.0)
         for line in range(count):
-            dx, dy = lines[line, 0] - x[k], lines[line, 1] - y[k]
-            step_x, step_y = lines[line, 2], lines[line, 3]
-            first, number = int(lines[line, 4]), int(lines[line, 5])
-            along, across = (dx, dy) if step_y == 0 else (dy, dx)
-            step = step_x + step_y
-            chord = reach * reach - across * across
-            if chord < 0:
-                continue
-            half = np.sqrt(chord)
-            low, high = (-half - along) / step, (half - along) / step
-            if low > high:
-                low, high = high, low
-            for p in range(max(int(np.ceil(low)), 0), min(int(np.floor(high)) + 1, number)):
+            dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x[k], y[k], reach)
+            for p in range(start, stop):
                 px, py = dx + p * step_x, dy + p * step_y
                 distance = np.sqrt(px * px + py * py)
                 if distance > 0:
