@@ -4,22 +4,20 @@ A descent's frames part is written last, after its images and labels: whatever h
 has none is rendered again.
 """
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow as pa
 from rich.progress import Progress
 
-import perilune_render
-import perilune_shared
 from perilune_render import tables
-from perilune_render.blender.renderer import BLENDER_VERSION, Renderer
+from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
 from perilune_render.exr import Radiance, write_exr
 from perilune_render.labels import RimCircles, crater_index, label_frame
 from perilune_render.output import begin_or_go_on, file_columns, write_overview, write_png
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
+from perilune_render.recipe import recipe_of
 from perilune_render.resample import seen_by
 from perilune_render.sensor import FixedPattern, develop
 from perilune_render.streams import derived_seed, stream
@@ -28,19 +26,12 @@ from perilune_render.terrain.catalogue import read_catalogue
 from perilune_render.terrain.elevation import read_elevation
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.scene import Scene, resolved_m
+from perilune_shared.checksums import seal
 from perilune_shared.errors import UserError
 from perilune_shared.frames import Array, sun_direction
-from perilune_shared.manifest import (
-    CameraInfo,
-    Counts,
-    Dataset,
-    DatasetInfo,
-    count_rows,
-    open_dataset,
-    read_part,
-    write_info,
-    write_part,
-)
+from perilune_shared.info import CameraInfo, Counts, DatasetInfo, recipes_of, write_info
+from perilune_shared.manifest import Dataset, count_rows, open_dataset
+from perilune_shared.parts import read_part, write_part
 from perilune_shared.schema import SCHEMA_VERSION, Kind
 
 LICENCE = "CC-BY-4.0"
@@ -68,7 +59,7 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
             continue
         progress.update(task, note=f"{scene_plan.scene_id}: growing")
         scene = cached_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
-        _write_scene(out, scene_plan, scene, config, trajectories)
+        _write_scene(out, scene_plan, scene, config, info.recipe().key, trajectories)
         progress.update(task, note=scene_plan.scene_id)
         sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
         circles = RimCircles.of_scene(scene)
@@ -81,6 +72,7 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
     finished = info.model_copy(update={"counts": count_rows(dataset), "complete": True})
     write_overview(dataset)
     write_info(out, finished)
+    seal(out)
     return open_dataset(out)
 
 
@@ -93,23 +85,16 @@ def _check_ground(config: DatasetConfig, grid: Grid) -> None:
 
 
 def _open_or_begin(config: DatasetConfig, kind: Kind, preset: str, out: Path, plan: Plan) -> DatasetInfo:
-    resolved = json.loads(config.model_dump_json())
     info = DatasetInfo(
         name=f"perilune-{preset}-{kind}",
         kind=kind,
         schema_version=SCHEMA_VERSION,
         complete=False,
+        images="files",
         split_by=config.kind(kind).split_by,
-        preset=preset,
-        config=resolved,
-        seed=config.seed,
         camera=CameraInfo.of(plan.camera),
         exr_camera=CameraInfo.of(plan.exr_camera) if config.render.exr else None,
-        versions={
-            "perilune_render": perilune_render.__version__,
-            "perilune_shared": perilune_shared.__version__,
-            "blender": BLENDER_VERSION,
-        },
+        recipes=recipes_of(recipe_of(config, kind, preset)),
         counts=Counts(),
         licence=LICENCE,
     )
@@ -121,10 +106,10 @@ def _frames_part(out: Path, trajectory: TrajectoryPlan) -> Path:
 
 
 def _write_scene(
-    out: Path, plan: ScenePlan, scene: Scene, config: DatasetConfig, trajectories: list[TrajectoryPlan]
+    out: Path, plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str, trajectories: list[TrajectoryPlan]
 ) -> None:
     parts = {
-        **tables.scene_tables(plan, scene, config),
+        **tables.scene_tables(plan, scene, config, recipe),
         "trajectories": tables.trajectory_table(trajectories),
     }
     for name, rows in parts.items():

@@ -5,39 +5,31 @@ is written last.
 """
 
 import json
-import shutil
 from dataclasses import asdict
 from pathlib import Path
 
 import pyarrow as pa
 from rich.progress import Progress
 
-import perilune_render
-import perilune_shared
 from perilune_render import tables
 from perilune_render.config import DatasetConfig
 from perilune_render.exr import read_radiance
 from perilune_render.labels import RimCircles, label_frame
 from perilune_render.output import begin_or_go_on, first_difference, write_overview, write_png
 from perilune_render.plan import camera_of
+from perilune_render.recipe import versions
 from perilune_render.resample import seen_by
 from perilune_render.sensor import FixedPattern, develop
 from perilune_render.streams import stream
 from perilune_shared import files
 from perilune_shared.camera import Camera
+from perilune_shared.checksums import seal
 from perilune_shared.config import resolve_over
 from perilune_shared.errors import UserError
 from perilune_shared.frames import matrix_from_quaternion
-from perilune_shared.manifest import (
-    Counts,
-    Dataset,
-    Origin,
-    count_rows,
-    open_dataset,
-    read_part,
-    write_info,
-    write_part,
-)
+from perilune_shared.info import Counts, Origin, Recipe, recipes_of, write_info
+from perilune_shared.manifest import Dataset, count_rows, open_dataset
+from perilune_shared.parts import write_part
 
 
 def develop_dataset(
@@ -49,52 +41,61 @@ def develop_dataset(
     are the source's; so are the labels where the camera is the same, else they are made again. Raises UserError where
     another setting is changed, the source is incomplete or lacks EXRs, or those do not show all that the camera sees.
     """
+    if len(source.info.recipes) != 1:
+        raise UserError(source.root, "recipes", len(source.info.recipes), "one: the dataset as it was rendered")
+    old = source.info.recipe()
     config = _changed(source, config_file, settings)
     camera, exr_camera = _cameras(source, config)
+    made_of = Origin(
+        name=source.info.name,
+        sha256=files.sha256_of(source.root / "dataset.json"),
+        camera_config=old.config["camera"],
+    )
+    recipe = old.model_copy(
+        update={
+            "config": json.loads(config.model_dump_json()),
+            "versions": {**old.versions, **{k: v for k, v in versions().items() if k.startswith("perilune")}},
+            "developed_from": made_of,
+        }
+    )
     info = source.info.model_copy(
         update={
             "name": f"{source.info.name}-developed",
             "complete": False,
-            "config": json.loads(config.model_dump_json()),
             "camera": source.info.camera.model_copy(update=asdict(camera)),
             "exr_camera": None,
-            "developed_from": Origin(name=source.info.name, sha256=files.sha256_of(source.root / "dataset.json")),
-            "versions": {
-                **source.info.versions,
-                "perilune_render": perilune_render.__version__,
-                "perilune_shared": perilune_shared.__version__,
-            },
+            "recipes": recipes_of(recipe),
+            "history": (),
             "counts": Counts(),
         }
     )
-    parts = source.parts("frames")
-    rows = [read_part(part, "frames") for part in parts]
-    for part, table in zip(parts, rows, strict=True):
-        if table["exr_path"].null_count:
-            raise UserError(part, "exr_path", "null", "a dataset rendered with dataset.render.exr=true")
+    if source.table("frames", ["exr_path"])["exr_path"].null_count:
+        raise UserError(source.root, "exr_path", "null", "a dataset rendered with dataset.render.exr=true")
     info = begin_or_go_on(out, info)
     if info.complete:
         return open_dataset(out)
-    for name in ("scenes", "craters", "boulders", "trajectories"):
-        for part in source.parts(name):
-            _copy(part, out / "manifest" / name / part.name)
-    task = progress.add_task("develop", total=sum(len(table) for table in rows), unit="frames", note="")
+    task = progress.add_task("develop", total=source.info.counts.frames, unit="frames", note="")
     pattern = FixedPattern.draw(config.sensor, camera, config.seed)
-    for part, table in zip(parts, rows, strict=True):
-        if not (out / "manifest" / "frames" / part.name).exists():
-            _develop_descent(source, out, config, camera, exr_camera, pattern, part.stem, table)
-        progress.advance(task, len(table))
+    for scene_id in source.scene_ids():
+        _copy_scene(source, out, scene_id, info.recipe())
+        for descent in source.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pylist():
+            name = f"{scene_id}.{descent['trajectory_id']}"
+            table = source.table("frames", scene_id=scene_id, trajectory_id=descent["trajectory_id"])
+            if not (out / "manifest" / "frames" / f"{name}.parquet").exists():
+                _develop_descent(source, out, config, camera, exr_camera, pattern, name, table, descent["seed"])
+            progress.advance(task, len(table))
     dataset = Dataset(out, info)
     write_overview(dataset)
     write_info(out, info.model_copy(update={"counts": count_rows(dataset), "complete": True}))
+    seal(out)
     return open_dataset(out)
 
 
 def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
     """The source's settings with the user's changes, all of which must be of the sensor or the camera."""
     where = str(source.root / "dataset.json")
-    before = resolve_over(DatasetConfig, "dataset", where, source.info.config)
-    after = resolve_over(DatasetConfig, "dataset", where, source.info.config, config_file, settings)
+    before = resolve_over(DatasetConfig, "dataset", where, source.info.recipe().config)
+    after = resolve_over(DatasetConfig, "dataset", where, source.info.recipe().config, config_file, settings)
     kept = set(DatasetConfig.model_fields) - {"sensor", "camera"}
     theirs, ours = before.model_dump(include=kept), after.model_dump(include=kept)
     if theirs != ours:
@@ -133,14 +134,13 @@ def _develop_descent(
     pattern: FixedPattern,
     name: str,
     table: pa.Table,
+    seed: int,
 ) -> None:
     """One part of `frames`, with its images and labels."""
     rows = table.to_pylist()
-    scene_id = rows[0]["scene_id"]
+    scene_id, trajectory_id = rows[0]["scene_id"], rows[0]["trajectory_id"]
     same = camera == source.info.camera.intrinsics()
     circles = None if same else RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
-    descents = source.table("trajectories", scene_id=scene_id).to_pylist()
-    seeds = {descent["trajectory_id"]: descent["seed"] for descent in descents}
     written, labels = [], []
     for row in rows:
         radiance = read_radiance(source.file(row["exr_path"]))
@@ -150,7 +150,7 @@ def _develop_descent(
             raise UserError(row["exr_path"], "size", f"{size[0]} x {size[1]} pixels", wanted)
         rotation = matrix_from_quaternion(row["rotation_wxyz"])
         velocity = rotation @ row["velocity_mps"]
-        rng = stream(seeds[row["trajectory_id"]], "sensor", row["frame_index"])
+        rng = stream(seed, "sensor", row["frame_index"])
         image = develop(radiance, config.sensor, camera, exr_camera, velocity, pattern, rng)
         written.append(write_png(out, row["frame_id"], image, config.sensor.bits))
         if circles is not None:
@@ -162,14 +162,18 @@ def _develop_descent(
     # A labels part without its frames part is left from a stop between the two.
     label_part.unlink(missing_ok=True)
     if circles is None:
-        _copy(source.root / "manifest" / "labels" / f"{name}.parquet", label_part)
+        write_part(out, "labels", name, source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id))
     else:
         write_part(out, "labels", name, pa.concat_tables(labels))
     write_part(out, "frames", name, tables.developed_frame_table(table, camera, written))
 
 
-def _copy(part: Path, to: Path) -> None:
-    """Copy a part, whole or not at all; one that is there is left."""
-    if not to.exists():
-        with files.written_aside(to) as aside:
-            shutil.copyfile(part, aside)
+def _copy_scene(source: Dataset, out: Path, scene_id: str, recipe: Recipe) -> None:
+    """Bring the parts of a scene that are not there yet, the scene's row with its new recipe."""
+    for name in ("scenes", "craters", "boulders", "trajectories"):
+        if not (out / "manifest" / name / f"{scene_id}.parquet").exists():
+            rows = source.table(name, scene_id=scene_id)
+            if name == "scenes":
+                place = rows.schema.get_field_index("recipe")
+                rows = rows.set_column(place, rows.schema.field(place), [[recipe.key] * len(rows)])
+            write_part(out, name, scene_id, rows)

@@ -7,7 +7,12 @@ import numpy as np
 from perilune_render.config import FlightConfig
 from perilune_render.streams import stream
 from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY, NominalDescent
-from perilune_shared.frames import Array, matrix_from_rotation_vector
+from perilune_shared.frames import (
+    Array,
+    matrix_from_quaternion,
+    matrix_from_rotation_vector,
+    quaternion_from_matrix,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,8 +27,13 @@ class Flight:
     """Camera, O_L, metres (N, 3)."""
     velocity_mps: Array
     """Camera, O_L, metres per second (N, 3)."""
-    rotation_camera_from_site: Array
-    """(N, 3, 3)."""
+    rotation_wxyz: Array
+    """rotation_camera_from_site as unit quaternions (N, 4), as the manifest keeps them."""
+
+    @property
+    def rotation_camera_from_site(self) -> Array:
+        """Matrices (N, 3, 3), made of the quaternions, so that a manifest's pose is that of the rendering exactly."""
+        return matrix_from_quaternion(self.rotation_wxyz)
 
 
 def fly(config: FlightConfig, n_frames: int, seed: int) -> Flight:
@@ -48,7 +58,7 @@ def fly(config: FlightConfig, n_frames: int, seed: int) -> Flight:
         time,
         nominal.position_at(time) + config.position_sigma_m * offset[:, :3],
         nominal.velocity_at(time) + config.position_sigma_m * rate[:, :3],
-        rotations,
+        np.stack([quaternion_from_matrix(rotation) for rotation in rotations]),
     )
 
 

@@ -9,7 +9,8 @@ from perilune_render.labels import Labels
 from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_shared import files
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import Dataset, DatasetInfo, open_dataset, write_info
+from perilune_shared.info import DatasetInfo, Recipe, write_info
+from perilune_shared.manifest import Dataset, open_dataset
 
 _SHEET_FRAMES = 12
 _MEANS = ("threads", "cache_gib")
@@ -31,10 +32,10 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
         write_info(out, info)
         return info
     existing = open_dataset(out).info
+    if len(existing.recipes) != 1 or existing.history:
+        raise UserError(out, "--out", f"a dataset put together otherwise: {existing.name}", "another folder")
     for name in ("kind", "config", "versions", "developed_from"):
-        theirs, ours = getattr(existing, name), getattr(info, name)
-        if name == "config":
-            theirs, ours = _without_means(theirs), _without_means(ours)
+        theirs, ours = (_compared(each.recipe(), name) for each in (existing, info))
         if theirs != ours:
             raise UserError(
                 out / "dataset.json",
@@ -45,9 +46,12 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
     return existing
 
 
-def _without_means(config: dict) -> dict:
-    """Settings that change how fast, not what."""
-    return {**config, "render": {k: v for k, v in config.get("render", {}).items() if k not in _MEANS}}
+def _compared(recipe: Recipe, name: str) -> object:
+    """One field of a recipe, without the settings that change how fast, not what."""
+    value = getattr(recipe, name)
+    if name != "config":
+        return value
+    return {**value, "render": {k: v for k, v in value.get("render", {}).items() if k not in _MEANS}}
 
 
 def first_difference(theirs: object, ours: object, path: str = "") -> str:

@@ -10,7 +10,8 @@ from perilune_render.plan import ScenePlan, TrajectoryPlan
 from perilune_render.terrain.craters import ORIGINS
 from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera
-from perilune_shared.frames import Array, quaternion_from_matrix, selenographic_from_site
+from perilune_shared.content import content_sha256
+from perilune_shared.frames import Array, selenographic_from_site
 from perilune_shared.schema import TABLES
 
 _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
@@ -26,25 +27,11 @@ def _vectors(values: ArrayLike) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(rows.ravel()), rows.shape[1])
 
 
-def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig) -> dict[str, pa.Table]:
-    """Parts of the tables scenes, craters and boulders for one scene."""
+def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str) -> dict[str, pa.Table]:
+    """Parts of the tables scenes, craters and boulders for one scene, made by the recipe of a key."""
     craters, rims, boulders = scene.craters, scene.rims, scene.boulders
     latitude, longitude = selenographic_from_site(craters.x_m, craters.y_m, scene.latitude_deg, scene.longitude_deg)
-    return {
-        "scenes": _table(
-            "scenes",
-            {
-                "scene_id": [plan.scene_id],
-                "seed": [plan.seed],
-                "latitude_deg": [scene.latitude_deg],
-                "longitude_deg": [scene.longitude_deg],
-                "sun_azimuth_deg": [plan.sun_azimuth_deg],
-                "sun_elevation_deg": [plan.sun_elevation_deg],
-                "photometry": [config.light.photometry],
-                "dem_source": [scene.dem_source],
-                "extent_m": [scene.grid.extent_m],
-            },
-        ),
+    ground = {
         "craters": _table(
             "craters",
             {
@@ -79,6 +66,25 @@ def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig) -> dict[s
             },
         ),
     }
+    return {
+        "scenes": _table(
+            "scenes",
+            {
+                "scene_id": [plan.scene_id],
+                "seed": [plan.seed],
+                "latitude_deg": [scene.latitude_deg],
+                "longitude_deg": [scene.longitude_deg],
+                "sun_azimuth_deg": [plan.sun_azimuth_deg],
+                "sun_elevation_deg": [plan.sun_elevation_deg],
+                "photometry": [config.light.photometry],
+                "dem_source": [scene.dem_source],
+                "extent_m": [scene.grid.extent_m],
+                "recipe": [recipe],
+                "content_sha256": [content_sha256(ground["craters"], ground["boulders"])],
+            },
+        ),
+        **ground,
+    }
 
 
 def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
@@ -112,7 +118,7 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
         "split": list(trajectory.splits),
         **{name: [getattr(camera, name)] * n for name in _CAMERA},
         "position_m": _vectors(flight.position_m),
-        "rotation_wxyz": _vectors([quaternion_from_matrix(r) for r in flight.rotation_camera_from_site]),
+        "rotation_wxyz": _vectors(flight.rotation_wxyz),
         "velocity_mps": _vectors(flight.velocity_mps),
         "sun_direction": _vectors(np.tile(sun, (n, 1))),
     }

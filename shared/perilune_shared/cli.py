@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from perilune_shared.errors import EXIT_USER_ERROR, run_command_line
 from perilune_shared.manifest import open_dataset
@@ -35,7 +36,9 @@ def validate(
         return
     table = Table("file", "row", "column", "found", "wanted", title=f"{dataset}: {len(faults)} faults")
     for fault in faults[:most]:
-        table.add_row(fault.file, "" if fault.row is None else str(fault.row), fault.column, fault.found, fault.wanted)
+        row = "" if fault.row is None else str(fault.row)
+        # As Text, since brackets would be read as markup.
+        table.add_row(*map(Text, (fault.file, row, fault.column, fault.found, fault.wanted)))
     console.print(table)
     raise typer.Exit(EXIT_USER_ERROR)
 
@@ -47,7 +50,8 @@ def stats(dataset: DatasetArgument) -> None:
     frame = summary(opened)
     info = opened.info
     state = "" if info.complete else ", not complete"
-    table = Table(title=f"{info.name}{state}", caption=f"split by {info.split_by}, seed {info.seed}")
+    leak = "" if info.split_by == "scene" else ": splits share terrain, so that test figures flatter"
+    table = Table(title=f"{info.name}{state}", caption=f"split by {info.split_by}{leak}")
     # A measure a row, so that the table fits a narrow terminal.
     measures = frame.set_index("split").astype(object).T
     table.add_column("")

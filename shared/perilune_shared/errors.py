@@ -24,10 +24,18 @@ class UserError(Exception):
     """A fault in what the user gave: file or place, field, value found, and what would be right."""
 
     def __init__(self, where: object, field: str, found: object, wanted: str):
-        text = str(found)
-        if len(text) > 120:
-            text = text[:117] + "..."
-        super().__init__(" ".join(f"{where}: {field}: found {text}; wanted {wanted}".split()))
+        super().__init__(one_line(f"{where}: {field}: found {shortened(found)}; wanted {wanted}"))
+
+
+def one_line(text: object) -> str:
+    """Text on one line, with a question mark for what would steer a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
+
+
+def shortened(value: object, most: int = 120) -> str:
+    """A value as text of at most `most` characters."""
+    text = str(value)
+    return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def run_command_line(app: Callable[[], object]) -> None:

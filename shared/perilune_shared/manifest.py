@@ -1,126 +1,24 @@
-"""A dataset on disk: dataset.json, Parquet parts under manifest/, frames under frames/.
+"""A dataset on disk: dataset.json, Parquet parts under manifest/, frames under frames/ or packed in images/.
 
 Parts are written once, aside and renamed, and never rewritten. Use::
 
     dataset = open_dataset("data/small/detect")
-    labels = dataset.table("labels", columns=["frame_id", "radius_px"]).to_pandas()
+    labels = dataset.table("labels", ["frame_id", "radius_px"], split="test").to_pandas()
 """
 
-import json
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from perilune_shared import files
-from perilune_shared.camera import Camera
-from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.errors import UserError
-from perilune_shared.schema import SCHEMA_VERSION, TABLES, Kind, SplitUnit
+from perilune_shared.info import Counts, DatasetInfo, read_info
+from perilune_shared.parts import WHOLE_TABLE, Part
+from perilune_shared.schema import IMAGES, TABLES
 
-_LARGEST_INFO_BYTES = 10_000_000
-
-
-class _Info(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class CameraInfo(_Info):
-    """The camera of all frames; pixels, metres and O_B."""
-
-    width_px: Annotated[int, Field(gt=0, le=100_000)]
-    """Image width, pixels."""
-    height_px: Annotated[int, Field(gt=0, le=100_000)]
-    """Image height, pixels."""
-    fx_px: Annotated[float, Field(gt=0)]
-    """Focal length over the pixel's width, pixels."""
-    fy_px: Annotated[float, Field(gt=0)]
-    """Focal length over the pixel's height, pixels."""
-    cx_px: float
-    """Principal point, pixels right of the left edge."""
-    cy_px: float
-    """Principal point, pixels below the top edge."""
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """Brown-Conrady k1, k2, p1, p2, k3, on coordinates over the focal length."""
-    rotation_camera_from_body: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-    """Rows of the matrix (3, 3)."""
-    position_in_body_m: tuple[float, float, float]
-    """Centre of projection in O_B, metres."""
-
-    @classmethod
-    def of(cls, camera: Camera) -> "CameraInfo":
-        """A camera at the body's origin that looks down on a level flight."""
-        x, y, z = ROTATION_CAMERA_FROM_BODY.tolist()
-        rows = tuple(x), tuple(y), tuple(z)
-        return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=(0.0, 0.0, 0.0))
-
-    def intrinsics(self) -> Camera:
-        """The camera that projects, with its distortion."""
-        return Camera(self.width_px, self.height_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion)
-
-
-class Counts(_Info):
-    """Rows in each table."""
-
-    scenes: int = 0
-    """Terrains."""
-    craters: int = 0
-    """Craters of all scenes."""
-    boulders: int = 0
-    """Boulders of all scenes."""
-    trajectories: int = 0
-    """Descents."""
-    frames: int = 0
-    """Images."""
-    labels: int = 0
-    """Craters in images."""
-
-
-class Origin(_Info):
-    """The dataset from whose EXRs another was developed."""
-
-    name: str
-    """Its name."""
-    sha256: str
-    """Of its dataset.json."""
-
-
-class DatasetInfo(_Info):
-    """Content of dataset.json."""
-
-    name: str
-    """For people."""
-    kind: Kind
-    """What it is for."""
-    schema_version: str
-    """Of tables and files."""
-    complete: bool
-    """False while the renderer is still at work, or was stopped."""
-    split_by: SplitUnit
-    """What no two splits share."""
-    preset: str
-    """Where the settings began."""
-    config: dict[str, Any]
-    """The resolved `dataset` section."""
-    seed: int
-    """From which every random stream is derived."""
-    camera: CameraInfo
-    """Of all frames."""
-    exr_camera: CameraInfo | None = None
-    """Of the EXRs: a camera without distortion that sees all that `camera` sees; null where there are none."""
-    developed_from: Origin | None = None
-    """Where the frames were developed again from; null where they were rendered."""
-    versions: dict[str, str]
-    """Packages and Blender."""
-    counts: Counts
-    """Rows in each table, once complete."""
-    licence: str
-    """SPDX name."""
+_LARGEST_PNG_BYTES = 200_000_000
 
 
 class Dataset:
@@ -130,98 +28,142 @@ class Dataset:
         self.root = root
         self.info = info
 
-    def parts(self, table: str) -> list[Path]:
-        """The table's part files, sorted by name."""
-        return sorted(self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet"))
+    def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[Path]:
+        """The table's part files, sorted by name; only those that may hold rows of a scene or a descent."""
+        found = sorted(self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet"))
+        return [part for part in found if _may_hold(part.stem, scene_id, trajectory_id)]
 
     def table(
         self,
         table: str,
         columns: Sequence[str] | None = None,
         scene_id: str | None = None,
+        trajectory_id: str | None = None,
         split: str | None = None,
     ) -> pa.Table:
-        """One table, whole or with chosen columns, of one scene or one split where the table has that column.
+        """One table as Arrow, whole or with chosen columns, of one scene, one descent (with its scene), one split.
 
-        Raises UserError where a part is truncated or of another schema.
+        Only parts, row groups and columns that are asked for are read. Labels are of the split of their frame, craters
+        and boulders are of none. Raises UserError where a part is truncated or of another schema, or the table or a
+        column is not known.
         """
-        wanted = list(columns) if columns is not None else TABLES[table].names
-        keys = {"scene_id": scene_id, "split": split}
-        keys = {name: value for name, value in keys.items() if value is not None}
-        loaded = list(dict.fromkeys([*wanted, *keys]))
-        schema = pa.schema([TABLES[table].field(name) for name in loaded])
-        pieces = [read_part(part, table, loaded) for part in self.parts(table)]
-        joined = pa.concat_tables([piece.cast(schema) for piece in pieces]) if pieces else schema.empty_table()
-        for name, value in keys.items():
-            joined = joined.filter(pc.field(name) == value)
-        return joined.select(wanted)
+        _check_names(table, columns)
+        if trajectory_id is not None and scene_id is None:
+            raise UserError("table", "scene_id", "None", "the scene too: names of descents repeat in each scene")
+        names = list(columns) if columns is not None else TABLES[table].names
+        wanted = pa.schema([TABLES[table].field(name) for name in names])
+        pieces = [
+            _chosen(Part(part, table), names, scene_id, trajectory_id, split if table != "labels" else None)
+            for part in self.parts(table, scene_id, trajectory_id)
+        ]
+        rows = pa.concat_tables([piece.cast(wanted) for piece in pieces]) if pieces else wanted.empty_table()
+        if split is not None and table == "labels":
+            if "frame_id" not in names:
+                return self.table(table, [*names, "frame_id"], scene_id, trajectory_id, split).select(names)
+            rows = rows.filter(pc.is_in(rows["frame_id"], self._frame_ids(scene_id, trajectory_id, split)))
+        return rows
+
+    def _frame_ids(self, scene_id: str | None, trajectory_id: str | None, split: str) -> pa.Array:
+        return self.table("frames", ["frame_id"], scene_id, trajectory_id, split)["frame_id"].combine_chunks()
+
+    def scene_ids(self) -> list[str]:
+        """All scenes, in order."""
+        return sorted(self.table("scenes", ["scene_id"])["scene_id"].to_pylist())
+
+    def scene(self, scene_id: str) -> dict[str, pa.Table]:
+        """Every table of one scene."""
+        return {name: self.table(name, scene_id=scene_id) for name in TABLES}
 
     def file(self, relative: str) -> Path:
         """A frame's file, checked to lie inside the dataset."""
         return files.inside(self.root, relative)
 
+    def pngs(self, frames: pa.Table) -> Iterator[tuple[str, bytes]]:
+        """frame_id and PNG bytes of frames given by rows with frame_id and png_path, from files or packed.
 
-def read_part(part: Path, table: str, columns: Sequence[str] | None = None) -> pa.Table:
-    """One Parquet part. Raises UserError where it cannot be read or is of another table or schema version."""
-    try:
-        parquet = pq.ParquetFile(part)
-        metadata = parquet.schema_arrow.metadata or {}
-        version = metadata.get(b"perilune.schema_version", b"none").decode(errors="replace")
-        if version != SCHEMA_VERSION:
-            raise UserError(part, "schema_version", version, f"{SCHEMA_VERSION}; migrate the dataset")
-        found = metadata.get(b"perilune.table", b"none").decode(errors="replace")
-        if found != table:
-            raise UserError(part, "perilune.table", found, table)
-        missing = [name for name in columns or TABLES[table].names if name not in parquet.schema_arrow.names]
+        Files come in the order of the rows, packed frames in the order in which they lie. Raises UserError where one
+        is missing.
+        """
+        if self.info.images in ("absent", "planned"):
+            wanted = "a dataset with its frames; `perilune-render regenerate` makes them"
+            raise UserError(self.root, "images", self.info.images, wanted)
+        rows = frames.select(["frame_id", "png_path"]).to_pydict()
+        paths = dict(zip(rows["frame_id"], rows["png_path"], strict=True))
+        if self.info.images == "packed":
+            yield from self._packed(set(paths))
+            return
+        for frame_id, relative in paths.items():
+            path = self.file(relative)
+            if not path.is_file():
+                raise UserError(path, "frame", "no such file", "the PNG that the manifest names")
+            if path.stat().st_size > _LARGEST_PNG_BYTES:
+                raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {_LARGEST_PNG_BYTES}")
+            yield frame_id, path.read_bytes()
+
+    def _packed(self, wanted: set[str]) -> Iterator[tuple[str, bytes]]:
+        missing = set(wanted)
+        for shard in self.shards():
+            part = Part(shard, "images", IMAGES)
+            for group in range(part.file.metadata.num_row_groups):
+                keys = part.read(["frame_id"], [group])["frame_id"].to_pylist()
+                if missing.isdisjoint(keys):
+                    continue
+                images = part.read(["image"], [group])["image"]
+                for frame_id, image in zip(keys, images, strict=True):
+                    if frame_id in missing:
+                        missing.remove(frame_id)
+                        yield frame_id, image["bytes"].as_py() or b""
         if missing:
-            raise UserError(part, "columns", f"no {missing[0]}", f"every column of schema version {SCHEMA_VERSION}")
-        return parquet.read(columns=list(columns) if columns is not None else None)
-    except (pa.ArrowException, OSError) as error:
-        raise UserError(part, "content", error, "a whole Parquet file") from None
+            raise UserError(self.root / "images", "frame_id", f"no {min(missing)}", "every frame of the manifest")
+
+    def shards(self) -> list[Path]:
+        """The Parquet files with packed frames."""
+        return sorted(self.root.joinpath("images").glob("[A-Za-z0-9]*.parquet"))
 
 
 def open_dataset(root: str | Path) -> Dataset:
     """Open a dataset. Raises UserError where it is missing, damaged or of another schema version."""
-    root = Path(root)
-    path = root / "dataset.json"
-    if not path.is_file():
-        raise UserError(root, "dataset.json", "no such file", "the folder of a dataset (see `make dataset`)")
-    if path.stat().st_size > _LARGEST_INFO_BYTES:
-        raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {_LARGEST_INFO_BYTES}")
-    try:
-        content = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise UserError(path, "content", error, "JSON") from None
-    if not isinstance(content, dict):
-        raise UserError(path, "content", type(content).__name__, "a JSON object")
-    version = content.get("schema_version")
-    if version != SCHEMA_VERSION:
-        raise UserError(path, "schema_version", version, f"{SCHEMA_VERSION}; migrate the dataset")
-    try:
-        return Dataset(root, DatasetInfo.model_validate_json(json.dumps(content)))
-    except ValidationError as error:
-        fault = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in fault["loc"])
-        raise UserError(path, field, repr(fault["input"]), fault["msg"]) from None
-
-
-def write_info(root: Path, info: DatasetInfo) -> None:
-    """Write dataset.json, whole or not at all."""
-    files.write_text(root / "dataset.json", info.model_dump_json(indent=2) + "\n")
-
-
-def write_part(root: Path, table: str, name: str, rows: pa.Table) -> Path:
-    """Append one part `manifest/<table>/<name>.parquet`. A part that exists is never rewritten."""
-    part = root / "manifest" / table / f"{name}.parquet"
-    if part.exists():
-        raise FileExistsError(part)
-    with files.written_aside(part) as aside:
-        pq.write_table(rows.cast(TABLES[table]), aside, compression="zstd")
-    return part
+    return Dataset(Path(root), read_info(Path(root)))
 
 
 def count_rows(dataset: Dataset) -> Counts:
     """Rows present in each table, read from the parts' footers."""
-    return Counts(
-        **{name: sum(pq.ParquetFile(part).metadata.num_rows for part in dataset.parts(name)) for name in TABLES}
-    )
+    return Counts(**{name: sum(Part(part, name).n_rows for part in dataset.parts(name)) for name in TABLES})
+
+
+def _check_names(table: str, columns: Sequence[str] | None) -> None:
+    if table not in TABLES:
+        raise UserError("table", "name", table, "one of " + ", ".join(TABLES))
+    for name in columns or ():
+        if name not in TABLES[table].names:
+            raise UserError(table, "column", name, "one of " + ", ".join(TABLES[table].names))
+
+
+def _may_hold(stem: str, scene_id: str | None, trajectory_id: str | None) -> bool:
+    """Whether a part of this name may hold rows of a scene, and of a descent in it."""
+    scene, _, trajectory = stem.partition(".")
+    if stem == WHOLE_TABLE or scene_id is None:
+        return True
+    return scene == scene_id and (trajectory_id is None or trajectory in ("", trajectory_id))
+
+
+def _chosen(
+    part: Part, names: Sequence[str], scene_id: str | None, trajectory_id: str | None, split: str | None
+) -> pa.Table:
+    """Rows of a part of one scene, descent and split, where its table has such columns; labels go by their frame_id."""
+    columns = part.schema.names
+    equal = {"scene_id": scene_id, "trajectory_id": trajectory_id, "split": split}
+    equal = {name: value for name, value in equal.items() if value is not None and name in columns}
+    by_frame = scene_id is not None and "scene_id" not in columns
+    prefix = f"{scene_id}/{trajectory_id}/" if trajectory_id is not None else f"{scene_id}/"
+    groups = None
+    if part.path.stem == WHOLE_TABLE and scene_id is not None:
+        # "0" comes after "/" and "~" after every character of a name.
+        low, high = (prefix, prefix[:-1] + "0") if by_frame else (scene_id, scene_id + "\x00")
+        groups = part.groups_within("frame_id" if by_frame else "scene_id", low, high)
+    rows = part.read(list(dict.fromkeys([*names, *equal, *(["frame_id"] if by_frame else [])])), groups)
+    for name, value in equal.items():
+        rows = rows.filter(pc.equal(rows[name], value))
+    if by_frame and part.path.stem in (WHOLE_TABLE, scene_id):
+        rows = rows.filter(pc.starts_with(rows["frame_id"], prefix))
+    return rows.select(list(names))

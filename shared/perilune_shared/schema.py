@@ -1,4 +1,4 @@
-"""The tables of a dataset: every column with its type, unit and frame of reference (schema version 2).
+"""The tables of a dataset: every column with its type, unit and frame of reference (schema version 3).
 
 The same text stands in the metadata of every Parquet file, so that a file found alone still says what it holds.
 """
@@ -7,7 +7,7 @@ from typing import Literal
 
 import pyarrow as pa
 
-SCHEMA_VERSION = "2"
+SCHEMA_VERSION = "3"
 _TEXT, _REAL, _INTEGER = pa.string(), pa.float64(), pa.int64()
 
 
@@ -40,6 +40,8 @@ TABLES: dict[str, pa.Schema] = {
         _column("photometry", _TEXT, "", "name of the reflectance law and parameter set"),
         _column("dem_source", _TEXT, "", "name and SHA-256 of the elevation model, or 'procedural'"),
         _column("extent_m", _REAL, "m", "side of the square terrain, centred on the site"),
+        _column("recipe", _TEXT, "", "what it was made by: a key of `recipes` in dataset.json"),
+        _column("content_sha256", _TEXT, "", "of its craters and boulders to a millimetre (perilune_shared.content)"),
     ),
     "craters": _table(
         "craters",
@@ -103,8 +105,8 @@ TABLES: dict[str, pa.Schema] = {
         _column("velocity_mps", _vector(3), "m/s", "camera, O_L"),
         _column("sun_direction", _vector(3), "", "unit vector towards the Sun, O_L"),
         _column("png_path", _TEXT, "", "relative to the dataset"),
-        _column("png_sha256", _TEXT, "", "of the whole file"),
-        _column("png_bytes", _INTEGER, "B", "file size"),
+        _column("png_sha256", _TEXT, "", "of the whole file; null where never rendered", optional=True),
+        _column("png_bytes", _INTEGER, "B", "file size; null where never rendered", optional=True),
         _column("exr_path", _TEXT, "", "relative to the dataset; null where not written", optional=True),
         _column("exr_sha256", _TEXT, "", "of the whole file; null where not written", optional=True),
         _column("exr_bytes", _INTEGER, "B", "file size; null where not written", optional=True),
@@ -127,6 +129,37 @@ TABLES: dict[str, pa.Schema] = {
         _column("sunlit_fraction", _REAL, "", "share of the crater's seen pixels that the Sun reaches"),
     ),
 }
+KEYS: dict[str, list[str]] = {
+    "scenes": ["scene_id"],
+    "craters": ["scene_id", "crater_id"],
+    "boulders": ["scene_id", "boulder_id"],
+    "trajectories": ["scene_id", "trajectory_id"],
+    "frames": ["frame_id"],
+    "labels": ["frame_id", "crater_id"],
+}
+"""What names one row of each table."""
+
+IMAGES = pa.schema(
+    [
+        _column("frame_id", _TEXT, "", "the frame"),
+        pa.field(
+            "image",
+            pa.struct([pa.field("bytes", pa.binary()), pa.field("path", _TEXT)]),
+            nullable=False,
+            metadata={"unit": "", "meaning": "the PNG file's bytes, and the png_path of the frame"},
+        ),
+    ],
+    metadata={
+        "perilune.table": "images",
+        "perilune.schema_version": SCHEMA_VERSION,
+        # Hugging Face `datasets` decodes the column as an image by this.
+        "huggingface": '{"info": {"features": {"frame_id": {"dtype": "string", "_type": "Value"}, '
+        '"image": {"_type": "Image"}}}}',
+    },
+)
+"""The frames of a packed dataset: images/*.parquet."""
+
 Kind = Literal["detect", "nav"]
 SplitUnit = Literal["scene", "trajectory", "frame"]
+ImageState = Literal["files", "packed", "absent", "planned"]
 SPLITS = ("train", "val", "test")

@@ -1,35 +1,58 @@
-"""What a dataset holds, in numbers."""
+"""What a dataset holds, in numbers. Read a part at a time, so that memory does not grow with the dataset."""
 
+import numpy as np
 import pandas as pd
+import pyarrow.compute as pc
 
 from perilune_shared.manifest import Dataset
+from perilune_shared.parts import Part
 
 
 def summary(dataset: Dataset) -> pd.DataFrame:
     """One row a split: scenes, trajectories, frames, labels, labels per frame and quantiles of the radius in pixels."""
-    frames = dataset.table("frames", ["frame_id", "scene_id", "trajectory_id", "split", "png_bytes"]).to_pandas()
-    labels = dataset.table("labels", ["frame_id", "radius_px", "visible_fraction"]).to_pandas()
-    labels = labels.merge(frames[["frame_id", "split"]], on="frame_id")
-    rows = []
-    for split, part in frames.groupby("split"):
-        seen = labels[labels["split"] == split]
-        rows.append(
-            {
-                "split": split,
-                "scenes": part["scene_id"].nunique(),
-                "trajectories": len(part.drop_duplicates(["scene_id", "trajectory_id"])),
-                "frames": len(part),
-                "labels": len(seen),
-                "labels_per_frame": round(len(seen) / len(part), 1),
-                "radius_px_q10": _quantile(seen["radius_px"], 0.1),
-                "radius_px_median": _quantile(seen["radius_px"], 0.5),
-                "radius_px_q90": _quantile(seen["radius_px"], 0.9),
-                "visible_fraction_mean": round(float(seen["visible_fraction"].mean()), 3) if len(seen) else None,
-                "png_mb": round(part["png_bytes"].sum() / 1e6, 1),
-            }
-        )
-    return pd.DataFrame(rows)
+    columns = ["frame_id", "scene_id", "trajectory_id", "split", "png_bytes"]
+    frames = dataset.table("frames", columns)
+    found = {split: _Gathered() for split in sorted(frames["split"].unique().to_pylist())}
+    split_of = frames["split"].combine_chunks().dictionary_encode()
+    names = np.array(split_of.dictionary.to_pylist(), object)
+    ids = frames["frame_id"].combine_chunks()
+    for part in dataset.parts("labels"):
+        opened = Part(part, "labels")
+        for group in range(opened.file.metadata.num_row_groups):
+            rows = opened.read(["frame_id", "radius_px", "visible_fraction"], [group])
+            place = pc.index_in(rows["frame_id"], ids)
+            kept = place.is_valid()
+            rows, place = rows.filter(kept), place.filter(kept).to_numpy()
+            code = split_of.indices.to_numpy()[place]
+            radius, visible = rows["radius_px"].to_numpy(), rows["visible_fraction"].to_numpy()
+            for k, name in enumerate(names):
+                own = code == k
+                found[name].radius_px.append(radius[own].astype(np.float32))
+                found[name].visible += float(visible[own].sum())
+    table = frames.to_pandas()
+    return pd.DataFrame([_row(split, part, found[split]) for split, part in table.groupby("split")])
 
 
-def _quantile(values: pd.Series, share: float) -> float | None:
-    return round(float(values.quantile(share)), 2) if len(values) else None
+class _Gathered:
+    """Of the labels of one split."""
+
+    def __init__(self) -> None:
+        self.radius_px: list[np.ndarray] = []
+        self.visible = 0.0
+
+
+def _row(split: str, frames: pd.DataFrame, labels: _Gathered) -> dict:
+    radius = np.concatenate(labels.radius_px) if labels.radius_px else np.empty(0, np.float32)
+    quantiles = np.quantile(radius, [0.1, 0.5, 0.9]).round(2).tolist() if len(radius) else [None] * 3
+    png_bytes = frames["png_bytes"].sum()
+    return {
+        "split": split,
+        "scenes": frames["scene_id"].nunique(),
+        "trajectories": len(frames.drop_duplicates(["scene_id", "trajectory_id"])),
+        "frames": len(frames),
+        "labels": len(radius),
+        "labels_per_frame": round(len(radius) / len(frames), 1),
+        **dict(zip(("radius_px_q10", "radius_px_median", "radius_px_q90"), quantiles, strict=True)),
+        "visible_fraction_mean": round(labels.visible / len(radius), 3) if len(radius) else None,
+        "png_mb": round(float(png_bytes) / 1e6, 1),
+    }

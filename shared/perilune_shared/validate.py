@@ -1,264 +1,231 @@
-"""Checks of a whole dataset: every fault with file, row, column, what was found and what was wanted."""
+"""Checks of a whole dataset: every fault with file, row, column, what was found and what was wanted.
 
+Tables are read a part and then a descent at a time, so that memory does not grow with the dataset.
+"""
+
+import hashlib
+from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 from rich.progress import Progress
 
-from perilune_shared import files
-from perilune_shared.camera import camera_from_site
-from perilune_shared.ellipse import project_circles
+from perilune_shared import checksums, files
+from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
-from perilune_shared.frames import matrix_from_quaternion
-from perilune_shared.manifest import Dataset, read_part
-from perilune_shared.schema import SCHEMA_VERSION, SPLITS, TABLES
+from perilune_shared.faults import Fault, part_faults
+from perilune_shared.frames import selenographic_from_site
+from perilune_shared.manifest import Dataset
+from perilune_shared.parts import Part
+from perilune_shared.png import png_header
+from perilune_shared.schema import IMAGES, KEYS, TABLES
+from perilune_shared.validate_descent import descent_faults
 
-_KEYS = {
-    "scenes": ["scene_id"],
-    "craters": ["scene_id", "crater_id"],
-    "boulders": ["scene_id", "boulder_id"],
-    "trajectories": ["scene_id", "trajectory_id"],
-    "frames": ["frame_id"],
-    "labels": ["frame_id", "crater_id"],
-}
-_POSITIVE = (
-    "diameter_m",
-    "extent_m",
-    "ellipse_a_px",
-    "ellipse_b_px",
-    "radius_px",
-    "duration_s",
-    "n_frames",
-    "width_px",
-    "height_px",
-    "fx_px",
-    "fy_px",
-    "png_bytes",
-)
-_RANGES = {
-    "latitude_deg": (-90, 90),
-    "longitude_deg": (-180, 180),
-    "sun_elevation_deg": (-90, 90),
-    "visible_fraction": (0, 1),
-    "sunlit_fraction": (0, 1),
-    "age_myr": (0, 4600),
-    "ellipse_theta_rad": (0, np.pi),
-}
-_UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
-_LABEL_TOLERANCE_PX = 1e-6
-
-
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """One thing wrong in a dataset."""
-
-    file: str
-    """Relative to the dataset."""
-    row: int | None
-    """Row within the table, from 0; None where the fault is the whole file's."""
-    column: str
-    """Column or property."""
-    found: str
-    """The value."""
-    wanted: str
-    """What would be right."""
+_DEGREES = 1e-9
+_NOT_PLANNED = ("craters", "boulders", "labels")
 
 
 def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
-    """All faults of a dataset; an empty list means that it can be trusted."""
-    faults: list[Fault] = []
-    tables: dict[str, pd.DataFrame] = {}
-    for name in TABLES:
-        pieces = []
-        for part in dataset.parts(name):
-            where = part.relative_to(dataset.root).as_posix()
-            try:
-                piece = read_part(part, name)
-            except UserError as error:
-                faults.append(Fault(where, None, "part", str(error), "a readable part of this schema"))
-                continue
-            if not piece.schema.equals(TABLES[name]):
-                faults.append(
-                    Fault(where, None, "schema", str(piece.schema)[:80], f"the schema of version {SCHEMA_VERSION}")
-                )
-                continue
-            pieces.append(piece)
-            faults += _values(where, piece)
-        tables[name] = (pa.concat_tables(pieces) if pieces else TABLES[name].empty_table()).to_pandas()
-    faults += _keys(tables)
-    faults += _counts(dataset, tables)
-    faults += _splits(dataset, tables)
-    if not faults:
-        faults += _labels(dataset, tables)
-    faults += _files(dataset, tables["frames"], progress)
-    return faults
+    """All faults of a dataset; an empty list means that it can be trusted.
 
-
-def _values(where: str, piece: pa.Table) -> Iterator[Fault]:
-    """Ranges, finiteness and unit lengths within one part."""
-    for field in piece.schema:
-        column = piece[field.name]
-        if not field.nullable and column.null_count:
-            row = column.is_null().to_pylist().index(True)
-            yield Fault(where, row, field.name, "null", "a value")
-            continue
-        if pa.types.is_fixed_size_list(field.type):
-            values = np.array(column.to_pylist(), np.float64).reshape(len(column), field.type.list_size)
-        elif pa.types.is_floating(field.type) or pa.types.is_integer(field.type):
-            values = column.to_pandas().to_numpy(np.float64)[:, None]
-        else:
-            continue
-        checks = [(~np.isfinite(values).all(axis=1) & ~column.is_null().to_numpy(), "a finite number")]
-        if field.name in _POSITIVE:
-            checks.append((values[:, 0] <= 0, "above 0"))
-        if field.name in _RANGES:
-            low, high = _RANGES[field.name]
-            checks.append(((values[:, 0] < low) | (values[:, 0] > high), f"{low} to {high}"))
-        if field.name in _UNIT_VECTORS:
-            checks.append((np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6, "length 1"))
-        for wrong, wanted in checks:
-            if wrong.any():
-                row = int(np.argmax(wrong))
-                yield Fault(where, row, field.name, str(values[row].tolist()), wanted)
-
-
-def _keys(tables: dict[str, pd.DataFrame]) -> Iterator[Fault]:
-    """Unique ids and foreign keys."""
-    for name, key in _KEYS.items():
-        doubled = tables[name].duplicated(key)
-        if doubled.any():
-            row = int(np.argmax(doubled))
-            yield Fault(f"manifest/{name}", row, "+".join(key), str(tables[name][key].iloc[row].tolist()), "unique")
-    references = [
-        ("craters", "scenes", ["scene_id"]),
-        ("boulders", "scenes", ["scene_id"]),
-        ("trajectories", "scenes", ["scene_id"]),
-        ("frames", "trajectories", ["scene_id", "trajectory_id"]),
-        ("labels", "frames", ["frame_id"]),
+    Faults of the same file and column are told once, at their first row. The labels' projections are all made again.
+    """
+    faults = [
+        Fault.of(file, None, "SHA-256", found, wanted) for file, found, wanted in checksums.faults_of(dataset.root)
     ]
-    for name, target, key in references:
-        known = pd.MultiIndex.from_frame(tables[target][key])
-        missing = ~pd.MultiIndex.from_frame(tables[name][key]).isin(known)
-        if missing.any():
-            row = int(np.argmax(missing))
-            yield Fault(
-                f"manifest/{name}",
-                row,
-                "+".join(key),
-                str(tables[name][key].iloc[row].tolist()),
-                f"in {target}",
-            )
-    labelled = tables["labels"][["frame_id", "crater_id"]].merge(
-        tables["frames"][["frame_id", "scene_id"]], on="frame_id"
-    )
-    unknown = ~np.asarray(
-        pd.MultiIndex.from_frame(labelled[["scene_id", "crater_id"]]).isin(
-            pd.MultiIndex.from_frame(tables["craters"][["scene_id", "crater_id"]])
-        )
-    )
-    if unknown.any():
-        row = int(np.argmax(unknown))
-        yield Fault("manifest/labels", row, "crater_id", str(labelled.loc[row, "crater_id"]), "in craters")
-
-
-def _counts(dataset: Dataset, tables: dict[str, pd.DataFrame]) -> Iterator[Fault]:
     if not dataset.info.complete:
-        yield Fault("dataset.json", None, "complete", "False", "a finished dataset; run `make dataset` again to go on")
-    for name, table in tables.items():
+        wanted = "a finished dataset; run `make dataset` again to go on"
+        faults.append(Fault.of("dataset.json", None, "complete", "False", wanted))
+    for name in TABLES:
+        for part in dataset.parts(name):
+            faults += part_faults(dataset, part, name)
+    try:
+        faults += _tables(dataset, progress)
+    except UserError as error:
+        if not faults:
+            faults.append(Fault.of("manifest", None, "part", error, "readable parts"))
+    faults += _images(dataset, progress)
+    return list({(fault.file, fault.column, fault.row is None): fault for fault in reversed(faults)}.values())[::-1]
+
+
+def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
+    """What rows of several tables must agree in."""
+    counts = {name: sum(Part(part, name).n_rows for part in dataset.parts(name)) for name in TABLES}
+    for name, present in counts.items():
         counted = getattr(dataset.info.counts, name)
-        if counted != len(table):
-            yield Fault("dataset.json", None, f"counts.{name}", str(counted), f"{len(table)}, the rows present")
-    frames = tables["frames"].groupby(["scene_id", "trajectory_id"]).size()
-    for row, planned in enumerate(tables["trajectories"].itertuples()):
-        present = int(frames.get((planned.scene_id, planned.trajectory_id), 0))
-        if present != planned.n_frames:
-            yield Fault(
-                "manifest/trajectories",
-                row,
-                "n_frames",
-                str(planned.n_frames),
-                f"{present}, the frames present",
-            )
-
-
-def _splits(dataset: Dataset, tables: dict[str, pd.DataFrame]) -> Iterator[Fault]:
-    """No scene, or no trajectory, in two splits, as dataset.json promises."""
-    frames = tables["frames"]
-    unknown = ~frames["split"].isin(SPLITS)
-    if unknown.any():
-        row = int(np.argmax(unknown))
-        yield Fault("manifest/frames", row, "split", str(frames.loc[row, "split"]), ", ".join(SPLITS))
-    key = {"scene": ["scene_id"], "trajectory": ["scene_id", "trajectory_id"], "frame": ["frame_id"]}
-    shared = frames.groupby(key[dataset.info.split_by])["split"].nunique() > 1
-    if shared.any():
-        yield Fault(
-            "manifest/frames",
-            None,
-            "split",
-            str(shared.index[int(np.argmax(shared))]),
-            f"one split for each {dataset.info.split_by}",
-        )
-
-
-def _labels(dataset: Dataset, tables: dict[str, pd.DataFrame], n_sampled: int = 2000) -> Iterator[Fault]:
-    """Ellipses of a sample of labels, projected again from crater and pose."""
-    labels = tables["labels"]
-    if labels.empty:
-        return
-    camera = dataset.info.camera.intrinsics()
-    rows = np.unique(np.linspace(0, len(labels) - 1, n_sampled).astype(int))
-    sample = labels.iloc[rows].assign(row=rows).merge(tables["frames"], on="frame_id")
-    sample = sample.merge(tables["craters"], on=["scene_id", "crater_id"])
-    for _, group in sample.groupby("frame_id"):
-        rotation = matrix_from_quaternion(group["rotation_wxyz"].iloc[0])
-        centres = camera_from_site(group[["x_m", "y_m", "z_m"]].to_numpy(), group["position_m"].iloc[0], rotation)
-        normals = group[["normal_x", "normal_y", "normal_z"]].to_numpy() @ rotation.T
-        ellipses = project_circles(camera, centres, normals, group["diameter_m"].to_numpy() / 2)
-        again = np.stack([ellipses.cx_px, ellipses.cy_px, ellipses.a_px, ellipses.b_px], axis=1)
-        again = np.concatenate([again, ellipses.bounding_boxes()], axis=1)
-        names = [
-            "ellipse_cx_px",
-            "ellipse_cy_px",
-            "ellipse_a_px",
-            "ellipse_b_px",
-            "bbox_x0_px",
-            "bbox_y0_px",
-            "bbox_x1_px",
-            "bbox_y1_px",
-        ]
-        apart = ~(np.abs(again - group[names].to_numpy()) < _LABEL_TOLERANCE_PX * (1 + ellipses.a_px[:, None]))
-        if apart.any():
-            row, column = np.argwhere(apart)[0]
-            yield Fault(
-                "manifest/labels",
-                int(group["row"].iloc[row]),
-                names[column],
-                str(group[names[column]].iloc[row]),
-                f"{again[row, column]}, projected from crater and pose",
-            )
-
-
-def _files(dataset: Dataset, frames: pd.DataFrame, progress: Progress | None) -> Iterator[Fault]:
-    """Presence, size and hash of every frame's files."""
-    task = progress.add_task("hashing", total=len(frames), unit="frames", note="") if progress else None
-    for row, frame in enumerate(frames.to_dict("records")):
-        for kind in ("png", "exr"):
-            relative = frame[f"{kind}_path"]
-            if kind == "exr" and not isinstance(relative, str):
-                continue
-            try:
-                path = dataset.file(relative)
-            except UserError as error:
-                yield Fault("manifest/frames", row, f"{kind}_path", str(error), "a path inside the dataset")
-                continue
-            if not path.is_file():
-                yield Fault(relative, row, f"{kind}_path", "no such file", "the frame")
-            elif path.stat().st_size != frame[f"{kind}_bytes"]:
-                yield Fault(relative, row, f"{kind}_bytes", str(path.stat().st_size), str(frame[f"{kind}_bytes"]))
-            elif files.sha256_of(path) != frame[f"{kind}_sha256"]:
-                yield Fault(relative, row, f"{kind}_sha256", "another content", frame[f"{kind}_sha256"])
+        if counted != present:
+            yield Fault.of("dataset.json", None, f"counts.{name}", counted, f"{present}, the rows present")
+        if dataset.info.images == "planned" and name in _NOT_PLANNED and present:
+            yield Fault.of(f"manifest/{name}", None, "images", "rows", "none: the dataset says that it is only planned")
+    scene_ids = dataset.table("scenes", ["scene_id"])["scene_id"].to_pylist()
+    yield from _unique(dataset, "scenes", dataset.table("scenes", KEYS["scenes"]), "manifest/scenes")
+    used: set[str] = set()
+    seen = dict.fromkeys(TABLES, 0)
+    splits_of_terrain: dict[str, set[str]] = defaultdict(set)
+    task = progress.add_task("checking", total=len(scene_ids), unit="scenes", note="") if progress else None
+    for scene_id in dict.fromkeys(scene_ids):
+        scene = dataset.table("scenes", scene_id=scene_id)
+        used.add(scene["recipe"][0].as_py())
+        frame_splits = dataset.table("frames", ["split"], scene_id=scene_id)["split"]
+        splits_of_terrain[scene["content_sha256"][0].as_py()] |= set(frame_splits.unique().to_pylist())
+        seen["scenes"] += len(scene)
+        yield from _scene(dataset, scene_id, scene, seen)
         if progress is not None and task is not None:
             progress.advance(task)
+    for name, present in counts.items():
+        if seen[name] != present:
+            wanted = f"{seen[name]}: those of the scenes and descents listed"
+            yield Fault.of(f"manifest/{name}", None, "+".join(KEYS[name][:1]), f"{present} rows", wanted)
+    if used != set(dataset.info.recipes):
+        yield Fault.of("dataset.json", None, "recipes", sorted(dataset.info.recipes), f"{sorted(used)}, as scenes name")
+    for terrain, splits in splits_of_terrain.items():
+        if len(splits) > 1 and dataset.info.split_by == "scene":
+            found = f"terrain {terrain[:12]} in {' and '.join(sorted(map(str, splits)))}"
+            yield Fault.of("manifest/frames", None, "split", found, "one split for each scene: no common terrain")
+
+
+def _scene(dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int]) -> Iterator[Fault]:
+    """One scene's row, craters and boulders, then each of its descents; counts what it has seen."""
+    where = {name: _place(dataset, name, scene_id) for name in TABLES}
+    craters = dataset.table("craters", scene_id=scene_id)
+    boulders = dataset.table("boulders", scene_id=scene_id)
+    trajectories = dataset.table("trajectories", scene_id=scene_id)
+    for name, rows in (("craters", craters), ("boulders", boulders), ("trajectories", trajectories)):
+        seen[name] += len(rows)
+        yield from _unique(dataset, name, rows.select(KEYS[name]), where[name])
+    row = scene.to_pylist()[0]
+    if dataset.info.images != "planned":
+        content = content_sha256(craters, boulders)
+        if row["content_sha256"] != content:
+            yield Fault.of(where["scenes"], 0, "content_sha256", row["content_sha256"], f"{content}, of its craters")
+    if len(craters):
+        yield from _crater_places(craters, row, where["craters"])
+    for descent in trajectories.to_pylist():
+        trajectory_id = descent["trajectory_id"]
+        frames = dataset.table("frames", scene_id=scene_id, trajectory_id=trajectory_id)
+        labels = dataset.table("labels", scene_id=scene_id, trajectory_id=trajectory_id)
+        seen["frames"] += len(frames)
+        seen["labels"] += len(labels)
+        places = {name: _place(dataset, name, scene_id, trajectory_id) for name in ("frames", "labels")}
+        for name, rows in (("frames", frames), ("labels", labels)):
+            yield from _unique(dataset, name, rows.select(KEYS[name]), places[name])
+        yield from descent_faults(dataset.info, row, craters, descent, frames, labels, places)
+
+
+def _crater_places(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault]:
+    """Latitude and longitude follow from x and y; normals are of length 1."""
+    normals = np.stack([craters[f"normal_{axis}"].to_numpy() for axis in "xyz"], axis=1)
+    wrong = np.flatnonzero(np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-6)
+    if len(wrong):
+        yield Fault.of(where, int(wrong[0]), "normal_x", normals[wrong[0]].tolist(), "a normal of length 1")
+    x, y = craters["x_m"].to_numpy(), craters["y_m"].to_numpy()
+    latitude, longitude = selenographic_from_site(x, y, scene["latitude_deg"], scene["longitude_deg"])
+    for name, again in (("latitude_deg", latitude), ("longitude_deg", longitude)):
+        apart = np.abs(craters[name].to_numpy() - again)
+        apart = np.minimum(apart, np.abs(apart - 360))
+        wrong = np.flatnonzero(apart > _DEGREES)
+        if len(wrong):
+            found = craters[name][int(wrong[0])].as_py()
+            yield Fault.of(where, int(wrong[0]), name, found, f"{again[wrong[0]]}, of the place x_m, y_m")
+
+
+def _place(dataset: Dataset, table: str, scene_id: str, trajectory_id: str | None = None) -> str:
+    parts = dataset.parts(table, scene_id, trajectory_id)
+    return parts[0].relative_to(dataset.root).as_posix() if len(parts) == 1 else f"manifest/{table}"
+
+
+def _unique(dataset: Dataset, table: str, keys: pa.Table, where: str) -> Iterator[Fault]:
+    counted = keys.group_by(keys.column_names).aggregate([([], "count_all")])
+    doubled = counted.filter(pc.greater(counted["count_all"], 1))
+    if len(doubled):
+        found = list(doubled.to_pylist()[0].values())[:-1]
+        yield Fault.of(where, None, "+".join(KEYS[table]), found, "unique")
+
+
+def _images(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
+    """Presence, size, header and hash of every frame's files."""
+    info = dataset.info
+    if info.images in ("absent", "planned"):
+        return
+    task = progress.add_task("hashing", total=info.counts.frames, unit="frames", note="") if progress else None
+    columns = ["frame_id", *(f"{kind}_{name}" for kind in ("png", "exr") for name in ("path", "bytes", "sha256"))]
+    for part in dataset.parts("frames"):
+        where = part.relative_to(dataset.root).as_posix()
+        try:
+            rows = Part(part, "frames").read(columns)
+        except UserError:
+            continue
+        places = {frame_id: row for row, frame_id in enumerate(rows["frame_id"].to_pylist())}
+        records = rows.to_pylist()
+        for row, frame in enumerate(records):
+            for kind in ("png", "exr") if info.images == "files" else ():
+                if frame[f"{kind}_path"] is not None:
+                    yield from _file(dataset, frame, kind, row, where)
+            if progress is not None and task is not None:
+                progress.advance(task)
+        if info.images == "packed":
+            try:
+                for frame_id, png in dataset.pngs(rows):
+                    frame = records[places[frame_id]]
+                    yield from _png(dataset, png, len(png), hashlib.sha256(png).hexdigest(), frame, places[frame_id])
+            except UserError as error:
+                yield Fault.of("images", None, "frame_id", error, "every frame of the manifest")
+    if info.images == "packed":
+        yield from _shards(dataset)
+
+
+def _shards(dataset: Dataset) -> Iterator[Fault]:
+    known = set(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())
+    found: set[str] = set()
+    for shard in dataset.shards():
+        where = shard.relative_to(dataset.root).as_posix()
+        try:
+            keys = Part(shard, "images", IMAGES).read(["frame_id"])["frame_id"].to_pylist()
+        except UserError as error:
+            yield Fault.of(where, None, "part", error, "a readable shard of frames")
+            continue
+        odd = [key for key in keys if key not in known or key in found]
+        if odd or len(set(keys)) != len(keys):
+            yield Fault.of(where, None, "frame_id", (odd or ["twice the same"])[0], "frames of the manifest, each once")
+        found |= set(keys)
+
+
+def _file(dataset: Dataset, frame: dict, kind: str, row: int, where: str) -> Iterator[Fault]:
+    relative = frame[f"{kind}_path"]
+    try:
+        path = dataset.file(relative)
+    except UserError as error:
+        yield Fault.of(where, row, f"{kind}_path", error, "a path inside the dataset")
+        return
+    if not path.is_file():
+        yield Fault.of(relative, row, f"{kind}_path", "no such file", "the frame")
+        return
+    n_bytes = path.stat().st_size
+    if n_bytes != frame[f"{kind}_bytes"]:
+        yield Fault.of(relative, row, f"{kind}_bytes", n_bytes, frame[f"{kind}_bytes"])
+    elif kind == "exr":
+        if files.sha256_of(path) != frame["exr_sha256"]:
+            yield Fault.of(relative, row, "exr_sha256", "another content", frame["exr_sha256"])
+    else:
+        with path.open("rb") as stream:
+            head = stream.read(64)
+        yield from _png(dataset, head, n_bytes, files.sha256_of(path), frame, row)
+
+
+def _png(dataset: Dataset, head: bytes, n_bytes: int, sha256: str, frame: dict, row: int) -> Iterator[Fault]:
+    """A PNG's size, hash and header, given its first bytes."""
+    where, camera = frame["png_path"], dataset.info.camera
+    if n_bytes != frame["png_bytes"]:
+        yield Fault.of(where, row, "png_bytes", n_bytes, frame["png_bytes"])
+    if sha256 != frame["png_sha256"]:
+        yield Fault.of(where, row, "png_sha256", "another content", frame["png_sha256"])
+    try:
+        header = png_header(head)
+    except ValueError as error:
+        yield Fault.of(where, row, "png_path", error, "a grey PNG")
+        return
+    if (header.width_px, header.height_px) != (camera.width_px, camera.height_px):
+        size = f"{header.width_px} x {header.height_px}"
+        yield Fault.of(where, row, "width_px", size, f"{camera.width_px} x {camera.height_px}")

@@ -11,7 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import count_rows, open_dataset, read_part, write_part
+from perilune_shared.manifest import count_rows, open_dataset
+from perilune_shared.parts import read_part, write_part
 from perilune_shared.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.stats import summary
 from perilune_shared.validate import validate

@@ -1,9 +1,12 @@
+import struct
+import zlib
+
 import cv2
 import numpy as np
 import pytest
 
 from perilune_shared.errors import UserError
-from perilune_train.data.frames import read_image
+from perilune_train.data.frames import decode
 
 
 @pytest.mark.parametrize("bits", [10, 12, 16])
@@ -15,11 +18,21 @@ def test_a_16_bit_frame_has_the_range_of_an_8_bit_one(tmp_path, bits):
     assert fine.max() == 2**bits - 1
     cv2.imwrite(str(tmp_path / "fine.png"), fine << (16 - bits))
     for name in ("8.png", "fine.png"):
-        image = read_image(tmp_path / name, 16, 16)
+        image = decode((tmp_path / name).read_bytes(), name, 16, 16)
         assert image.dtype == np.uint8 and np.array_equal(image, grey)
 
 
-def test_a_frame_that_is_no_image_is_refused(tmp_path):
-    (tmp_path / "0.png").write_bytes(b"no image")
-    with pytest.raises(UserError, match="does not decode"):
-        read_image(tmp_path / "0.png", 16, 16)
+def bomb(width, height):
+    """A PNG that says it is large, and holds nothing."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    chunk = b"IHDR" + header
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk)) + bytes(12)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [(b"no image", "not a PNG"), (bomb(60_000, 60_000), "60000 x 60000"), (bomb(16, 16), "does not decode")],
+)
+def test_a_frame_that_is_no_image_is_refused(content, told):
+    with pytest.raises(UserError, match=told):
+        decode(content, "0.png", 16, 16)

@@ -22,7 +22,6 @@ from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
 from perilune_shared.frames import Array
 
-BLENDER_VERSION: str = bpy.app.version_string
 _FAR_M = 1e9
 _LEAST_FREE_BYTES = 16_000_000
 _LIT = 1e-4

@@ -1,5 +1,6 @@
 """A real elevation model as the base of a scene: any projection, any pixel size, holes."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,7 +80,8 @@ def read_elevation(path: Path) -> ElevationModel:
     except RasterioError as error:
         raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
     pixel = _pixel_m(transform, crs, middle, lat[0], lon[0])
-    source = f"{path.name} sha256:{sha256_of(path)}"
+    plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
+    source = f"{plain_name} sha256:{sha256_of(path)}"
     return ElevationModel(height, known, transform, crs, float(lat[0]), float(lon[0]), pixel, source)
 
 

@@ -1,7 +1,6 @@
 """A dataset's frames in memory: pixels as 8-bit grey, beside their rows of the manifest."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset
+from perilune_shared.png import png_header
 from perilune_shared.progress import progress_bar
 
 
@@ -26,39 +26,43 @@ class FrameStore:
         return len(self.images)
 
 
-def read_image(path: Path, height_px: int, width_px: int, size_bytes: int | None = None) -> NDArray[np.uint8]:
-    """One frame (height, width), 8-bit grey; of a 16-bit PNG the upper eight bits.
+def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int | None = None) -> NDArray[np.uint8]:
+    """One frame (height, width), 8-bit grey, of a PNG's bytes; of a 16-bit PNG the upper eight bits.
 
-    Raises UserError where the file is missing, is not `size_bytes` long as the manifest says, is no image, or has
-    another size in pixels.
+    Raises UserError where it is not `size_bytes` long as the manifest says, is no grey PNG, or has another size in
+    pixels (which is known before it is unpacked).
     """
-    if not path.is_file():
-        raise UserError(path, "frame", "no such file", "the PNG that the manifest names")
     # A decoder may fill the missing rows of a truncated file without a word; its length tells.
-    if size_bytes is not None and path.stat().st_size != size_bytes:
-        raise UserError(path, "png_bytes", f"{path.stat().st_size} bytes", f"{size_bytes} bytes; the file is damaged")
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if size_bytes is not None and len(png) != size_bytes:
+        raise UserError(name, "png_bytes", f"{len(png)} bytes", f"{size_bytes} bytes; the file is damaged")
+    try:
+        header = png_header(png)
+    except ValueError as error:
+        raise UserError(name, "frame", error, "a grey PNG") from None
+    if (header.height_px, header.width_px) != (height_px, width_px):
+        raise UserError(name, "size", f"{header.width_px} x {header.height_px}", f"{width_px} x {height_px} pixels")
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise UserError(path, "frame", "a file that does not decode", "a grey PNG")
-    if image.dtype == np.uint16:
-        image = image >> 8
-    if image.shape != (height_px, width_px):
-        raise UserError(path, "size", f"{image.shape[1]} x {image.shape[0]}", f"{width_px} x {height_px} pixels")
-    return image.astype(np.uint8, copy=False)
+        raise UserError(name, "frame", "a file that does not decode", "a grey PNG")
+    return (image >> 8 if image.dtype == np.uint16 else image).astype(np.uint8, copy=False)
 
 
 def load_frames(dataset: Dataset, split: str) -> FrameStore:
     """All frames of a split, 64 kB each at 256 x 256. Raises UserError on a split without frames or a bad frame."""
-    table = dataset.table("frames", split=split).to_pandas()
+    rows = dataset.table("frames", split=split)
+    table = rows.to_pandas()
     if table.empty:
         raise UserError(dataset.root, "split", f"no {split} frames", "a dataset with frames in train, val and test")
     table = table.sort_values(["scene_id", "trajectory_id", "frame_index"], ignore_index=True)
     camera = dataset.info.camera
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
+    place = {frame_id: i for i, frame_id in enumerate(table["frame_id"])}
+    paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()
     with progress_bar() as progress:
         task = progress.add_task(f"load {split}", total=len(table), unit="frames", note="")
-        for i, row in enumerate(table.itertuples()):
-            images[i] = read_image(dataset.file(row.png_path), camera.height_px, camera.width_px, row.png_bytes)
+        for frame_id, png in dataset.pngs(rows):
+            i = place[frame_id]
+            images[i] = decode(png, f"{dataset.root}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
             progress.advance(task)
     return FrameStore(table, images)
 

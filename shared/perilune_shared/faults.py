@@ -1,0 +1,163 @@
+"""Faults of a dataset, and the checks that need no more than one part: names, schema, values."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from perilune_shared.errors import UserError, one_line, shortened
+from perilune_shared.manifest import Dataset
+from perilune_shared.parts import WHOLE_TABLE, Part
+from perilune_shared.schema import SPLITS, TABLES
+
+ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+_FRAME_ID = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}/[A-Za-z0-9][A-Za-z0-9_-]{0,63}/[0-9]{6}$"
+_PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
+_PLAIN = r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$"
+_SHA256 = r"^[0-9a-f]{64}$"
+_TEXTS = {
+    "scene_id": ID_PATTERN,
+    "trajectory_id": ID_PATTERN,
+    "frame_id": _FRAME_ID,
+    "png_path": _PATH,
+    "exr_path": _PATH,
+    "png_sha256": _SHA256,
+    "exr_sha256": _SHA256,
+    "content_sha256": _SHA256,
+    "recipe": r"^[0-9a-f]{16}$",
+    "split": "^(" + "|".join(SPLITS) + ")$",
+}
+_POSITIVE = (
+    "diameter_m",
+    "extent_m",
+    "ellipse_a_px",
+    "ellipse_b_px",
+    "radius_px",
+    "duration_s",
+    "n_frames",
+    "width_px",
+    "height_px",
+    "fx_px",
+    "fy_px",
+    "png_bytes",
+    "exr_bytes",
+)
+_NOT_NEGATIVE = ("crater_id", "boulder_id", "shape_id", "frame_index", "seed", "time_s")
+_RANGES = {
+    "latitude_deg": (-90, 90),
+    "longitude_deg": (-180, 180),
+    "sun_azimuth_deg": (-360, 360),
+    "sun_elevation_deg": (-90, 90),
+    "visible_fraction": (0, 1),
+    "sunlit_fraction": (0, 1),
+    "age_myr": (0, 4600),
+    "ellipse_theta_rad": (0, np.pi),
+}
+_UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
+_MOST = 1e12
+"""No length, time or size of a descent comes near."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing wrong in a dataset."""
+
+    file: str
+    """Relative to the dataset."""
+    row: int | None
+    """Row within the file or table, from 0; None where the fault is the whole file's."""
+    column: str
+    """Column or property."""
+    found: str
+    """The value."""
+    wanted: str
+    """What would be right."""
+
+    @classmethod
+    def of(cls, file: object, row: int | None, column: object, found: object, wanted: object) -> "Fault":
+        """A fault from values of any origin, made short and plain."""
+        return cls(one_line(file), row, one_line(column), shortened(one_line(found)), one_line(wanted))
+
+
+def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
+    """Whatever one part shows to be wrong by itself."""
+    where = path.relative_to(dataset.root).as_posix()
+    if path.is_symlink() or not path.resolve().is_relative_to(dataset.root.resolve()):
+        yield Fault.of(where, None, "part", "a link", "a file of the dataset's own")
+        return
+    try:
+        part = Part(path, table)
+        names = part.found.names
+        if names != TABLES[table].names:
+            odd = sorted(set(names) ^ set(TABLES[table].names)) or "another order"
+            yield Fault.of(where, None, "schema", odd, f"the columns of {table}")
+            return
+        for found, wanted in zip(part.found, TABLES[table], strict=True):
+            if (found.type, found.nullable) != (wanted.type, wanted.nullable) or found.metadata != wanted.metadata:
+                yield Fault.of(where, None, found.name, found.metadata, f"{wanted.type} with {wanted.metadata}")
+        rows = part.read()
+    except UserError as error:
+        yield Fault.of(where, None, "part", error, "a readable part of this schema")
+        return
+    yield from _of_the_name(where, path.stem, rows)
+    for field in rows.schema:
+        yield from _of_values(where, field, rows[field.name].combine_chunks())
+
+
+def _of_the_name(where: str, stem: str, rows: pa.Table) -> Iterator[Fault]:
+    """A reader looks for a scene's rows by the parts' names, so that these must hold no others."""
+    scene, _, trajectory = stem.partition(".")
+    if stem == WHOLE_TABLE:
+        return
+    if "scene_id" in rows.column_names:
+        own = pc.equal(rows["scene_id"], scene)
+        if trajectory and "trajectory_id" in rows.column_names:
+            own = pc.and_(own, pc.equal(rows["trajectory_id"], trajectory))
+    else:
+        own = pc.starts_with(rows["frame_id"], f"{scene}/{trajectory}/" if trajectory else f"{scene}/")
+    others = np.flatnonzero(~np.asarray(own, bool))
+    if len(others):
+        yield Fault.of(where, int(others[0]), "part", "a row of another scene or descent", f"rows of {stem} alone")
+
+
+def _of_values(where: str, field: pa.Field, column: pa.Array) -> Iterator[Fault]:
+    """Nulls, finiteness, ranges, lengths and patterns of one column."""
+    present = ~np.asarray(column.is_null(), bool)
+    if not field.nullable and not present.all():
+        yield Fault.of(where, int(np.argmin(present)), field.name, "null", "a value")
+        return
+    checks: list[tuple[np.ndarray, str]] = []
+    if pa.types.is_string(field.type):
+        pattern = _TEXTS.get(field.name, _PLAIN)
+        fits = np.asarray(pc.fill_null(pc.match_substring_regex(column, pattern), False), bool)
+        line_breaks = np.asarray(pc.fill_null(pc.match_substring(column, "\n"), False), bool)
+        checks.append((~fits | line_breaks, f"text like {pattern}"))
+        values = None
+    elif pa.types.is_fixed_size_list(field.type):
+        values = column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), field.type.list_size)
+    else:
+        values = column.fill_null(1).to_numpy(zero_copy_only=False).astype(np.float64)[:, None]
+    if values is not None:
+        checks.append((~(np.abs(values) < _MOST).all(axis=1) & (field.name != "seed"), "a finite number"))
+        if field.name in _POSITIVE:
+            checks.append((values[:, 0] <= 0, "above 0"))
+        if field.name in _NOT_NEGATIVE:
+            checks.append((values[:, 0] < 0, "at least 0"))
+        if field.name in _RANGES:
+            low, high = _RANGES[field.name]
+            checks.append(((values[:, 0] < low) | (values[:, 0] > high), f"{low} to {high}"))
+        if field.name in _UNIT_VECTORS:
+            checks.append((np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6, "length 1"))
+    for wrong, wanted in checks:
+        rows = np.flatnonzero(wrong & present)
+        if len(rows):
+            yield Fault.of(where, int(rows[0]), field.name, column[int(rows[0])].as_py(), wanted)
+
+
+def matches(pattern: str, text: object) -> bool:
+    """Whether a text is wholly of a pattern."""
+    return isinstance(text, str) and re.fullmatch(pattern.removeprefix("^").removesuffix("$"), text) is not None

@@ -1,0 +1,205 @@
+"""dataset.json: what a dataset is, what it was made by, what was done to it."""
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from perilune_shared import files
+from perilune_shared.camera import Camera
+from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.errors import UserError
+from perilune_shared.schema import SCHEMA_VERSION, ImageState, Kind, SplitUnit
+
+INFO_NAME = "dataset.json"
+_LARGEST_INFO_BYTES = 10_000_000
+# Names reach tables, pages and shells: they are letters, digits and a few marks that mean nothing there.
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$")]
+_Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_Row = tuple[float, float, float]
+
+
+class _Info(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class CameraInfo(_Info):
+    """The camera of all frames; pixels, metres and O_B."""
+
+    width_px: Annotated[int, Field(gt=0, le=100_000)]
+    """Image width, pixels."""
+    height_px: Annotated[int, Field(gt=0, le=100_000)]
+    """Image height, pixels."""
+    fx_px: Annotated[float, Field(gt=0)]
+    """Focal length over the pixel's width, pixels."""
+    fy_px: Annotated[float, Field(gt=0)]
+    """Focal length over the pixel's height, pixels."""
+    cx_px: float
+    """Principal point, pixels right of the left edge."""
+    cy_px: float
+    """Principal point, pixels below the top edge."""
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """Brown-Conrady k1, k2, p1, p2, k3, on coordinates over the focal length."""
+    rotation_camera_from_body: tuple[_Row, _Row, _Row]
+    """Rows of the matrix (3, 3)."""
+    position_in_body_m: _Row
+    """Centre of projection in O_B, metres."""
+
+    @classmethod
+    def of(cls, camera: Camera) -> "CameraInfo":
+        """A camera at the body's origin that looks down on a level flight."""
+        x, y, z = ROTATION_CAMERA_FROM_BODY.tolist()
+        rows = tuple(x), tuple(y), tuple(z)
+        return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=(0.0, 0.0, 0.0))
+
+    def intrinsics(self) -> Camera:
+        """The camera that projects, with its distortion."""
+        return Camera(self.width_px, self.height_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion)
+
+
+class Counts(_Info):
+    """Rows in each table."""
+
+    scenes: Annotated[int, Field(ge=0)] = 0
+    """Terrains."""
+    craters: Annotated[int, Field(ge=0)] = 0
+    """Craters of all scenes."""
+    boulders: Annotated[int, Field(ge=0)] = 0
+    """Boulders of all scenes."""
+    trajectories: Annotated[int, Field(ge=0)] = 0
+    """Descents."""
+    frames: Annotated[int, Field(ge=0)] = 0
+    """Images."""
+    labels: Annotated[int, Field(ge=0)] = 0
+    """Craters in images."""
+
+
+class Origin(_Info):
+    """The dataset from whose EXRs another was developed."""
+
+    name: Name
+    """Its name."""
+    sha256: _Sha256
+    """Of its dataset.json."""
+    camera_config: dict[str, Any]
+    """Its section `dataset.camera`, which the ground and the EXRs were made for."""
+
+
+class Recipe(_Info):
+    """All that scenes and frames follow from, beside their seeds: enough to make them again."""
+
+    preset: Name
+    """Where the settings began."""
+    kind: Kind
+    """Which of the preset's datasets."""
+    seed: Annotated[int, Field(ge=0)]
+    """From which every random stream is derived."""
+    config: dict[str, Any]
+    """The resolved `dataset` section."""
+    versions: dict[Name, Name]
+    """Packages and Blender."""
+    developed_from: Origin | None = None
+    """Where the frames were developed again from; null where they were rendered."""
+
+    @property
+    def key(self) -> str:
+        """Names the recipe by its content."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+class DatasetInfo(_Info):
+    """Content of dataset.json."""
+
+    name: Name
+    """For people."""
+    kind: Kind
+    """What it is for."""
+    schema_version: str
+    """Of tables and files."""
+    complete: bool
+    """False while the renderer is still at work, or was stopped."""
+    images: ImageState
+    """files under frames/, packed in images/*.parquet, absent (elsewhere), or planned (not even labels are here)."""
+    split_by: SplitUnit
+    """What no two splits share. Less than a scene means that splits share terrain."""
+    camera: CameraInfo
+    """Of all frames."""
+    exr_camera: CameraInfo | None = None
+    """Of the EXRs: a camera without distortion that sees all that `camera` sees; null where there are none."""
+    recipes: dict[str, Recipe]
+    """By key; each scene names its own."""
+    history: tuple[Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f<>&`$]{1,500}$")], ...] = ()
+    """What was done since rendering, a line each."""
+    counts: Counts
+    """Rows in each table, once complete."""
+    licence: Name
+    """SPDX expression."""
+
+    def recipe(self) -> Recipe:
+        """The only recipe of a dataset that was rendered at one go. Raises ValueError where there are more."""
+        (recipe,) = self.recipes.values()
+        return recipe
+
+    def changed(self, line: str, **fields: Any) -> "DatasetInfo":
+        """A copy with fields replaced and a line of history."""
+        plain = "".join(c if c.isprintable() and c not in "<>&`$" else "?" for c in line)[:500]
+        return self.model_copy(update={"history": (*self.history, plain), **fields})
+
+
+def recipes_of(*recipes: Recipe) -> dict[str, Recipe]:
+    """Recipes by their keys."""
+    return {recipe.key: recipe for recipe in recipes}
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file. Raises UserError where it is missing, too large or no JSON object."""
+    if not path.is_file():
+        raise UserError(path.parent, path.name, "no such file", "the folder of a dataset (see `make dataset`)")
+    if path.stat().st_size > _LARGEST_INFO_BYTES:
+        raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {_LARGEST_INFO_BYTES}")
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise UserError(path, "content", error, "JSON") from None
+    if not isinstance(content, dict):
+        raise UserError(path, "content", type(content).__name__, "a JSON object")
+    return content
+
+
+def read_info(root: Path) -> DatasetInfo:
+    """The dataset.json of a folder. Raises UserError where it is missing, damaged or of another schema version."""
+    path = root / INFO_NAME
+    content = read_object(path)
+    version = content.get("schema_version")
+    if version != SCHEMA_VERSION:
+        raise UserError(path, "schema_version", version, f"{SCHEMA_VERSION}; see `perilune-manifest migrate`")
+    return checked_info(content, path)
+
+
+def checked_info(content: dict[str, Any], path: Path) -> DatasetInfo:
+    """Plain data as a DatasetInfo. Raises UserError with the first field that is wrong."""
+    try:
+        info = DatasetInfo.model_validate_json(json.dumps(content))
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        field = ".".join(str(part) for part in fault["loc"])
+        raise UserError(path, field, repr(fault["input"]), fault["msg"]) from None
+    for key, recipe in info.recipes.items():
+        if recipe.key != key:
+            raise UserError(path, f"recipes.{key}", "another content", f"the recipe that hashes to {recipe.key}")
+    return info
+
+
+def write_info(root: Path, info: DatasetInfo) -> None:
+    """Write dataset.json, whole or not at all."""
+    files.write_text(root / INFO_NAME, info.model_dump_json(indent=2) + "\n")
+
+
+def joined_licence(licences: Iterable[str]) -> str:
+    """The SPDX expression of data under all of several licences."""
+    return " AND ".join(sorted({part for licence in licences for part in licence.split(" AND ")}))

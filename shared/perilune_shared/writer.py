@@ -1,0 +1,192 @@
+"""Writing a whole dataset anew, scene by scene, aside and renamed: how merge, subset, split and the others end.
+
+What can be reckoned from the rows is reckoned here and nowhere added up: rows of each table, frames of each descent,
+its split, and what the splits do not share.
+"""
+
+import contextlib
+import os
+import shutil
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from perilune_shared import checksums, files
+from perilune_shared.errors import UserError
+from perilune_shared.info import Counts, DatasetInfo, write_info
+from perilune_shared.manifest import Dataset
+from perilune_shared.parts import WHOLE_TABLE, write_part
+from perilune_shared.schema import IMAGES, TABLES, SplitUnit
+
+SceneTables = dict[str, pa.Table]
+"""Every table of one scene, by name."""
+_PER_DESCENT = ("frames", "labels")
+_IMAGES_A_GROUP = 128
+
+
+class DatasetWriter:
+    """Collects a dataset in a hidden folder beside `out`; `written` renames it at the end."""
+
+    def __init__(self, out: Path, info: DatasetInfo, *, whole_tables: bool = False):
+        self.out, self.info = out, info
+        self.root = out.with_name(f".{out.name}.{os.getpid()}.part")
+        self.whole_tables = whole_tables
+        self._rows = dict.fromkeys(TABLES, 0)
+        self._kept: dict[str, list[pa.Table]] = defaultdict(list)
+        self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
+        self._frames_split = False
+        self._recipes: set[str] = set()
+
+    def add_scene(self, tables: SceneTables) -> None:
+        """Append one scene, whose frames are not empty; descents get their number of frames and their split anew."""
+        frames = tables["frames"]
+        splits = frames["split"].to_numpy(zero_copy_only=False)
+        terrain = tables["scenes"]["content_sha256"][0].as_py()
+        self._splits_of_terrain[terrain] |= set(splits)
+        self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
+        tables = {**tables, "trajectories": _settled(tables["trajectories"], frames)}
+        self._frames_split |= tables["trajectories"]["split"].null_count > 0
+        scene_id = tables["scenes"]["scene_id"][0].as_py()
+        for name, rows in tables.items():
+            self._rows[name] += len(rows)
+            rows = rows.cast(TABLES[name])
+            if self.whole_tables:
+                self._kept[name].append(rows)
+            elif name in _PER_DESCENT:
+                for trajectory_id in pc.unique(frames["trajectory_id"]).to_pylist():
+                    own = pc.starts_with(rows["frame_id"], f"{scene_id}/{trajectory_id}/")
+                    write_part(self.root, name, f"{scene_id}.{trajectory_id}", rows.filter(own))
+            else:
+                write_part(self.root, name, scene_id, rows)
+
+    def add_images(self, source: Dataset, frames: pa.Table, names: dict[str, str], *, link: bool) -> None:
+        """Bring frames of another dataset as files: `frames` are its rows, `names` give the new frame_id of each.
+
+        With `link` files are linked where the disk allows it, else copied.
+        """
+        by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path"]).to_pylist()}
+        if source.info.images == "packed":
+            for frame_id, png in source.pngs(frames):
+                files.write_bytes(self.root / f"frames/{names[frame_id]}.png", png)
+        else:
+            for row in frames.select(["frame_id", "png_path"]).to_pylist():
+                by_id[row["frame_id"]]["png_path"] = row["png_path"]
+        for frame_id, row in by_id.items():
+            for kind in ("png", "exr"):
+                if row.get(f"{kind}_path") is not None:
+                    _bring(source.file(row[f"{kind}_path"]), self.root / f"frames/{names[frame_id]}.{kind}", link=link)
+
+    def pack_images(self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int) -> None:
+        """Write frames (frame_id, png_path, PNG bytes) into shards images/*.parquet of about `shard_bytes`."""
+        shard, size, writer = 0, 0, None
+        waiting: list[tuple[str, str, bytes]] = []
+        self.root.joinpath("images").mkdir(parents=True, exist_ok=True)
+
+        def flush() -> None:
+            nonlocal writer, waiting
+            if not waiting:
+                return
+            if writer is None:
+                path = self.root / "images" / f"{shard:05d}.parquet"
+                # PNG is compressed already, and no two frames are alike.
+                writer = pq.ParquetWriter(path, IMAGES, compression="none", use_dictionary=["frame_id"])
+            rows = [{"frame_id": name, "image": {"bytes": png, "path": path}} for name, path, png in waiting]
+            writer.write_table(pa.Table.from_pylist(rows, schema=IMAGES))
+            waiting = []
+
+        for name, path, png in images:
+            if size and size + len(png) > shard_bytes:
+                flush()
+                if writer is not None:
+                    writer.close()
+                shard, size, writer = shard + 1, 0, None
+            waiting.append((name, path, png))
+            size += len(png)
+            if len(waiting) == _IMAGES_A_GROUP:
+                flush()
+        flush()
+        if writer is not None:
+            writer.close()
+
+    def finish(self) -> None:
+        """Write what remains, dataset.json and the checksums."""
+        for name, pieces in self._kept.items():
+            if name in _PER_DESCENT:
+                pieces = [_sorted_by(piece, "frame_id") for piece in pieces]
+            rows = pa.concat_tables(pieces)
+            write_part(self.root, name, WHOLE_TABLE, rows, max(1000, len(rows) // 200))
+        shared = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
+        unit: SplitUnit = "frame" if self._frames_split else "trajectory" if shared else "scene"
+        recipes = {key: recipe for key, recipe in self.info.recipes.items() if key in self._recipes}
+        info = self.info.model_copy(update={"split_by": unit, "recipes": recipes, "counts": Counts(**self._rows)})
+        write_info(self.root, info)
+        checksums.seal(self.root)
+
+
+@contextlib.contextmanager
+def written(out: Path, info: DatasetInfo, *, whole_tables: bool = False) -> Iterator[DatasetWriter]:
+    """A writer for a new dataset in `out`, which appears whole or not at all.
+
+    `info` gives all that does not follow from the rows; a dataset of no frames is refused. Raises UserError where `out`
+    holds something.
+    """
+    check_free(out)
+    writer = DatasetWriter(out, info, whole_tables=whole_tables)
+    shutil.rmtree(writer.root, ignore_errors=True)
+    writer.root.mkdir(parents=True)
+    try:
+        yield writer
+        if not writer._rows["frames"]:
+            raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
+        writer.finish()
+        if out.is_dir():
+            out.rmdir()
+        writer.root.replace(out)
+    finally:
+        shutil.rmtree(writer.root, ignore_errors=True)
+
+
+def check_free(out: Path) -> None:
+    """Raises UserError where a folder for a new dataset holds something."""
+    if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
+        raise UserError(out, "--out", "something that is there", "a new or empty folder")
+
+
+def _settled(trajectories: pa.Table, frames: pa.Table) -> pa.Table:
+    """The descents that have frames, with the number and the common split of these."""
+    counted = frames.group_by("trajectory_id").aggregate(
+        [("frame_id", "count"), ("split", "count_distinct"), ("split", "min")]
+    )
+    rows = {row["trajectory_id"]: row for row in counted.to_pylist()}
+    ids = trajectories["trajectory_id"].to_pylist()
+    trajectories = trajectories.filter(pa.array(name in rows for name in ids))
+    own = [rows[name] for name in ids if name in rows]
+    values = {
+        "n_frames": pa.array([row["frame_id_count"] for row in own], pa.int64()),
+        "split": pa.array([row["split_min"] if row["split_count_distinct"] == 1 else None for row in own], pa.string()),
+    }
+    for name, column in values.items():
+        place = trajectories.schema.get_field_index(name)
+        trajectories = trajectories.set_column(place, trajectories.schema.field(place), column)
+    return trajectories
+
+
+def _sorted_by(table: pa.Table, column: str) -> pa.Table:
+    order = np.argsort(table[column].to_numpy(zero_copy_only=False), kind="stable")
+    return table.take(pa.array(order))
+
+
+def _bring(path: Path, to: Path, *, link: bool) -> None:
+    if not path.is_file():
+        raise UserError(path, "frame", "no such file", "the file that the manifest names")
+    to.parent.mkdir(parents=True, exist_ok=True)
+    if link:
+        with contextlib.suppress(OSError):
+            os.link(path, to)
+            return
+    shutil.copyfile(path, to)
