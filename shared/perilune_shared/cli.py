@@ -1,6 +1,5 @@
 """`perilune-manifest`: look after datasets without Blender and without torch."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -8,6 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from perilune_shared.cli_change import DatasetArgument, register
 from perilune_shared.errors import EXIT_USER_ERROR, run_command_line
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
@@ -20,7 +20,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the one that holds dataset.json.")]
 
 
 @app.command()
@@ -63,6 +62,9 @@ def stats(dataset: DatasetArgument) -> None:
     console.print(table)
     counts = info.counts.model_dump()
     console.print(", ".join(f"{count} {name}" for name, count in counts.items()))
+
+
+register(app)
 
 
 def main() -> None:

@@ -85,8 +85,8 @@ class Origin(_Info):
     """Its name."""
     sha256: _Sha256
     """Of its dataset.json."""
-    camera_config: dict[str, Any]
-    """Its section `dataset.camera`, which the ground and the EXRs were made for."""
+    camera_config: dict[str, Any] | None
+    """Its section `dataset.camera`, which the ground and the EXRs were made for; null where that is not known."""
 
 
 class Recipe(_Info):

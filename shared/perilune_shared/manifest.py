@@ -103,8 +103,10 @@ class Dataset:
     def _packed(self, wanted: set[str]) -> Iterator[tuple[str, bytes]]:
         missing = set(wanted)
         for shard in self.shards():
+            if not missing:
+                return
             part = Part(shard, "images", IMAGES)
-            for group in range(part.file.metadata.num_row_groups):
+            for group in part.groups_within("frame_id", min(missing), max(missing) + "\x00"):
                 keys = part.read(["frame_id"], [group])["frame_id"].to_pylist()
                 if missing.isdisjoint(keys):
                     continue

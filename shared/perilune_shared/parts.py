@@ -26,8 +26,11 @@ _FOOTER_BYTES = 100_000_000
 class Part:
     """An opened part, whose footer has been checked."""
 
-    def __init__(self, path: Path, table: str, schema: pa.Schema | None = None):
-        """Raises UserError where it is no Parquet file, of another table or schema version, or too large."""
+    def __init__(self, path: Path, table: str, schema: pa.Schema | None = None, version: str = SCHEMA_VERSION):
+        """Raises UserError where it is no Parquet file, of another table or schema version, or too large.
+
+        `schema` is that of the table's columns where it is not that of TABLES, as in older versions.
+        """
         self.path, self.schema = path, schema or TABLES[table]
         texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
         try:
@@ -42,7 +45,7 @@ class Part:
         except (pa.ArrowException, OSError, ValueError) as error:
             raise UserError(path, "content", error, "a whole Parquet file") from None
         metadata = self.found.metadata or {}
-        for name, wanted in (("schema_version", SCHEMA_VERSION), ("table", table)):
+        for name, wanted in (("schema_version", version), ("table", table)):
             got = metadata.get(f"perilune.{name}".encode(), b"none").decode(errors="replace")
             if got != wanted:
                 hint = "; see `perilune-manifest migrate`" if name == "schema_version" else ""

@@ -5,6 +5,7 @@ its split, and what the splits do not share.
 """
 
 import contextlib
+import json
 import os
 import shutil
 from collections import defaultdict
@@ -18,7 +19,7 @@ import pyarrow.parquet as pq
 
 from perilune_shared import checksums, files
 from perilune_shared.errors import UserError
-from perilune_shared.info import Counts, DatasetInfo, write_info
+from perilune_shared.info import Counts, DatasetInfo, checked_info, write_info
 from perilune_shared.manifest import Dataset
 from perilune_shared.parts import WHOLE_TABLE, write_part
 from perilune_shared.schema import IMAGES, TABLES, SplitUnit
@@ -136,6 +137,8 @@ def written(out: Path, info: DatasetInfo, *, whole_tables: bool = False) -> Iter
     holds something.
     """
     check_free(out)
+    # A copy of an info with fields replaced was never checked.
+    checked_info(json.loads(info.model_dump_json()), out)
     writer = DatasetWriter(out, info, whole_tables=whole_tables)
     shutil.rmtree(writer.root, ignore_errors=True)
     writer.root.mkdir(parents=True)

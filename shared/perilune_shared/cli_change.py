@@ -1,0 +1,148 @@
+"""Commands of `perilune-manifest` that make one dataset of others."""
+
+import enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from perilune_shared import diff as differing
+from perilune_shared import merge as merging
+from perilune_shared import migrate as migrating
+from perilune_shared import pack as packing
+from perilune_shared.manifest import Dataset, open_dataset
+from perilune_shared.progress import progress_bar
+from perilune_shared.split import split_dataset
+from perilune_shared.subset import subset as choose
+
+EXIT_DIFFERENT = 1
+
+
+class Images(enum.StrEnum):
+    """What becomes of frames."""
+
+    LINK = "link"
+    COPY = "copy"
+    NONE = "none"
+
+
+class Unit(enum.StrEnum):
+    """What is dealt to the splits as a whole."""
+
+    SCENE = "scene"
+    TRAJECTORY = "trajectory"
+    FRAME = "frame"
+
+
+DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the one that holds dataset.json.")]
+OutOption = Annotated[Path, typer.Option(help="New folder for the result.")]
+ImagesOption = Annotated[
+    Images, typer.Option(help="Frames: link (hard links, or copies where the disk has none), copy, none.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to a command line."""
+    for command in (merge, subset, split, diff, migrate, pack, unpack):
+        app.command()(command)
+
+
+def _tell(out: Path) -> Dataset:
+    made = open_dataset(out)
+    counts = made.info.counts
+    Console().print(
+        Text(f"{out}: {counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames, "
+             f"{counts.labels} labels, frames {made.info.images}, split by {made.info.split_by}"),
+        soft_wrap=True,
+    )  # fmt: skip
+    return made
+
+
+def merge(
+    datasets: Annotated[list[Path], typer.Argument(help="Folders of two datasets or more, of one kind and camera.")],
+    out: OutOption,
+    name: Annotated[str, typer.Option(help="Name of the result.")] = "merged",
+    images: ImagesOption = Images.LINK,
+) -> None:
+    """Make one dataset of several. The same scene or frame in two of them comes once."""
+    with progress_bar() as progress:
+        merging.merge([open_dataset(path) for path in datasets], out, name, images.value, progress)
+    _tell(out)
+
+
+def subset(
+    dataset: DatasetArgument,
+    out: OutOption,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(help='Condition on columns, as "radius_px > 5" or "split == \'test\'"; may be repeated.'),
+    ] = None,
+    frames: Annotated[int | None, typer.Option(help="At most this many frames.")] = None,
+    mb: Annotated[float | None, typer.Option(help="At most this many megabytes of PNGs.")] = None,
+    images: ImagesOption = Images.LINK,
+) -> None:
+    """Take part of a dataset: frames or labels for which conditions hold, so many frames, so many megabytes."""
+    with progress_bar() as progress:
+        choose(open_dataset(dataset), out, tuple(where or ()), frames, mb, images.value, progress)
+    _tell(out)
+
+
+def split(
+    dataset: DatasetArgument,
+    out: OutOption,
+    by: Annotated[
+        Unit, typer.Option(help="What goes together; frame is the paper's protocol, which leaks terrain.")
+    ] = Unit.SCENE,
+    val: Annotated[float, typer.Option(help="Share for validation.")] = 0.1,
+    test: Annotated[float, typer.Option(help="Share for the test.")] = 0.1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the deal.")] = 0,
+    images: ImagesOption = Images.LINK,
+) -> None:
+    """Deal train, val and test anew, by scene, descent or frame."""
+    with progress_bar() as progress:
+        split_dataset(open_dataset(dataset), out, by.value, val, test, seed, images.value, progress)
+    made = _tell(out)
+    if made.info.split_by != "scene":
+        Console().print("the splits share terrain: figures of the test flatter")
+
+
+def diff(first: DatasetArgument, second: DatasetArgument) -> None:
+    """Show what differs between two datasets. Exit code 1 where something does."""
+    found = differing.differences(open_dataset(first), open_dataset(second))
+    if not found:
+        Console().print("no difference")
+        return
+    table = Table("where", "column", "rows", "for example", "first", "second")
+    for each in found:
+        cells = (each.place, each.column, str(each.rows), each.example, each.first, each.second)
+        table.add_row(*map(Text, cells))
+    Console().print(table)
+    raise typer.Exit(EXIT_DIFFERENT)
+
+
+def migrate(dataset: DatasetArgument, out: OutOption) -> None:
+    """Bring a dataset of an older schema version to the present one."""
+    with progress_bar() as progress:
+        migrating.migrate(dataset, out, progress)
+    _tell(out)
+
+
+def pack(
+    dataset: DatasetArgument,
+    out: OutOption,
+    shard_mb: Annotated[float, typer.Option(help="Size of an image shard, megabytes.")] = 1000,
+) -> None:
+    """Put frames into few large Parquet files and each table into one, to move or to stream them."""
+    with progress_bar() as progress:
+        packing.pack(open_dataset(dataset), out, shard_mb, progress)
+    _tell(out)
+
+
+def unpack(dataset: DatasetArgument, out: OutOption) -> None:
+    """Make files of packed frames again."""
+    with progress_bar() as progress:
+        packing.unpack(open_dataset(dataset), out, progress)
+    _tell(out)

@@ -1,0 +1,92 @@
+"""What differs between two datasets, row by row and column by column."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.errors import one_line, shortened
+from perilune_shared.manifest import Dataset
+from perilune_shared.schema import KEYS, TABLES
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One column in which rows differ, or rows that only one dataset has."""
+
+    place: str
+    """Table, or dataset.json."""
+    column: str
+    """Column or field; empty where whole rows are missing."""
+    rows: int
+    """How many rows differ."""
+    example: str
+    """Key of the first such row."""
+    first: str
+    """Its value in the first dataset."""
+    second: str
+    """Its value in the second dataset."""
+
+
+def differences(first: Dataset, second: Dataset) -> list[Difference]:
+    """All differences; none means that both hold the same, however their parts and frames are stored."""
+    found = list(_info(_plain(first), _plain(second), ""))
+    one, two = set(first.scene_ids()), set(second.scene_ids())
+    for there, other, only in ((one, two, True), (two, one, False)):
+        alone = sorted(there - other)
+        if alone:
+            present = ("present", "-") if only else ("-", "present")
+            found.append(Difference("scenes", "", len(alone), alone[0], *present))
+    gathered: dict[tuple[str, str], Difference] = {}
+    for scene_id in sorted(one & two):
+        for name in TABLES:
+            pair = (dataset.table(name, scene_id=scene_id).to_pandas() for dataset in (first, second))
+            for each in _rows(name, *pair):
+                key = (each.place, each.column + (each.first if not each.column else ""))
+                before = gathered.get(key)
+                total = each.rows + (before.rows if before else 0)
+                kept = before or each
+                gathered[key] = Difference(kept.place, kept.column, total, kept.example, kept.first, kept.second)
+    return found + list(gathered.values())
+
+
+def _plain(dataset: Dataset) -> dict:
+    return dataset.info.model_dump(mode="json", exclude={"images", "counts"})
+
+
+def _info(one: object, two: object, path: str) -> Iterator[Difference]:
+    if one == two:
+        return
+    if isinstance(one, dict) and isinstance(two, dict):
+        for key in sorted({*one, *two}):
+            yield from _info(one.get(key), two.get(key), f"{path}.{key}".lstrip("."))
+        return
+    yield Difference("dataset.json", path, 1, "", _text(one), _text(two))
+
+
+def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Difference]:
+    """Differences of one table of one scene."""
+    keys = KEYS[table]
+    one, two = (frame.drop_duplicates(keys).set_index(keys).sort_index() for frame in (one, two))
+    for there, other, present in ((one, two, ("present", "-")), (two, one, ("-", "present"))):
+        alone = there.index.difference(other.index)
+        if len(alone):
+            yield Difference(table, "", len(alone), _text(alone[0]), *present)
+    common = one.index.intersection(two.index)
+    one, two = one.loc[common], two.loc[common]
+    for column in one.columns:
+        a, b = one[column], two[column]
+        if a.map(np.ndim).gt(0).any() if a.dtype == object else False:
+            apart = np.array([not np.array_equal(x, y, equal_nan=True) for x, y in zip(a, b, strict=True)], bool)
+        else:
+            apart = ~((a == b) | (a.isna() & b.isna())).fillna(False).to_numpy(bool)
+        if apart.any():
+            row = int(np.argmax(apart))
+            yield Difference(
+                table, column, int(apart.sum()), _text(common[row]), _text(a.iloc[row]), _text(b.iloc[row])
+            )
+
+
+def _text(value: object) -> str:
+    return shortened(one_line(value), 60)

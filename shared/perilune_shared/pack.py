@@ -1,0 +1,58 @@
+"""A dataset in few large files, and back: frames as PNG bytes in images/*.parquet, each table as one part."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_shared.errors import UserError
+from perilune_shared.info import DatasetInfo
+from perilune_shared.manifest import Dataset
+from perilune_shared.rewrite import check_complete, rewrite, with_column
+from perilune_shared.writer import written
+
+_EXR = ("exr_path", "exr_sha256", "exr_bytes")
+_ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
+
+
+def pack(source: Dataset, out: Path, shard_mb: float = 1000, progress: Progress | None = None) -> None:
+    """Write a packed dataset: frames in shards of about `shard_mb` megabytes, which Hugging Face `datasets` opens too.
+
+    A dataset without frames is packed as its tables alone. EXRs stay behind: their columns become null.
+    """
+    check_complete(source)
+    if not shard_mb > 0:
+        raise UserError("--shard-mb", "size", shard_mb, "above 0")
+    packed = source.info.images in ("files", "packed")
+    info = source.info
+    if packed:
+        info = info.changed("packed", images="packed", exr_camera=None)
+    frames = source.table("frames").sort_by(_ORDER)
+    task = progress.add_task("packing", total=len(frames), unit="frames", note="") if progress else None
+    with written(out, info, whole_tables=True) as writer:
+        for scene_id in source.scene_ids():
+            tables = source.scene(scene_id)
+            writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
+        if packed:
+            writer.pack_images(_images(source, frames, progress, task), round(shard_mb * 1e6))
+
+
+def _images(source: Dataset, frames: pa.Table, progress: Progress | None, task) -> Iterator[tuple[str, str, bytes]]:
+    path_of = dict(zip(frames["frame_id"].to_pylist(), frames["png_path"].to_pylist(), strict=True))
+    for frame_id, png in source.pngs(frames):
+        yield frame_id, path_of[frame_id], png
+        if progress is not None:
+            progress.advance(task)
+
+
+def unpack(source: Dataset, out: Path, progress: Progress | None = None) -> None:
+    """Write a dataset with a part for each scene and descent, and frames as files."""
+    info: DatasetInfo = source.info.changed("unpacked")
+    rewrite(source, out, info, lambda tables: tables, "link", progress)
+
+
+def _without_exr(frames: pa.Table) -> pa.Table:
+    for name in _EXR:
+        frames = with_column(frames, name, [None] * len(frames))
+    return frames

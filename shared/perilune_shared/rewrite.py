@@ -1,0 +1,74 @@
+"""One dataset rewritten as another: the way of all tools that change or choose rows."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.progress import Progress
+
+from perilune_shared.errors import UserError
+from perilune_shared.info import DatasetInfo
+from perilune_shared.manifest import Dataset
+from perilune_shared.schema import ImageState
+from perilune_shared.writer import SceneTables, written
+
+ImageMode = Literal["link", "copy", "none"]
+"""What becomes of frames: hard links where the disk allows them (the tools never change a frame), copies, or left."""
+
+
+def rewrite(
+    source: Dataset,
+    out: Path,
+    info: DatasetInfo,
+    change: Callable[[SceneTables], SceneTables],
+    images: ImageMode,
+    progress: Progress | None = None,
+) -> None:
+    """Write every scene of `source` as `change` gives it; scenes and labels without frames fall away."""
+    check_complete(source)
+    info = info.model_copy(update={"images": state_of([source], images)})
+    scene_ids = source.scene_ids()
+    task = progress.add_task("writing", total=len(scene_ids), unit="scenes", note="") if progress else None
+    with written(out, info) as writer:
+        for scene_id in scene_ids:
+            tables = change(source.scene(scene_id))
+            frames = tables["frames"]
+            if len(frames):
+                own = pc.is_in(tables["labels"]["frame_id"], frames["frame_id"].combine_chunks())
+                writer.add_scene({**tables, "labels": tables["labels"].filter(own)})
+                if info.images == "files":
+                    names = {name: name for name in frames["frame_id"].to_pylist()}
+                    writer.add_images(source, frames, names, link=images == "link")
+            if progress is not None and task is not None:
+                progress.advance(task)
+
+
+def check_complete(source: Dataset) -> None:
+    """Raises UserError on a dataset that is still being rendered."""
+    if not source.info.complete:
+        raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
+
+
+def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
+    """Where the frames of what is written will be. Raises UserError where only some of the sources have theirs."""
+    states = {source.info.images for source in sources}
+    if states == {"planned"}:
+        return "planned"
+    if "planned" in states:
+        raise UserError(sources[0].root, "images", ", ".join(sorted(states)), "datasets that are all planned, or none")
+    if images == "none" or states == {"absent"}:
+        return "absent"
+    if "absent" in states:
+        missing = next(source for source in sources if source.info.images == "absent")
+        raise UserError(missing.root, "images", "absent", "its frames (`perilune-render regenerate`), or --images none")
+    return "files"
+
+
+def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
+    """A table with one column replaced."""
+    place = table.schema.get_field_index(name)
+    field = table.schema.field(place)
+    array = values if isinstance(values, pa.Array | pa.ChunkedArray) else pa.array(values, field.type)
+    return table.set_column(place, field, array)

@@ -1,0 +1,120 @@
+"""Part of a dataset: by conditions on columns, by a number of frames, by size."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_shared.errors import UserError
+from perilune_shared.expression import Condition, columns_of
+from perilune_shared.manifest import Dataset
+from perilune_shared.rewrite import ImageMode, rewrite
+from perilune_shared.writer import SceneTables
+
+
+def subset(
+    source: Dataset,
+    out: Path,
+    where: Sequence[str] = (),
+    n_frames: int | None = None,
+    megabytes: float | None = None,
+    images: ImageMode = "link",
+    progress: Progress | None = None,
+) -> None:
+    """Write the frames and labels of a dataset for which all conditions hold, at most so many, at most so large.
+
+    A condition on columns of frames, trajectories and scenes chooses frames; one that names labels or craters chooses
+    labels, and frames stay. Scenes keep all their craters and boulders, since their content is what names them. A
+    number of frames or a size (of the PNGs, 10^6 bytes each megabyte) is filled with whole descents, taken in turn from
+    each scene so that the ground stays varied; the last is cut short at its end. Raises UserError where nothing is
+    left.
+    """
+    conditions = [Condition(text) for text in where]
+    on_frames = [condition for condition in conditions if not condition.on_labels]
+    on_labels = [condition for condition in conditions if condition.on_labels]
+    kept = None
+    if n_frames is not None or megabytes is not None:
+        kept = _first_frames(source, on_frames, n_frames, megabytes)
+
+    def change(tables: SceneTables) -> SceneTables:
+        frames = tables["frames"]
+        mask = _holds(on_frames, tables, frames)
+        if kept is not None:
+            mask = mask & np.isin(frames["frame_id"].to_numpy(zero_copy_only=False), list(kept))
+        labels = tables["labels"].filter(pa.array(_holds(on_labels, tables, tables["labels"])))
+        return {**tables, "frames": frames.filter(pa.array(mask)), "labels": labels}
+
+    told = [*(f"where {text}" for text in where)]
+    told += [f"{n_frames} frames"] if n_frames is not None else []
+    told += [f"{megabytes:g} MB"] if megabytes is not None else []
+    info = source.info.changed("subset: " + ("; ".join(told) or "all").replace("<", " lt ").replace(">", " gt "))
+    rewrite(source, out, info, change, images, progress)
+
+
+def _first_frames(
+    source: Dataset, on_frames: Sequence[Condition], n_frames: int | None, megabytes: float | None
+) -> set[str]:
+    """frame_id of whole descents, in turn from each scene, up to a number or size."""
+    if (n_frames is not None and n_frames < 1) or (megabytes is not None and not megabytes > 0):
+        raise UserError("--frames or --mb", "size", n_frames if n_frames is not None else megabytes, "above 0")
+    pieces = []
+    for scene_id in source.scene_ids():
+        tables = {name: source.table(name, scene_id=scene_id) for name in ("scenes", "trajectories", "frames")}
+        frames = tables["frames"].filter(pa.array(_holds(on_frames, tables, tables["frames"])))
+        pieces.append(frames.select(["frame_id", "scene_id", "trajectory_id", "frame_index", "png_bytes"]).to_pandas())
+    table = pd.concat(pieces, ignore_index=True)
+    if megabytes is not None and table["png_bytes"].isna().any():
+        raise UserError(source.root, "png_bytes", "null", "--frames: the size of frames never rendered is not known")
+    table["descent"] = table.groupby("scene_id")["trajectory_id"].transform(lambda ids: pd.factorize(ids, sort=True)[0])
+    table = table.sort_values(["descent", "scene_id", "frame_index"], ignore_index=True)
+    if n_frames is not None:
+        table = table.iloc[:n_frames]
+    if megabytes is not None:
+        table = table[table["png_bytes"].cumsum() <= megabytes * 1e6]
+    return set(table["frame_id"])
+
+
+def _holds(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
+    """Where all conditions hold, for rows of a scene's frames or labels (N,)."""
+    mask = np.ones(len(rows), bool)
+    if not conditions or not len(rows):
+        return mask
+    columns = {(table, name): _column(tables, rows, table, name) for table, name in columns_of(conditions)}
+    for condition in conditions:
+        mask &= condition.holds(columns, len(rows))
+    return mask
+
+
+def _column(tables: SceneTables, rows: pa.Table, table: str, name: str) -> np.ndarray:
+    """A column of a table of one scene, joined to rows of frames or labels."""
+    values = _numpy(tables[table][name])
+    if table == "scenes":
+        return np.repeat(values, len(rows), axis=0)
+    if "crater_id" in rows.column_names and table == "labels":
+        return values
+    if table == "craters":
+        return values[_places(rows["crater_id"], tables["craters"]["crater_id"])]
+    frames = tables["frames"]
+    of_frame = np.arange(len(rows))
+    if "crater_id" in rows.column_names:
+        of_frame = _places(rows["frame_id"], frames["frame_id"])
+    if table == "frames":
+        return values[of_frame]
+    return values[_places(frames["trajectory_id"], tables["trajectories"]["trajectory_id"])][of_frame]
+
+
+def _numpy(column: pa.ChunkedArray) -> np.ndarray:
+    if pa.types.is_fixed_size_list(column.type):
+        flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        return flat.reshape(len(column), column.type.list_size)
+    values = column.to_numpy()
+    # Nulls of text would not compare.
+    return np.array(["" if v is None else v for v in values], object) if values.dtype == object else values
+
+
+def _places(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
+    index = pd.Index(within.to_pandas())
+    return index.get_indexer(values.to_pandas())

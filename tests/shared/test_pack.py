@@ -1,0 +1,122 @@
+"""Packed datasets, unpacked, old ones migrated, and what differs."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from perilune_shared.diff import differences
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import open_dataset
+from perilune_shared.migrate import migrate
+from perilune_shared.pack import pack, unpack
+from perilune_shared.split import split_dataset
+from perilune_shared.subset import subset
+from perilune_shared.validate import validate
+
+OLD = Path(__file__).parent / "old"
+
+
+@pytest.fixture(scope="module")
+def packed(drawn, tmp_path_factory):
+    out = tmp_path_factory.mktemp("packed") / "p"
+    pack(open_dataset(drawn), out, shard_mb=0.1)
+    return out
+
+
+def test_packed_and_unpacked_it_is_the_same(drawn, packed, tmp_path):
+    source, made = open_dataset(drawn), open_dataset(packed)
+    assert validate(made) == [] and made.info.images == "packed" and len(made.shards()) > 1
+    assert not (packed / "frames").exists() and len(list(packed.rglob("*.parquet"))) == 6 + len(made.shards())
+    unpack(made, tmp_path / "u")
+    again = open_dataset(tmp_path / "u")
+    assert validate(again) == []
+    assert [each.column for each in differences(source, again)] == ["history"]
+    for path in source.table("frames", ["png_path"])["png_path"].to_pylist():
+        assert again.file(path).read_bytes() == source.file(path).read_bytes()
+
+
+def test_packed_frames_are_found_by_their_ids(drawn, packed):
+    source, made = open_dataset(drawn), open_dataset(packed)
+    frames = made.table("frames", split="test")
+    found = dict(made.pngs(frames))
+    assert found == dict(source.pngs(source.table("frames", split="test"))) and len(found) == 8
+
+
+def test_one_descent_of_a_packed_table(drawn, packed):
+    source, made = open_dataset(drawn), open_dataset(packed)
+    for name in ("frames", "labels", "trajectories"):
+        theirs = source.table(name, scene_id="s003", trajectory_id="t003")
+        assert len(theirs) and made.table(name, scene_id="s003", trajectory_id="t003").equals(theirs)
+    assert made.table("craters", ["x_m"], scene_id="s002").equals(source.table("craters", ["x_m"], scene_id="s002"))
+
+
+def test_a_packed_dataset_can_be_cut(packed, tmp_path):
+    subset(open_dataset(packed), tmp_path / "s", ["split == 'val'"])
+    made = open_dataset(tmp_path / "s")
+    assert validate(made) == [] and made.info.images == "files" and made.info.counts.frames == 8
+
+
+def test_a_shard_is_an_image_dataset_by_its_own_metadata(packed):
+    schema = pq.read_schema(open_dataset(packed).shards()[0])
+    features = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
+    assert features["image"] == {"_type": "Image"} and schema.names == ["frame_id", "image"]
+
+
+@pytest.mark.parametrize("version", ["1", "2"])
+def test_old_datasets_are_migrated(version, tmp_path):
+    """Each was rendered by the release that wrote its version, then cut to the craters with labels."""
+    with pytest.raises(UserError, match="migrate"):
+        open_dataset(OLD / version)
+    migrate(OLD / version, tmp_path / "new")
+    made = open_dataset(tmp_path / "new")
+    assert validate(made) == []
+    assert made.info.history == (f"migrated from schema version {version}",)
+    assert made.info.recipe().config["camera"]["width_px"] == 64 and made.info.recipe().seed == 20240117
+    old = pq.read_table(next((OLD / version / "manifest/labels").glob("*.parquet")))
+    assert made.table("labels", ["ellipse_cx_px"])["ellipse_cx_px"].to_pylist() == old["ellipse_cx_px"].to_pylist()
+    origins = set(made.table("craters")["origin"].to_pylist())
+    assert origins == {"primary"} if version == "1" else "primary" in origins
+    with pytest.raises(UserError, match="nothing to migrate"):
+        migrate(tmp_path / "new", tmp_path / "newer")
+
+
+def test_damaged_old_datasets_are_refused(tmp_path):
+    old = shutil.copytree(OLD / "2", tmp_path / "old")
+    info = json.loads((old / "dataset.json").read_text())
+
+    def told(match, **changes):
+        (old / "dataset.json").write_text(json.dumps({**info, **changes}))
+        with pytest.raises(UserError, match=match):
+            migrate(old, tmp_path / "new")
+        assert not (tmp_path / "new").exists()
+
+    told("schema_version", schema_version="0")
+    told("schema_version", schema_version=["2"])
+    told("complete", complete=False)
+    told("config", config=3)
+    told("camera", camera={})
+    (old / "dataset.json").write_text(json.dumps({k: v for k, v in info.items() if k != "seed"}))
+    with pytest.raises(UserError, match="seed"):
+        migrate(old, tmp_path / "new")
+    (old / "dataset.json").write_text(json.dumps(info))
+    part = next((old / "manifest/labels").glob("*.parquet"))
+    part.write_bytes(part.read_bytes()[:-30])
+    with pytest.raises(UserError, match="whole Parquet"):
+        migrate(old, tmp_path / "new")
+
+
+def test_differences_are_named(drawn, tmp_path):
+    source = open_dataset(drawn)
+    assert differences(source, source) == []
+    subset(source, tmp_path / "s", ["split != 'val'", "radius_px > 4"])
+    split_dataset(open_dataset(tmp_path / "s"), tmp_path / "t", by="frame")
+    found = {(each.place, each.column): each for each in differences(source, open_dataset(tmp_path / "t"))}
+    assert found["scenes", ""].rows == 1 and found["scenes", ""].second == "-"
+    n_small = source.table("labels", ["radius_px"], split="train").to_pandas()["radius_px"].le(4).sum()
+    n_small += source.table("labels", ["radius_px"], split="test").to_pandas()["radius_px"].le(4).sum()
+    assert found["labels", ""].rows == n_small
+    assert found["frames", "split"].rows > 0 and found["dataset.json", "split_by"].second == "frame"
+    assert ("frames", "position_m") not in found and ("craters", "") not in found
