@@ -21,9 +21,9 @@ from perilune_render.blender.stage import aim
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import write_frame
 from perilune_render.exr import read_exr
-from perilune_render.labels import RimCircles, label_frame
+from perilune_render.labels import RimCircles, Shown, label_frame, with_contrast
 from perilune_render.plan import make_plan
-from perilune_render.sensor import FixedPattern
+from perilune_render.sensor import FixedPattern, expected, expose
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import resolve
 from perilune_shared.files import write_text
@@ -60,8 +60,12 @@ def main() -> None:
                 start = time.perf_counter()
                 if which == 0:
                     radiance = renderer.render(*pose, seed=index)
-                    write_frame(out, config, plan, circles, pattern, trajectory, index, radiance)
+                    velocity = pose[1] @ trajectory.flight.velocity_mps[index]
+                    exposure = expose(radiance, config.sensor, plan.camera, plan.camera, velocity)
+                    write_frame(out, config, plan, circles, pattern, trajectory, index, radiance, exposure)
                     found = label_frame(circles, plan.camera, *pose, radiance, 2.0, 50.0)
+                    shown = Shown(*expected(exposure, config.sensor), sun)
+                    found = with_contrast(found, circles, plan.camera, *pose, shown)
                     tables.label_table(trajectory.frame_id(index), found)
                     ours.append(time.perf_counter() - start)
                 else:

@@ -237,5 +237,6 @@ def _add_labels(
                 "radius_px": radius[i],
                 "visible_fraction": 1.0,
                 "sunlit_fraction": 1.0,
+                "contrast": 1.0 if i % 4 == 3 else 20.0,
             }
         )

@@ -14,12 +14,12 @@ from perilune_render import tables
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
 from perilune_render.exr import Radiance, write_exr
-from perilune_render.labels import RimCircles, crater_index, label_frame
+from perilune_render.labels import RimCircles, Shown, crater_index, label_frame, with_contrast
 from perilune_render.output import begin_or_go_on, file_columns, write_overview, write_png
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
 from perilune_render.recipe import recipe_of
 from perilune_render.resample import seen_by
-from perilune_render.sensor import FixedPattern, develop
+from perilune_render.sensor import Exposure, FixedPattern, expected, expose, read_out
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.catalogue import read_catalogue
@@ -136,9 +136,14 @@ def _render_trajectory(
     for index in range(len(trajectory.splits)):
         pose = flight.position_m[index], flight.rotation_camera_from_site[index]
         radiance = renderer.render(*pose, seed=derived_seed(trajectory.seed, "frame", index))
-        rows.append(write_frame(out, config, plan, circles, pattern, trajectory, index, radiance))
+        velocity = pose[1] @ flight.velocity_mps[index]
+        exposure = expose(radiance, config.sensor, plan.camera, plan.exr_camera, velocity)
+        rows.append(write_frame(out, config, plan, circles, pattern, trajectory, index, radiance, exposure))
         seen = seen_by(radiance, plan.camera, plan.exr_camera)
-        found = label_frame(circles, plan.camera, *pose, seen, config.labels.min_radius_px, config.labels.max_radius_px)
+        limits = config.labels.min_radius_px, config.labels.max_radius_px
+        shown = Shown(*expected(exposure, config.sensor), sun)
+        found = label_frame(circles, plan.camera, *pose, seen, *limits)
+        found = with_contrast(found, circles, plan.camera, *pose, shown)
         labels.append(tables.label_table(trajectory.frame_id(index), found))
         advance()
     name = f"{trajectory.scene_id}.{trajectory.trajectory_id}"
@@ -157,16 +162,15 @@ def write_frame(
     trajectory: TrajectoryPlan,
     index: int,
     radiance: Radiance,
+    exposure: Exposure,
 ) -> dict[str, str | int]:
-    """Develop and write one frame's PNG, and its EXR where asked for; its columns png_* and exr_* of the manifest."""
+    """Write one frame's PNG from its exposure, and its EXR where asked for; its columns png_* and exr_*."""
     flight, frame_id = trajectory.flight, trajectory.frame_id(index)
-    rotation = flight.rotation_camera_from_site[index]
-    velocity = rotation @ flight.velocity_mps[index]
-    rng = stream(trajectory.seed, "sensor", index)
-    image = develop(radiance, config.sensor, plan.camera, plan.exr_camera, velocity, pattern, rng)
+    image = read_out(exposure, config.sensor, pattern, stream(trajectory.seed, "sensor", index))
     row = write_png(out, frame_id, image, config.sensor.bits)
     if config.render.exr:
         path = f"frames/{frame_id}.exr"
-        write_exr(out / path, radiance, crater_index(circles, plan.exr_camera, flight.position_m[index], rotation))
+        pose = flight.position_m[index], flight.rotation_camera_from_site[index]
+        write_exr(out / path, radiance, crater_index(circles, plan.exr_camera, *pose, radiance.depth_m))
         row |= file_columns(out, "exr", path)
     return row

@@ -8,18 +8,19 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 from rich.progress import Progress
 
 from perilune_render import tables
 from perilune_render.config import DatasetConfig
 from perilune_render.exr import read_radiance
-from perilune_render.labels import RimCircles, label_frame
+from perilune_render.labels import Labels, RimCircles, Shown, label_frame, with_contrast
 from perilune_render.output import begin_or_go_on, first_difference, write_overview, write_png
 from perilune_render.plan import camera_of
 from perilune_render.recipe import versions
 from perilune_render.resample import seen_by
-from perilune_render.sensor import FixedPattern, develop
+from perilune_render.sensor import FixedPattern, expected, expose, read_out
 from perilune_render.streams import stream
 from perilune_shared import files
 from perilune_shared.camera import Camera
@@ -38,8 +39,9 @@ def develop_dataset(
     """Make a dataset in `out` from the EXRs of another; its settings are those of `source`, with changes.
 
     A file and single settings may change `dataset.sensor` and `dataset.camera`. Scenes, craters, boulders and descents
-    are the source's; so are the labels where the camera is the same, else they are made again. Raises UserError where
-    another setting is changed, the source is incomplete or lacks EXRs, or those do not show all that the camera sees.
+    are the source's; so are the labels where the camera is the same, but for their contrast, else they are made again.
+    Raises UserError where another setting is changed, the source is incomplete or lacks EXRs, or those do not show all
+    that the camera sees.
     """
     if len(source.info.recipes) != 1:
         raise UserError(source.root, "recipes", len(source.info.recipes), "one: the dataset as it was rendered")
@@ -139,8 +141,10 @@ def _develop_descent(
     """One part of `frames`, with its images and labels."""
     rows = table.to_pylist()
     scene_id, trajectory_id = rows[0]["scene_id"], rows[0]["trajectory_id"]
-    same = camera == source.info.camera.intrinsics()
-    circles = None if same else RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
+    circles = RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
+    known = None
+    if camera == source.info.camera.intrinsics():
+        known = source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id).to_pandas()
     written, labels = [], []
     for row in rows:
         radiance = read_radiance(source.file(row["exr_path"]))
@@ -151,20 +155,22 @@ def _develop_descent(
         rotation = matrix_from_quaternion(row["rotation_wxyz"])
         velocity = rotation @ row["velocity_mps"]
         rng = stream(seed, "sensor", row["frame_index"])
-        image = develop(radiance, config.sensor, camera, exr_camera, velocity, pattern, rng)
+        exposure = expose(radiance, config.sensor, camera, exr_camera, velocity)
+        image = read_out(exposure, config.sensor, pattern, rng)
         written.append(write_png(out, row["frame_id"], image, config.sensor.bits))
-        if circles is not None:
-            pose = row["position_m"], rotation
-            seen = seen_by(radiance, camera, exr_camera)
+        pose = np.array(row["position_m"]), rotation
+        if known is None:
             limits = config.labels.min_radius_px, config.labels.max_radius_px
-            labels.append(tables.label_table(row["frame_id"], label_frame(circles, camera, *pose, seen, *limits)))
+            found = label_frame(circles, camera, *pose, seen_by(radiance, camera, exr_camera), *limits)
+        else:
+            found = Labels.from_table(known[known["frame_id"] == row["frame_id"]])
+        shown = Shown(*expected(exposure, config.sensor), np.array(row["sun_direction"]))
+        found = with_contrast(found, circles, camera, *pose, shown)
+        labels.append(tables.label_table(row["frame_id"], found))
     label_part = out / "manifest" / "labels" / f"{name}.parquet"
     # A labels part without its frames part is left from a stop between the two.
     label_part.unlink(missing_ok=True)
-    if circles is None:
-        write_part(out, "labels", name, source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id))
-    else:
-        write_part(out, "labels", name, pa.concat_tables(labels))
+    write_part(out, "labels", name, pa.concat_tables(labels))
     write_part(out, "frames", name, tables.developed_frame_table(table, camera, written))
 
 

@@ -1,15 +1,17 @@
-"""Crater labels of a frame: ellipses, how much of each rim is seen, how much of each crater is lit."""
+"""Crater labels of a frame: ellipses, how much of each rim is seen, how much of each crater is lit, what it shows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
 from perilune_render.exr import Radiance
+from perilune_render.label_pixels import contrasts, smallest_crater, sunlit_fractions
 from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera, camera_from_site
-from perilune_shared.ellipse import Ellipses, project_circles, rim_points
+from perilune_shared.ellipse import Ellipses, plane_basis, project_circles, rim_points
 from perilune_shared.frames import Array
+from perilune_shared.masks import SLACK_PX, SLACK_RADII
 
 _N_RIM = 48
 
@@ -26,6 +28,8 @@ class Labels:
     """Share of the rim inside the image and not hidden (N,)."""
     sunlit_fraction: Array
     """Share of the crater's seen pixels that the Sun reaches; 0 where none is seen (N,)."""
+    contrast: Array
+    """The crater's own shading over its standard error, from noise and clutter; NaN where not measured (N,)."""
 
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "Labels":
@@ -38,7 +42,20 @@ class Labels:
             ellipses,
             rows["visible_fraction"].to_numpy(),
             rows["sunlit_fraction"].to_numpy(),
+            rows["contrast"].to_numpy(),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What the sensor shows of a frame, whatever the noise's draw (`perilune_render.sensor.expected`)."""
+
+    grey: np.ndarray
+    """Mean of each grey value, DN (h, w)."""
+    noise: np.ndarray
+    """Standard deviation of each grey value, DN (h, w)."""
+    sun: Array
+    """Unit vector (3,) towards the Sun, O_L."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +99,8 @@ def label_frame(
 ) -> Labels:
     """Labels by the paper's rule: centre in the frame, radius within bounds; visibility from the rendered depth.
 
-    `radiance` is in the pixels of `camera` (`perilune_render.resample.seen_by`).
+    `radiance` is in the pixels of `camera` (`perilune_render.resample.seen_by`). The contrast, which is the sensor's
+    too, is NaN: `with_contrast` measures it.
     """
     in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
     rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
@@ -104,7 +122,38 @@ def label_frame(
         ellipses.theta_rad[kept],
     )
     visible = _visible_fraction(circles, camera, position_m, rotation_camera_from_site, radiance.depth_m, rows)
-    return Labels(circles.crater_id[rows], ellipses, visible, _sunlit_fraction(ellipses, radiance.sunlit))
+    lit = sunlit_fractions(ellipses, radiance.sunlit)
+    return Labels(circles.crater_id[rows], ellipses, visible, lit, np.full(len(rows), np.nan))
+
+
+def with_contrast(
+    labels: Labels,
+    circles: RimCircles,
+    camera: Camera,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    shown: Shown,
+) -> Labels:
+    """The labels of a frame with their contrast (`perilune_render.label_pixels.contrasts`) in what `camera` shows."""
+    order = np.argsort(circles.crater_id, kind="stable")
+    rows = order[np.searchsorted(circles.crater_id, labels.crater_id, sorter=order)]
+    centre = np.stack([labels.ellipses.cx_px, labels.ellipses.cy_px], axis=-1)
+    matrices = _image_from_rim(circles, camera, position_m, rotation_camera_from_site, shown.sun, rows)
+    return replace(labels, contrast=contrasts(centre, matrices, shown.grey, shown.noise))
+
+
+def _image_from_rim(
+    circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, sun: Array, rows: np.ndarray
+) -> Array:
+    """Matrices (N, 2, 2) from places on the rim's plane, in radii along the Sun's direction and across, to pixels."""
+    centre, normal = circles.centre_m[rows], circles.normal[rows]
+    along = sun - (normal @ sun)[:, None] * normal
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    # With the Sun right above a crater no direction is towards it.
+    along = np.where(length > 1e-9, along / np.maximum(length, 1e-9), plane_basis(normal)[0])
+    axes = circles.radius_m[rows, None, None] * np.stack([along, np.cross(normal, along)], axis=1)
+    ends = [camera.project(camera_from_site(centre[:, None] + side * axes, position_m, rotation)) for side in (1, -1)]
+    return np.swapaxes(ends[0] - ends[1], 1, 2) / 2
 
 
 def _visible_fraction(
@@ -125,61 +174,41 @@ def _visible_fraction(
     inside = camera.inside(pixels)
     column = np.where(inside, pixels[..., 0], 0).astype(int)
     row = np.where(inside, pixels[..., 1], 0).astype(int)
-    slack = np.maximum(0.1 * radii, 2 * points[:, 0, 2] / camera.fx_px)
+    slack = np.maximum(SLACK_RADII * radii, SLACK_PX * points[:, 0, 2] / camera.fx_px)
     return (inside & (points[..., 2] <= depth_m[row, column] + slack[:, None])).mean(axis=1)
 
 
-def _sunlit_fraction(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
-    """Share of lit pixels among those whose centre lies in each ellipse and in the image."""
-    height, width = sunlit.shape
-    boxes = ellipses.bounding_boxes()
-    lit = np.zeros(len(boxes))
-    x0, y0 = (
-        np.clip(np.floor(boxes[:, 0]), 0, width).astype(int),
-        np.clip(np.floor(boxes[:, 1]), 0, height).astype(int),
-    )
-    x1, y1 = (
-        np.clip(np.ceil(boxes[:, 2]), 0, width).astype(int),
-        np.clip(np.ceil(boxes[:, 3]), 0, height).astype(int),
-    )
-    for k in range(len(boxes)):
-        inside = _inside_ellipse(ellipses, k, x0[k], y0[k], x1[k], y1[k])
-        if inside.any():
-            lit[k] = float(sunlit[y0[k] : y1[k], x0[k] : x1[k]][inside].mean())
-    return lit
-
-
-def _inside_ellipse(ellipses: Ellipses, k: int, x0: int, y0: int, x1: int, y1: int) -> np.ndarray:
-    dx = np.arange(x0, x1)[None, :] + 0.5 - ellipses.cx_px[k]
-    dy = np.arange(y0, y1)[:, None] + 0.5 - ellipses.cy_px[k]
-    cos, sin = np.cos(ellipses.theta_rad[k]), np.sin(ellipses.theta_rad[k])
-    return ((dx * cos + dy * sin) / ellipses.a_px[k]) ** 2 + ((dy * cos - dx * sin) / ellipses.b_px[k]) ** 2 <= 1
-
-
 def crater_index(
-    circles: RimCircles, camera: Camera, position_m: Array, rotation_camera_from_site: Array
+    circles: RimCircles,
+    camera: Camera,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    depth_m: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Index image (h, w) float32 of the smallest crater whose rim each pixel's centre lies in; -1 none.
+    """Instance image (h, w) float32: the smallest crater whose visible interior holds each pixel's centre; -1 none.
 
-    Every crater of at least a pixel across counts, also those that become no labels.
+    The interior is the rim's disc; it is visible where the ground of `depth_m` (h, w), metres along the axis, is not
+    nearer than the disc's plane (but for a tenth of the radius and two pixels' width). Without depth all of it is.
+    Every crater of at least a pixel across counts, also those that become no labels. `camera` has no distortion.
     """
     in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
-    rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
-    candidate = np.flatnonzero((rough > 0.5) & (in_camera[:, 2] > 0))
+    candidate = _reaching_in(camera, in_camera, circles.radius_m)
     candidate = candidate[np.argsort(-circles.radius_m[candidate], kind="stable")]
-    ellipses = project_circles(
-        camera,
-        in_camera[candidate],
-        circles.normal[candidate] @ rotation_camera_from_site.T,
-        circles.radius_m[candidate],
-    )
-    image = np.full((camera.height_px, camera.width_px), -1, np.float32)
-    boxes = ellipses.bounding_boxes()
-    size = (camera.width_px, camera.height_px)
-    in_view = (boxes[:, 0] < size[0]) & (boxes[:, 1] < size[1]) & (boxes[:, 2] > 0) & (boxes[:, 3] > 0)
-    for k in np.flatnonzero(in_view):
-        x0, y0 = (int(np.clip(np.floor(boxes[k, i]), 0, size[i])) for i in (0, 1))
-        x1, y1 = (int(np.clip(np.ceil(boxes[k, 2 + i]), 0, size[i])) for i in (0, 1))
-        if x1 > x0 and y1 > y0:
-            image[y0:y1, x0:x1][_inside_ellipse(ellipses, k, x0, y0, x1, y1)] = circles.crater_id[candidate[k]]
-    return image
+    centres, radii = in_camera[candidate], circles.radius_m[candidate]
+    normals = circles.normal[candidate] @ rotation_camera_from_site.T
+    boxes = project_circles(camera, centres, normals, radii).bounding_boxes()
+    return smallest_crater(circles.crater_id[candidate], centres, normals, radii, boxes, camera, depth_m)
+
+
+def _reaching_in(camera: Camera, centre_m: Array, radius_m: Array) -> np.ndarray:
+    """Rows of circles (N, 3), (N,) in O_C, in front of the camera and a pixel across, that may reach into the image."""
+    x, y, z = centre_m.T
+    rows = np.flatnonzero((z > 0) & (2 * camera.fx_px * radius_m > z))
+    x, y, z, radius = x[rows], y[rows], z[rows], radius_m[rows]
+    with np.errstate(divide="ignore"):
+        # How far a sphere of that radius reaches from its centre's image.
+        wide = np.where(z > radius, radius / np.abs(z - radius), np.inf)
+    size = np.array([camera.width_px, camera.height_px])
+    middle = np.stack([camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px], axis=-1)
+    reach = np.stack([camera.fx_px * np.hypot(1, x / z), camera.fy_px * np.hypot(1, y / z)], axis=-1) * wide[:, None]
+    return rows[((middle > -reach) & (middle < size + reach)).all(axis=1)]

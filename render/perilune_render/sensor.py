@@ -54,6 +54,16 @@ class FixedPattern:
         return cls(np.maximum(response, 0), offset, np.where(hot, extra, np.float32(0)))
 
 
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """What falls on the sensor in one frame: no noise yet, no fixed pattern."""
+
+    light: np.ndarray
+    """Radiance factor I/F of each pixel after point spread and motion blur (h, w) float32."""
+    time_s: float
+    """Exposure time, seconds."""
+
+
 def develop(
     radiance: Radiance,
     config: SensorConfig,
@@ -63,12 +73,17 @@ def develop(
     pattern: FixedPattern,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """The grey image (h, w) of `camera`, in DN from 0 to 2^bits - 1: uint8, or uint16 above 8 bits.
+    """The grey image (h, w) of `camera`, in DN from 0 to 2^bits - 1: `expose`, then `read_out`."""
+    return read_out(expose(radiance, config, camera, exr_camera, velocity_camera_mps), config, pattern, rng)
+
+
+def expose(
+    radiance: Radiance, config: SensorConfig, camera: Camera, exr_camera: Camera, velocity_camera_mps: Array
+) -> Exposure:
+    """What falls on the sensor of `camera`: resampling, point spread, exposure, motion blur, in this order.
 
     `radiance` is as `exr_camera` sees it, in the middle of the exposure; the velocity (3,) of the camera is along its
-    own axes O_C. In this order: resampling to `camera`, point spread, exposure, motion blur, electrons with PRNU, dark
-    current and hot pixels, Poisson noise, read noise, DSNU, full well, gain, black level, rounding and clipping. `rng`
-    draws the noise in time alone.
+    own axes O_C.
     """
     light = np.maximum(resample(radiance.radiance_factor.astype(np.float32, copy=False), camera, exr_camera), 0)
     if config.psf_sigma_px > 0:
@@ -78,9 +93,18 @@ def develop(
     if config.motion_blur and _fastest_px(radiance.depth_m, camera, exr_camera, way_m) >= _LEAST_MOTION_PX:
         depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
         light = _blurred(light, motion_px(depth_m, camera, way_m))
-    electrons = light * pattern.response
-    electrons *= config.responsivity_e_per_s * exposure_s
-    electrons += config.dark_current_e_per_s * exposure_s
+    return Exposure(light, exposure_s)
+
+
+def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rng: np.random.Generator) -> np.ndarray:
+    """The grey image (h, w) of an exposure, in DN from 0 to 2^bits - 1: uint8, or uint16 above 8 bits.
+
+    In this order: electrons with PRNU, dark current and hot pixels, Poisson noise, read noise, DSNU, full well, gain,
+    black level, rounding and clipping. `rng` draws the noise in time alone.
+    """
+    electrons = exposure.light * pattern.response
+    electrons *= config.responsivity_e_per_s * exposure.time_s
+    electrons += config.dark_current_e_per_s * exposure.time_s
     electrons += pattern.hot_e
     normal = rng.standard_normal(electrons.shape, np.float32)
     noisy = electrons + np.sqrt(electrons + np.float32(config.read_noise_e**2)) * normal
@@ -91,6 +115,23 @@ def develop(
     grey = np.minimum(noisy, config.full_well_e) * (config.gain * largest / config.full_well_e)
     grey += config.black_level_share * largest
     return np.clip(np.rint(grey), 0, largest).astype(np.uint8 if config.bits == 8 else np.uint16)
+
+
+def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (h, w) float32 of each grey value, DN, over all noise and all sensors of the kind.
+
+    sigma_y^2 as above, with PRNU and DSNU, which are noise to whoever sees one frame. Hot pixels are left out. Where
+    the sensor clips, in the brightest pixels and in shadows that a black level of 0 cuts off, the deviation is that
+    without clipping: rather more than less.
+    """
+    largest = 2**config.bits - 1
+    per_e = config.gain * largest / config.full_well_e
+    light_e = exposure.light * np.float32(config.responsivity_e_per_s * exposure.time_s)
+    dark_e = config.dark_current_e_per_s * exposure.time_s
+    mean = np.minimum(light_e + np.float32(dark_e), config.full_well_e) * per_e + config.black_level_share * largest
+    still_e2 = config.read_noise_e**2 + config.dark_nonuniformity_e**2 + dark_e
+    variance_e2 = light_e + np.square(config.gain_nonuniformity * light_e) + np.float32(still_e2)
+    return np.clip(mean, 0, largest), np.sqrt(np.float32(per_e**2) * variance_e2 + np.float32(1 / 12))
 
 
 def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:

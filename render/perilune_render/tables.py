@@ -152,5 +152,6 @@ def label_table(frame_id: str, labels: Labels) -> pa.Table:
             "radius_px": e.radius_px(),
             "visible_fraction": labels.visible_fraction,
             "sunlit_fraction": labels.sunlit_fraction,
+            "contrast": labels.contrast,
         },
     )

@@ -37,15 +37,24 @@ def images(root):
     return [cv2.imread(str(dataset.file(path)), cv2.IMREAD_UNCHANGED) for path in paths]
 
 
+def assert_labels_differ_in_contrast_alone(old, new):
+    """The contrast is that of the sensor; all else is kept to the last bit."""
+    before, after = (d.table("labels").drop_columns(["contrast"]) for d in (old, new))
+    assert after.equals(before)
+
+
 def test_developed_alike_the_frames_are_the_same_bytes(tiny, tmp_path):
     """What the renderer wrote in one go and what comes of its EXRs afterwards."""
     assert develop(tiny / "detect", tmp_path / "new").returncode == 0
     old, new = open_dataset(tiny / "detect"), open_dataset(tmp_path / "new")
     assert validate(new) == []
-    for table in (*SAME_TABLES, "labels"):
+    for table in SAME_TABLES:
         assert new.table(table).equals(old.table(table))
     assert new.table("scenes").drop_columns("recipe").equals(old.table("scenes").drop_columns("recipe"))
     assert set(new.table("scenes")["recipe"].to_pylist()) == set(new.info.recipes) != set(old.info.recipes)
+    assert_labels_differ_in_contrast_alone(old, new)
+    contrast = [d.table("labels")["contrast"].to_numpy() for d in (old, new)]
+    np.testing.assert_allclose(contrast[1], contrast[0], rtol=1e-6, atol=1e-6)
     before, after = old.table("frames"), new.table("frames")
     assert after["exr_path"].null_count == len(after)
     exr = ["exr_path", "exr_sha256", "exr_bytes"]
@@ -56,7 +65,7 @@ def test_developed_alike_the_frames_are_the_same_bytes(tiny, tmp_path):
     assert not list((tmp_path / "new").rglob("*.exr"))
 
 
-def test_another_sensor_changes_the_pixels_and_keeps_the_labels(tiny, tmp_path):
+def test_another_sensor_changes_the_pixels_and_of_the_labels_their_contrast(tiny, tmp_path):
     file = tmp_path / "sensor.yaml"
     file.write_text("dataset: {sensor: {bits: 12, read_noise_e: 100.0}}\n")
     changes = settings("sensor.psf_sigma_px=1.5", "sensor.black_level_share=0.05")
@@ -65,12 +74,21 @@ def test_another_sensor_changes_the_pixels_and_keeps_the_labels(tiny, tmp_path):
     assert validate(new) == []
     sensor = new.info.recipe().config["sensor"]
     assert (sensor["bits"], sensor["read_noise_e"], sensor["psf_sigma_px"]) == (12, 100.0, 1.5)
-    assert new.table("labels").equals(open_dataset(tiny / "detect").table("labels"))
+    old = open_dataset(tiny / "detect")
+    assert_labels_differ_in_contrast_alone(old, new)
     for old, image in zip(images(tiny / "detect"), images(tmp_path / "new"), strict=True):
         # Twelve bits in the upper bits of sixteen.
         assert image.dtype == np.uint16 and (image & 0xF == 0).all() and len(np.unique(image)) > 300
         assert np.corrcoef(old.ravel(), image.ravel())[0, 1] > 0.8
         assert np.percentile(image, 99) / 65535 == pytest.approx(0.8, abs=0.05)
+
+
+def test_a_noisier_sensor_lowers_every_contrast(tiny, tmp_path):
+    assert develop(tiny / "detect", tmp_path / "new", *settings("sensor.read_noise_e=1500.0")).returncode == 0
+    old, new = open_dataset(tiny / "detect"), open_dataset(tmp_path / "new")
+    assert_labels_differ_in_contrast_alone(old, new)
+    before, after = (d.table("labels")["contrast"].to_numpy() for d in (old, new))
+    assert (np.abs(after) < np.abs(before)).all() and (after < 4).mean() > (before < 4).mean() + 0.1
 
 
 def test_another_camera_makes_new_labels_that_fit(tiny, tmp_path):

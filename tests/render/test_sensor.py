@@ -6,7 +6,7 @@ import pytest
 
 from perilune_render.config import SensorConfig
 from perilune_render.exr import Radiance
-from perilune_render.sensor import FixedPattern, develop, motion_px
+from perilune_render.sensor import FixedPattern, develop, expected, expose, motion_px
 from perilune_shared.camera import Camera
 
 CAMERA = Camera(200, 160, 220.0, 220.0, 100.0, 80.0)
@@ -196,3 +196,29 @@ def test_the_same_seed_gives_the_same_frame():
     light = np.random.default_rng(0).random((160, 200)) * 0.1
     frames = [photograph(light, SensorConfig(), frame) for frame in (1, 1, 2)]
     assert np.array_equal(frames[0], frames[1]) and not np.array_equal(frames[0], frames[2])
+
+
+@pytest.mark.parametrize("light", [0.0, 0.003, 0.1, 0.25])
+@pytest.mark.parametrize("bits", [8, 12])
+def test_expected_mean_and_deviation_are_those_of_frames(light, bits):
+    """Over many sensors and frames, with all noise but hot pixels."""
+    config = sensor(
+        bits=bits,
+        read_noise_e=80,
+        dark_current_e_per_s=20_000,
+        dark_nonuniformity_e=40,
+        gain_nonuniformity=0.02,
+        black_level_share=0.05,
+        psf_sigma_px=0.5,
+    )
+    images = np.array([photograph(light, config, frame, seed=frame) for frame in range(8)])
+    mean, deviation = expected(expose(scene(light), config, CAMERA, CAMERA, np.zeros(3)), config)
+    assert mean.dtype == deviation.dtype == np.float32 and mean.std() < 1e-4 * mean.mean()
+    assert images.mean() == pytest.approx(mean.mean(), rel=1e-3)
+    assert images.std() == pytest.approx(deviation.mean(), rel=0.01)
+
+
+def test_what_is_expected_stops_at_the_full_well():
+    config = sensor(bits=8, black_level_share=0.1)
+    mean, _ = expected(expose(scene(5.0), config, CAMERA, CAMERA, np.zeros(3)), config)
+    assert (mean == 255).all() and (photograph(5.0, config) == 255).all()
