@@ -71,7 +71,7 @@ def read_config_file(path: Path) -> dict[str, dict]:
         raise UserError(path, "configuration", type(content).__name__, "a mapping of sections")
     for name, section in content.items():
         if name not in SECTIONS:
-            raise UserError(path, str(name), "unknown section", _nearest(str(name), SECTIONS))
+            raise UserError(path, str(name), "unknown section", nearest(str(name), SECTIONS))
         if not isinstance(section, dict):
             raise UserError(path, name, repr(section), "a mapping of settings")
     return content
@@ -84,7 +84,7 @@ def parse_setting(text: str) -> tuple[list[str], Any]:
     if not separator or len(path) < 2 or not all(path):
         raise UserError("--set", text, "not section.key=value", "for example dataset.seed=3")
     if path[0] not in SECTIONS:
-        raise UserError("--set", key, "unknown section", _nearest(path[0], SECTIONS))
+        raise UserError("--set", key, "unknown section", nearest(path[0], SECTIONS))
     return path, parse_yaml(value, f"--set {key}")
 
 
@@ -101,7 +101,7 @@ def resolve(
     Raises UserError naming the source, the key, the value and what would be right.
     """
     if preset not in PRESETS:
-        raise UserError("--preset", "preset", preset, _nearest(preset, PRESETS))
+        raise UserError("--preset", "preset", preset, nearest(preset, PRESETS))
     preset_text = resources.files(package).joinpath("presets", f"{preset}.yaml").read_text(encoding="utf-8")
     base = parse_yaml(preset_text, preset).get(section, {})
     return resolve_over(model, section, f"preset {preset}", base, config_file, settings)
@@ -153,7 +153,8 @@ def _merge(base: dict, over: dict) -> dict:
     return merged
 
 
-def _nearest(name: str, known: typing.Iterable[str]) -> str:
+def nearest(name: str, known: typing.Iterable[str]) -> str:
+    """What a user may have meant by an unknown name: the known one most like it, or all of them."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)
@@ -165,7 +166,7 @@ def _explain(error: ValidationError, model: type[Section], section: str, sources
     where = next((name for name, content in reversed(sources) if _holds(content, location)), sources[-1][0])
     field = ".".join([section, *location])
     if fault["type"] == "extra_forbidden":
-        return UserError(where, field, "unknown key", _nearest(location[-1], _fields_at(model, location[:-1])))
+        return UserError(where, field, "unknown key", nearest(location[-1], _fields_at(model, location[:-1])))
     if fault["type"] == "missing":
         return UserError(where, field, "nothing", "a value")
     wanted = fault["msg"][0].lower() + fault["msg"][1:]

@@ -41,11 +41,33 @@ def test_worn_craters_are_ignored_and_no_others(dataset_detect, split):
         assert part.wanted[part.labelled].tolist() == (rows["crater_id"] % 4 != 3).tolist()
         np.testing.assert_array_equal(part.boxes[part.labelled, 0], rows["bbox_x0_px"])
     assert any((~part.wanted).any() for part in split.labels)
-    everything = load_split(dataset, "train", LabelSettings(min_depth_ratio=0.0))
+    everything = load_split(dataset, "train", LabelSettings(min_depth_ratio=0.0, min_contrast=0.0))
     assert all(part.wanted[part.labelled].all() for part in everything.labels)
-    large = load_split(dataset, "train", LabelSettings(min_depth_ratio=0.0, radius_px=(10.0, 50.0)))
+    paper = load_split(dataset, "train", LabelSettings(selection="paper"))
+    assert [part.wanted.tolist() for part in paper.labels] == [part.wanted.tolist() for part in everything.labels]
+    large = load_split(dataset, "train", LabelSettings(selection="paper", radius_px=(10.0, 50.0)))
+    assert large.radius_px == (10.0, 50.0)
     for part in large.labels:
         np.testing.assert_array_equal(part.wanted[part.labelled], part.radius_px[part.labelled] >= 10)
+
+
+def test_craters_that_show_too_little_are_ignored(dataset_detect):
+    """In this dataset worn craters have a contrast of 1, the others of 20."""
+    plain = {"selection": "paper", "min_contrast": None}
+    dataset = open_dataset(dataset_detect)
+    shares = []
+    for least in (None, 1.0, 1.1, 20.0, 20.1):
+        split = load_split(dataset, "train", LabelSettings(**{**plain, "min_contrast": least}))
+        shares.append(np.mean(np.concatenate([part.wanted[part.labelled] for part in split.labels])))
+    assert shares[0] == shares[1] == 1 > shares[2] == shares[3] > 0.5 and shares[4] == 0
+
+
+def test_without_a_range_of_radii_that_of_the_whole_dataset_is_judged(dataset_detect):
+    dataset = open_dataset(dataset_detect)
+    radius_px = dataset.table("labels").to_pandas()["radius_px"]
+    splits = [load_split(dataset, name, LabelSettings(selection="all")) for name in ("train", "test")]
+    assert {split.radius_px for split in splits} == {(radius_px.min(), radius_px.max())}
+    assert all(part.wanted[part.labelled].all() for part in splits[0].labels)
 
 
 def test_craters_just_outside_the_labelled_range_are_ignored():

@@ -47,6 +47,47 @@ def test_a_run_leaves_all_its_files(finished):
     assert parse_yaml(finished.config.read_text(), "")["detect"]["strides"] == [4, 8, 16]
 
 
+def test_a_run_stores_the_selection_that_it_used(finished):
+    visible = {
+        "selection": "visible",
+        "min_visible_fraction": 0.3,
+        "min_sunlit_fraction": 0.1,
+        "min_depth_ratio": 0.04,
+        "min_contrast": 4.0,
+    }
+    stored = parse_yaml(finished.config.read_text(), "")["detect"]["labels"]
+    assert stored == {**visible, "radius_px": [2.0, 50.0]}
+    metrics = json.loads(finished.metrics.read_text())
+    told = {key.removeprefix("labels/"): value for key, value in metrics.items() if key.startswith("labels/")}
+    assert told == {**visible, "min_radius_px": 2.0, "max_radius_px": 50.0}
+    # The stored file alone resolves to the same.
+    assert resolve(DetectConfig, "detect", "perilune_train", "paper", finished.config).labels == settings().labels
+
+
+def test_a_selection_is_named_and_its_thresholds_replaced():
+    paper = settings("detect.labels.selection=paper", "detect.labels.radius_px=[3, 20]").labels
+    assert (paper.selection, paper.radius_px, paper.min_contrast) == ("paper", (3.0, 20.0), None)
+    bold = settings("detect.labels.min_contrast=10").labels
+    assert (bold.selection, bold.min_contrast, bold.min_depth_ratio) == ("visible", 10.0, 0.04)
+    assert settings("detect.labels.min_contrast=null").labels.min_contrast is None
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("selection=visibel", "detect.labels.selection: found 'visibel'; wanted visible (nearest known)"),
+        ("selection=3", "detect.labels.selection: found 3; wanted "),
+        ("min_contrst=3", "min_contrst: found unknown key; wanted min_contrast (nearest known)"),
+        ("radius_px=[3, 20, 30]", "detect.labels.radius_px: found"),
+        ("min_depth_ratio=deep", "detect.labels.min_depth_ratio: found 'deep'; wanted "),
+    ],
+)
+def test_an_unknown_selection_is_refused_in_one_line(setting, told):
+    with pytest.raises(UserError) as caught:
+        settings(f"detect.labels.{setting}")
+    assert told in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_the_table_of_detections(finished, dataset_detect):
     table = pq.read_table(finished.root / "detections.parquet").to_pandas()
     assert list(table.columns) == ["frame_id", "x0_px", "y0_px", "x1_px", "y1_px", "score"]

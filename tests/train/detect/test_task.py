@@ -1,5 +1,7 @@
 """Schedule, moving average, freezing; that the loss learns."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -63,7 +65,8 @@ def test_while_frozen_only_gates_and_head_may_learn(split, tmp_path):
 def test_a_few_frames_can_be_learned_by_heart(split, tmp_path):
     """The whole chain (assignment, loss, decoding, suppression, matching) agrees: else this cannot work."""
     config = DetectConfig(width=0.125, in_channels=1, strides=(4, 8, 16), attention="cbam_identity", batch_size=4)
-    few = type(split)(type(split.frames)(split.frames.table[:4], split.frames.images[:4]), split.labels[:4])
+    frames = type(split.frames)(split.frames.table[:4], split.frames.images[:4])
+    few = replace(split, frames=frames, labels=split.labels[:4])
     network = build_network(config, label_sizes(few), tmp_path).train()
     images, targets = next(iter(loader(EvaluationFrames(few), config)))
     optimizer = torch.optim.AdamW(network.parameters(), 5e-3)

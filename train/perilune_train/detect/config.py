@@ -1,24 +1,45 @@
 """Settings of crater detection: the section `detect`."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from perilune_shared.config import Section
+from perilune_shared.config import Section, nearest
+from perilune_shared.selection import SELECTIONS, Selection
 from perilune_train.config import Attention, Count, Device, Positive, Precision, Share
 
 
-class LabelSettings(Section):
-    """Which labels are craters to find. The others are ignored: neither wanted nor counted as false."""
+class LabelSettings(Selection):
+    """Which labels are craters to find. The others are ignored: neither wanted nor counted as false.
 
-    min_depth_ratio: Share = 0.04
-    """Least depth over diameter, on the finished terrain: below it a crater is worn away."""
-    min_visible_fraction: Share = 0.3
-    """Least share of the rim that lies inside the image and is not hidden."""
-    min_sunlit_fraction: Share = 0.1
-    """Least share of the crater's pixels that the Sun reaches."""
-    radius_px: tuple[Positive, Positive] = (2.0, 50.0)
-    """Radii that are labelled and judged (the paper's 2 to 50), pixels."""
+    A name gives all thresholds; single ones given beside it replace its own. What is resolved is what a run stores.
+    """
+
+    selection: str = "visible"
+    """Name of a selection: all, paper (2 to 50 px, centre in the frame) or visible (what a frame shows)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _resolved(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        name = given.get("selection", "visible")
+        if not isinstance(name, str):
+            return given
+        if name not in SELECTIONS:
+            # As a fault of the name alone: the field's own check tells it.
+            return {"selection": name}
+        limits = given.get("radius_px")
+        if isinstance(limits, list):
+            given = {**given, "radius_px": tuple(limits)}
+        return {**SELECTIONS[name].model_dump(), **given}
+
+    @field_validator("selection")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name not in SELECTIONS:
+            raise ValueError(nearest(name, SELECTIONS))
+        return name
 
 
 class AugmentSettings(Section):

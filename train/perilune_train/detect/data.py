@@ -16,13 +16,14 @@ from perilune_shared.ellipse import project_circles
 from perilune_shared.errors import UserError
 from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.manifest import Dataset
+from perilune_shared.selection import read_labels, selected
 from perilune_train.data.frames import FrameStore, load_frames, normalised
 from perilune_train.detect.assign import Targets
 from perilune_train.detect.config import AugmentSettings, DetectConfig, LabelSettings
 
 Array = NDArray[np.float64]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
-_CRATER = ["scene_id", "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "depth_m", "diameter_m"]
+_CRATER = ["scene_id", "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 
 
@@ -50,6 +51,8 @@ class DetectSplit:
     """Pixels and poses."""
     labels: list[FrameLabels]
     """One entry a frame."""
+    radius_px: tuple[float, float]
+    """Radii that are labelled and judged, pixels."""
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -62,19 +65,10 @@ def load_split(dataset: Dataset, split: str, settings: LabelSettings) -> DetectS
         if size % 32:
             raise UserError(dataset.root, field, size, "a multiple of 32, the network's coarsest stride")
     frames = load_frames(dataset, split)
-    columns = ["frame_id", "crater_id", *_BOX, *_ELLIPSE, "radius_px", "visible_fraction", "sunlit_fraction"]
-    labels = dataset.table("labels", columns).to_pandas()
-    labels = labels.merge(frames.table[["frame_id", "scene_id"]], on="frame_id")
+    labels = read_labels(dataset, [*_BOX, *_ELLIPSE], split)
+    labels["labelled"], labels["wanted"] = True, selected(labels, settings)
+    radius_px = settings.radius_px or _labelled_range(dataset)
     craters = dataset.table("craters", _CRATER).to_pandas()
-    depths = craters[["scene_id", "crater_id", "depth_m", "diameter_m"]]
-    labels = labels.merge(depths, on=["scene_id", "crater_id"], how="left", validate="many_to_one")
-    labels["labelled"] = True
-    labels["wanted"] = (
-        (labels["depth_m"] >= settings.min_depth_ratio * labels["diameter_m"])
-        & (labels["visible_fraction"] >= settings.min_visible_fraction)
-        & (labels["sunlit_fraction"] >= settings.min_sunlit_fraction)
-        & labels["radius_px"].between(*settings.radius_px)
-    )
     by_frame = {str(name): part for name, part in labels.groupby("frame_id")}
     by_scene = {str(name): part for name, part in craters.groupby("scene_id")}
     parts = []
@@ -82,7 +76,7 @@ def load_split(dataset: Dataset, split: str, settings: LabelSettings) -> DetectS
         known = by_frame.get(frame["frame_id"], labels.iloc[:0])
         others = by_scene.get(frame["scene_id"], craters.iloc[:0])
         others = others[~others["crater_id"].isin(known["crater_id"])]
-        rows = unlabelled_craters(others, camera.intrinsics(), frame, settings.radius_px)
+        rows = unlabelled_craters(others, camera.intrinsics(), frame, radius_px)
         part = pd.concat([known, rows]) if len(rows) else known
         parts.append(
             FrameLabels(
@@ -93,7 +87,13 @@ def load_split(dataset: Dataset, split: str, settings: LabelSettings) -> DetectS
                 part["labelled"].to_numpy(np.bool_),
             )
         )
-    return DetectSplit(frames, parts)
+    return DetectSplit(frames, parts, radius_px)
+
+
+def _labelled_range(dataset: Dataset) -> tuple[float, float]:
+    """Least and largest radius of all labels of a dataset, pixels."""
+    radius_px = dataset.table("labels", ["radius_px"]).to_pandas()["radius_px"]
+    return float(radius_px.min()), float(radius_px.max())
 
 
 def unlabelled_craters(

@@ -70,7 +70,13 @@ def load_detector(path: Path) -> YOLOv3:
 def judge(split: DetectSplit, found: list[Detections], config: DetectConfig) -> Matches:
     """The detections of a split against its labels."""
     height, width = split.frames.images.shape[1:]
-    return match_split(found, split.labels, (width, height), config.evaluation.match_iou, config.labels.radius_px)
+    return match_split(found, split.labels, (width, height), config.evaluation.match_iou, split.radius_px)
+
+
+def selection_used(config: DetectConfig, split: DetectSplit) -> dict[str, float | int | str | None]:
+    """What was wanted, for metrics.json: the selection's name and its thresholds; null asks for nothing."""
+    used = {f"labels/{key}": value for key, value in config.labels.model_dump(exclude={"radius_px"}).items()}
+    return used | {"labels/min_radius_px": split.radius_px[0], "labels/max_radius_px": split.radius_px[1]}
 
 
 def write_detections(path: Path, split: DetectSplit, found: list[Detections]) -> None:
@@ -123,6 +129,7 @@ def run_detect(
         ),
         "parameters": sum(p.numel() for p in network.parameters()),
     }
+    metrics |= selection_used(config, splits["test"])
     metrics |= evaluate(run, config, splits, device, bf16)
     runs.write_metrics(run, metrics)
     return run

@@ -125,7 +125,7 @@ class DetectTask(lightning.LightningModule):
         split = self.splits["val"]
         height, width = split.frames.images.shape[1:]
         matches = match_split(
-            self.judged, split.labels, (width, height), self.config.evaluation.match_iou, self.config.labels.radius_px
+            self.judged, split.labels, (width, height), self.config.evaluation.match_iou, split.radius_px
         )
         points = curve(matches)
         _, recall, f1 = at_threshold(matches, points.best_threshold())

@@ -1,0 +1,72 @@
+"""Named selections, and the labels with what they ask for."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from perilune_shared.manifest import open_dataset
+from perilune_shared.selection import SELECTIONS, Selection, read_labels, selected
+
+GOOD = {
+    "radius_px": 5.0,
+    "visible_fraction": 0.9,
+    "sunlit_fraction": 0.9,
+    "contrast": 20.0,
+    "depth_m": 1.0,
+    "diameter_m": 10.0,
+}
+
+
+def labels(*changes):
+    return pd.DataFrame([{**GOOD, **change} for change in changes])
+
+
+def test_the_named_selections():
+    rows = labels(
+        {},
+        {"radius_px": 1.9},
+        {"radius_px": 51.0},
+        {"visible_fraction": 0.2},
+        {"sunlit_fraction": 0.05},
+        {"contrast": 3.9},
+        {"depth_m": 0.39},
+        {"depth_m": np.nan, "diameter_m": np.nan},
+    )
+    assert selected(rows, SELECTIONS["all"]).all()
+    assert selected(rows, SELECTIONS["paper"]).tolist() == [True, False, False, *[True] * 5]
+    assert selected(rows, SELECTIONS["visible"]).tolist() == [True, *[False] * 7]
+
+
+@pytest.mark.parametrize(
+    ("threshold", "value", "row"),
+    [
+        ("radius_px", (5.0, 5.0), {"radius_px": 5.1}),
+        ("min_visible_fraction", 0.9, {"visible_fraction": 0.89}),
+        ("min_sunlit_fraction", 0.9, {"sunlit_fraction": 0.89}),
+        ("min_depth_ratio", 0.1, {"depth_m": 0.99}),
+        ("min_contrast", 20.0, {"contrast": -30.0}),
+    ],
+)
+def test_each_threshold_is_inclusive_and_tells_on_its_own(threshold, value, row):
+    chosen = selected(labels({}, row), Selection(**{threshold: value}))
+    assert chosen.dtype == np.bool_ and chosen.tolist() == [True, False]
+
+
+def test_labels_are_read_with_their_craters(tiny):
+    dataset = open_dataset(tiny / "detect")
+    rows = read_labels(dataset, ["ellipse_a_px"])
+    table = dataset.table("labels").to_pandas()
+    for column in ("frame_id", "crater_id", "contrast", "ellipse_a_px"):
+        assert rows[column].tolist() == table[column].tolist()
+    craters = dataset.table("craters").to_pandas().set_index(["scene_id", "crater_id"])
+    row = rows.iloc[len(rows) // 2]
+    assert row.depth_m == craters.loc[(row.scene_id, row.crater_id)].depth_m
+    parts = [read_labels(dataset, split=split) for split in ("train", "val", "test")]
+    assert sum(map(len, parts)) == len(rows) and all(len(part) for part in parts)
+    # What is wanted of a real dataset is neither everything nor nothing.
+    seen = selected(rows, SELECTIONS["visible"])
+    assert 0.2 < seen.mean() < 0.95 and selected(rows, SELECTIONS["paper"]).all()
+    assert np.isfinite(rows["contrast"]).all() and (rows["contrast"] > 4).mean() < 0.98
+    # Deep craters show more than worn ones.
+    ratio = rows["depth_m"] / rows["diameter_m"]
+    assert rows["contrast"][ratio > 0.1].median() > 1.5 * rows["contrast"][ratio < 0.04].median()
