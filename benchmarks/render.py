@@ -20,11 +20,11 @@ from perilune_render.blender import bpy
 from perilune_render.blender.renderer import Renderer, one_ray_a_pixel, quiet, render_through
 from perilune_render.blender.stage import aim
 from perilune_render.config import DatasetConfig
-from perilune_render.dataset import write_frame
 from perilune_render.exr import read_exr
-from perilune_render.labels import RimCircles, Shown, label_frame, with_contrast
+from perilune_render.frame import Shot, Studio
+from perilune_render.labels import RimCircles
 from perilune_render.plan import make_plan
-from perilune_render.sensor import FixedPattern, expected, expose
+from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import resolve
 from perilune_shared.files import write_text
@@ -43,8 +43,8 @@ def main() -> None:
     scene = grow_scene(config, plan.camera, config.detect.flight, scene_plan.seed)
     scene_s = time.perf_counter() - start
     sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
-    circles = RimCircles.of_scene(scene)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
+    studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)
     ours, bare, centres = [], [], []
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -60,14 +60,10 @@ def main() -> None:
             for which in (0, 1) if index % 2 else (1, 0):
                 start = time.perf_counter()
                 if which == 0:
-                    radiance = renderer.render(*pose, seed=index)
-                    velocity = pose[1] @ trajectory.flight.velocity_mps[index]
-                    exposure = expose(radiance, config.sensor, plan.camera, plan.camera, velocity)
-                    write_frame(out, config, plan, circles, pattern, trajectory, index, radiance, exposure)
-                    found = label_frame(circles, plan.camera, *pose, radiance, 2.0, 50.0)
-                    shown = Shown(*expected(exposure, config.sensor), sun)
-                    found = with_contrast(found, circles, plan.camera, *pose, shown)
-                    tables.label_table(trajectory.frame_id(index), found)
+                    shot = Shot.planned(trajectory, index)
+                    radiance = renderer.render(*pose, seed=shot.render_seed)
+                    _, exposure = studio.write(out, shot, radiance)
+                    tables.label_table(shot.frame_id, studio.label(shot, radiance, exposure))
                     ours.append(time.perf_counter() - start)
                 else:
                     aim(renderer.stage, *pose)

@@ -1,8 +1,9 @@
 """`perilune-render`: datasets, previews and meshes from a configuration."""
 
 import enum
+import tempfile
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import typer
 from rich.console import Console
@@ -10,7 +11,7 @@ from rich.console import Console
 from perilune_render.config import DatasetConfig
 from perilune_render.plan import make_plan
 from perilune_shared.config import resolve
-from perilune_shared.errors import UserError, run_command_line
+from perilune_shared.errors import EXIT_USER_ERROR, UserError, run_command_line
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
 
@@ -117,6 +118,61 @@ def develop(
     Console().print(
         f"{out}: {counts.frames} frames, {counts.labels} labels; look at {out / 'overview.png'}", soft_wrap=True
     )
+
+
+@app.command()
+def plan(
+    out: Annotated[Path, typer.Option(help="New folder of the manifest.")],
+    preset: Preset = "small",
+    config: Config = None,
+    setting: Setting = None,
+    dem: Dem = None,
+    catalogue: Catalogue = None,
+    kind: Annotated[Kind, typer.Option(help="Crater detection or navigation (detect or nav).")] = Kind.DETECT,
+) -> None:
+    """Write a dataset's plan as a manifest without frames, for others to render. Grows every scene for its hash."""
+    resolved = _resolve(preset, config, setting, dem, catalogue)
+    from perilune_render.planned import write_plan
+
+    with progress_bar() as progress:
+        write_plan(resolved, _first(kind), preset, out, progress)
+    counts = open_dataset(out).info.counts
+    Console().print(f"{out}: {counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames planned")
+
+
+@app.command()
+def regenerate(
+    manifest: Annotated[Path, typer.Option(help="Folder of a dataset or of its manifest alone.")],
+    frames: Annotated[
+        list[str] | None, typer.Option(help="A frame_id, as scene-0000/trajectory-0000/000003; may be repeated.")
+    ] = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Only tell how the frames compare; without --frames, of a sample.")
+    ] = False,
+    sample: Annotated[int, typer.Option(min=1, help="Frames of the sample, evenly spread.")] = 12,
+    out: Annotated[Path | None, typer.Option(help="Folder for the frames; with --verify a temporary one.")] = None,
+    dem: Annotated[Path | None, typer.Option(help="This machine's copy of the elevation model.")] = None,
+    catalogue: Annotated[Path | None, typer.Option(help="This machine's copy of the crater catalogue.")] = None,
+) -> None:
+    """Make frames again from a manifest alone, and compare them with its hashes. Exit code 2 where one differs."""
+    if not verify and (out is None or not frames):
+        raise UserError("regenerate", "--frames and --out", "not given", "both, or --verify")
+    dataset = open_dataset(manifest)
+    from perilune_render.regenerate import State, spread
+    from perilune_render.regenerate import regenerate as make_again
+
+    ids = list(dict.fromkeys(frames)) if frames else spread(dataset, sample)
+    with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
+        outcomes = make_again(dataset, ids, out or Path(folder), progress, dem, catalogue)
+    counts = {state: sum(o.state == state for o in outcomes) for state in get_args(State)}
+    for outcome in outcomes:
+        if outcome.state != "identical" and not verify:
+            Console().print(f"{outcome.png_path}: {outcome.state}", soft_wrap=True)
+    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count or state == "identical")
+    ground = "" if all(o.same_ground for o in outcomes) else "; the ground came out otherwise than its hash says"
+    Console().print(f"{len(outcomes)} frames: {told}{ground}", soft_wrap=True)
+    if counts["different"] or ground:
+        raise typer.Exit(EXIT_USER_ERROR)
 
 
 @app.command()

@@ -5,15 +5,36 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from perilune_render.config import DatasetConfig
 from perilune_render.labels import Labels
 from perilune_render.picture import draw_labels, enlarge, write_sheet
+from perilune_render.plan import Plan
 from perilune_shared import files
 from perilune_shared.errors import UserError
-from perilune_shared.info import DatasetInfo, Recipe, write_info
+from perilune_shared.info import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.manifest import Dataset, open_dataset
+from perilune_shared.schema import SCHEMA_VERSION
 
+LICENCE = "CC-BY-4.0"
 _SHEET_FRAMES = 12
 _MEANS = ("threads", "cache_gib")
+
+
+def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
+    """The dataset.json of a dataset that is begun."""
+    return DatasetInfo(
+        name=f"perilune-{recipe.preset}-{recipe.kind}",
+        kind=recipe.kind,
+        schema_version=SCHEMA_VERSION,
+        complete=False,
+        images="files",
+        split_by=config.kind(recipe.kind).split_by,
+        camera=CameraInfo.of(plan.camera),
+        exr_camera=CameraInfo.of(plan.exr_camera) if config.render.exr else None,
+        recipes=recipes_of(recipe),
+        counts=Counts(),
+        licence=LICENCE,
+    )
 
 
 def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:

@@ -7,6 +7,7 @@ from pathlib import Path
 import perilune_render
 import perilune_shared
 from perilune_render.config import DatasetConfig
+from perilune_render.terrain.cache import generator
 from perilune_shared.config import resolve_over
 from perilune_shared.errors import UserError
 from perilune_shared.info import Recipe
@@ -22,6 +23,7 @@ def versions() -> dict[str, str]:
         "perilune_shared": perilune_shared.__version__,
         "blender": metadata.version("bpy"),
         "numpy": metadata.version("numpy"),
+        "generator": generator()[:16],
     }
 
 

@@ -27,15 +27,15 @@ def _vectors(values: ArrayLike) -> pa.Array:
     return pa.FixedSizeListArray.from_arrays(pa.array(rows.ravel()), rows.shape[1])
 
 
-def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str) -> dict[str, pa.Table]:
-    """Parts of the tables scenes, craters and boulders for one scene, made by the recipe of a key."""
+def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
+    """Parts of the tables craters and boulders for one scene."""
     craters, rims, boulders = scene.craters, scene.rims, scene.boulders
     latitude, longitude = selenographic_from_site(craters.x_m, craters.y_m, scene.latitude_deg, scene.longitude_deg)
-    ground = {
+    return {
         "craters": _table(
             "craters",
             {
-                "scene_id": [plan.scene_id] * len(craters),
+                "scene_id": [scene_id] * len(craters),
                 "crater_id": np.arange(len(craters)),
                 "x_m": craters.x_m,
                 "y_m": craters.y_m,
@@ -55,7 +55,7 @@ def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: s
         "boulders": _table(
             "boulders",
             {
-                "scene_id": [plan.scene_id] * len(boulders),
+                "scene_id": [scene_id] * len(boulders),
                 "boulder_id": np.arange(len(boulders)),
                 "x_m": boulders.x_m,
                 "y_m": boulders.y_m,
@@ -66,6 +66,11 @@ def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: s
             },
         ),
     }
+
+
+def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str) -> dict[str, pa.Table]:
+    """Parts of the tables scenes, craters and boulders for one scene, made by the recipe of a key."""
+    ground = ground_tables(plan.scene_id, scene)
     return {
         "scenes": _table(
             "scenes",

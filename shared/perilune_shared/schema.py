@@ -127,7 +127,13 @@ TABLES: dict[str, pa.Schema] = {
         _column("radius_px", _REAL, "px", "sqrt(a b)"),
         _column("visible_fraction", _REAL, "", "share of the rim inside the image and not hidden"),
         _column("sunlit_fraction", _REAL, "", "share of the crater's seen pixels that the Sun reaches"),
-        _column("contrast", _REAL, "", "the crater's own shading over its standard error, from noise and clutter"),
+        _column(
+            "contrast",
+            _REAL,
+            "",
+            "the crater's own shading over its standard error, from noise and clutter; null where not known",
+            optional=True,
+        ),
     ),
 }
 KEYS: dict[str, list[str]] = {

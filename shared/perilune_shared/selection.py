@@ -55,14 +55,16 @@ _CRATER = ["scene_id", "crater_id", "depth_m", "diameter_m"]
 
 def selected(labels: pd.DataFrame, selection: Selection) -> NDArray[np.bool_]:
     """Whether each label (N,) is selected, from radius_px, visible_fraction, sunlit_fraction, contrast, depth_m and
-    diameter_m (see `read_labels`). A value that is not known (NaN) reaches no threshold."""
+    diameter_m (see `read_labels`). A contrast that is not known (NaN: migrated datasets) is not asked for; any other
+    value that is not known reaches no threshold."""
     chosen = np.ones(len(labels), np.bool_)
     if selection.radius_px is not None:
         chosen &= labels["radius_px"].between(*selection.radius_px).to_numpy()
     for column in ("visible_fraction", "sunlit_fraction", "contrast"):
         least = getattr(selection, f"min_{column}")
         if least is not None:
-            chosen &= labels[column].to_numpy() >= least
+            values = labels[column].to_numpy()
+            chosen &= (values >= least) | (np.isnan(values) & (column == "contrast"))
     if selection.min_depth_ratio is not None:
         chosen &= labels["depth_m"].to_numpy() >= selection.min_depth_ratio * labels["diameter_m"].to_numpy()
     return chosen

@@ -37,7 +37,7 @@ def cache_folder() -> Path:
 
 
 @functools.cache
-def _generator() -> str:
+def generator() -> str:
     """Hash of the code that grows scenes: whatever changes it makes other files."""
     package = Path(__file__).parent
     sources = [*sorted(package.glob("*.py")), package.parent / "streams.py", package.parent / "config.py"]
@@ -51,7 +51,7 @@ def scene_key(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed:
         if terrain[name] is not None and Path(terrain[name]).is_file():
             terrain[name] = [Path(terrain[name]).name, sha256_of(Path(terrain[name]))]
     content = {
-        "generator": _generator(),
+        "generator": generator(),
         "numpy": np.__version__,
         "terrain": terrain,
         "albedo_variation": config.light.albedo_variation,

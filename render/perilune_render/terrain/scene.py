@@ -91,6 +91,15 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
     )
 
 
+def check_ground(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> None:
+    """Raises UserError on faults of the files that the ground is made from: they must show before the work begins."""
+    grid = graded_grid(config, camera, flight)
+    if config.terrain.dem is not None:
+        model = read_elevation(Path(config.terrain.dem))
+        if config.terrain.catalogue is not None:
+            read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters, resolved_m(model))
+
+
 def resolved_m(model: ElevationModel) -> float:
     """Diameter in metres from which an elevation model shows a crater: four pixels. Smaller ones are added."""
     return _RESOLVED_PIXELS * model.pixel_m

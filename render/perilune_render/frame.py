@@ -1,0 +1,94 @@
+"""One frame from a rendering: its PNG, its EXR, its labels. The same for a new dataset and for a frame made again."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from perilune_render.config import DatasetConfig
+from perilune_render.exr import Radiance, write_exr
+from perilune_render.labels import Labels, RimCircles, Shown, crater_index, label_frame, with_contrast
+from perilune_render.output import file_columns, write_png
+from perilune_render.plan import TrajectoryPlan
+from perilune_render.resample import seen_by
+from perilune_render.sensor import Exposure, FixedPattern, expected, expose, read_out
+from perilune_render.streams import derived_seed, stream
+from perilune_shared.camera import Camera
+from perilune_shared.frames import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """Where, when and by which seed one frame is taken."""
+
+    frame_id: str
+    """Names its files."""
+    frame_index: int
+    """Place in the descent, from 0."""
+    trajectory_seed: int
+    """Of the descent's random streams."""
+    position_m: Array
+    """Camera, O_L, metres (3,)."""
+    rotation_camera_from_site: Array
+    """(3, 3)."""
+    velocity_mps: Array
+    """Camera, O_L, metres per second (3,)."""
+
+    @classmethod
+    def planned(cls, trajectory: TrajectoryPlan, index: int) -> "Shot":
+        """A frame of a planned descent."""
+        flight = trajectory.flight
+        return cls(
+            trajectory.frame_id(index),
+            index,
+            trajectory.seed,
+            flight.position_m[index],
+            flight.rotation_camera_from_site[index],
+            flight.velocity_mps[index],
+        )
+
+    @property
+    def render_seed(self) -> int:
+        """Of the renderer's samples."""
+        return derived_seed(self.trajectory_seed, "frame", self.frame_index)
+
+
+@dataclass(frozen=True, slots=True)
+class Studio:
+    """What all frames over one scene have in common."""
+
+    config: DatasetConfig
+    """Settings of sensor, labels and files."""
+    camera: Camera
+    """Of the PNGs and labels."""
+    exr_camera: Camera
+    """Of the rendering and the EXRs."""
+    pattern: FixedPattern
+    """Of the sensor."""
+    circles: RimCircles
+    """Of the scene's craters."""
+    sun: Array
+    """Unit vector towards the Sun, O_L (3,)."""
+
+    def write(self, out: Path, shot: Shot, radiance: Radiance) -> tuple[dict[str, str | int], Exposure]:
+        """Write a frame's PNG, and its EXR where asked for; its columns png_* and exr_*, and its exposure."""
+        velocity = shot.rotation_camera_from_site @ shot.velocity_mps
+        exposure = expose(radiance, self.config.sensor, self.camera, self.exr_camera, velocity)
+        noise = stream(shot.trajectory_seed, "sensor", shot.frame_index)
+        image = read_out(exposure, self.config.sensor, self.pattern, noise)
+        row = write_png(out, shot.frame_id, image, self.config.sensor.bits)
+        if self.config.render.exr:
+            path = f"frames/{shot.frame_id}.exr"
+            pose = shot.position_m, shot.rotation_camera_from_site
+            write_exr(out / path, radiance, crater_index(self.circles, self.exr_camera, *pose, radiance.depth_m))
+            row |= file_columns(out, "exr", path)
+        return row, exposure
+
+    def label(self, shot: Shot, radiance: Radiance, exposure: Exposure) -> Labels:
+        """The labels of a frame."""
+        pose = shot.position_m, shot.rotation_camera_from_site
+        seen = seen_by(radiance, self.camera, self.exr_camera)
+        limits = self.config.labels.min_radius_px, self.config.labels.max_radius_px
+        found = label_frame(self.circles, self.camera, *pose, seen, *limits)
+        shown = Shown(*expected(exposure, self.config.sensor), np.asarray(self.sun))
+        return with_contrast(found, self.circles, self.camera, *pose, shown)

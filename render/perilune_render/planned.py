@@ -1,0 +1,56 @@
+"""A plan as a dataset without a frame: scenes, trajectories and frames as Parquet, for others to render."""
+
+from pathlib import Path
+
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_render import tables
+from perilune_render.config import DatasetConfig
+from perilune_render.output import info_of
+from perilune_render.plan import make_plan
+from perilune_render.recipe import recipe_of
+from perilune_render.terrain.scene import check_ground, grow_scene
+from perilune_shared.frames import sun_direction
+from perilune_shared.schema import TABLES, Kind
+from perilune_shared.writer import written
+
+
+def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> None:
+    """Write the plan of the dataset `detect` or `nav` into the new folder `out`.
+
+    Every scene is grown once, for the hash of its content; nothing is rendered. Raises UserError on faults of the
+    settings, or where `out` holds something.
+    """
+    plan = make_plan(config, kind)
+    check_ground(config, plan.exr_camera, config.kind(kind).flight)
+    recipe = recipe_of(config, kind, preset)
+    info = info_of(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
+    task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes", note="")
+    with written(out, info, whole_tables=True) as writer:
+        for scene_plan in plan.scenes:
+            scene = grow_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
+            sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
+            trajectories = plan.of_scene(scene_plan.scene_id)
+            paths = ("png", "exr") if config.render.exr else ("png",)
+            frames = [
+                tables.frame_table(
+                    trajectory,
+                    plan.camera,
+                    sun,
+                    [
+                        {f"{kind}_path": f"frames/{trajectory.frame_id(i)}.{kind}" for kind in paths}
+                        for i in range(len(trajectory.splits))
+                    ],
+                )
+                for trajectory in trajectories
+            ]
+            writer.add_scene(
+                {
+                    "scenes": tables.scene_tables(scene_plan, scene, config, recipe.key)["scenes"],
+                    "trajectories": tables.trajectory_table(trajectories),
+                    "frames": pa.concat_tables(frames),
+                    **{name: TABLES[name].empty_table() for name in ("craters", "boulders", "labels")},
+                }
+            )
+            progress.advance(task)

@@ -1,0 +1,186 @@
+"""Frames of a manifest made again from the manifest alone: seeds, poses and the recorded recipe.
+
+On the same kind of machine a frame comes out byte for byte. Elsewhere rays may meet the ground a rounding apart, which
+can move single pixels: then the two are compared within a stated tolerance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.progress import Progress
+
+from perilune_render.blender.renderer import Renderer
+from perilune_render.config import CameraConfig, DatasetConfig
+from perilune_render.exr import read_exr
+from perilune_render.frame import Shot, Studio
+from perilune_render.labels import RimCircles
+from perilune_render.plan import camera_of
+from perilune_render.recipe import config_of
+from perilune_render.sensor import FixedPattern
+from perilune_render.tables import ground_tables
+from perilune_render.terrain.cache import cached_scene
+from perilune_shared.config import resolve_over
+from perilune_shared.content import content_sha256
+from perilune_shared.errors import UserError
+from perilune_shared.files import sha256_of
+from perilune_shared.frames import matrix_from_quaternion
+from perilune_shared.info import Recipe
+from perilune_shared.manifest import Dataset
+
+GREY_TOLERANCE = 2
+"""Grey levels of 255 by which pixels may differ."""
+RELATIVE_TOLERANCE = 1e-3
+"""Relative difference by which values of an EXR may differ."""
+OUTLIERS = 0.001
+"""Share of pixels that may differ by more: rays that meet another facet."""
+State = Literal["identical", "within tolerance", "different", "nothing to compare"]
+_ORDER: tuple[State, ...] = ("identical", "nothing to compare", "within tolerance", "different")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How one frame came out."""
+
+    frame_id: str
+    """Of the manifest."""
+    png: State
+    """The PNG against the manifest's hash, else against the dataset's own file."""
+    exr: State
+    """The EXR likewise; "nothing to compare" where the manifest has none."""
+    same_ground: bool
+    """Whether craters and boulders have the content that the scene's row states."""
+    png_path: Path
+    """The new PNG."""
+
+    @property
+    def state(self) -> State:
+        """The worse of both files."""
+        return max(self.png, self.exr, key=_ORDER.index)
+
+
+def regenerate(
+    dataset: Dataset,
+    frame_ids: Sequence[str],
+    out: Path,
+    progress: Progress,
+    dem: Path | None = None,
+    catalogue: Path | None = None,
+) -> list[Outcome]:
+    """Make frames again under `out`, with the manifest's own relative paths, and compare them.
+
+    `dem` and `catalogue` are this machine's copies of files that the recipes name; the manifest's own paths are never
+    opened. Raises UserError on frames that the manifest has not, and on recipes that this version cannot follow.
+    """
+    frames = dataset.table("frames")
+    known = set(frames["frame_id"].to_pylist())
+    for frame_id in frame_ids:
+        if frame_id not in known:
+            raise UserError(dataset.root, "frame_id", frame_id, f"a frame of the manifest, such as {min(known)}")
+    frames = frames.filter(pc.is_in(frames["frame_id"], pa.array(list(frame_ids), pa.string())))
+    task = progress.add_task("regenerate", total=len(frames), unit="frames", note="")
+    outcomes = []
+    for scene in dataset.table("scenes").sort_by("scene_id").to_pylist():
+        own = frames.filter(pc.equal(frames["scene_id"], scene["scene_id"])).sort_by("frame_id")
+        if len(own):
+            progress.update(task, note=f"{scene['scene_id']}: growing")
+            outcomes += _of_scene(dataset, scene, own.to_pylist(), out, dem, catalogue, lambda: progress.advance(task))
+    return outcomes
+
+
+def spread(dataset: Dataset, n_frames: int) -> list[str]:
+    """Ids of frames evenly spread over a dataset."""
+    ids = sorted(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())
+    return [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(n_frames, len(ids))).round().astype(int))]
+
+
+def _of_scene(
+    dataset: Dataset, scene: dict, rows: list[dict], out: Path, dem: Path | None, catalogue: Path | None, advance
+) -> list[Outcome]:
+    recipe = dataset.info.recipes[scene["recipe"]]
+    where = dataset.root / "dataset.json"
+    config = config_of(recipe, where, dem, catalogue)
+    ground_config = _ground_config(recipe, config, where)
+    camera, flight = camera_of(config.camera), ground_config.kind(recipe.kind).flight
+    exr_camera = camera_of(ground_config.camera).covering_pinhole()
+    if camera != dataset.info.camera.intrinsics():
+        raise UserError(where, "camera", dataset.info.camera.intrinsics(), f"that of its recipe, {camera}")
+    ground = cached_scene(ground_config, exr_camera, flight, scene["seed"])
+    if ground.dem_source != scene["dem_source"]:
+        raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
+    tables = ground_tables(scene["scene_id"], ground)
+    same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
+    sun = np.array(rows[0]["sun_direction"])
+    pattern = FixedPattern.draw(config.sensor, camera, config.seed)
+    studio = Studio(config, camera, exr_camera, pattern, RimCircles.of_scene(ground), sun)
+    seeds = dataset.table("trajectories", ["trajectory_id", "seed"], scene_id=scene["scene_id"]).to_pydict()
+    seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
+    outcomes = []
+    with Renderer(ground, ground_config, exr_camera, sun) as renderer:
+        for row in rows:
+            pose = np.array(row["position_m"]), matrix_from_quaternion(row["rotation_wxyz"])
+            seed = seed_of[row["trajectory_id"]]
+            shot = Shot(row["frame_id"], row["frame_index"], seed, *pose, np.array(row["velocity_mps"]))
+            studio.write(out, shot, renderer.render(*pose, seed=shot.render_seed))
+            png, exr = (_compared(dataset, row, kind, out) for kind in ("png", "exr"))
+            outcomes.append(Outcome(row["frame_id"], png, exr, same_ground, out / f"frames/{row['frame_id']}.png"))
+            advance()
+    return outcomes
+
+
+def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> DatasetConfig:
+    """The settings that ground and EXRs were made by: of a dataset that was developed again, with the first camera."""
+    origin = recipe.developed_from
+    if origin is None:
+        return config
+    if origin.camera_config is None:
+        raise UserError(
+            where, "developed_from", "no camera", "a dataset that says which camera its ground was made for"
+        )
+    camera = resolve_over(CameraConfig, "dataset.camera", str(where), origin.camera_config)
+    return config.model_copy(update={"camera": camera})
+
+
+def _compared(dataset: Dataset, row: dict, kind: str, out: Path) -> State:
+    """A new file against the hash of the old one, and against the old file where it is here and the hash differs."""
+    new = out / f"frames/{row['frame_id']}.{kind}"
+    if row[f"{kind}_sha256"] is None or not new.exists():
+        return "nothing to compare"
+    if sha256_of(new) == row[f"{kind}_sha256"]:
+        return "identical"
+    if kind == "png" and dataset.info.images in ("files", "packed"):
+        frames = dataset.table("frames", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
+        old = dict(dataset.pngs(frames.filter(pc.equal(frames["frame_id"], row["frame_id"]))))[row["frame_id"]]
+        return _state(png_far(old, new.read_bytes()))
+    if kind == "exr" and dataset.info.images == "files" and row["exr_path"] is not None:
+        return _state(exr_far(read_exr(dataset.file(row["exr_path"])), read_exr(new)))
+    return "different"
+
+
+def _state(far: float) -> State:
+    return "within tolerance" if far <= OUTLIERS else "different"
+
+
+def png_far(first: bytes, second: bytes) -> float:
+    """Share of the pixels of two PNGs that differ by more than GREY_TOLERANCE; 1 where they are not of one shape."""
+    one, two = (cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) for png in (first, second))
+    if one is None or two is None or one.shape != two.shape or one.dtype != two.dtype:
+        return 1.0
+    scale = 255 / np.iinfo(one.dtype).max
+    return float((np.abs(one.astype(float) - two) * scale > GREY_TOLERANCE).mean())
+
+
+def exr_far(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> float:
+    """Largest share, over the channels, of pixels that differ by more than RELATIVE_TOLERANCE."""
+    if {k: v.shape for k, v in first.items()} != {k: v.shape for k, v in second.items()}:
+        return 1.0
+    shares = []
+    for name, one in first.items():
+        close = np.isclose(one, second[name], rtol=RELATIVE_TOLERANCE, atol=RELATIVE_TOLERANCE, equal_nan=True)
+        shares.append(1 - float(close.mean()))
+    return max(shares, default=1.0)
