@@ -26,7 +26,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -99,6 +99,9 @@ bench-terrain: setup ## speed of growing the ground on one core; writes runs/ben
 
 bench-photometry: setup ## rendered radiance against the formulas; writes runs/bench/photometry.json
 	@$(BIN)/python benchmarks/photometry.py
+
+bench-manifest: setup ## reads of 100,000 frames and 5 million labels; writes runs/bench/manifest.json
+	@$(BIN)/python benchmarks/manifest.py
 
 bench-develop: setup ## frames a second of developing on one core; writes runs/bench/develop.json
 	@$(BIN)/python benchmarks/develop.py

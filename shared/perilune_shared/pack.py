@@ -29,7 +29,7 @@ def pack(source: Dataset, out: Path, shard_mb: float = 1000, progress: Progress 
     if packed:
         info = info.changed("packed", images="packed", exr_camera=None)
     frames = source.table("frames").sort_by(_ORDER)
-    task = progress.add_task("packing", total=len(frames), unit="frames", note="") if progress else None
+    task = progress.add_task("packing", total=len(frames), unit="frames", note="") if progress and packed else None
     with written(out, info, whole_tables=True) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
