@@ -20,9 +20,11 @@ class Radiance:
     radiance_factor: np.ndarray
     """I/F (h, w) float32."""
     depth_m: np.ndarray
-    """Along the camera's axis, metres; infinite where nothing is hit (h, w) float32."""
+    """Along the camera's axis, of the ray through the pixel's centre, metres; infinite where it hits nothing (h, w)
+    float32."""
     normal: np.ndarray
-    """Unit normal in O_L (h, w, 3) float32."""
+    """Unit shading normal in O_L, 0 where nothing is hit; where EXRs are asked for that of the same ray, else the mean
+    direction over the pixel's samples (h, w, 3) float32."""
     sunlit: np.ndarray
     """Whether the Sun reaches the pixel (h, w) bool."""
 

@@ -20,7 +20,7 @@ def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
         return image
     finer = max(1, int(np.ceil(source.fx_px / camera.fx_px - 0.01)))
     seen = cv2.remap(
-        image, *_places(_refined(camera, finer), source), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
+        image, *_places(refined(camera, finer), source), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
     )
     return seen if finer == 1 else cv2.resize(seen, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
 
@@ -43,7 +43,7 @@ def seen_by(radiance: Radiance, camera: Camera, source: Camera) -> Radiance:
     return replace(radiance, **{name: resample_nearest(image, camera, source) for name, image in images.items()})
 
 
-def _refined(camera: Camera, n: int) -> Camera:
+def refined(camera: Camera, n: int) -> Camera:
     """The same view with n x n pixels in place of each."""
     return replace(
         camera,

@@ -1,0 +1,161 @@
+"""Thin glowing rings on rim circles: rendered by Blender, and found again in the picture to a fraction of a pixel.
+
+A ring is a tube about the circle. In the picture its middle line is the circle's image: the outlines of a thin tube lie
+evenly on both sides, but for terms of the tube's width squared over distance and radius. Along a normal of a label's
+ellipse the ring is a hump, whose centre of gravity is the place of its middle line.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from perilune_render.blender import bpy
+from perilune_render.blender.renderer import configure, render_through
+from perilune_render.blender.stage import aim, mesh_from_arrays, sunlit_stage
+from perilune_render.config import LightConfig, RenderConfig
+from perilune_render.exr import Radiance
+from perilune_render.labels import Labels, RimCircles, label_frame
+from perilune_shared.camera import Camera, camera_from_site
+from perilune_shared.ellipse import Ellipses, rim_points
+from perilune_shared.frames import Array
+
+TUBE_PX = 1.5
+"""Half a ring's width, pixels of the picture."""
+REACH_PX = 6.0
+"""How far from the ellipse a ring is looked for, pixels of the picture."""
+LEAST_AXIS_PX = REACH_PX + TUBE_PX + 1
+"""Least semi-minor axis, pixels of the picture: a narrower ring's far side would come into reach."""
+LEAST_BEND_PX = 2 * TUBE_PX
+"""Least radius of curvature, pixels of the picture: at sharper ends both sides are in reach."""
+APART_PX = REACH_PX + TUBE_PX + 4
+"""Least distance between rings, pixels of the picture."""
+N_DIRECTIONS = 64
+_N_AROUND, _N_TUBE = 512, 8
+_STEP_PX = 0.125
+
+
+def labels_of(circles: RimCircles, camera: Camera, position_m: Array, rotation_camera_from_site: Array) -> Labels:
+    """Labels of 2 to 50 px by the project's own rule, with nothing in front of any."""
+    shape = (camera.height_px, camera.width_px)
+    nothing = Radiance(np.zeros(shape), np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros(shape, bool))
+    return label_frame(circles, camera, position_m, rotation_camera_from_site, nothing, 2.0, 50.0)
+
+
+def rows_of(ellipses: Ellipses, rows: np.ndarray) -> Ellipses:
+    """Some of the ellipses."""
+    e = ellipses
+    return Ellipses(e.cx_px[rows], e.cy_px[rows], e.a_px[rows], e.b_px[rows], e.theta_rad[rows])
+
+
+def outline(ellipses: Ellipses, n: int) -> tuple[Array, Array]:
+    """Points (N, n, 2) on the ellipses and outward unit normals (N, n, 2) there."""
+    e, angle = ellipses, 2 * np.pi * np.arange(n) / n
+    x, y = e.a_px[:, None] * np.cos(angle), e.b_px[:, None] * np.sin(angle)
+    along, across = np.cos(angle) / e.a_px[:, None], np.sin(angle) / e.b_px[:, None]
+    cos, sin = np.cos(e.theta_rad)[:, None], np.sin(e.theta_rad)[:, None]
+    points = np.stack([e.cx_px[:, None] + x * cos - y * sin, e.cy_px[:, None] + x * sin + y * cos], axis=-1)
+    normals = np.stack([along * cos - across * sin, along * sin + across * cos], axis=-1)
+    return points, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+
+
+def wide_enough(ellipses: Ellipses, scale: int) -> np.ndarray:
+    """Whether rings on the ellipses (N,) can be judged in a picture with `scale` pixels in place of each of theirs."""
+    bend_px = ellipses.b_px**2 / ellipses.a_px
+    return (ellipses.b_px * scale >= LEAST_AXIS_PX) & (bend_px * scale >= LEAST_BEND_PX)
+
+
+def apart(ellipses: Ellipses, camera: Camera, scale: int) -> np.ndarray:
+    """Rows of ellipses, the largest first, that lie whole in the frame and whose rings do not touch in the picture.
+
+    The picture has `scale` pixels in place of each of the camera's.
+    """
+    boxes, edge = ellipses.bounding_boxes(), APART_PX / scale
+    whole = (boxes[:, :2] > edge).all(axis=1)
+    whole &= (boxes[:, 2] < camera.width_px - edge) & (boxes[:, 3] < camera.height_px - edge)
+    rows = np.flatnonzero(whole & wide_enough(ellipses, scale))
+    points = outline(ellipses, 128)[0]
+    fine = max(4, scale // 2)
+    taken = np.zeros((fine * camera.height_px, fine * camera.width_px), np.uint8)
+    kept = []
+    for row in rows[np.argsort(-ellipses.a_px[rows], kind="stable")]:
+        line = [np.rint(points[row] * fine).astype(np.int32)]
+        if cv2.polylines(np.zeros_like(taken), line, True, 1)[taken > 0].any():
+            continue
+        cv2.polylines(taken, line, True, 1, thickness=int(np.ceil(2 * APART_PX / scale * fine)) + 1)
+        kept.append(row)
+    return np.array(kept, int)
+
+
+def render_rings(
+    folder: Path,
+    circles: RimCircles,
+    rows: np.ndarray,
+    camera: Camera,
+    position_m: Array,
+    rotation: Array,
+    samples: int,
+) -> np.ndarray:
+    """A picture (h, w) of glowing rings of 2 TUBE_PX of its pixels on some of the circles, 1 on them and 0 beside."""
+    centres, radii = circles.centre_m[rows], circles.radius_m[rows]
+    tubes_m = TUBE_PX / camera.fx_px * camera_from_site(centres, position_m, rotation)[:, 2]
+    light, up = LightConfig(), np.array([0.0, 0.0, 1.0])
+    stage = sunlit_stage(light, camera, up)
+    mesh = mesh_from_arrays("rings", *tubes(centres, circles.normal[rows], radii, tubes_m))
+    mesh.materials.append(_glow())
+    stage.collection.objects.link(bpy.data.objects.new("rings", mesh))
+    configure(stage, camera, RenderConfig(samples=samples), light)
+    aim(stage, position_m, rotation)
+    return render_through(folder / "rings.exr", stage, 0).radiance_factor
+
+
+def tubes(centres_m: Array, normals: Array, radii_m: Array, tubes_m: Array) -> tuple[Array, np.ndarray]:
+    """Tubes of radii tubes_m (N,) about N circles: vertices (V, 3) and quads (F, 4)."""
+    turn = 2 * np.pi * np.arange(_N_TUBE) / _N_TUBE
+    lines = [
+        rim_points(
+            centres_m + tubes_m[:, None] * np.sin(phi) * normals, normals, radii_m + tubes_m * np.cos(phi), _N_AROUND
+        )
+        for phi in turn
+    ]
+    points = np.stack(lines, axis=2)
+    n, around, tube = np.ogrid[: len(radii_m), :_N_AROUND, :_N_TUBE]
+    next_around, next_tube = (around + 1) % _N_AROUND, (tube + 1) % _N_TUBE
+    corners = [(around, tube), (next_around, tube), (next_around, next_tube), (around, next_tube)]
+    quads = np.stack([(n * _N_AROUND + i) * _N_TUBE + j for i, j in corners], axis=-1)
+    return points.reshape(-1, 3), quads.reshape(-1, 4)
+
+
+def ring_offsets(picture: np.ndarray, scale: int, ellipses: Ellipses) -> Array:
+    """Distances (N, N_DIRECTIONS) of the rings from the ellipses along these' normals, outwards, label pixels.
+
+    `picture` has `scale` pixels in place of each of the labels'. NaN where no whole ring lies within REACH_PX.
+    """
+    points, normals = outline(ellipses, N_DIRECTIONS)
+    steps = np.arange(-REACH_PX, REACH_PX + 0.5 * _STEP_PX, _STEP_PX)
+    places = scale * points[..., None, :] + steps[:, None] * normals[..., None, :] - 0.5
+    hump = map_coordinates(picture, np.moveaxis(places[..., ::-1], -1, 0), order=1)
+    mass = hump.sum(axis=-1) * _STEP_PX
+    whole = (mass > TUBE_PX) & (hump[..., 0] < 0.01) & (hump[..., -1] < 0.01)
+    return np.where(whole, (hump @ steps) * _STEP_PX / np.where(whole, mass, 1.0), np.nan) / scale
+
+
+def errors_px(offsets: Array, scale: int) -> Array:
+    """Error (N,) of each label: the r.m.s. over all directions of the distance of ring and ellipse, label pixels.
+
+    A direction without a ring counts as the largest distance that could have been seen.
+    """
+    return np.sqrt(np.mean(np.square(np.where(np.isnan(offsets), REACH_PX / scale, offsets)), axis=1))
+
+
+def _glow() -> bpy.types.Material:
+    """A surface of radiance 1 that lights nothing."""
+    material = bpy.data.materials.new("glow")
+    material.use_nodes = True
+    material.cycles.emission_sampling = "NONE"
+    tree = material.node_tree
+    tree.nodes.clear()
+    emission, output = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    return material
