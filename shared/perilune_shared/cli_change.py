@@ -27,6 +27,7 @@ class Images(enum.StrEnum):
     LINK = "link"
     COPY = "copy"
     NONE = "none"
+    PLAN = "plan"
 
 
 class Unit(enum.StrEnum):
@@ -40,7 +41,10 @@ class Unit(enum.StrEnum):
 DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the one that holds dataset.json.")]
 OutOption = Annotated[Path, typer.Option(help="New folder for the result.")]
 ImagesOption = Annotated[
-    Images, typer.Option(help="Frames: link (hard links, or copies where the disk has none), copy, none.")
+    Images,
+    typer.Option(
+        help="Frames: link (hard links, or copies where the disk has none), copy, none; plan leaves labels too."
+    ),
 ]
 
 

@@ -10,7 +10,7 @@ from rich.progress import Progress
 from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo, joined_licence
 from perilune_shared.manifest import Dataset
-from perilune_shared.rewrite import ImageMode, check_complete, state_of, with_column
+from perilune_shared.rewrite import ImageMode, bare, check_complete, state_of, with_column
 from perilune_shared.writer import SceneTables, written
 
 _CHANGING = ("scene_id", "trajectory_id", "n_frames", "split")
@@ -37,7 +37,7 @@ def merge(
         for scene_id, members in groups.items():
             descents: list[tuple[dict, str]] = []
             tables, brought = _join(scene_id, [(sources[i], own) for i, own in members], descents)
-            writer.add_scene(tables)
+            writer.add_scene(bare(tables) if info.images == "planned" else tables)
             for source, frames, names in brought:
                 if info.images == "files" and len(frames):
                     writer.add_images(source, frames, names, link=images == "link")

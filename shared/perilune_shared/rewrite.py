@@ -14,8 +14,10 @@ from perilune_shared.manifest import Dataset
 from perilune_shared.schema import ImageState
 from perilune_shared.writer import SceneTables, written
 
-ImageMode = Literal["link", "copy", "none"]
-"""What becomes of frames: hard links where the disk allows them (the tools never change a frame), copies, or left."""
+ImageMode = Literal["link", "copy", "none", "plan"]
+"""What becomes of frames: hard links where the disk allows them (the tools never change a frame), copies, or left out;
+with `plan` craters, boulders and labels are left out too, all of which follow from the scenes and poses."""
+_FOLLOWING = ("craters", "boulders", "labels")
 
 
 def rewrite(
@@ -37,7 +39,8 @@ def rewrite(
             frames = tables["frames"]
             if len(frames):
                 own = pc.is_in(tables["labels"]["frame_id"], frames["frame_id"].combine_chunks())
-                writer.add_scene({**tables, "labels": tables["labels"].filter(own)})
+                tables = {**tables, "labels": tables["labels"].filter(own)}
+                writer.add_scene(bare(tables) if info.images == "planned" else tables)
                 if info.images == "files":
                     names = {name: name for name in frames["frame_id"].to_pylist()}
                     writer.add_images(source, frames, names, link=images == "link")
@@ -54,7 +57,7 @@ def check_complete(source: Dataset) -> None:
 def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
     """Where the frames of what is written will be. Raises UserError where only some of the sources have theirs."""
     states = {source.info.images for source in sources}
-    if states == {"planned"}:
+    if states == {"planned"} or images == "plan":
         return "planned"
     if "planned" in states:
         raise UserError(sources[0].root, "images", ", ".join(sorted(states)), "datasets that are all planned, or none")
@@ -64,6 +67,11 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
         missing = next(source for source in sources if source.info.images == "absent")
         raise UserError(missing.root, "images", "absent", "its frames (`perilune-render regenerate`), or --images none")
     return "files"
+
+
+def bare(tables: SceneTables) -> SceneTables:
+    """A scene without the rows that follow from its seed and poses."""
+    return tables | {name: tables[name].slice(0, 0) for name in _FOLLOWING}
 
 
 def with_column(table: pa.Table, name: str, values: object) -> pa.Table:

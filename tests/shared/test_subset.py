@@ -106,6 +106,12 @@ def test_so_many_megabytes(drawn, tmp_path):
     assert min(made.table("frames", ["frame_index"])["frame_index"].to_pylist()) == 1
 
 
+def test_a_plan_keeps_hashes_and_leaves_what_follows(drawn, tmp_path):
+    made = taken(drawn, tmp_path / "s", images="plan")
+    assert made.info.images == "planned" and made.info.counts.craters == made.info.counts.labels == 0
+    assert made.table("frames", ["png_sha256"]).num_rows == 40 and made.table("frames")["png_sha256"].null_count == 0
+
+
 @pytest.mark.parametrize("options", [{"n_frames": 0}, {"megabytes": -1.0}, {"megabytes": 1e-5}])
 def test_nothing_left_is_refused(drawn, tmp_path, options):
     with pytest.raises(UserError):
