@@ -62,7 +62,7 @@ def main() -> None:
                 if which == 0:
                     shot = Shot.planned(trajectory, index)
                     radiance = renderer.render(*pose, seed=shot.render_seed)
-                    _, exposure = studio.write(out, shot, radiance)
+                    _, exposure = studio.write_png(out, shot, radiance)
                     tables.label_table(shot.frame_id, studio.label(shot, radiance, exposure))
                     ours.append(time.perf_counter() - start)
                 else:

@@ -93,7 +93,9 @@ def _render_trajectory(
     for index in range(len(trajectory.splits)):
         shot = Shot.planned(trajectory, index)
         radiance = renderer.render(shot.position_m, shot.rotation_camera_from_site, seed=shot.render_seed)
-        row, exposure = studio.write(out, shot, radiance)
+        row, exposure = studio.write_png(out, shot, radiance)
+        if studio.config.render.exr:
+            row |= studio.write_exr(out, shot, radiance)
         rows.append(row)
         labels.append(tables.label_table(shot.frame_id, studio.label(shot, radiance, exposure)))
         advance()

@@ -15,19 +15,17 @@ from rich.progress import Progress
 from perilune_render import tables
 from perilune_render.config import DatasetConfig
 from perilune_render.exr import read_radiance
-from perilune_render.labels import Labels, RimCircles, Shown, label_frame, with_contrast
-from perilune_render.output import begin_or_go_on, first_difference, write_overview, write_png
+from perilune_render.frame import Shot, Studio
+from perilune_render.labels import Labels, RimCircles
+from perilune_render.output import begin_or_go_on, first_difference, write_overview
 from perilune_render.plan import camera_of
 from perilune_render.recipe import versions
-from perilune_render.resample import seen_by
-from perilune_render.sensor import FixedPattern, expected, expose, read_out
-from perilune_render.streams import stream
+from perilune_render.sensor import FixedPattern
 from perilune_shared import files
 from perilune_shared.camera import Camera
 from perilune_shared.checksums import seal
 from perilune_shared.config import resolve_over
 from perilune_shared.errors import UserError
-from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.info import Counts, Origin, Recipe, recipes_of, write_info
 from perilune_shared.manifest import Dataset, count_rows, open_dataset
 from perilune_shared.parts import write_part
@@ -80,12 +78,15 @@ def develop_dataset(
     pattern = FixedPattern.draw(config.sensor, camera, config.seed)
     for scene_id in source.scene_ids():
         _copy_scene(source, out, scene_id, info.recipe())
+        circles = RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
         for descent in source.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pylist():
-            name = f"{scene_id}.{descent['trajectory_id']}"
-            table = source.table("frames", scene_id=scene_id, trajectory_id=descent["trajectory_id"])
-            if not (out / "manifest" / "frames" / f"{name}.parquet").exists():
-                _develop_descent(source, out, config, camera, exr_camera, pattern, name, table, descent["seed"])
-            progress.advance(task, len(table))
+            key = {"scene_id": scene_id, "trajectory_id": descent["trajectory_id"]}
+            frames = source.table("frames", scene_id=scene_id, trajectory_id=descent["trajectory_id"])
+            if not (out / "manifest" / "frames" / f"{'.'.join(key.values())}.parquet").exists():
+                sun = np.array(frames["sun_direction"][0].as_py())
+                studio = Studio(config, camera, exr_camera, pattern, circles, sun)
+                _develop_descent(source, out, studio, key, frames, descent["seed"])
+            progress.advance(task, len(frames))
     dataset = Dataset(out, info)
     write_overview(dataset)
     write_info(out, info.model_copy(update={"counts": count_rows(dataset), "complete": True}))
@@ -128,50 +129,35 @@ def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
 
 
 def _develop_descent(
-    source: Dataset,
-    out: Path,
-    config: DatasetConfig,
-    camera: Camera,
-    exr_camera: Camera,
-    pattern: FixedPattern,
-    name: str,
-    table: pa.Table,
-    seed: int,
+    source: Dataset, out: Path, studio: Studio, key: dict[str, str], frames: pa.Table, seed: int
 ) -> None:
     """One part of `frames`, with its images and labels."""
-    rows = table.to_pylist()
-    scene_id, trajectory_id = rows[0]["scene_id"], rows[0]["trajectory_id"]
-    circles = RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
     known = None
-    if camera == source.info.camera.intrinsics():
-        known = source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id).to_pandas()
+    if studio.camera == source.info.camera.intrinsics():
+        table = source.table("labels", scene_id=key["scene_id"], trajectory_id=key["trajectory_id"]).to_pandas()
+        known = {frame_id: rows for frame_id, rows in table.groupby("frame_id")}
+        none = table.iloc[:0]
+    exr_camera = studio.exr_camera
     written, labels = [], []
-    for row in rows:
+    for row in frames.to_pylist():
         radiance = read_radiance(source.file(row["exr_path"]))
         size = radiance.depth_m.shape[::-1]
         if size != (exr_camera.width_px, exr_camera.height_px):
             wanted = f"{exr_camera.width_px} x {exr_camera.height_px}, as dataset.json says"
             raise UserError(row["exr_path"], "size", f"{size[0]} x {size[1]} pixels", wanted)
-        rotation = matrix_from_quaternion(row["rotation_wxyz"])
-        velocity = rotation @ row["velocity_mps"]
-        rng = stream(seed, "sensor", row["frame_index"])
-        exposure = expose(radiance, config.sensor, camera, exr_camera, velocity)
-        image = read_out(exposure, config.sensor, pattern, rng)
-        written.append(write_png(out, row["frame_id"], image, config.sensor.bits))
-        pose = np.array(row["position_m"]), rotation
+        shot = Shot.recorded(row, seed)
+        png, exposure = studio.write_png(out, shot, radiance)
+        written.append(png)
         if known is None:
-            limits = config.labels.min_radius_px, config.labels.max_radius_px
-            found = label_frame(circles, camera, *pose, seen_by(radiance, camera, exr_camera), *limits)
+            found = studio.label(shot, radiance, exposure)
         else:
-            found = Labels.from_table(known[known["frame_id"] == row["frame_id"]])
-        shown = Shown(*expected(exposure, config.sensor), np.array(row["sun_direction"]))
-        found = with_contrast(found, circles, camera, *pose, shown)
-        labels.append(tables.label_table(row["frame_id"], found))
-    label_part = out / "manifest" / "labels" / f"{name}.parquet"
+            found = studio.contrasted(Labels.from_table(known.get(shot.frame_id, none)), shot, exposure)
+        labels.append(tables.label_table(shot.frame_id, found))
+    name = ".".join(key.values())
     # A labels part without its frames part is left from a stop between the two.
-    label_part.unlink(missing_ok=True)
+    (out / "manifest" / "labels" / f"{name}.parquet").unlink(missing_ok=True)
     write_part(out, "labels", name, pa.concat_tables(labels))
-    write_part(out, "frames", name, tables.developed_frame_table(table, camera, written))
+    write_part(out, "frames", name, tables.developed_frame_table(frames, studio.camera, written))
 
 
 def _copy_scene(source: Dataset, out: Path, scene_id: str, recipe: Recipe) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from perilune_render.resample import seen_by
 from perilune_render.sensor import Exposure, FixedPattern, expected, expose, read_out
 from perilune_render.streams import derived_seed, stream
 from perilune_shared.camera import Camera
-from perilune_shared.frames import Array
+from perilune_shared.frames import Array, matrix_from_quaternion
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,18 @@ class Shot:
             flight.velocity_mps[index],
         )
 
+    @classmethod
+    def recorded(cls, row: dict[str, Any], trajectory_seed: int) -> "Shot":
+        """A frame of a manifest, by its row of the table `frames`."""
+        return cls(
+            row["frame_id"],
+            row["frame_index"],
+            trajectory_seed,
+            np.array(row["position_m"]),
+            matrix_from_quaternion(row["rotation_wxyz"]),
+            np.array(row["velocity_mps"]),
+        )
+
     @property
     def render_seed(self) -> int:
         """Of the renderer's samples."""
@@ -70,25 +83,30 @@ class Studio:
     sun: Array
     """Unit vector towards the Sun, O_L (3,)."""
 
-    def write(self, out: Path, shot: Shot, radiance: Radiance) -> tuple[dict[str, str | int], Exposure]:
-        """Write a frame's PNG, and its EXR where asked for; its columns png_* and exr_*, and its exposure."""
+    def write_png(self, out: Path, shot: Shot, radiance: Radiance) -> tuple[dict[str, str | int], Exposure]:
+        """Develop and write a frame's PNG; its columns png_* of the manifest, and its exposure."""
         velocity = shot.rotation_camera_from_site @ shot.velocity_mps
         exposure = expose(radiance, self.config.sensor, self.camera, self.exr_camera, velocity)
         noise = stream(shot.trajectory_seed, "sensor", shot.frame_index)
         image = read_out(exposure, self.config.sensor, self.pattern, noise)
-        row = write_png(out, shot.frame_id, image, self.config.sensor.bits)
-        if self.config.render.exr:
-            path = f"frames/{shot.frame_id}.exr"
-            pose = shot.position_m, shot.rotation_camera_from_site
-            write_exr(out / path, radiance, crater_index(self.circles, self.exr_camera, *pose, radiance.depth_m))
-            row |= file_columns(out, "exr", path)
-        return row, exposure
+        return write_png(out, shot.frame_id, image, self.config.sensor.bits), exposure
+
+    def write_exr(self, out: Path, shot: Shot, radiance: Radiance) -> dict[str, str | int]:
+        """Write a frame's EXR; its columns exr_* of the manifest."""
+        path = f"frames/{shot.frame_id}.exr"
+        pose = shot.position_m, shot.rotation_camera_from_site
+        write_exr(out / path, radiance, crater_index(self.circles, self.exr_camera, *pose, radiance.depth_m))
+        return file_columns(out, "exr", path)
 
     def label(self, shot: Shot, radiance: Radiance, exposure: Exposure) -> Labels:
         """The labels of a frame."""
         pose = shot.position_m, shot.rotation_camera_from_site
         seen = seen_by(radiance, self.camera, self.exr_camera)
         limits = self.config.labels.min_radius_px, self.config.labels.max_radius_px
-        found = label_frame(self.circles, self.camera, *pose, seen, *limits)
+        return self.contrasted(label_frame(self.circles, self.camera, *pose, seen, *limits), shot, exposure)
+
+    def contrasted(self, labels: Labels, shot: Shot, exposure: Exposure) -> Labels:
+        """Labels with their contrast in an exposure."""
         shown = Shown(*expected(exposure, self.config.sensor), np.asarray(self.sun))
-        return with_contrast(found, self.circles, self.camera, *pose, shown)
+        pose = shot.position_m, shot.rotation_camera_from_site
+        return with_contrast(labels, self.circles, self.camera, *pose, shown)

@@ -63,7 +63,7 @@ class RimCircles:
     """The rim circles of N craters of a scene, O_L."""
 
     crater_id: np.ndarray
-    """Unique in the scene (N,)."""
+    """Unique in the scene, ascending (N,)."""
     centre_m: Array
     """(N, 3)."""
     normal: Array
@@ -80,6 +80,7 @@ class RimCircles:
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "RimCircles":
         """Rows of the manifest's table `craters`, of one scene."""
+        rows = rows.sort_values("crater_id")
         return cls(
             rows["crater_id"].to_numpy(),
             rows[["x_m", "y_m", "z_m"]].to_numpy(),
@@ -135,8 +136,7 @@ def with_contrast(
     shown: Shown,
 ) -> Labels:
     """The labels of a frame with their contrast (`perilune_render.label_pixels.contrasts`) in what `camera` shows."""
-    order = np.argsort(circles.crater_id, kind="stable")
-    rows = order[np.searchsorted(circles.crater_id, labels.crater_id, sorter=order)]
+    rows = np.searchsorted(circles.crater_id, labels.crater_id)
     centre = np.stack([labels.ellipses.cx_px, labels.ellipses.cy_px], axis=-1)
     matrices = _image_from_rim(circles, camera, position_m, rotation_camera_from_site, shown.sun, rows)
     return replace(labels, contrast=contrasts(centre, matrices, shown.grey, shown.noise))

@@ -29,7 +29,6 @@ from perilune_shared.config import resolve_over
 from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.files import sha256_of
-from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.info import Recipe
 from perilune_shared.manifest import Dataset
 
@@ -123,10 +122,12 @@ def _of_scene(
     outcomes = []
     with Renderer(ground, ground_config, exr_camera, sun) as renderer:
         for row in rows:
-            pose = np.array(row["position_m"]), matrix_from_quaternion(row["rotation_wxyz"])
-            seed = seed_of[row["trajectory_id"]]
-            shot = Shot(row["frame_id"], row["frame_index"], seed, *pose, np.array(row["velocity_mps"]))
-            studio.write(out, shot, renderer.render(*pose, seed=shot.render_seed))
+            shot = Shot.recorded(row, seed_of[row["trajectory_id"]])
+            radiance = renderer.render(shot.position_m, shot.rotation_camera_from_site, seed=shot.render_seed)
+            studio.write_png(out, shot, radiance)
+            # Frames that were developed again have no EXR, though their recipe has.
+            if row["exr_path"] is not None:
+                studio.write_exr(out, shot, radiance)
             png, exr = (_compared(dataset, row, kind, out) for kind in ("png", "exr"))
             outcomes.append(Outcome(row["frame_id"], png, exr, same_ground, out / f"frames/{row['frame_id']}.png"))
             advance()
