@@ -26,7 +26,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -108,6 +108,9 @@ bench-develop: setup ## frames a second of developing on one core; writes runs/b
 
 bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/labels.json and docs/labels_histogram.png
 	@$(BIN)/python benchmarks/labels.py --picture docs/labels_histogram.png
+
+bench-contrast: setup ## how well contrast tells craters that the detector finds; writes runs/bench/contrast.json
+	@$(BIN)/python benchmarks/contrast.py $(DATA)/detect $(RUNS)/detect/$(NAME)
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

@@ -1,0 +1,148 @@
+"""How well the labels' contrast tells craters that a trained detector finds from those that it misses.
+
+`python benchmarks/contrast.py DATASET RUN`: a dataset and a detect run on it. On the test split, for the craters of the
+selection `visible` without its contrast: the area under the ROC curve (AUC) of contrast, depth ratio and radius, over
+all and by radius; the share found by contrast; and the run's own detections judged by each selection. A crater is found
+where a detection with the run's threshold or more overlaps it by IoU 0.5, best scores first. Writes
+runs/bench/contrast.json, and with --picture FRAME_ID contrast.jpg, an enlarged frame, plain and coloured by contrast.
+"""
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import typer
+from numpy.typing import NDArray
+
+from perilune_shared.errors import run_command_line
+from perilune_shared.files import write_text
+from perilune_shared.frames import Array
+from perilune_shared.manifest import Dataset, open_dataset
+from perilune_shared.selection import SELECTIONS, read_labels, selected
+from perilune_train.detect.boxes import iou_matrix
+from perilune_train.detect.config import LabelSettings
+from perilune_train.detect.data import load_split
+from perilune_train.detect.metrics import RADIUS_BINS_PX, Detections, figures, match_split
+
+_BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
+_ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
+_EDGES = (-1e9, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, np.inf)
+_COLOURS = ((2.0, (60, 60, 255)), (4.0, (0, 150, 255)), (8.0, (0, 235, 235)), (np.inf, (80, 220, 80)))
+"""Below each contrast, its colour (blue, green, red)."""
+_SCALE = 4
+
+
+def auc(values: Array, found: NDArray[np.bool_]) -> float | None:
+    """Share of pairs of a found and a missed crater in which the found one has the larger value; a tie counts half.
+
+    None where there are no such pairs.
+    """
+    rank = pd.Series(values).rank().to_numpy()
+    n, m = int(found.sum()), int((~found).sum())
+    return float((rank[found].sum() - n * (n + 1) / 2) / (n * m)) if n and m else None
+
+
+def found_by(labels: pd.DataFrame, detections: dict[str, Detections], threshold: float) -> NDArray[np.bool_]:
+    """Whether each label (N,) is found: in order of score each detection takes the free label of highest IoU."""
+    found = np.zeros(len(labels), np.bool_)
+    for frame_id, rows in labels.groupby("frame_id").indices.items():
+        own = detections.get(str(frame_id))
+        if own is None:
+            continue
+        overlap = iou_matrix(own.boxes[own.scores >= threshold], labels[_BOX].to_numpy()[rows])
+        free = np.ones(len(rows), np.bool_)
+        for row in overlap:
+            best = int(np.where(free, row, -1.0).argmax())
+            if free[best] and row[best] >= 0.5:
+                free[best] = False
+        found[rows] = ~free
+    return found
+
+
+def measure(dataset: Dataset, detections: dict[str, Detections], threshold: float) -> dict:
+    """The figures of contrast.json."""
+    labels = read_labels(dataset, _BOX, "test")
+    labels = labels[selected(labels, SELECTIONS["visible"].model_copy(update={"min_contrast": None}))]
+    labels = labels.reset_index(drop=True)
+    labels["depth_ratio"] = labels["depth_m"] / labels["diameter_m"]
+    found = found_by(labels, detections, threshold)
+    radius, contrast = labels["radius_px"].to_numpy(), labels["contrast"].to_numpy()
+    table: dict[str, dict] = {}
+    for low, high in [(2.0, 50.0), *pairwise(RADIUS_BINS_PX)]:
+        own = (radius >= low) & (radius <= high)
+        columns = ("contrast", "depth_ratio", "radius_px")
+        table[f"{low:g}-{high:g} px"] = {
+            "labels": int(own.sum()),
+            "found": float(found[own].mean()) if own.any() else None,
+            **{name: auc(labels[name].to_numpy()[own], found[own]) for name in columns},
+        }
+    shares: list[dict] = []
+    for low, high in pairwise(_EDGES):
+        own = (contrast >= low) & (contrast < high)
+        share = float(found[own].mean()) if own.any() else None
+        shares.append({"from": low, "labels": int(own.sum()), "found": share})
+    return {"auc": table, "found_by_contrast": shares}
+
+
+def judge(dataset: Dataset, detections: dict[str, Detections], threshold: float) -> dict:
+    """The detections by each selection, and by `visible` without its contrast."""
+    settings = {name: LabelSettings(selection=name) for name in ("visible", "paper")}
+    settings["visible without contrast"] = LabelSettings(selection="visible", min_contrast=None)
+    result = {}
+    for name, chosen in settings.items():
+        split = load_split(dataset, "test", chosen)
+        none = Detections(np.empty((0, 4)), np.empty(0))
+        found = [detections.get(frame, none) for frame in split.frames.table["frame_id"]]
+        height, width = split.frames.images.shape[1:]
+        matches = match_split(found, split.labels, (width, height), 0.5, split.radius_px)
+        result[name] = {"labels": len(matches.wanted_radius_px), **figures(matches, threshold)}
+    return result
+
+
+def draw(dataset: Dataset, frame_id: str, path: Path) -> None:
+    """The left upper part of a frame, plain and with the labels that `visible` but for its contrast selects."""
+    frames = dataset.table("frames", ["frame_id", "png_path"]).to_pandas().set_index("frame_id")
+    grey = cv2.imread(str(dataset.file(frames.loc[frame_id, "png_path"])), cv2.IMREAD_GRAYSCALE)[:176, :176]
+    large = cv2.resize(grey, None, fx=_SCALE, fy=_SCALE, interpolation=cv2.INTER_CUBIC)
+    plain = cv2.cvtColor(large, cv2.COLOR_GRAY2BGR)
+    drawn = plain.copy()
+    labels = read_labels(dataset, _ELLIPSE)
+    labels = labels[labels["frame_id"] == frame_id]
+    chosen = labels[selected(labels, SELECTIONS["visible"].model_copy(update={"min_contrast": None}))]
+    for contrast, (cx, cy, a, b, theta) in zip(chosen["contrast"], chosen[_ELLIPSE].to_numpy(), strict=True):
+        colour = next(colour for below, colour in _COLOURS if contrast < below)
+        box = ((cx * _SCALE, cy * _SCALE), (2 * a * _SCALE, 2 * b * _SCALE), np.degrees(theta))
+        cv2.ellipse(drawn, box, colour, 1, cv2.LINE_AA)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.hstack([plain, drawn]), [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+def main(
+    dataset: Path,
+    run: Path,
+    picture: Annotated[str, typer.Option(help="frame_id to draw.")] = "",
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Hold contrast beside what a detector found."""
+    opened = open_dataset(dataset)
+    table = pq.read_table(run / "detections.parquet").to_pandas().sort_values("score", ascending=False, kind="stable")
+    detections = {
+        str(name): Detections(rows[["x0_px", "y0_px", "x1_px", "y1_px"]].to_numpy(), rows["score"].to_numpy())
+        for name, rows in table.groupby("frame_id")
+    }
+    threshold = json.loads((run / "metrics.json").read_text())["test/threshold"]
+    result = {**measure(opened, detections, threshold), "judged": judge(opened, detections, threshold)}
+    text = json.dumps(result, indent=1)
+    write_text(out / "contrast.json", text + "\n")
+    print(text)
+    if picture:
+        draw(opened, picture, out / "contrast.jpg")
+
+
+if __name__ == "__main__":
+    run_command_line(lambda: typer.run(main))
