@@ -150,18 +150,19 @@ def regenerate(
         bool, typer.Option("--verify", help="Only tell how the frames compare; without --frames, of a sample.")
     ] = False,
     sample: Annotated[int, typer.Option(min=1, help="Frames of the sample, evenly spread.")] = 12,
+    everything: Annotated[bool, typer.Option("--all", help="All frames of the manifest.")] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for the frames; with --verify a temporary one.")] = None,
     dem: Annotated[Path | None, typer.Option(help="This machine's copy of the elevation model.")] = None,
     catalogue: Annotated[Path | None, typer.Option(help="This machine's copy of the crater catalogue.")] = None,
 ) -> None:
     """Make frames again from a manifest alone, and compare them with its hashes. Exit code 2 where one differs."""
-    if not verify and (out is None or not frames):
-        raise UserError("regenerate", "--frames and --out", "not given", "both, or --verify")
+    if not verify and (out is None or not (frames or everything)):
+        raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
     dataset = open_dataset(manifest)
     from perilune_render.regenerate import State, spread
     from perilune_render.regenerate import regenerate as make_again
 
-    ids = list(dict.fromkeys(frames)) if frames else spread(dataset, sample)
+    ids = list(dict.fromkeys(frames or ())) or spread(dataset, dataset.info.counts.frames if everything else sample)
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         outcomes = make_again(dataset, ids, out or Path(folder), progress, dem, catalogue)
     counts = {state: sum(o.state == state for o in outcomes) for state in get_args(State)}

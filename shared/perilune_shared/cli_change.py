@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from perilune_shared import attach as attaching
 from perilune_shared import diff as differing
 from perilune_shared import merge as merging
 from perilune_shared import migrate as migrating
@@ -50,7 +51,7 @@ ImagesOption = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add the commands to a command line."""
-    for command in (merge, subset, split, diff, migrate, pack, unpack):
+    for command in (merge, subset, split, diff, migrate, pack, unpack, attach):
         app.command()(command)
 
 
@@ -149,4 +150,18 @@ def unpack(dataset: DatasetArgument, out: OutOption) -> None:
     """Make files of packed frames again."""
     with progress_bar() as progress:
         packing.unpack(open_dataset(dataset), out, progress)
+    _tell(out)
+
+
+def attach(
+    manifest: DatasetArgument,
+    frames: Annotated[Path, typer.Option(help="Folder that `perilune-render regenerate --out` filled.")],
+    out: OutOption,
+    rehash: Annotated[
+        bool, typer.Option("--rehash", help="Take frames of other hashes, and write theirs down.")
+    ] = False,
+) -> None:
+    """Make a dataset of a manifest without frames and the frames that were made from it."""
+    with progress_bar() as progress:
+        attaching.attach(open_dataset(manifest), frames, out, rehash, progress)
     _tell(out)

@@ -117,7 +117,7 @@ def test_masks_under_distortion_are_in_the_camera_that_is_asked_for(tiny_detect)
     """A pinhole dataset read as that of a distorted camera within it: the same ground, other pixels."""
     dataset = open_dataset(tiny_detect)
     pinhole = dataset.info.camera
-    bent = pinhole.model_copy(update={"width_px": 64, "height_px": 64, "cx_px": 32.0, "cy_px": 32.0})
+    bent = pinhole.model_copy(update={"width_px": 64, "height_px": 64, "cx_px": 31.7, "cy_px": 32.0})
     bent = bent.model_copy(update={"distortion": (-0.3, 0.0, 0.0, 0.0, 0.0)})
     dataset.info = dataset.info.model_copy(update={"camera": bent, "exr_camera": pinhole})
     frame = dataset.table("frames").to_pandas().iloc[5]

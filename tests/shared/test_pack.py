@@ -7,6 +7,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from perilune_shared.attach import attach
 from perilune_shared.diff import differences
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import open_dataset
@@ -77,6 +78,7 @@ def test_old_datasets_are_migrated(version, tmp_path):
     assert made.info.recipe().config["camera"]["width_px"] == 64 and made.info.recipe().seed == 20240117
     old = pq.read_table(next((OLD / version / "manifest/labels").glob("*.parquet")))
     assert made.table("labels", ["ellipse_cx_px"])["ellipse_cx_px"].to_pylist() == old["ellipse_cx_px"].to_pylist()
+    assert made.table("labels")["contrast"].null_count == len(old)
     origins = set(made.table("craters")["origin"].to_pylist())
     assert origins == {"primary"} if version == "1" else "primary" in origins
     with pytest.raises(UserError, match="nothing to migrate"):
@@ -120,3 +122,26 @@ def test_differences_are_named(drawn, tmp_path):
     assert found["labels", ""].rows == n_small
     assert found["frames", "split"].rows > 0 and found["dataset.json", "split_by"].second == "frame"
     assert ("frames", "position_m") not in found and ("craters", "") not in found
+
+
+def test_a_manifest_and_its_frames_become_a_dataset(drawn, tmp_path):
+    source = open_dataset(drawn)
+    subset(source, tmp_path / "m", ["split == 'val'"], images="none")
+    manifest = open_dataset(tmp_path / "m")
+    attach(manifest, drawn, tmp_path / "whole")
+    whole = open_dataset(tmp_path / "whole")
+    assert validate(whole) == [] and whole.info.images == "files"
+    assert whole.table("frames").equals(source.table("frames", split="val"))
+    other = shutil.copytree(drawn / "frames", tmp_path / "other/frames").parent
+    path = other / whole.table("frames")["png_path"][3].as_py()
+    path.write_bytes(path.read_bytes() + b"more")
+    with pytest.raises(UserError, match="--rehash"):
+        attach(manifest, other, tmp_path / "w")
+    attach(manifest, other, tmp_path / "w", rehash=True)
+    assert validate(open_dataset(tmp_path / "w")) == []
+    path.unlink()
+    with pytest.raises(UserError, match=path.name):
+        attach(manifest, other, tmp_path / "w2")
+    with pytest.raises(UserError, match="images"):
+        attach(whole, drawn, tmp_path / "w2")
+    assert not (tmp_path / "w2").exists()

@@ -1,0 +1,57 @@
+"""The shared manifests are whole, and a frame of each comes out as it did when they were written."""
+
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.progress import Progress
+
+from perilune_render.regenerate import OUTLIERS, png_far, regenerate
+from perilune_shared.manifest import open_dataset
+from perilune_shared.validate import validate
+
+FOLDER = Path(__file__).parent.parent / "data_manifests"
+NAMES = sorted(path.parent.name for path in FOLDER.glob("*/dataset.json"))
+REAL = os.environ.get("PERILUNE_REAL_DEM")
+
+
+def test_all_are_here():
+    kinds = ("detect", "nav")
+    assert sorted([f"{p}-{k}" for p in ("small", "paper", "large") for k in kinds] + ["south-pole-detect"]) == NAMES
+    counts = {name: open_dataset(FOLDER / name).info.counts for name in NAMES}
+    assert [counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds] == [343, 49, 343, 49]
+    assert all(
+        counts[f"{p}-{k}"].frames == 100 * counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_whole_and_named_in_the_readme(name):
+    dataset = open_dataset(FOLDER / name)
+    assert validate(dataset) == [] and dataset.info.images == "planned"
+    sums = hashlib.sha256((FOLDER / name / "SHA256SUMS").read_bytes()).hexdigest()
+    readme = (FOLDER / "README.md").read_text(encoding="utf-8")
+    assert re.search(rf"`{name}`.*`{sums[:16]}`", readme), f"{name}: {sums[:16]}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_frame_is_made_again(name, tmp_path):
+    """The reference picture was rendered with the manifest; another kind of machine may differ in single pixels."""
+    dem = None
+    if name.startswith("south-pole"):
+        if REAL is None:
+            pytest.skip("PERILUNE_REAL_DEM is not set to the elevation model NPC_2km.tif")
+        dem = Path(REAL)
+    (reference,) = (FOLDER / name).glob("frames/**/*.png")
+    frame_id = reference.relative_to(FOLDER / name / "frames").with_suffix("").as_posix()
+    with Progress(disable=True) as progress:
+        (outcome,) = regenerate(open_dataset(FOLDER / name), [frame_id], tmp_path, progress, dem)
+    assert outcome.same_ground
+    again = outcome.png_path.read_bytes()
+    assert png_far(reference.read_bytes(), again) <= OUTLIERS
+    image = cv2.imdecode(np.frombuffer(again, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image.shape == (256, 256) and image.std() > 5
