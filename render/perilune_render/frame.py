@@ -85,11 +85,15 @@ class Studio:
 
     def write_png(self, out: Path, shot: Shot, radiance: Radiance) -> tuple[dict[str, str | int], Exposure]:
         """Develop and write a frame's PNG; its columns png_* of the manifest, and its exposure."""
+        image, exposure = self.take(shot, radiance)
+        return write_png(out, shot.frame_id, image, self.config.sensor.bits), exposure
+
+    def take(self, shot: Shot, radiance: Radiance) -> tuple[np.ndarray, Exposure]:
+        """A frame's grey values (h, w), as the sensor gives them, and its exposure."""
         velocity = shot.rotation_camera_from_site @ shot.velocity_mps
         exposure = expose(radiance, self.config.sensor, self.camera, self.exr_camera, velocity)
         noise = stream(shot.trajectory_seed, "sensor", shot.frame_index)
-        image = read_out(exposure, self.config.sensor, self.pattern, noise)
-        return write_png(out, shot.frame_id, image, self.config.sensor.bits), exposure
+        return read_out(exposure, self.config.sensor, self.pattern, noise), exposure
 
     def write_exr(self, out: Path, shot: Shot, radiance: Radiance) -> dict[str, str | int]:
         """Write a frame's EXR; its columns exr_* of the manifest."""

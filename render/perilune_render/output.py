@@ -14,6 +14,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.info import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.manifest import Dataset, open_dataset
 from perilune_shared.schema import SCHEMA_VERSION
+from perilune_shared.selection import SELECTIONS, selected
 
 LICENCE = "CC-BY-4.0"
 _SHEET_FRAMES = 12
@@ -106,7 +107,7 @@ def file_columns(root: Path, kind: str, path: str) -> dict[str, str | int]:
 
 
 def write_overview(dataset: Dataset) -> None:
-    """overview.png: frames from the whole dataset, each beside itself with its labels drawn."""
+    """overview.png: frames from the whole dataset, each beside itself with its labels, green where they are visible."""
     frames = dataset.table("frames", ["frame_id", "scene_id", "png_path"]).to_pandas()
     chosen = frames.iloc[np.unique(np.linspace(0, len(frames) - 1, _SHEET_FRAMES).astype(int))]
     labels = dataset.table("labels").to_pandas()
@@ -116,6 +117,6 @@ def write_overview(dataset: Dataset) -> None:
         image = cv2.imread(str(dataset.file(frame.png_path)), cv2.IMREAD_GRAYSCALE)
         own = labels[labels["frame_id"] == frame.frame_id]
         own = own.merge(craters[craters["scene_id"] == frame.scene_id], on="crater_id")
-        drawn = draw_labels(image, Labels.from_table(own), (own["depth_m"] / own["diameter_m"]).to_numpy())
+        drawn = draw_labels(image, Labels.from_table(own), selected(own, SELECTIONS["visible"]))
         pictures += [enlarge(image, 2), drawn]
     write_sheet(dataset.root / "overview.png", pictures, 6)

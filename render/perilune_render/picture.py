@@ -8,11 +8,11 @@ import numpy as np
 from perilune_render.labels import Labels
 from perilune_shared.files import write_bytes
 
-_CLEAR, _WORN = (80, 220, 80), (60, 140, 255)
+_CHOSEN, _OTHER = (80, 220, 80), (60, 140, 255)
 
 
-def draw_labels(image: np.ndarray, labels: Labels, depth_ratio: np.ndarray, scale: int = 2) -> np.ndarray:
-    """A colour picture (scale h, scale w, 3) with the ellipses drawn: green from d/D 0.04 on, orange below."""
+def draw_labels(image: np.ndarray, labels: Labels, chosen: np.ndarray, scale: int = 2) -> np.ndarray:
+    """A colour picture (scale h, scale w, 3) with the ellipses drawn: green where `chosen` (N,), else orange."""
     picture = cv2.cvtColor(enlarge(image, scale), cv2.COLOR_GRAY2BGR)
     e = labels.ellipses
     for k in range(len(labels.crater_id)):
@@ -21,7 +21,7 @@ def draw_labels(image: np.ndarray, labels: Labels, depth_ratio: np.ndarray, scal
             (2 * e.a_px[k] * scale, 2 * e.b_px[k] * scale),
             np.degrees(e.theta_rad[k]),
         )
-        cv2.ellipse(picture, box, _CLEAR if depth_ratio[k] >= 0.04 else _WORN, 1, cv2.LINE_AA)
+        cv2.ellipse(picture, box, _CHOSEN if chosen[k] else _OTHER, 1, cv2.LINE_AA)
     return picture
 
 

@@ -4,16 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
+from perilune_render import tables
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
-from perilune_render.labels import RimCircles, label_frame
+from perilune_render.frame import Shot, Studio
+from perilune_render.labels import RimCircles
 from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_render.plan import make_plan
-from perilune_render.resample import seen_by
-from perilune_render.sensor import FixedPattern, develop
-from perilune_render.streams import stream
+from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.cache import cached_scene
 from perilune_shared.frames import sun_direction
+from perilune_shared.selection import SELECTIONS, selected
 
 
 def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 4) -> None:
@@ -21,24 +22,20 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
     scene = cached_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
-    ratio = scene.rims.depth_m / scene.craters.diameter_m
-    plain, drawn = [], []
-    circles = RimCircles.of_scene(scene)
+    sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
-    with Renderer(
-        scene, config, plan.exr_camera, sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
-    ) as renderer:
+    studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)
+    depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
+    plain, drawn = [], []
+    with Renderer(scene, config, plan.exr_camera, sun) as renderer:
         for index in np.linspace(0, len(trajectory.splits) - 1, n_frames).astype(int):
-            pose = trajectory.flight.position_m[index], trajectory.flight.rotation_camera_from_site[index]
-            radiance = renderer.render(*pose)
-            velocity = pose[1] @ trajectory.flight.velocity_mps[index]
-            rng = stream(trajectory.seed, "sensor", index)
-            image = develop(radiance, config.sensor, plan.camera, plan.exr_camera, velocity, pattern, rng)
-            seen = seen_by(radiance, plan.camera, plan.exr_camera)
-            labels = label_frame(
-                circles, plan.camera, *pose, seen, config.labels.min_radius_px, config.labels.max_radius_px
-            )
+            shot = Shot.planned(trajectory, index)
+            radiance = renderer.render(shot.position_m, shot.rotation_camera_from_site, seed=shot.render_seed)
+            image, exposure = studio.take(shot, radiance)
+            labels = studio.label(shot, radiance, exposure)
+            rows = tables.label_table(shot.frame_id, labels).to_pandas()
+            rows = rows.assign(depth_m=depth_m[labels.crater_id], diameter_m=diameter_m[labels.crater_id])
             grey = image if config.sensor.bits == 8 else (image >> (config.sensor.bits - 8)).astype(np.uint8)
             plain.append(enlarge(grey, 2))
-            drawn.append(draw_labels(grey, labels, ratio[labels.crater_id]))
+            drawn.append(draw_labels(grey, labels, selected(rows, SELECTIONS["visible"])))
     write_sheet(path, plain + drawn, n_frames)
