@@ -1,0 +1,79 @@
+"""`perilune-manifest export`: a dataset for the tools of other fields."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import open_dataset
+from perilune_shared.progress import progress_bar
+from perilune_shared.schema import SPLITS
+from perilune_shared.writer import check_free
+
+DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the one that holds dataset.json.")]
+
+
+class ExportFormat(StrEnum):
+    """What a dataset can be turned into."""
+
+    COCO = "coco"
+    YOLO = "yolo"
+    TUM = "tum"
+    KITTI = "kitti"
+    CROISSANT = "croissant"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this file."""
+    app.command()(export)
+
+
+def export(
+    dataset: DatasetArgument,
+    format: Annotated[
+        ExportFormat,
+        typer.Option(help="coco and yolo: boxes and ellipses; tum and kitti: camera poses; croissant: metadata."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="New folder; for croissant a .json file in the dataset, croissant.json unless given."),
+    ] = None,
+    split: Annotated[str | None, typer.Option(help="train, val or test alone (not for croissant).")] = None,
+) -> None:
+    """Write labels, trajectories or metadata in the form of another field's tools. See docs/export.md."""
+    from perilune_shared.export_coco import export_coco
+    from perilune_shared.export_croissant import export_croissant
+    from perilune_shared.export_trajectory import export_kitti, export_tum
+    from perilune_shared.export_yolo import export_yolo
+
+    opened = open_dataset(dataset)
+    if split is not None and split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    if format is ExportFormat.CROISSANT:
+        if split is not None:
+            raise UserError("--split", "split", split, "none: Croissant describes the whole dataset")
+        _say(f"{export_croissant(opened, out)}: written")
+        return
+    if out is None:
+        raise UserError("--out", "folder", "none", f"a new folder for the {format} files")
+    check_free(out)
+    with progress_bar() as progress:
+        match format:
+            case ExportFormat.COCO:
+                done = f"{export_coco(opened, out, progress, split)} annotations"
+            case ExportFormat.YOLO:
+                done = f"{export_yolo(opened, out, progress, split)} boxes"
+            case ExportFormat.TUM:
+                done = f"{export_tum(opened, out, progress, split)} descents"
+            case ExportFormat.KITTI:
+                done = f"{export_kitti(opened, out, progress, split)} descents"
+    _say(f"{out}: {done}")
+
+
+def _say(line: str) -> None:
+    # As Text, since brackets would be read as markup.
+    Console().print(Text(line), soft_wrap=True)

@@ -1,0 +1,166 @@
+"""COCO files are read by pycocotools, whose evaluator gives the truth full marks."""
+
+import contextlib
+import io
+import json
+
+import numpy as np
+import pyarrow.compute as pc
+import pytest
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+from rich.progress import Progress
+
+from perilune_shared.errors import UserError
+from perilune_shared.export_coco import area_of, cut_at_edges, export_coco
+from perilune_shared.manifest import open_dataset
+
+SMALLEST_PX = 4.0
+
+
+def only_large(dataset, scene_id, labels):
+    return pc.greater(labels["radius_px"], SMALLEST_PX).to_numpy(zero_copy_only=False)
+
+
+def exported(root, out, **choice):
+    with Progress(disable=True) as progress:
+        export_coco(open_dataset(root), out, progress, **choice)
+    return out
+
+
+def quietly(function, *arguments):
+    with contextlib.redirect_stdout(io.StringIO()):
+        return function(*arguments)
+
+
+@pytest.fixture(scope="module")
+def whole(drawn, tmp_path_factory):
+    return exported(drawn, tmp_path_factory.mktemp("coco") / "all")
+
+
+@pytest.fixture(scope="module")
+def chosen(drawn, tmp_path_factory):
+    return exported(drawn, tmp_path_factory.mktemp("coco") / "large", choose=only_large)
+
+
+def average_precision(truth: COCO, results: list[dict], kind: str) -> float:
+    """Mean over the IoU thresholds 0.5 to 0.95 of all predictions of an image, not of COCO's first 100."""
+    evaluation = COCOeval(truth, quietly(truth.loadRes, results), kind)
+    evaluation.params.maxDets = [1, 10, 10_000]
+    quietly(evaluation.evaluate)
+    quietly(evaluation.accumulate)
+    precision = evaluation.eval["precision"][:, :, 0, 0, -1]
+    assert precision.shape == (10, 101)
+    return float(precision.mean())
+
+
+def perfect(truth: COCO, *, crowd=False) -> list[dict]:
+    return [
+        {
+            "image_id": a["image_id"],
+            "category_id": 1,
+            "bbox": a["bbox"],
+            "segmentation": a["segmentation"],
+            "score": 1.0,
+        }
+        for a in truth.anns.values()
+        if crowd or not a["iscrowd"]
+    ]
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test"])
+@pytest.mark.parametrize("kind", ["bbox", "segm"])
+def test_perfect_predictions_have_an_ap_of_one(whole, split, kind):
+    truth = quietly(COCO, whole / f"instances_{split}.json")
+    results = perfect(truth)
+    assert len(results) > 100
+    assert average_precision(truth, results, kind) == pytest.approx(1, abs=1e-12)
+
+
+def test_moved_predictions_do_not(whole):
+    truth = quietly(COCO, whole / "instances_test.json")
+    moved = [{**result, "bbox": [result["bbox"][0] + 1, *result["bbox"][1:]]} for result in perfect(truth)]
+    assert 0.1 < average_precision(truth, moved, "bbox") < 0.9
+
+
+def test_every_label_is_there(drawn, whole):
+    dataset = open_dataset(drawn)
+    frames = {row["png_path"]: row for row in dataset.table("frames").to_pylist()}
+    labels = {(row["frame_id"], row["crater_id"]): row for row in dataset.table("labels").to_pylist()}
+    for split in ("train", "val", "test"):
+        truth = quietly(COCO, whole / f"instances_{split}.json")
+        assert {i["file_name"] for i in truth.imgs.values()} == {
+            p for p, row in frames.items() if row["split"] == split
+        }
+        for annotation in truth.anns.values():
+            image = truth.imgs[annotation["image_id"]]
+            row = labels.pop((frames[image["file_name"]]["frame_id"], annotation["crater_id"]))
+            x, y, w, h = annotation["bbox"]
+            corners = [x, y, x + w, y + h]
+            wanted = [row[f"bbox_{name}_px"] for name in ("x0", "y0", "x1", "y1")]
+            assert np.allclose(corners, np.clip(wanted, 0, image["width"]), atol=2e-3)
+            assert annotation["ellipse"][0] == pytest.approx(row["ellipse_cx_px"], abs=1e-6)
+            assert annotation["visible_fraction"] == 1.0
+    assert not labels
+
+
+def test_masks_cover_the_ellipses(whole):
+    """Rasterised by pycocotools, a whole ellipse has its area and its middle, in our pixels."""
+    truth = quietly(COCO, whole / "instances_train.json")
+    checked, outline = 0, []
+    for annotation in truth.anns.values():
+        cx, cy, a, b, _ = annotation["ellipse"]
+        if a < 8 or min(cx, cy, 128 - cx, 128 - cy) < a + 1:
+            continue
+        rows, columns = np.nonzero(truth.annToMask(annotation))
+        assert len(rows) == pytest.approx(np.pi * a * b, rel=0.05)
+        assert annotation["area"] == pytest.approx(np.pi * a * b, rel=1e-3)
+        outline.append([columns.mean() + 0.5 - cx, rows.mean() + 0.5 - cy])
+        checked += 1
+    assert checked > 10
+    assert np.abs(np.mean(outline, axis=0)).max() < 0.1
+
+
+def test_craters_that_are_not_chosen_are_ignored(chosen):
+    truth = quietly(COCO, chosen / "instances_test.json")
+    crowd = [a for a in truth.anns.values() if a["iscrowd"]]
+    assert 0 < len(crowd) < len(truth.anns)
+    assert max(np.sqrt(a["ellipse"][2] * a["ellipse"][3]) for a in crowd) <= SMALLEST_PX
+    assert average_precision(truth, perfect(truth), "bbox") == pytest.approx(1, abs=1e-12)
+    # Whoever finds them too is neither worse nor better.
+    assert average_precision(truth, perfect(truth, crowd=True), "bbox") == 1.0
+
+
+def test_numbers_do_not_depend_on_split_and_choice(drawn, whole, chosen, tmp_path):
+    one = exported(drawn, tmp_path / "one", split="test")
+    assert [path.name for path in one.iterdir()] == ["instances_test.json"]
+    assert (one / "instances_test.json").read_bytes() == (whole / "instances_test.json").read_bytes()
+    ids = [{a["id"]: a["bbox"] for a in json.loads((f / "instances_val.json").read_text())["annotations"]}
+           for f in (whole, chosen)]  # fmt: skip
+    assert ids[0] == ids[1]
+    every = [a["id"] for f in whole.iterdir() for a in json.loads(f.read_text())["annotations"]]
+    assert sorted(every) == list(range(1, len(every) + 1))
+
+
+def test_packed_frames_give_the_same(packed, whole, tmp_path):
+    again = exported(packed, tmp_path / "packed")
+    for path in whole.iterdir():
+        assert (again / path.name).read_bytes() == path.read_bytes()
+
+
+def test_a_polygon_is_cut_at_the_edges():
+    square = np.array([[-1.0, -1.0], [3.0, -1.0], [3.0, 3.0], [-1.0, 3.0]])
+    cut = cut_at_edges(square, 10, 2)
+    assert area_of(cut) == pytest.approx(3 * 2) and cut.min() == 0 and cut.max(axis=0).tolist() == [3, 2]
+    assert len(cut_at_edges(square + 20, 10, 10)) == 0
+
+
+def test_nothing_half_written(drawn, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    with pytest.raises(UserError, match="new or empty"):
+        exported(drawn, out)
+    with pytest.raises(ZeroDivisionError):
+        exported(drawn, tmp_path / "new", choose=lambda *_: 1 / 0)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]

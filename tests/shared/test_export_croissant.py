@@ -1,0 +1,116 @@
+"""Croissant metadata is read by mlcroissant, which reads the records of the local files by it."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import mlcroissant
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from perilune_shared.cli import app
+from perilune_shared.errors import UserError
+from perilune_shared.export_croissant import export_croissant
+from perilune_shared.manifest import open_dataset
+from perilune_shared.schema import TABLES
+from perilune_shared.validate import validate
+from perilune_shared.writer import written
+
+
+@pytest.fixture(scope="module", params=["drawn", "packed", "parts"])
+def described(request, tmp_path_factory):
+    """Datasets of each layout: one part a table, packed frames, a part a scene or descent."""
+    copy = tmp_path_factory.mktemp(request.param) / "set"
+    if request.param == "parts":
+        source = open_dataset(request.getfixturevalue("drawn"))
+        with written(copy, source.info) as writer:
+            for scene_id in source.scene_ids():
+                writer.add_scene(source.scene(scene_id))
+            frames = source.table("frames")
+            writer.add_images(source, frames, {name: name for name in frames["frame_id"].to_pylist()}, link=True)
+    else:
+        shutil.copytree(request.getfixturevalue(request.param), copy)
+    dataset = open_dataset(copy)
+    return dataset, mlcroissant.Dataset(export_croissant(dataset))
+
+
+def text(value):
+    return value.decode() if isinstance(value, bytes) else value
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_records_are_the_rows(described, table):
+    dataset, croissant = described
+    assert not croissant.metadata.ctx.issues.errors
+    rows = dataset.table(table).to_pylist()
+    records = list(croissant.records(table))
+    assert len(records) == len(rows)
+    names = TABLES[table].names
+    assert set(records[0]) == {f"{table}/{name}" for name in names} if records else table == "boulders"
+    for record, row in list(zip(records, rows, strict=True))[:: max(1, len(rows) // 50)]:
+        for name in names:
+            found = text(record[f"{table}/{name}"])
+            if isinstance(row[name], list):
+                assert np.array_equal(found, row[name]), name
+            else:
+                assert found == row[name], name
+
+
+def test_images_are_the_frames(described):
+    dataset, croissant = described
+    column = "frame_id" if dataset.info.images == "packed" else "png_path"
+    found = {text(r[f"images/{column}"]): r["images/image"] for r in croissant.records("images")}
+    frames = dataset.table("frames")
+    pngs = dict(dataset.pngs(frames))
+    names = dict(zip(frames["frame_id"].to_pylist(), frames[column].to_pylist(), strict=True))
+    assert len(found) == len(pngs) == 20
+    for frame_id in list(pngs)[::7]:
+        wanted = np.asarray(Image.open(io.BytesIO(pngs[frame_id])).convert("L"))
+        assert np.array_equal(np.asarray(found[names[frame_id]].convert("L")), wanted)
+
+
+def test_units_and_meanings_are_told(described):
+    dataset, _ = described
+    content = json.loads((dataset.root / "croissant.json").read_text())
+    fields = {field["@id"]: field for records in content["recordSet"] for field in records["field"]}
+    assert fields["craters/diameter_m"]["description"] == "rim crest to rim crest [m]"
+    assert fields["frames/rotation_wxyz"]["arrayShape"] == "4"
+    assert content["license"] == "https://spdx.org/licenses/CC0-1.0.html"
+
+
+def test_the_dataset_stays_valid(described):
+    assert validate(described[0]) == []
+
+
+def test_a_wrong_sum_is_not_sealed_over(drawn, tmp_path):
+    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+    sums = (root / "SHA256SUMS").read_text()
+    (root / "SHA256SUMS").write_text(sums.replace(sums[:8], "00000000"))
+    with pytest.raises(UserError, match="another content"):
+        export_croissant(open_dataset(root))
+    assert not (root / "croissant.json").exists()
+    with pytest.raises(UserError, match="another folder"):
+        export_croissant(open_dataset(root), tmp_path / "croissant.json")
+
+
+def test_command_line(drawn, tmp_path):
+    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+
+    def arguments(*more):
+        return ["export", str(root), "--format", *map(str, more)]
+
+    for name in ("coco", "yolo", "tum", "kitti"):
+        done = CliRunner().invoke(app, arguments(name, "--out", tmp_path / name, "--split", "val"))
+        assert done.exit_code == 0 and f"/{name}: " in done.stdout, done.stdout
+        assert any((tmp_path / name).rglob("*.*"))
+    assert CliRunner().invoke(app, arguments("croissant")).exit_code == 0 and (root / "croissant.json").is_file()
+    for wrong in (["coco"], ["croissant", "--split", "val"], ["yolo", "--split", "training"]):
+        assert isinstance(CliRunner().invoke(app, arguments(*wrong)).exception, UserError)
+    manifest = str(Path(sys.executable).parent / "perilune-manifest")
+    taken = subprocess.run([manifest, *arguments("tum", "--out", root)], capture_output=True, text=True)
+    assert taken.returncode == 2 and len(taken.stderr.strip().splitlines()) == 1, taken.stderr

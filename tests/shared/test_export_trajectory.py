@@ -1,0 +1,92 @@
+"""Trajectories are read by evo, whose error of the truth against the truth is nothing."""
+
+import numpy as np
+import pytest
+from evo.core import metrics
+from evo.core.trajectory import PosePath3D, PoseTrajectory3D
+from evo.tools import file_interface
+from rich.progress import Progress
+
+from perilune_shared.camera import Camera
+from perilune_shared.export_trajectory import export_kitti, export_tum
+from perilune_shared.manifest import open_dataset
+
+DESCENTS = ["s000/t000", "s001/t001", "s002/t002", "s003/t003"]
+
+
+@pytest.fixture(scope="module")
+def files(drawn, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trajectories")
+    with Progress(disable=True) as progress:
+        assert export_tum(open_dataset(drawn), folder / "tum", progress) == 4
+        assert export_kitti(open_dataset(drawn), folder / "kitti", progress) == 4
+    return folder
+
+
+def truth(root, descent) -> PoseTrajectory3D:
+    """The manifest's poses, camera to O_L, built by evo from quaternions (w, x, y, z)."""
+    scene, trajectory = descent.split("/")
+    frames = open_dataset(root).table("frames", scene_id=scene, trajectory_id=trajectory).to_pandas()
+    w, x, y, z = np.stack(frames["rotation_wxyz"]).T
+    return PoseTrajectory3D(
+        positions_xyz=np.stack(frames["position_m"]),
+        orientations_quat_wxyz=np.column_stack([w, -x, -y, -z]),
+        timestamps=frames["time_s"].to_numpy(),
+    )
+
+
+def largest_error(reference, estimate, relation) -> float:
+    error = metrics.APE(relation)
+    error.process_data((reference, estimate))
+    return error.get_statistic(metrics.StatisticsType.max)
+
+
+RELATIONS = [metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg]
+
+
+@pytest.mark.parametrize("descent", DESCENTS)
+@pytest.mark.parametrize("relation", RELATIONS)
+def test_tum_has_no_error(drawn, files, descent, relation):
+    found = file_interface.read_tum_trajectory_file(files / f"tum/{descent}.txt")
+    assert found.check()[0] and found.num_poses == 5
+    wanted = truth(drawn, descent)
+    assert np.array_equal(found.timestamps, wanted.timestamps)
+    assert largest_error(wanted, found, relation) < 1e-6
+    other = truth(drawn, next(name for name in DESCENTS if name != descent))
+    assert largest_error(other, found, relation) > 0.1
+
+
+@pytest.mark.parametrize("descent", DESCENTS)
+@pytest.mark.parametrize("relation", RELATIONS)
+def test_kitti_has_no_error(drawn, files, descent, relation):
+    found = file_interface.read_kitti_poses_file(files / f"kitti/{descent}.txt")
+    assert found.check()[0] and found.num_poses == 5
+    wanted = truth(drawn, descent)
+    times = np.loadtxt(files / f"kitti/{descent}.times.txt")
+    assert np.array_equal(times, wanted.timestamps)
+    # The reference is the first camera.
+    first = np.linalg.inv(wanted.poses_se3[0])
+    relative = PosePath3D(poses_se3=[first @ pose for pose in wanted.poses_se3])
+    assert np.allclose(found.poses_se3[0], np.eye(4), atol=1e-12)
+    assert largest_error(relative, found, relation) < 1e-6
+
+
+def test_a_pose_takes_the_camera_to_the_site(drawn, files):
+    """A label's crater, taken to the camera by the inverse of the file's pose, comes to its place in the image."""
+    dataset = open_dataset(drawn)
+    pose = file_interface.read_tum_trajectory_file(files / "tum/s000/t000.txt").poses_se3[0]
+    craters = dataset.table("craters", scene_id="s000").to_pandas().set_index("crater_id")
+    labels = dataset.table("labels", scene_id="s000", trajectory_id="t000").to_pandas()
+    labels = labels[labels["frame_id"] == "s000/t000/000000"]
+    labels = labels[labels["radius_px"] < 6]
+    camera: Camera = dataset.info.camera.intrinsics()
+    points = craters.loc[labels["crater_id"], ["x_m", "y_m", "z_m"]].to_numpy()
+    seen = camera.project((points - pose[:3, 3]) @ pose[:3, :3])
+    assert len(labels) > 3
+    assert np.allclose(seen, labels[["ellipse_cx_px", "ellipse_cy_px"]], atol=0.1)
+
+
+def test_one_split(drawn, tmp_path):
+    with Progress(disable=True) as progress:
+        assert export_tum(open_dataset(drawn), tmp_path / "tum", progress, split="val") == 1
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.txt")] == ["tum/s002/t002.txt"]
