@@ -1,4 +1,4 @@
-"""`perilune-manifest export`: a dataset for the tools of other fields."""
+"""`perilune-manifest export` and `card`: a dataset for the tools of other fields, and a page about it for people."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -30,6 +30,7 @@ class ExportFormat(StrEnum):
 def add_to(app: typer.Typer) -> None:
     """Register the commands of this file."""
     app.command()(export)
+    app.command()(card)
 
 
 def export(
@@ -72,6 +73,20 @@ def export(
             case ExportFormat.KITTI:
                 done = f"{export_kitti(opened, out, progress, split)} descents"
     _say(f"{out}: {done}")
+
+
+def card(
+    dataset: DatasetArgument,
+    out: Annotated[
+        Path | None, typer.Option(help="Markdown file, its picture beside it; README.md in the dataset unless given.")
+    ] = None,
+) -> None:
+    """Write a page about the dataset: counts, histograms, labelled frames, licence, how to make it again."""
+    from perilune_shared.card import write_card
+
+    with progress_bar() as progress:
+        page, picture = write_card(open_dataset(dataset), out, progress)
+    _say(f"{page}, {picture}: written")
 
 
 def _say(line: str) -> None:

@@ -18,7 +18,7 @@ from perilune_shared import files
 from perilune_shared.errors import UserError
 from perilune_shared.info import INFO_NAME
 from perilune_shared.manifest import Dataset
-from perilune_shared.own_files import add_files
+from perilune_shared.own_files import add_files, check_sums
 from perilune_shared.schema import KEYS, TABLES
 
 CROISSANT_NAME = "croissant.json"
@@ -82,8 +82,9 @@ def export_croissant(dataset: Dataset, out: Path | None = None) -> Path:
         raise UserError(out, "--out", INFO_NAME, "a name that is not taken")
     if not dataset.info.complete:
         raise UserError(dataset.root, "complete", "false", "a finished dataset")
+    seal = check_sums(dataset, [out])
     text = json.dumps(metadata_of(dataset), indent=1, allow_nan=False) + "\n"
-    add_files(dataset, {out: text.encode()})
+    add_files(dataset, {out: text.encode()}, seal=seal)
     return out
 
 
