@@ -84,6 +84,7 @@ def draw(dataset: Dataset, gathered: Gathered) -> bytes:
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
+        from matplotlib.patches import Patch
     except ImportError:
         raise UserError("card", "matplotlib", "not installed", 'pip install "perilune-shared[pictures]"') from None
     samples = gathered.samples if dataset.info.images in ("files", "packed") else []
@@ -102,7 +103,9 @@ def draw(dataset: Dataset, gathered: Gathered) -> bytes:
         _draw_frame(axis, row, labels, pngs[row["frame_id"]])
     for axis, (name, by_split) in zip(axes[n_sample_rows:].ravel(), measures.items(), strict=False):
         _draw_histogram(axis, name, by_split)
-    axes[n_sample_rows, 0].legend(fontsize=7, frameon=False)
+    present = [split for split in SPLITS if split in gathered.measures["altitude_m"]]
+    keys = [Patch(color=_COLOURS[split], label=split) for split in present]
+    axes[n_sample_rows, 0].legend(handles=keys, fontsize=7, frameon=False)
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()
@@ -179,7 +182,7 @@ def _draw_histogram(axis: "Axes", name: str, by_split: Mapping[str, np.ndarray])
         logarithmic = name in _LOGARITHMIC
         # Heights stacked on a logarithmic axis would mislead: there they are lines from the axis.
         style = {"histtype": "step"} if logarithmic else {"stacked": True}
-        axis.hist(list(finite.values()), edges.tolist(), log=logarithmic, color=colours, label=list(finite), **style)
+        axis.hist(list(finite.values()), edges.tolist(), log=logarithmic, color=colours, **style)
     axis.set_xlabel(TITLES[name], fontsize=8)
     axis.tick_params(labelsize=7)
     axis.spines[["top", "right"]].set_visible(False)

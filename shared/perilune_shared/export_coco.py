@@ -33,7 +33,7 @@ def export_coco(
     """Write `out`/instances_<split>.json for each split, or for one; returns the number of annotations.
 
     `file_name` is the frame's png_path, so that the image folder is the dataset's. Raises UserError where `out` holds
-    something or no frame is of the split.
+    something, a png_path leads out of the dataset or no frame is of the split.
     """
     task = progress.add_task("coco", total=len(dataset.scene_ids()), unit="scenes")
     opened: dict[str, _SplitFile] = {}
@@ -131,6 +131,7 @@ class _SplitFile:
     def __init__(self, path: Path, dataset: Dataset):
         info = dataset.info
         self.n_annotations = 0
+        self._dataset = dataset
         self._images: list[dict[str, Any]] = []
         head = {
             "info": {
@@ -147,6 +148,8 @@ class _SplitFile:
     def add(self, frames: pd.DataFrame, annotations: dict[int, list[dict[str, Any]]]) -> None:
         """Frames of this split, with the annotations of each."""
         for row in frames.to_dict("records"):
+            # Readers join the name to a folder: it must not lead out of it.
+            self._dataset.file(row["png_path"])
             self._images.append(
                 {
                     "id": row["image_id"],

@@ -170,6 +170,22 @@ def test_a_frame_of_another_size_is_refused(drawn, tmp_path):
         carded(root)
 
 
+def test_frames_of_16_bits_and_no_labels(drawn, card, tmp_path):
+    """The upper eight bits are the picture; a dataset without labels has a card too."""
+    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+    for path in root.rglob("*.png"):
+        grey = np.asarray(Image.open(path)).astype(np.uint16)
+        Image.fromarray(grey * 257).save(path)
+    pages = [carded(root, tmp_path / "deep.md")]
+    part = root / "manifest/labels/all.parquet"
+    pq.write_table(TABLES["labels"].empty_table(), part)
+    pages.append(carded(root, tmp_path / "bare.md"))
+    plain, deep, bare = (np.asarray(Image.open(p)) for p in (card / "card.png", *(picture for _, picture in pages)))
+    assert np.array_equal(plain, deep)
+    assert bare.shape == plain.shape and not np.array_equal(bare, plain)
+    assert "label radius" in pages[0][0].read_text() and "label radius" not in pages[1][0].read_text()
+
+
 def test_command_line(drawn, tmp_path):
     done = CliRunner().invoke(app, ["card", str(drawn), "--out", str(tmp_path / "about.md")])
     assert done.exit_code == 0 and (tmp_path / "about.png").is_file()

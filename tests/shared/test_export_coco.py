@@ -3,9 +3,13 @@
 import contextlib
 import io
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
@@ -14,6 +18,8 @@ from rich.progress import Progress
 from perilune_shared.errors import UserError
 from perilune_shared.export_coco import area_of, cut_at_edges, export_coco
 from perilune_shared.manifest import open_dataset
+from perilune_shared.parts import read_part
+from perilune_shared.schema import TABLES
 
 SMALLEST_PX = 4.0
 
@@ -164,3 +170,14 @@ def test_nothing_half_written(drawn, tmp_path):
     with pytest.raises(ZeroDivisionError):
         exported(drawn, tmp_path / "new", choose=lambda *_: 1 / 0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+
+
+def test_a_path_out_of_the_dataset_is_refused(drawn, tmp_path):
+    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+    part = root / "manifest/frames/all.parquet"
+    rows = read_part(part, "frames").to_pylist()
+    rows[3]["png_path"] = "../../etc/passwd"
+    pq.write_table(pa.Table.from_pylist(rows, schema=TABLES["frames"]), part)
+    with pytest.raises(UserError, match="inside the dataset"):
+        exported(root, tmp_path / "coco")
+    assert not (tmp_path / "coco").exists()
