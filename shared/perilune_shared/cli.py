@@ -7,8 +7,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from perilune_shared.cli_change import DatasetArgument, register
 from perilune_shared import cli_export
+from perilune_shared.cli_change import DatasetArgument, register
 from perilune_shared.errors import EXIT_USER_ERROR, run_command_line
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar

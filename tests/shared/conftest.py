@@ -4,6 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from perilune_shared.info import read_info
+from perilune_shared.manifest import open_dataset
+from perilune_shared.writer import written
 from tests.drawn_dataset import build_dataset
 
 
@@ -17,3 +20,24 @@ def drawn(tmp_path_factory) -> Path:
 def other(tmp_path_factory) -> Path:
     """As `drawn`, on other terrains with the same names. Read only."""
     return build_dataset(tmp_path_factory.mktemp("drawn") / "b", "detect", seed=8)
+
+
+@pytest.fixture(scope="session")
+def crowded(tmp_path_factory) -> Path:
+    """A dataset with its frames as files: 4 descents of 5 frames, each over its own terrain."""
+    root = tmp_path_factory.mktemp("crowded") / "set"
+    return build_dataset(root, "detect", splits={"train": 2, "val": 1, "test": 1}, n_frames=5, side_px=128, craters=600)
+
+
+@pytest.fixture(scope="session")
+def crowded_packed(crowded, tmp_path_factory) -> Path:
+    """The same with whole tables and its frames in Parquet."""
+    source, out = open_dataset(crowded), tmp_path_factory.mktemp("packed") / "set"
+    info = read_info(crowded).model_copy(update={"images": "packed"})
+    with written(out, info, whole_tables=True) as writer:
+        for scene_id in source.scene_ids():
+            writer.add_scene(source.scene(scene_id))
+        frames = source.table("frames")
+        paths = dict(zip(frames["frame_id"].to_pylist(), frames["png_path"].to_pylist(), strict=True))
+        writer.pack_images(((name, paths[name], png) for name, png in source.pngs(frames)), shard_bytes=100_000)
+    return out

@@ -45,8 +45,8 @@ def rendered(page: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def card(drawn, tmp_path_factory):
-    root = Path(shutil.copytree(drawn, tmp_path_factory.mktemp("card") / "set"))
+def card(crowded, tmp_path_factory):
+    root = Path(shutil.copytree(crowded, tmp_path_factory.mktemp("card") / "set"))
     page, picture = carded(root)
     assert (page.name, picture.name) == ("README.md", "card.png")
     return root
@@ -94,8 +94,8 @@ def test_terrain_in_two_splits_is_told(tmp_path):
     assert "1 of 1 terrains are in more than one split" in html and "Split by trajectory" in html
 
 
-def test_what_a_dataset_says_is_harmless(drawn, card, tmp_path):
-    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+def test_what_a_dataset_says_is_harmless(crowded, card, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
     part = root / "manifest/scenes/all.parquet"
     rows = read_part(part, "scenes").to_pylist()
     rows = [{**row, "photometry": EVIL, "dem_source": EVIL[::-1]} for row in rows]
@@ -137,20 +137,20 @@ def test_the_recipe_can_be_followed(card, tmp_path):
     ]
 
 
-def test_packed_and_absent_frames(packed, drawn, card, tmp_path):
-    from_packed = carded(packed, tmp_path / "packed.md")[1].read_bytes()
+def test_packed_and_absent_frames(crowded_packed, crowded, card, tmp_path):
+    from_packed = carded(crowded_packed, tmp_path / "packed.md")[1].read_bytes()
     assert np.array_equal(
         *(np.asarray(Image.open(io.BytesIO(b))) for b in (from_packed, (card / "card.png").read_bytes()))
     )
-    dataset = open_dataset(drawn)
+    dataset = open_dataset(crowded)
     dataset.info = dataset.info.model_copy(update={"images": "absent"})
     with Progress(disable=True) as progress:
         page, picture = write_card(dataset, tmp_path / "absent.md", progress)
     assert Image.open(picture).height < 500 and "the manifest alone" in page.read_text()
 
 
-def test_files_of_others_stay(drawn, tmp_path):
-    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+def test_files_of_others_stay(crowded, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
     (root / "README.md").write_text("mine")
     with pytest.raises(UserError, match="no card wrote"):
         carded(root)
@@ -162,17 +162,17 @@ def test_files_of_others_stay(drawn, tmp_path):
     assert not (root / "README.md").exists() and not (root / "card.png").exists()
 
 
-def test_a_frame_of_another_size_is_refused(drawn, tmp_path):
-    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+def test_a_frame_of_another_size_is_refused(crowded, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
     for path in root.rglob("*.png"):
         Image.new("L", (4000, 4000)).save(path)
     with pytest.raises(UserError, match="4000 x 4000 px"):
         carded(root)
 
 
-def test_frames_of_16_bits_and_no_labels(drawn, card, tmp_path):
+def test_frames_of_16_bits_and_no_labels(crowded, card, tmp_path):
     """The upper eight bits are the picture; a dataset without labels has a card too."""
-    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
     for path in root.rglob("*.png"):
         grey = np.asarray(Image.open(path)).astype(np.uint16)
         Image.fromarray(grey * 257).save(path)
@@ -186,12 +186,12 @@ def test_frames_of_16_bits_and_no_labels(drawn, card, tmp_path):
     assert "label radius" in pages[0][0].read_text() and "label radius" not in pages[1][0].read_text()
 
 
-def test_command_line(drawn, tmp_path):
-    done = CliRunner().invoke(app, ["card", str(drawn), "--out", str(tmp_path / "about.md")])
+def test_command_line(crowded, tmp_path):
+    done = CliRunner().invoke(app, ["card", str(crowded), "--out", str(tmp_path / "about.md")])
     assert done.exit_code == 0 and (tmp_path / "about.png").is_file()
     assert "](about.png)" in (tmp_path / "about.md").read_text()
     without = "import sys; sys.modules['matplotlib'] = None; from perilune_shared.cli import main; main()"
-    command = [sys.executable, "-c", without, "card", str(drawn), "--out", str(tmp_path / "b.md")]
+    command = [sys.executable, "-c", without, "card", str(crowded), "--out", str(tmp_path / "b.md")]
     bare = subprocess.run(command, capture_output=True, text=True)
     assert bare.returncode == 2 and "perilune-shared[pictures]" in bare.stderr
     assert not (tmp_path / "b.md").exists()

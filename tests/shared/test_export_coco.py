@@ -40,13 +40,13 @@ def quietly(function, *arguments):
 
 
 @pytest.fixture(scope="module")
-def whole(drawn, tmp_path_factory):
-    return exported(drawn, tmp_path_factory.mktemp("coco") / "all")
+def whole(crowded, tmp_path_factory):
+    return exported(crowded, tmp_path_factory.mktemp("coco") / "all")
 
 
 @pytest.fixture(scope="module")
-def chosen(drawn, tmp_path_factory):
-    return exported(drawn, tmp_path_factory.mktemp("coco") / "large", choose=only_large)
+def chosen(crowded, tmp_path_factory):
+    return exported(crowded, tmp_path_factory.mktemp("coco") / "large", choose=only_large)
 
 
 def average_precision(truth: COCO, results: list[dict], kind: str) -> float:
@@ -89,8 +89,8 @@ def test_moved_predictions_do_not(whole):
     assert 0.1 < average_precision(truth, moved, "bbox") < 0.9
 
 
-def test_every_label_is_there(drawn, whole):
-    dataset = open_dataset(drawn)
+def test_every_label_is_there(crowded, whole):
+    dataset = open_dataset(crowded)
     frames = {row["png_path"]: row for row in dataset.table("frames").to_pylist()}
     labels = {(row["frame_id"], row["crater_id"]): row for row in dataset.table("labels").to_pylist()}
     for split in ("train", "val", "test"):
@@ -137,8 +137,8 @@ def test_craters_that_are_not_chosen_are_ignored(chosen):
     assert average_precision(truth, perfect(truth, crowd=True), "bbox") == pytest.approx(1, abs=1e-12)
 
 
-def test_numbers_do_not_depend_on_split_and_choice(drawn, whole, chosen, tmp_path):
-    one = exported(drawn, tmp_path / "one", split="test")
+def test_numbers_do_not_depend_on_split_and_choice(crowded, whole, chosen, tmp_path):
+    one = exported(crowded, tmp_path / "one", split="test")
     assert [path.name for path in one.iterdir()] == ["instances_test.json"]
     assert (one / "instances_test.json").read_bytes() == (whole / "instances_test.json").read_bytes()
     ids = [{a["id"]: a["bbox"] for a in json.loads((f / "instances_val.json").read_text())["annotations"]}
@@ -148,8 +148,8 @@ def test_numbers_do_not_depend_on_split_and_choice(drawn, whole, chosen, tmp_pat
     assert sorted(every) == list(range(1, len(every) + 1))
 
 
-def test_packed_frames_give_the_same(packed, whole, tmp_path):
-    again = exported(packed, tmp_path / "packed")
+def test_packed_frames_give_the_same(crowded_packed, whole, tmp_path):
+    again = exported(crowded_packed, tmp_path / "packed")
     for path in whole.iterdir():
         assert (again / path.name).read_bytes() == path.read_bytes()
 
@@ -161,19 +161,19 @@ def test_a_polygon_is_cut_at_the_edges():
     assert len(cut_at_edges(square + 20, 10, 10)) == 0
 
 
-def test_nothing_half_written(drawn, tmp_path):
+def test_nothing_half_written(crowded, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
     with pytest.raises(UserError, match="new or empty"):
-        exported(drawn, out)
+        exported(crowded, out)
     with pytest.raises(ZeroDivisionError):
-        exported(drawn, tmp_path / "new", choose=lambda *_: 1 / 0)
+        exported(crowded, tmp_path / "new", choose=lambda *_: 1 / 0)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
 
 
-def test_a_path_out_of_the_dataset_is_refused(drawn, tmp_path):
-    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+def test_a_path_out_of_the_dataset_is_refused(crowded, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
     part = root / "manifest/frames/all.parquet"
     rows = read_part(part, "frames").to_pylist()
     rows[3]["png_path"] = "../../etc/passwd"

@@ -22,12 +22,12 @@ from perilune_shared.validate import validate
 from perilune_shared.writer import written
 
 
-@pytest.fixture(scope="module", params=["drawn", "packed", "parts"])
+@pytest.fixture(scope="module", params=["crowded", "crowded_packed", "parts"])
 def described(request, tmp_path_factory):
     """Datasets of each layout: one part a table, packed frames, a part a scene or descent."""
     copy = tmp_path_factory.mktemp(request.param) / "set"
     if request.param == "parts":
-        source = open_dataset(request.getfixturevalue("drawn"))
+        source = open_dataset(request.getfixturevalue("crowded"))
         with written(copy, source.info) as writer:
             for scene_id in source.scene_ids():
                 writer.add_scene(source.scene(scene_id))
@@ -87,8 +87,8 @@ def test_the_dataset_stays_valid(described):
     assert validate(described[0]) == []
 
 
-def test_a_wrong_sum_is_not_sealed_over(drawn, tmp_path):
-    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+def test_a_wrong_sum_is_not_sealed_over(crowded, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
     sums = (root / "SHA256SUMS").read_text()
     (root / "SHA256SUMS").write_text(sums.replace(sums[:8], "00000000"))
     with pytest.raises(UserError, match="another content"):
@@ -98,8 +98,8 @@ def test_a_wrong_sum_is_not_sealed_over(drawn, tmp_path):
         export_croissant(open_dataset(root), tmp_path / "croissant.json")
 
 
-def test_command_line(drawn, tmp_path):
-    root = Path(shutil.copytree(drawn, tmp_path / "set"))
+def test_command_line(crowded, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
 
     def arguments(*more):
         return ["export", str(root), "--format", *map(str, more)]

@@ -15,11 +15,11 @@ DESCENTS = ["s000/t000", "s001/t001", "s002/t002", "s003/t003"]
 
 
 @pytest.fixture(scope="module")
-def files(drawn, tmp_path_factory):
+def files(crowded, tmp_path_factory):
     folder = tmp_path_factory.mktemp("trajectories")
     with Progress(disable=True) as progress:
-        assert export_tum(open_dataset(drawn), folder / "tum", progress) == 4
-        assert export_kitti(open_dataset(drawn), folder / "kitti", progress) == 4
+        assert export_tum(open_dataset(crowded), folder / "tum", progress) == 4
+        assert export_kitti(open_dataset(crowded), folder / "kitti", progress) == 4
     return folder
 
 
@@ -46,22 +46,22 @@ RELATIONS = [metrics.PoseRelation.translation_part, metrics.PoseRelation.rotatio
 
 @pytest.mark.parametrize("descent", DESCENTS)
 @pytest.mark.parametrize("relation", RELATIONS)
-def test_tum_has_no_error(drawn, files, descent, relation):
+def test_tum_has_no_error(crowded, files, descent, relation):
     found = file_interface.read_tum_trajectory_file(files / f"tum/{descent}.txt")
     assert found.check()[0] and found.num_poses == 5
-    wanted = truth(drawn, descent)
+    wanted = truth(crowded, descent)
     assert np.array_equal(found.timestamps, wanted.timestamps)
     assert largest_error(wanted, found, relation) < 1e-6
-    other = truth(drawn, next(name for name in DESCENTS if name != descent))
+    other = truth(crowded, next(name for name in DESCENTS if name != descent))
     assert largest_error(other, found, relation) > 0.1
 
 
 @pytest.mark.parametrize("descent", DESCENTS)
 @pytest.mark.parametrize("relation", RELATIONS)
-def test_kitti_has_no_error(drawn, files, descent, relation):
+def test_kitti_has_no_error(crowded, files, descent, relation):
     found = file_interface.read_kitti_poses_file(files / f"kitti/{descent}.txt")
     assert found.check()[0] and found.num_poses == 5
-    wanted = truth(drawn, descent)
+    wanted = truth(crowded, descent)
     times = np.loadtxt(files / f"kitti/{descent}.times.txt")
     assert np.array_equal(times, wanted.timestamps)
     # The reference is the first camera.
@@ -71,9 +71,9 @@ def test_kitti_has_no_error(drawn, files, descent, relation):
     assert largest_error(relative, found, relation) < 1e-6
 
 
-def test_a_pose_takes_the_camera_to_the_site(drawn, files):
+def test_a_pose_takes_the_camera_to_the_site(crowded, files):
     """A label's crater, taken to the camera by the inverse of the file's pose, comes to its place in the image."""
-    dataset = open_dataset(drawn)
+    dataset = open_dataset(crowded)
     pose = file_interface.read_tum_trajectory_file(files / "tum/s000/t000.txt").poses_se3[0]
     craters = dataset.table("craters", scene_id="s000").to_pandas().set_index("crater_id")
     labels = dataset.table("labels", scene_id="s000", trajectory_id="t000").to_pandas()
@@ -86,7 +86,7 @@ def test_a_pose_takes_the_camera_to_the_site(drawn, files):
     assert np.allclose(seen, labels[["ellipse_cx_px", "ellipse_cy_px"]], atol=0.1)
 
 
-def test_one_split(drawn, tmp_path):
+def test_one_split(crowded, tmp_path):
     with Progress(disable=True) as progress:
-        assert export_tum(open_dataset(drawn), tmp_path / "tum", progress, split="val") == 1
+        assert export_tum(open_dataset(crowded), tmp_path / "tum", progress, split="val") == 1
     assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.txt")] == ["tum/s002/t002.txt"]

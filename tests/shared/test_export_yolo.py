@@ -37,7 +37,7 @@ def parsed(folder) -> dict:
     return found
 
 
-@pytest.mark.parametrize("kind", ["drawn", "packed"])
+@pytest.mark.parametrize("kind", ["crowded", "crowded_packed"])
 def test_boxes_and_images_are_those_of_the_manifest(kind, request, tmp_path):
     dataset = open_dataset(request.getfixturevalue(kind))
     found = parsed(exported(dataset.root, tmp_path / "yolo"))
@@ -59,20 +59,20 @@ def test_boxes_and_images_are_those_of_the_manifest(kind, request, tmp_path):
     assert n_cut > 0
 
 
-def test_one_split_and_a_choice(drawn, tmp_path):
-    dataset = open_dataset(drawn)
-    none = exported(drawn, tmp_path / "none", split="val", choose=lambda _d, _s, labels: np.zeros(len(labels), bool))
+def test_one_split_and_a_choice(crowded, tmp_path):
+    dataset = open_dataset(crowded)
+    none = exported(crowded, tmp_path / "none", split="val", choose=lambda _d, _s, labels: np.zeros(len(labels), bool))
     found = parsed(none)
     assert list(found) == ["val"] and len(found["val"]) == 5
     assert all(len(boxes) == 0 for boxes in found["val"].values())
     assert not (tmp_path / "none/images/s000").exists()
-    assert sum(map(len, parsed(exported(drawn, tmp_path / "all"))["val"].values())) == len(
+    assert sum(map(len, parsed(exported(crowded, tmp_path / "all"))["val"].values())) == len(
         dataset.table("labels", split="val")
     )
 
 
-def test_a_dataset_without_frames_is_refused(drawn, tmp_path):
-    dataset = open_dataset(drawn)
+def test_a_dataset_without_frames_is_refused(crowded, tmp_path):
+    dataset = open_dataset(crowded)
     dataset.info = dataset.info.model_copy(update={"images": "absent"})
     with Progress(disable=True) as progress, pytest.raises(UserError, match="regenerate"):
         export_yolo(dataset, tmp_path / "yolo", progress)
