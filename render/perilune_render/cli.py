@@ -169,7 +169,7 @@ def regenerate(
     for outcome in outcomes:
         if outcome.state != "identical" and not verify:
             Console().print(f"{outcome.png_path}: {outcome.state}", soft_wrap=True)
-    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count or state == "identical")
+    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     ground = "" if all(o.same_ground for o in outcomes) else "; the ground came out otherwise than its hash says"
     Console().print(f"{len(outcomes)} frames: {told}{ground}", soft_wrap=True)
     if counts["different"] or ground:

@@ -38,8 +38,8 @@ RELATIVE_TOLERANCE = 1e-3
 """Relative difference by which values of an EXR may differ."""
 OUTLIERS = 0.001
 """Share of pixels that may differ by more: rays that meet another facet."""
-State = Literal["identical", "within tolerance", "different", "nothing to compare"]
-_ORDER: tuple[State, ...] = ("identical", "nothing to compare", "within tolerance", "different")
+State = Literal["identical", "within tolerance", "different", "new"]
+_ORDER: tuple[State, ...] = ("identical", "new", "within tolerance", "different")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +49,9 @@ class Outcome:
     frame_id: str
     """Of the manifest."""
     png: State
-    """The PNG against the manifest's hash, else against the dataset's own file."""
-    exr: State
-    """The EXR likewise; "nothing to compare" where the manifest has none."""
+    """The PNG against the manifest's hash, else against the dataset's own file; new where the manifest has no hash."""
+    exr: State | None
+    """The EXR likewise; None where the frame has none."""
     same_ground: bool
     """Whether craters and boulders have the content that the scene's row states."""
     png_path: Path
@@ -60,7 +60,7 @@ class Outcome:
     @property
     def state(self) -> State:
         """The worse of both files."""
-        return max(self.png, self.exr, key=_ORDER.index)
+        return max((state for state in (self.png, self.exr) if state is not None), key=_ORDER.index)
 
 
 def regenerate(
@@ -128,7 +128,8 @@ def _of_scene(
             # Frames that were developed again have no EXR, though their recipe has.
             if row["exr_path"] is not None:
                 studio.write_exr(out, shot, radiance)
-            png, exr = (_compared(dataset, row, kind, out) for kind in ("png", "exr"))
+            png = _compared(dataset, row, "png", out)
+            exr = _compared(dataset, row, "exr", out) if row["exr_path"] is not None else None
             outcomes.append(Outcome(row["frame_id"], png, exr, same_ground, out / f"frames/{row['frame_id']}.png"))
             advance()
     return outcomes
@@ -150,8 +151,8 @@ def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> Datase
 def _compared(dataset: Dataset, row: dict, kind: str, out: Path) -> State:
     """A new file against the hash of the old one, and against the old file where it is here and the hash differs."""
     new = out / f"frames/{row['frame_id']}.{kind}"
-    if row[f"{kind}_sha256"] is None or not new.exists():
-        return "nothing to compare"
+    if row[f"{kind}_sha256"] is None:
+        return "new"
     if sha256_of(new) == row[f"{kind}_sha256"]:
         return "identical"
     if kind == "png" and dataset.info.images in ("files", "packed"):

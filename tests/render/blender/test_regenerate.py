@@ -70,7 +70,7 @@ def test_a_plan_is_the_dataset_before_it_is_rendered(tiny, plan, tmp_path):
     assert found == hashes | {(name, "") for name in ("craters", "boulders", "labels")}
     frame_id = "scene-0001/trajectory-0000/000005"
     (outcome,) = again(plan, tmp_path, [frame_id])
-    assert outcome.same_ground and outcome.state == "nothing to compare"
+    assert outcome.same_ground and outcome.state == "new"
     path = f"frames/{frame_id}.png"
     assert (tmp_path / path).read_bytes() == (tiny / "detect" / path).read_bytes()
 
@@ -80,7 +80,7 @@ def test_developed_frames_are_made_again_with_the_first_camera_ground(tiny, tmp_
     done = run("develop", "--dataset", tiny / "detect", "--out", tmp_path / "d", *changes)
     assert done.returncode == 0, done.stderr
     (outcome,) = again(tmp_path / "d", tmp_path / "out", ["scene-0002/trajectory-0000/000004"])
-    assert outcome.png == "identical" and outcome.same_ground
+    assert (outcome.png, outcome.exr, outcome.state) == ("identical", None, "identical") and outcome.same_ground
 
 
 def test_verify_counts_what_is_the_same(tiny_detect):
