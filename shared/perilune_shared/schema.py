@@ -152,7 +152,6 @@ IMAGES = pa.schema(
         pa.field(
             "image",
             pa.struct([pa.field("bytes", pa.binary()), pa.field("path", _TEXT)]),
-            nullable=False,
             metadata={"unit": "", "meaning": "the PNG file's bytes, and the png_path of the frame"},
         ),
     ],
