@@ -140,11 +140,8 @@ def _develop_descent(
     exr_camera = studio.exr_camera
     written, labels = [], []
     for row in frames.to_pylist():
-        radiance = read_radiance(source.file(row["exr_path"]))
-        size = radiance.depth_m.shape[::-1]
-        if size != (exr_camera.width_px, exr_camera.height_px):
-            wanted = f"{exr_camera.width_px} x {exr_camera.height_px}, as dataset.json says"
-            raise UserError(row["exr_path"], "size", f"{size[0]} x {size[1]} pixels", wanted)
+        size_px = exr_camera.width_px, exr_camera.height_px
+        radiance = read_radiance(source.file(row["exr_path"]), size_px)
         shot = Shot.recorded(row, seed)
         png, exposure = studio.write_png(out, shot, radiance)
         written.append(png)

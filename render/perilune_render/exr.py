@@ -9,7 +9,9 @@ import OpenEXR
 
 from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
+from perilune_shared.info import LARGEST_IMAGE_PX
 
+_MOST_CHANNELS = 64
 CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 
@@ -41,20 +43,46 @@ def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:
             raise OSError(errno.ENOSPC, f"cannot write ({error})", str(path)) from None
 
 
-def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """Channels (h, w) by name. Raises UserError where the file is missing or damaged."""
+def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
+    """Channels (h, w) by name. Raises UserError where the file is missing, damaged or not of `size_px` (width, height).
+
+    A small file may unpack to any size: its header is looked at before its pixels.
+    """
     if not path.is_file():
         raise UserError(path, "exr", "no such file", "an EXR frame")
     try:
+        with OpenEXR.File(str(path), header_only=True) as header:
+            _check_header(path, header, size_px)
         with OpenEXR.File(str(path), separate_channels=True) as image:
             return {name: channel.pixels for name, channel in image.channels().items()}
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, TypeError, MemoryError) as error:
         raise UserError(path, "exr", error, "a whole EXR file") from None
 
 
-def read_radiance(path: Path) -> Radiance:
-    """A frame as it was before the sensor. Raises UserError where the file is missing, damaged or lacks a channel."""
-    channels = read_exr(path)
+def _check_header(path: Path, image: OpenEXR.File, size_px: tuple[int, int] | None) -> None:
+    """Raises UserError where the pixels of an EXR file should not be unpacked."""
+    if len(image.parts) != 1:
+        raise UserError(path, "parts", len(image.parts), "one")
+    header = image.parts[0].header
+    low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
+    width, height = (high - low + 1).tolist()
+    if width < 1 or height < 1 or width * height > LARGEST_IMAGE_PX:
+        raise UserError(path, "size", f"{width} x {height} pixels", f"at most {LARGEST_IMAGE_PX} pixels")
+    if size_px is not None and (width, height) != size_px:
+        raise UserError(path, "size", f"{width} x {height} pixels", f"{size_px[0]} x {size_px[1]}")
+    channels = header["channels"]
+    if len(channels) > _MOST_CHANNELS:
+        raise UserError(path, "channels", len(channels), f"at most {_MOST_CHANNELS}")
+    if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels):
+        raise UserError(path, "channels", "fewer samples than pixels", "a value for each pixel")
+
+
+def read_radiance(path: Path, size_px: tuple[int, int] | None = None) -> Radiance:
+    """A frame as it was before the sensor, of an expected width and height, if given.
+
+    Raises UserError where the file is missing, damaged, of another size or lacks a channel.
+    """
+    channels = read_exr(path, size_px)
     missing = [name for name in CHANNELS if name not in channels]
     if missing:
         raise UserError(path, "channels", f"no {missing[0]}", ", ".join(CHANNELS))

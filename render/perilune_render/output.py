@@ -92,7 +92,7 @@ def write_png(root: Path, frame_id: str, image: np.ndarray, bits: int) -> dict[s
     """
     path = f"frames/{frame_id}.png"
     stored = image if bits == 8 else image << (16 - bits)
-    files.write_bytes(root / path, cv2.imencode(".png", stored)[1].tobytes())
+    files.write_bytes(files.inside(root, path), cv2.imencode(".png", stored)[1].tobytes())
     return file_columns(root, "png", path)
 
 

@@ -11,14 +11,16 @@ from perilune_shared import files
 from perilune_shared.errors import UserError
 
 SUMS_NAME = "SHA256SUMS"
-_LARGEST_BYTES = 100_000_000
+_LARGEST_BYTES = 20_000_000
+_LARGEST_FILE = 2**36
 _LINE = re.compile(r"([0-9a-f]{64})  (\S+)")
 _OWN_FOLDERS = ("manifest", "images")
 
 
 def seal(root: Path) -> None:
-    """Write SHA256SUMS of all that lies in the dataset now."""
-    lines = [f"{files.sha256_of(root / name)}  {name}\n" for name in _covered(root)]
+    """Write SHA256SUMS of all that lies in the dataset now; files of odd names and links are left out, and are faults then."""
+    names = [name for name in _covered(root) if files.is_plain(name) and not (root / name).is_symlink()]
+    lines = [f"{files.sha256_of(root / name)}  {name}\n" for name in names]
     files.write_text(root / SUMS_NAME, "".join(lines))
 
 
@@ -44,12 +46,14 @@ def faults_of(root: Path) -> Iterator[tuple[str, str, str]]:
         try:
             file = files.inside(root, name)
         except UserError as error:
-            yield SUMS_NAME, str(error), "a path inside the dataset"
+            yield SUMS_NAME, error.found, error.wanted
             continue
         if not file.is_file():
-            yield name, "no such file", f"the file with SHA-256 {sha256}"
+            yield name, "no such file", f"the file with SHA-256 {sha256}, as {SUMS_NAME} has it"
+        elif file.stat().st_size > _LARGEST_FILE:
+            yield name, f"{file.stat().st_size} bytes", f"at most {_LARGEST_FILE}"
         elif files.sha256_of(file) != sha256:
-            yield name, "another content", f"SHA-256 {sha256}"
+            yield name, "another content", f"SHA-256 {sha256}, as {SUMS_NAME} has it"
     for name in sorted(present - set(listed)):
         if name.split("/")[0] in (*_OWN_FOLDERS, "dataset.json"):
             yield name, "not listed in SHA256SUMS", "only files that the dataset was written with"

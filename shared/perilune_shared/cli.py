@@ -9,7 +9,7 @@ from rich.text import Text
 
 from perilune_shared import cli_export
 from perilune_shared.cli_change import DatasetArgument, register
-from perilune_shared.errors import EXIT_USER_ERROR, run_command_line
+from perilune_shared.errors import EXIT_USER_ERROR, one_line, run_command_line, shortened
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
 from perilune_shared.stats import summary
@@ -32,12 +32,12 @@ def validate(
         faults = find_faults(open_dataset(dataset), progress)
     console = Console()
     if not faults:
-        console.print(f"{dataset}: no fault")
+        console.print(Text(f"{one_line(dataset)}: no fault"))
         return
-    table = Table("file", "row", "column", "found", "wanted", title=f"{dataset}: {len(faults)} faults")
+    table = Table("file", "row", "column", "found", "wanted", title=Text(f"{one_line(dataset)}: {len(faults)} faults"))
     for fault in faults[:most]:
         row = "" if fault.row is None else str(fault.row)
-        # As Text, since brackets would be read as markup.
+        # As Text, since brackets would be read as markup; so with all that a stranger may have named.
         table.add_row(*map(Text, (fault.file, row, fault.column, fault.found, fault.wanted)))
     console.print(table)
     raise typer.Exit(EXIT_USER_ERROR)
@@ -56,7 +56,7 @@ def stats(dataset: DatasetArgument) -> None:
     measures = frame.set_index("split").astype(object).T
     table.add_column("")
     for split in measures.columns:
-        table.add_column(str(split), justify="right")
+        table.add_column(Text(shortened(one_line(split))), justify="right")
     for name, values in measures.iterrows():
         table.add_row(str(name), *(str(value) for value in values))
     console = Console()

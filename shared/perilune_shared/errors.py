@@ -24,7 +24,11 @@ class UserError(Exception):
     """A fault in what the user gave: file or place, field, value found, and what would be right."""
 
     def __init__(self, where: object, field: str, found: object, wanted: str):
-        super().__init__(one_line(f"{where}: {field}: found {shortened(found)}; wanted {wanted}"))
+        # Any of them may come out of a stranger's file, in any length.
+        self.field, self.found, self.wanted = shortened(field), shortened(found), shortened(wanted, 500)
+        super().__init__(
+            one_line(f"{shortened(where, 4200)}: {self.field}: found {self.found}; wanted {self.wanted}"),
+        )
 
 
 def one_line(text: object) -> str:

@@ -11,18 +11,16 @@ import pyarrow.compute as pc
 
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.manifest import Dataset
-from perilune_shared.parts import WHOLE_TABLE, Part
+from perilune_shared.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, WHOLE_TABLE, Part
 from perilune_shared.schema import SPLITS, TABLES
 
-ID_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
-_FRAME_ID = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}/[A-Za-z0-9][A-Za-z0-9_-]{0,63}/[0-9]{6}$"
 _PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
 _PLAIN = r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$"
 _SHA256 = r"^[0-9a-f]{64}$"
 _TEXTS = {
     "scene_id": ID_PATTERN,
     "trajectory_id": ID_PATTERN,
-    "frame_id": _FRAME_ID,
+    "frame_id": FRAME_ID_PATTERN,
     "png_path": _PATH,
     "exr_path": _PATH,
     "png_sha256": _SHA256,
@@ -80,7 +78,18 @@ class Fault:
     @classmethod
     def of(cls, file: object, row: int | None, column: object, found: object, wanted: object) -> "Fault":
         """A fault from values of any origin, made short and plain."""
-        return cls(one_line(file), row, one_line(column), shortened(one_line(found)), one_line(wanted))
+        return cls(
+            shortened(one_line(file), 300),
+            row,
+            shortened(one_line(column)),
+            shortened(one_line(found)),
+            shortened(one_line(wanted), 300),
+        )
+
+    @classmethod
+    def told(cls, file: object, row: int | None, error: UserError) -> "Fault":
+        """A fault that reading gave as an error."""
+        return cls.of(file, row, error.field, error.found, error.wanted)
 
 
 def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
@@ -88,6 +97,9 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
     where = path.relative_to(dataset.root).as_posix()
     if path.is_symlink() or not path.resolve().is_relative_to(dataset.root.resolve()):
         yield Fault.of(where, None, "part", "a link", "a file of the dataset's own")
+        return
+    if not matches(PART_PATTERN, path.stem):
+        yield Fault.of(where, None, "part", path.stem, f"a name like {PART_PATTERN}")
         return
     try:
         part = Part(path, table)
@@ -99,16 +111,18 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
         for found, wanted in zip(part.found, TABLES[table], strict=True):
             if (found.type, found.nullable) != (wanted.type, wanted.nullable) or found.metadata != wanted.metadata:
                 yield Fault.of(where, None, found.name, found.metadata, f"{wanted.type} with {wanted.metadata}")
-        rows = part.read()
+        first_row = 0
+        for group in range(part.n_groups):
+            rows = part.read(groups=[group], any_ids=True)
+            yield from _of_the_name(where, first_row, path.stem, rows)
+            for field in rows.schema:
+                yield from _of_values(where, first_row, field, rows[field.name].combine_chunks())
+            first_row += len(rows)
     except UserError as error:
-        yield Fault.of(where, None, "part", error, "a readable part of this schema")
-        return
-    yield from _of_the_name(where, path.stem, rows)
-    for field in rows.schema:
-        yield from _of_values(where, field, rows[field.name].combine_chunks())
+        yield Fault.told(where, None, error)
 
 
-def _of_the_name(where: str, stem: str, rows: pa.Table) -> Iterator[Fault]:
+def _of_the_name(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
     """A reader looks for a scene's rows by the parts' names, so that these must hold no others."""
     scene, _, trajectory = stem.partition(".")
     if stem == WHOLE_TABLE:
@@ -121,14 +135,15 @@ def _of_the_name(where: str, stem: str, rows: pa.Table) -> Iterator[Fault]:
         own = pc.starts_with(rows["frame_id"], f"{scene}/{trajectory}/" if trajectory else f"{scene}/")
     others = np.flatnonzero(~np.asarray(own, bool))
     if len(others):
-        yield Fault.of(where, int(others[0]), "part", "a row of another scene or descent", f"rows of {stem} alone")
+        row = first_row + int(others[0])
+        yield Fault.of(where, row, "part", "a row of another scene or descent", f"rows of {stem} alone")
 
 
-def _of_values(where: str, field: pa.Field, column: pa.Array) -> Iterator[Fault]:
+def _of_values(where: str, first_row: int, field: pa.Field, column: pa.Array) -> Iterator[Fault]:
     """Nulls, finiteness, ranges, lengths and patterns of one column."""
     present = ~np.asarray(column.is_null(), bool)
     if not field.nullable and not present.all():
-        yield Fault.of(where, int(np.argmin(present)), field.name, "null", "a value")
+        yield Fault.of(where, first_row + int(np.argmin(present)), field.name, "null", "a value")
         return
     checks: list[tuple[np.ndarray, str]] = []
     if pa.types.is_string(field.type):
@@ -155,7 +170,7 @@ def _of_values(where: str, field: pa.Field, column: pa.Array) -> Iterator[Fault]
     for wrong, wanted in checks:
         rows = np.flatnonzero(wrong & present)
         if len(rows):
-            yield Fault.of(where, int(rows[0]), field.name, column[int(rows[0])].as_py(), wanted)
+            yield Fault.of(where, first_row + int(rows[0]), field.name, column[int(rows[0])].as_py(), wanted)
 
 
 def matches(pattern: str, text: object) -> bool:

@@ -4,12 +4,14 @@ import contextlib
 import hashlib
 import os
 import re
+import stat
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from perilune_shared.errors import UserError
 
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+_LONGEST_PATH = 500
 
 
 @contextlib.contextmanager
@@ -44,15 +46,37 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def is_plain(relative: object) -> bool:
+    """Whether it is a relative POSIX path of plain names, without regard to links."""
+    short = isinstance(relative, str) and len(relative) <= _LONGEST_PATH
+    parts = PurePosixPath(str(relative)).parts if short else ()
+    return bool(parts) and all(_PLAIN_NAME.fullmatch(part) for part in parts)
+
+
 def inside(root: Path, relative: str) -> Path:
     """The file that a manifest's relative POSIX path names below `root`.
 
-    Raises UserError where the path is absolute, climbs, has an odd name or leaves `root` through a link.
+    Raises UserError where the path is absolute, climbs, has an odd name, is too long or leaves `root` through a link.
     """
-    parts = PurePosixPath(relative).parts if isinstance(relative, str) else ()
-    if not parts or not all(_PLAIN_NAME.fullmatch(part) for part in parts):
+    if not is_plain(relative):
         raise UserError(root, "path", repr(relative), "a relative POSIX path of plain names inside the dataset")
-    path = root.joinpath(*parts)
-    if not path.resolve().is_relative_to(root.resolve()):
+    path = root.joinpath(*PurePosixPath(relative).parts)
+    try:
+        own = path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError):  # links that lead to themselves
+        own = False
+    if not own:
         raise UserError(root, "path", repr(relative), "a path that no link leads out of the dataset")
     return path
+
+
+def check_plain_file(path: Path) -> int:
+    """The size of a file, bytes. Raises UserError where it is none: opening a pipe or a device may never end."""
+    try:
+        state = path.lstat()
+    except (OSError, ValueError):
+        raise UserError(path, "file", "no such file", "a file of the dataset's own") from None
+    if not stat.S_ISREG(state.st_mode):
+        found = "a link" if stat.S_ISLNK(state.st_mode) else "a folder, a pipe or a device"
+        raise UserError(path, "file", found, "a file of the dataset's own")
+    return state.st_size

@@ -18,7 +18,8 @@ from perilune_shared.info import Counts, DatasetInfo, read_info
 from perilune_shared.parts import WHOLE_TABLE, Part
 from perilune_shared.schema import IMAGES, TABLES
 
-_LARGEST_PNG_BYTES = 200_000_000
+LARGEST_FRAME_BYTES = 2**30
+"""Of a PNG or an EXR."""
 
 
 class Dataset:
@@ -96,8 +97,8 @@ class Dataset:
             path = self.file(relative)
             if not path.is_file():
                 raise UserError(path, "frame", "no such file", "the PNG that the manifest names")
-            if path.stat().st_size > _LARGEST_PNG_BYTES:
-                raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {_LARGEST_PNG_BYTES}")
+            if path.stat().st_size > LARGEST_FRAME_BYTES:
+                raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {LARGEST_FRAME_BYTES}")
             yield frame_id, path.read_bytes()
 
     def _packed(self, wanted: set[str]) -> Iterator[tuple[str, bytes]]:

@@ -4,6 +4,7 @@ A part's name says whose rows it holds: `<scene_id>` or `<scene_id>.<trajectory_
 row groups then hold a scene or a few descents each.
 """
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -13,14 +14,27 @@ import pyarrow.parquet as pq
 
 from perilune_shared import files
 from perilune_shared.errors import UserError
+from perilune_shared.pages import pages_of
 from perilune_shared.schema import SCHEMA_VERSION, TABLES
 
 WHOLE_TABLE = "all"
 """Name of the part that holds all rows of its table."""
 _MOST_ROWS = 50_000_000
+_MOST_GROUP_ROWS = 2**21
 _LONGEST_TEXT = 1000
 _MOST_BYTES = 8 * 2**30
-_FOOTER_BYTES = 100_000_000
+# Of a footer's list: a schema nested deeper than this ends the process.
+_LONGEST_LIST = 10_000
+_LONGEST_FOOTER_TEXT = 10_000_000
+# No row of any table takes less room, however well it is compressed, and none shrinks more.
+_SPARE_ROWS, _BYTES_A_ROW = 10_000, 4
+_SPARE_BYTES, _MOST_SHRUNK = 2**26, 200
+_ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
+ID_PATTERN = f"^{_ID}$"
+"""Scenes and descents: their names become names of files."""
+FRAME_ID_PATTERN = f"^{_ID}/{_ID}/[0-9]{{6}}$"
+PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
+_IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
 
 
 class Part:
@@ -32,17 +46,19 @@ class Part:
         `schema` is that of the table's columns where it is not that of TABLES, as in older versions.
         """
         self.path, self.schema = path, schema or TABLES[table]
-        texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
+        self._n_bytes = files.check_plain_file(path)
+        limits = {
+            "thrift_string_size_limit": _LONGEST_FOOTER_TEXT,
+            "thrift_container_size_limit": _LONGEST_LIST,
+        }
         try:
-            # As dictionaries, a short file cannot grow into gigabytes of text before its length is known.
-            self.file = pq.ParquetFile(
-                path,
-                read_dictionary=texts,
-                thrift_string_size_limit=_FOOTER_BYTES,
-                thrift_container_size_limit=_FOOTER_BYTES,
-            )
-            self.found = pq.ParquetFile(path, metadata=self.file.metadata).schema_arrow
-        except (pa.ArrowException, OSError, ValueError) as error:
+            with pq.ParquetFile(path, **limits) as plain:
+                self.found = plain.schema_arrow
+                texts = [field.name for field in self.found if pa.types.is_string(field.type)]
+                # As dictionaries, a short file cannot grow into gigabytes of text before its length is known.
+                self.file = pq.ParquetFile(path, metadata=plain.metadata, read_dictionary=texts)
+            self._check_size()
+        except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(path, "content", error, "a whole Parquet file") from None
         metadata = self.found.metadata or {}
         for name, wanted in (("schema_version", version), ("table", table)):
@@ -50,34 +66,48 @@ class Part:
             if got != wanted:
                 hint = "; see `perilune-manifest migrate`" if name == "schema_version" else ""
                 raise UserError(path, f"perilune.{name}", got, wanted + hint)
-        self._check_size()
 
     @property
     def n_rows(self) -> int:
         """Rows of the part."""
         return self.file.metadata.num_rows
 
+    @property
+    def n_groups(self) -> int:
+        """Row groups of the part."""
+        return self.file.metadata.num_row_groups
+
     def _check_size(self) -> None:
         footer = self.file.metadata
-        if footer.num_rows > _MOST_ROWS:
-            raise UserError(self.path, "rows", footer.num_rows, f"at most {_MOST_ROWS}")
-        n_bytes = 0
+        most_rows = min(_MOST_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_A_ROW)
+        n_bytes, n_rows = 0, 0
         for group in range(footer.num_row_groups):
             rows = footer.row_group(group)
-            n_bytes += rows.total_byte_size
+            n_rows += rows.num_rows
+            if not 0 <= rows.num_rows <= min(_MOST_GROUP_ROWS, most_rows):
+                wanted = f"at most {min(_MOST_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
+                raise UserError(self.path, "rows", f"{rows.num_rows} in a row group", wanted)
             for place in range(rows.num_columns):
                 column = rows.column(place)
+                n_bytes += max(column.total_uncompressed_size, 0)
                 # The longest list is a quaternion.
                 if column.num_values > 4 * rows.num_rows:
                     raise UserError(self.path, column.path_in_schema, f"{column.num_values} values", "4 a row at most")
-                # One image repeated by a dictionary would be a small file that unpacks without end.
-                if column.path_in_schema == "image.bytes" and column.has_dictionary_page:
-                    raise UserError(self.path, column.path_in_schema, "a dictionary", "plain bytes for each frame")
-        if n_bytes > _MOST_BYTES:
-            raise UserError(self.path, "size", f"{n_bytes} bytes unpacked", f"at most {_MOST_BYTES}")
+        if footer.num_rows != n_rows or n_rows > most_rows:
+            wanted = f"those of its row groups, {n_rows}, and at most {most_rows} for {self._n_bytes} bytes"
+            raise UserError(self.path, "rows", footer.num_rows, wanted)
+        most = min(_MOST_BYTES, _SPARE_BYTES + _MOST_SHRUNK * self._n_bytes)
+        if n_bytes > most:
+            raise UserError(self.path, "size", f"{n_bytes} bytes unpacked", f"at most {most} for {self._n_bytes} bytes")
 
-    def read(self, columns: Sequence[str] | None = None, groups: Iterable[int] | None = None) -> pa.Table:
-        """Rows with chosen columns, of chosen row groups. Raises UserError where that cannot be read."""
+    def read(
+        self, columns: Sequence[str] | None = None, groups: Iterable[int] | None = None, *, any_ids: bool = False
+    ) -> pa.Table:
+        """Rows with chosen columns, of chosen row groups.
+
+        Raises UserError where that cannot be read, or names of scenes, descents and frames could not be names of files
+        (unless `any_ids`).
+        """
         names = list(columns) if columns is not None else self.schema.names
         wanted = pa.schema([self.schema.field(name) for name in names], metadata=self.schema.metadata)
         for field in wanted:
@@ -87,25 +117,46 @@ class Part:
             if self.found.field(place).type != field.type:
                 raise UserError(self.path, field.name, self.found.field(place).type, f"{field.type}")
         try:
-            if groups is None:
-                rows = self.file.read(columns=names)
-            else:
-                rows = self.file.read_row_groups(list(groups), columns=names)
+            chosen = list(range(self.n_groups) if groups is None else groups)
+            for group in chosen:
+                self._check_pages(group, names)
+            rows = self.file.read_row_groups(chosen, columns=names)
             for field in wanted:
                 if pa.types.is_string(field.type):
-                    self._check_text(rows[field.name])
+                    self._check_text(field.name, rows[field.name], None if any_ids else _IDS.get(field.name))
             rows = rows.cast(wanted)
             rows.validate(full=True)
             return rows
-        except (pa.ArrowException, OSError, ValueError) as error:
+        except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(self.path, "content", error, "a whole Parquet file") from None
 
-    def _check_text(self, column: pa.ChunkedArray) -> None:
+    def _check_pages(self, group: int, names: list[str]) -> None:
+        """The footer's sizes were checked; here that the pages keep to them."""
+        metadata = self.file.metadata.row_group(group)
+        for column in map(metadata.column, range(metadata.num_columns)):
+            name = column.path_in_schema
+            if name.split(".")[0] not in names:
+                continue
+            pages = pages_of(self.path, column)
+            if pages.unpacked_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
+                found = f"{pages.unpacked_bytes} bytes unpacked and {pages.n_values} values"
+                wanted = f"at most {column.total_uncompressed_size} and {column.num_values}, as its footer says"
+                raise UserError(self.path, name, found, wanted)
+            # One image repeated by a dictionary would be a small file that unpacks without end.
+            if name.startswith("image.") and pages.has_dictionary:
+                raise UserError(self.path, name, "a dictionary", "plain bytes for each frame")
+
+    def _check_text(self, name: str, column: pa.ChunkedArray, pattern: str | None) -> None:
         for chunk in column.chunks:
             words = chunk.dictionary if pa.types.is_dictionary(chunk.type) else chunk
             longest = pc.max(pc.binary_length(words)).as_py() or 0
             if longest > _LONGEST_TEXT:
-                raise UserError(self.path, "text", f"{longest} bytes long", f"at most {_LONGEST_TEXT}")
+                raise UserError(self.path, name, f"text of {longest} bytes", f"at most {_LONGEST_TEXT}")
+            if pattern is not None:
+                fits = pc.and_not(pc.match_substring_regex(words, pattern), pc.match_substring(words, "\n"))
+                if pc.all(fits).as_py() is False:
+                    odd = words.filter(pc.invert(fits))[0].as_py()
+                    raise UserError(self.path, name, repr(odd), f"text like {pattern}")
 
     def groups_within(self, column: str, low: str, high: str) -> list[int]:
         """Row groups that may hold texts from `low` up to, but not including, `high`, by their statistics."""
@@ -115,7 +166,11 @@ class Part:
         chosen = []
         for group in range(footer.num_row_groups):
             known = footer.row_group(group).column(place).statistics if place >= 0 else None
-            if known is None or not known.has_min_max or (str(known.min) < high and str(known.max) >= low):
+            try:
+                far = known is not None and known.has_min_max and not (str(known.min) < high and str(known.max) >= low)
+            except (pa.ArrowException, ValueError):  # of another type, or no text
+                far = False
+            if not far:
                 chosen.append(group)
         return chosen
 
@@ -126,7 +181,12 @@ def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> p
 
 
 def write_part(root: Path, table: str, name: str, rows: pa.Table, rows_a_group: int | None = None) -> Path:
-    """Write one part `manifest/<table>/<name>.parquet`. A part that exists is never rewritten."""
+    """Write one part `manifest/<table>/<name>.parquet`. A part that exists is never rewritten.
+
+    Raises UserError where the name, which may come from another dataset's rows, could not be a part's.
+    """
+    if not re.fullmatch(PART_PATTERN, name) or name.endswith("\n"):
+        raise UserError(root, "part", repr(name), f"a name like {PART_PATTERN}")
     part = root / "manifest" / table / f"{name}.parquet"
     if part.exists():
         raise FileExistsError(part)

@@ -3,9 +3,12 @@
 Tables are read a part and then a descent at a time, so that memory does not grow with the dataset.
 """
 
+import contextlib
 import hashlib
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -17,8 +20,8 @@ from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.faults import Fault, part_faults
 from perilune_shared.frames import selenographic_from_site
-from perilune_shared.manifest import Dataset
-from perilune_shared.parts import Part
+from perilune_shared.manifest import LARGEST_FRAME_BYTES, Dataset
+from perilune_shared.parts import WHOLE_TABLE, Part
 from perilune_shared.png import png_header
 from perilune_shared.schema import IMAGES, KEYS, TABLES
 from perilune_shared.validate_descent import descent_faults
@@ -32,6 +35,12 @@ def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
 
     Faults of the same file and column are told once, at their first row. The labels' projections are all made again.
     """
+    # What makes numbers overflow is told as a fault; numpy's warnings would come between the lines.
+    with np.errstate(all="ignore"):
+        return _faults(dataset, progress)
+
+
+def _faults(dataset: Dataset, progress: Progress | None) -> list[Fault]:
     faults = [
         Fault.of(file, None, "SHA-256", found, wanted) for file, found, wanted in checksums.faults_of(dataset.root)
     ]
@@ -45,8 +54,12 @@ def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
         faults += _tables(dataset, progress)
     except UserError as error:
         if not faults:
-            faults.append(Fault.of("manifest", None, "part", error, "readable parts"))
-    faults += _images(dataset, progress)
+            faults.append(Fault.told("manifest", None, error))
+    try:
+        faults += _images(dataset, progress)
+    except UserError as error:
+        if not faults:
+            faults.append(Fault.told("images", None, error))
     return list({(fault.file, fault.column, fault.row is None): fault for fault in reversed(faults)}.values())[::-1]
 
 
@@ -62,16 +75,21 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
     scene_ids = dataset.table("scenes", ["scene_id"])["scene_id"].to_pylist()
     yield from _unique(dataset, "scenes", dataset.table("scenes", KEYS["scenes"]), "manifest/scenes")
     used: set[str] = set()
+    told: set[tuple[str, str]] = set()
     seen = dict.fromkeys(TABLES, 0)
     splits_of_terrain: dict[str, set[str]] = defaultdict(set)
     task = progress.add_task("checking", total=len(scene_ids), unit="scenes", note="") if progress else None
     for scene_id in dict.fromkeys(scene_ids):
         scene = dataset.table("scenes", scene_id=scene_id)
+        if not len(scene):
+            wanted = "names of parts and statistics of row groups that tell where a scene's rows are"
+            yield Fault.of("manifest/scenes", None, "part", f"{scene_id} elsewhere", wanted)
+            continue
         used.add(scene["recipe"][0].as_py())
         frame_splits = dataset.table("frames", ["split"], scene_id=scene_id)["split"]
         splits_of_terrain[scene["content_sha256"][0].as_py()] |= set(frame_splits.unique().to_pylist())
         seen["scenes"] += len(scene)
-        yield from _scene(dataset, scene_id, scene, seen)
+        yield from _scene(dataset, scene_id, scene, seen, told)
         if progress is not None and task is not None:
             progress.advance(task)
     for name, present in counts.items():
@@ -86,7 +104,9 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
             yield Fault.of("manifest/frames", None, "split", found, "one split for each scene: no common terrain")
 
 
-def _scene(dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int]) -> Iterator[Fault]:
+def _scene(
+    dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int], told: set[tuple[str, str]]
+) -> Iterator[Fault]:
     """One scene's row, craters and boulders, then each of its descents; counts what it has seen."""
     where = {name: _place(dataset, name, scene_id) for name in TABLES}
     craters = dataset.table("craters", scene_id=scene_id)
@@ -101,7 +121,7 @@ def _scene(dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int
         if row["content_sha256"] != content:
             yield Fault.of(where["scenes"], 0, "content_sha256", row["content_sha256"], f"{content}, of its craters")
     if len(craters):
-        yield from _crater_places(craters, row, where["craters"])
+        yield from _in_file(dataset, _crater_places(craters, row, where["craters"]), scene_id, told)
     for descent in trajectories.to_pylist():
         trajectory_id = descent["trajectory_id"]
         frames = dataset.table("frames", scene_id=scene_id, trajectory_id=trajectory_id)
@@ -111,7 +131,27 @@ def _scene(dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int
         places = {name: _place(dataset, name, scene_id, trajectory_id) for name in ("frames", "labels")}
         for name, rows in (("frames", frames), ("labels", labels)):
             yield from _unique(dataset, name, rows.select(KEYS[name]), places[name])
-        yield from descent_faults(dataset.info, row, craters, descent, frames, labels, places)
+        faults = descent_faults(dataset.info, row, craters, descent, frames, labels, places)
+        yield from _in_file(dataset, faults, f"{scene_id}/{trajectory_id}/", told)
+
+
+def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, told: set[tuple[str, str]]) -> Iterator[Fault]:
+    """Faults with rows counted within a scene or a descent (`own` begins its frames' names) as rows of the file.
+
+    What was told of a file and column is not told again.
+    """
+    for fault in faults:
+        path = dataset.root / fault.file
+        if (fault.file, fault.column) in told:
+            continue
+        told.add((fault.file, fault.column))
+        if fault.row is not None and path.stem == WHOLE_TABLE:
+            part = Part(path, path.parent.name)
+            key = "frame_id" if "frame_id" in part.schema.names else "scene_id"
+            keys = part.read([key])[key]
+            found = pc.starts_with(keys, own) if key == "frame_id" else pc.equal(keys, own)
+            fault = replace(fault, row=int(np.flatnonzero(found)[fault.row]))
+        yield fault
 
 
 def _crater_places(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault]:
@@ -153,27 +193,35 @@ def _images(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
     columns = ["frame_id", *(f"{kind}_{name}" for kind in ("png", "exr") for name in ("path", "bytes", "sha256"))]
     for part in dataset.parts("frames"):
         where = part.relative_to(dataset.root).as_posix()
-        try:
-            rows = Part(part, "frames").read(columns)
-        except UserError:
-            continue
-        places = {frame_id: row for row, frame_id in enumerate(rows["frame_id"].to_pylist())}
-        records = rows.to_pylist()
-        for row, frame in enumerate(records):
-            for kind in ("png", "exr") if info.images == "files" else ():
-                if frame[f"{kind}_path"] is not None:
-                    yield from _file(dataset, frame, kind, row, where)
-            if progress is not None and task is not None:
-                progress.advance(task)
-        if info.images == "packed":
-            try:
-                for frame_id, png in dataset.pngs(rows):
-                    frame = records[places[frame_id]]
-                    yield from _png(dataset, png, len(png), hashlib.sha256(png).hexdigest(), frame, places[frame_id])
-            except UserError as error:
-                yield Fault.of("images", None, "frame_id", error, "every frame of the manifest")
+        first_row = 0
+        for rows in _groups(part, columns):
+            places = {frame_id: first_row + row for row, frame_id in enumerate(rows["frame_id"].to_pylist())}
+            records = rows.to_pylist()
+            for row, frame in enumerate(records, first_row):
+                for kind in ("png", "exr") if info.images == "files" else ():
+                    if frame[f"{kind}_path"] is not None:
+                        yield from _file(dataset, frame, kind, row, where)
+                if progress is not None and task is not None:
+                    progress.advance(task)
+            if info.images == "packed":
+                try:
+                    for frame_id, png in dataset.pngs(rows):
+                        row = places[frame_id]
+                        sha256 = hashlib.sha256(png).hexdigest()
+                        yield from _png(dataset, png, len(png), sha256, records[row - first_row], row)
+                except UserError as error:
+                    yield Fault.told("images", None, error)
+            first_row += len(rows)
     if info.images == "packed":
         yield from _shards(dataset)
+
+
+def _groups(part: Path, columns: list[str]) -> Iterator[pa.Table]:
+    """The row groups of a part of `frames`, as far as it can be read; why not further, the part's own checks tell."""
+    with contextlib.suppress(UserError):
+        opened = Part(part, "frames")
+        for group in range(opened.n_groups):
+            yield opened.read(columns, [group])
 
 
 def _shards(dataset: Dataset) -> Iterator[Fault]:
@@ -184,7 +232,7 @@ def _shards(dataset: Dataset) -> Iterator[Fault]:
         try:
             keys = Part(shard, "images", IMAGES).read(["frame_id"])["frame_id"].to_pylist()
         except UserError as error:
-            yield Fault.of(where, None, "part", error, "a readable shard of frames")
+            yield Fault.told(where, None, error)
             continue
         odd = [key for key in keys if key not in known or key in found]
         if odd or len(set(keys)) != len(keys):
@@ -197,13 +245,15 @@ def _file(dataset: Dataset, frame: dict, kind: str, row: int, where: str) -> Ite
     try:
         path = dataset.file(relative)
     except UserError as error:
-        yield Fault.of(where, row, f"{kind}_path", error, "a path inside the dataset")
+        yield Fault.of(where, row, f"{kind}_path", error.found, error.wanted)
         return
     if not path.is_file():
         yield Fault.of(relative, row, f"{kind}_path", "no such file", "the frame")
         return
     n_bytes = path.stat().st_size
-    if n_bytes != frame[f"{kind}_bytes"]:
+    if n_bytes > LARGEST_FRAME_BYTES:
+        yield Fault.of(relative, row, f"{kind}_bytes", n_bytes, f"at most {LARGEST_FRAME_BYTES}")
+    elif n_bytes != frame[f"{kind}_bytes"]:
         yield Fault.of(relative, row, f"{kind}_bytes", n_bytes, frame[f"{kind}_bytes"])
     elif kind == "exr":
         if files.sha256_of(path) != frame["exr_sha256"]:

@@ -6,13 +6,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_shared.ellipse import project_circles
+from perilune_shared.ellipse import Ellipses, project_circles
 from perilune_shared.faults import Fault
 from perilune_shared.frames import Array, matrix_from_quaternion, sun_direction
 from perilune_shared.info import DatasetInfo
 
 _LABEL_TOLERANCE_PX = 1e-6
 _SUN_TOLERANCE = 1e-9
+_FARTHEST_M = 1e9
 _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
 _BOX = ("bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px")
 
@@ -29,7 +30,7 @@ def descent_faults(
     """Faults of a descent: its scene's row and craters, its own row, its frames and labels, and these tables' files."""
     yield from _frames(info, scene, descent, frames, where["frames"])
     if len(labels):
-        yield from _labels(info, craters, frames, labels, where["labels"])
+        yield from _labels(info, craters, frames, labels, where)
 
 
 def _frames(info: DatasetInfo, scene: dict, descent: dict, frames: pa.Table, where: str) -> Iterator[Fault]:
@@ -76,12 +77,15 @@ def _frames(info: DatasetInfo, scene: dict, descent: dict, frames: pa.Table, whe
             yield Fault.of(where, int(wrong[0]), f"{kind}_sha256", "null", "path, hash and size together")
 
 
-def _labels(info: DatasetInfo, craters: pa.Table, frames: pa.Table, labels: pa.Table, where: str) -> Iterator[Fault]:
+def _labels(
+    info: DatasetInfo, craters: pa.Table, frames: pa.Table, labels: pa.Table, places: dict[str, str]
+) -> Iterator[Fault]:
     """Frames and craters that labels name, and their ellipses, projected again from crater and pose."""
+    where = places["labels"]
     frame_of = _places(labels["frame_id"], frames["frame_id"])
     crater_of = _places(labels["crater_id"], craters["crater_id"])
-    for name, places in (("frame_id", frame_of), ("crater_id", crater_of)):
-        unknown = np.flatnonzero(places < 0)
+    for name, found_at in (("frame_id", frame_of), ("crater_id", crater_of)):
+        unknown = np.flatnonzero(found_at < 0)
         if len(unknown):
             found = labels[name][int(unknown[0])].as_py()
             yield Fault.of(where, int(unknown[0]), name, found, f"in {name.removesuffix('_id')}s")
@@ -90,6 +94,7 @@ def _labels(info: DatasetInfo, craters: pa.Table, frames: pa.Table, labels: pa.T
         return
     again = _projected(info, craters, frames, crater_of[known], frame_of[known])
     size = 1 + again["ellipse_a_px"]
+    misfit = np.zeros(len(known), bool)
     for name, values in again.items():
         apart = np.abs(labels[name].to_numpy()[known] - values)
         tolerance = _LABEL_TOLERANCE_PX * size
@@ -97,10 +102,18 @@ def _labels(info: DatasetInfo, craters: pa.Table, frames: pa.Table, labels: pa.T
             # A circle has no direction; half a turn is none.
             apart = np.minimum(apart, np.pi - apart) * np.minimum(1, size - 1 - again["ellipse_b_px"])
         wrong = np.flatnonzero(~(apart < tolerance))
+        misfit[wrong] = True
         if len(wrong):
             row = int(known[wrong[0]])
             wanted = f"{values[wrong[0]]}, projected from crater and pose"
             yield Fault.of(where, row, name, labels[name][row].as_py(), wanted)
+    # One wrong label is the label's fault; where none fits, it is the pose's.
+    labelled = np.bincount(frame_of[known], minlength=len(frames))
+    lost = np.bincount(frame_of[known[misfit]], minlength=len(frames))
+    odd = np.flatnonzero((labelled > 1) & (lost == labelled))
+    if len(odd):
+        found = f"none of {labelled[odd[0]]} labels fits"
+        yield Fault.of(places["frames"], int(odd[0]), "position_m+rotation_wxyz", found, "the pose of its labels")
 
 
 def _projected(
@@ -114,8 +127,15 @@ def _projected(
     in_camera = np.einsum("nij,nj->ni", rotation, offset)
     turned = np.einsum("nij,nj->ni", rotation, normal)
     radius = craters["diameter_m"].to_numpy()[crater_of] / 2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ellipses = project_circles(info.camera.intrinsics(), in_camera, turned, radius)
+    sound = (np.abs(in_camera) < _FARTHEST_M).all(axis=1) & (np.abs(turned) <= 2).all(axis=1)
+    sound &= (radius > 0) & (radius < _FARTHEST_M)
+    # A circle behind the camera has no image: then the label fits nothing.
+    in_camera[~sound], turned[~sound], radius[~sound] = (0, 0, -10), (0, 0, 1), 1
+    with np.errstate(all="ignore"):
+        try:
+            ellipses = project_circles(info.camera.intrinsics(), in_camera, turned, radius)
+        except np.linalg.LinAlgError:
+            ellipses = Ellipses(*np.full((5, len(radius)), np.nan))
     names = ("cx_px", "cy_px", "a_px", "b_px", "theta_rad")
     columns = {f"ellipse_{name}": getattr(ellipses, name) for name in names}
     boxes = dict(zip(_BOX, ellipses.bounding_boxes().T, strict=True))

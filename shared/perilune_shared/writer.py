@@ -73,14 +73,15 @@ class DatasetWriter:
         by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path"]).to_pylist()}
         if source.info.images == "packed":
             for frame_id, png in source.pngs(frames):
-                files.write_bytes(self.root / f"frames/{names[frame_id]}.png", png)
+                files.write_bytes(files.inside(self.root, f"frames/{names[frame_id]}.png"), png)
         else:
             for row in frames.select(["frame_id", "png_path"]).to_pylist():
                 by_id[row["frame_id"]]["png_path"] = row["png_path"]
         for frame_id, row in by_id.items():
             for kind in ("png", "exr"):
                 if row.get(f"{kind}_path") is not None:
-                    _bring(source.file(row[f"{kind}_path"]), self.root / f"frames/{names[frame_id]}.{kind}", link=link)
+                    to = files.inside(self.root, f"frames/{names[frame_id]}.{kind}")
+                    _bring(source.file(row[f"{kind}_path"]), to, link=link)
 
     def pack_images(self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int) -> None:
         """Write frames (frame_id, png_path, PNG bytes) into shards images/*.parquet of about `shard_bytes`."""

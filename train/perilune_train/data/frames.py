@@ -1,5 +1,6 @@
 """A dataset's frames in memory: pixels as 8-bit grey, beside their rows of the manifest."""
 
+import os
 from dataclasses import dataclass
 
 import cv2
@@ -48,13 +49,17 @@ def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int
 
 
 def load_frames(dataset: Dataset, split: str) -> FrameStore:
-    """All frames of a split, 64 kB each at 256 x 256. Raises UserError on a split without frames or a bad frame."""
+    """All frames of a split, 64 kB each at 256 x 256. Raises UserError on none, too many or a bad one."""
     rows = dataset.table("frames", split=split)
     table = rows.to_pandas()
     if table.empty:
         raise UserError(dataset.root, "split", f"no {split} frames", "a dataset with frames in train, val and test")
     table = table.sort_values(["scene_id", "trajectory_id", "frame_index"], ignore_index=True)
     camera = dataset.info.camera
+    n_bytes = len(table) * camera.height_px * camera.width_px
+    if n_bytes > os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"):
+        found = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
+        raise UserError(dataset.root, "frames", found, f"{split} frames that fit into this machine's memory")
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
     place = {frame_id: i for i, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()

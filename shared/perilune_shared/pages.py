@@ -1,0 +1,101 @@
+"""What the pages of a Parquet column unpack to, by the headers that a reader goes by.
+
+A footer may say anything of its columns; the reader unpacks what the pages' own headers say. Both are Thrift's compact
+protocol, as parquet.thrift describes it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+_HEADER_BYTES = 16_384
+_DEEPEST = 4
+_DICTIONARY = 2
+_BOOLS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _STRUCT = (1, 2), 3, (4, 5, 6), 7, 8, 12
+_TYPE, _UNPACKED, _PACKED, _DATA, _DATA_V2 = 1, 2, 3, 5, 8
+
+
+@dataclass(frozen=True, slots=True)
+class Pages:
+    """All pages of one column in one row group."""
+
+    unpacked_bytes: int
+    """Room that they take once unpacked, at most."""
+    n_values: int
+    """Values in them."""
+    has_dictionary: bool
+    """Whether one is a dictionary."""
+
+
+def pages_of(path: Path, column: Any) -> Pages:
+    """Walk the pages of a column, given its metadata as pyarrow has it. Raises ValueError where they are damaged."""
+    start = column.data_page_offset
+    if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
+        start = column.dictionary_page_offset
+    end = start + column.total_compressed_size
+    unpacked, n_values, has_dictionary = 0, 0, False
+    with path.open("rb") as stream:
+        while start < end and n_values < column.num_values:
+            header, length = _header(stream, start)
+            sizes = header.get(_UNPACKED), header.get(_PACKED)
+            if not all(isinstance(size, int) and size >= 0 for size in sizes):
+                raise ValueError(f"a page at byte {start} without sizes")
+            unpacked += header[_UNPACKED]
+            has_dictionary |= header.get(_TYPE) == _DICTIONARY
+            for kind in (_DATA, _DATA_V2):
+                held = header.get(kind, {}).get(1, 0)
+                if held < 0:
+                    raise ValueError(f"a page at byte {start} with {held} values")
+                n_values += held
+            start += length + header[_PACKED]
+    return Pages(unpacked, n_values, has_dictionary)
+
+
+def _header(stream: BinaryIO, start: int) -> tuple[dict, int]:
+    """A page's header and its length, bytes."""
+    stream.seek(start)
+    buffer = stream.read(_HEADER_BYTES)
+    try:
+        return _struct(buffer, 0, 0)
+    except (IndexError, TypeError, AttributeError):
+        raise ValueError(f"no page at byte {start}") from None
+
+
+def _varint(buffer: bytes, at: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        byte = buffer[at]
+        value |= (byte & 0x7F) << shift
+        at += 1
+        if byte < 0x80:
+            return value, at
+    raise IndexError
+
+
+def _struct(buffer: bytes, at: int, depth: int) -> tuple[dict, int]:
+    """Integers and structs of a struct by their numbers, and where it ends. Raises IndexError at its buffer's end."""
+    if depth > _DEEPEST:
+        raise IndexError
+    fields: dict[int, Any] = {}
+    number = 0
+    while buffer[at]:
+        kind, step = buffer[at] & 15, buffer[at] >> 4
+        at += 1
+        if step:
+            number += step
+        else:
+            value, at = _varint(buffer, at)
+            number = (value >> 1) ^ -(value & 1)
+        if kind in _INTEGERS:
+            value, at = _varint(buffer, at)
+            fields[number] = (value >> 1) ^ -(value & 1)
+        elif kind == _TEXT:
+            length, at = _varint(buffer, at)
+            at += length
+        elif kind == _STRUCT:
+            fields[number], at = _struct(buffer, at, depth + 1)
+        elif kind in (_BYTE, _DOUBLE):
+            at += 1 if kind == _BYTE else 8
+        elif kind not in _BOOLS:  # no list stands in a page's header
+            raise IndexError
+    return fields, at + 1
