@@ -1,0 +1,317 @@
+"""A dataset is untrusted: Parquet files whose columns, footers or pages are not what they should be."""
+
+import os
+import pickle
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from tests import hostile_parquet as forged
+from tests.hostile import assert_refused, edit, part_of, sealed, told_within
+
+from perilune_shared.errors import UserError
+from perilune_shared.parts import Part
+from perilune_shared.schema import IMAGES, TABLES
+
+
+
+class Pickled:
+    """Whoever unpickles this makes a folder."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+def column(table, name, kind, values, nullable=False):
+    """A column of another type, under the metadata of the right one."""
+
+    def damage(root):
+        path = part_of(root, table)
+        rows = pq.read_table(path)
+        place = rows.schema.get_field_index(name)
+        cells = pa.array([values] * len(rows), kind)
+        field = pa.field(name, kind, nullable=nullable, metadata=rows.schema.field(place).metadata)
+        pq.write_table(rows.set_column(place, field, cells), path)
+
+    return sealed(damage)
+
+
+def table(name, change, **options):
+    """A whole table changed as Arrow."""
+
+    def damage(root):
+        path = part_of(root, name)
+        pq.write_table(change(pq.read_table(path)), path, **options)
+
+    return sealed(damage)
+
+
+def footer(name, change):
+    """A part's footer changed."""
+    return sealed(lambda root: forged.forge(part_of(root, name), change))
+
+
+def content(name, change):
+    """A part's bytes changed."""
+
+    def damage(root):
+        path = part_of(root, name)
+        path.write_bytes(change(path.read_bytes()))
+
+    return sealed(damage)
+
+
+def every_group(change):
+    return lambda found: [change(group) for group in forged.groups(found)]
+
+
+def every_column(change):
+    return every_group(lambda group: [change(each) for each in forged.columns(group)])
+
+
+def with_metadata(**more):
+    return lambda rows: rows.replace_schema_metadata({**rows.schema.metadata, **more})
+
+
+def renamed(old, new):
+    return lambda rows: rows.rename_columns([new if name == old else name for name in rows.column_names])
+
+
+def swapped(a, b):
+    """Two columns in each other's place."""
+
+    def change(rows):
+        names = rows.column_names
+        i, j = names.index(a), names.index(b)
+        names[i], names[j] = names[j], names[i]
+        return rows.select(names)
+
+    return change
+
+
+def extended(name):
+    return lambda rows: rows.append_column(pa.field(name, pa.int64()), pa.array([1] * len(rows)))
+
+
+def nulled(name):
+    """The first value of a column missing."""
+
+    def change(rows):
+        place = rows.schema.get_field_index(name)
+        cells = pa.array([None, *rows[name].to_pylist()[1:]], rows.schema.field(place).type)
+        return rows.set_column(place, pa.field(name, cells.type, metadata=rows.schema.field(place).metadata), cells)
+
+    return change
+
+
+CASES = {
+    "text as binary": (column("scenes", "photometry", pa.binary(), b"lambert"), "photometry"),
+    "text as a large one": (column("scenes", "photometry", pa.large_string(), "lambert"), "photometry"),
+    "text as a struct": (column("frames", "frame_id", pa.struct([("a", pa.string())]), {"a": "x"}), "frame_id"),
+    "text as a list": (column("frames", "png_path", pa.list_(pa.string()), ["a"]), "png_path"),
+    "text as a map": (column("frames", "split", pa.map_(pa.string(), pa.string()), [("a", "b")]), "split"),
+    "text as numbers": (column("frames", "scene_id", pa.int64(), 1), "scene_id"),
+    "text as a dictionary": (column("scenes", "photometry", pa.dictionary(pa.int8(), pa.string()), "a"), "photometry"),
+    "a number as a pickle": (column("craters", "x_m", pa.binary(), pickle.dumps(1.0)), "x_m"),
+    "a number as text": (column("craters", "diameter_m", pa.string(), "=1+1"), "diameter_m"),
+    "a number as a whole one": (column("craters", "depth_m", pa.int64(), 1), "depth_m"),
+    "a number in 32 bits": (column("craters", "z_m", pa.float32(), 1.0), "z_m"),
+    "a whole number as a real one": (column("labels", "crater_id", pa.float64(), 1.5), "crater_id"),
+    "a whole number as a time": (column("frames", "frame_index", pa.timestamp("ns"), 1), "frame_index"),
+    "a vector as a list of any length": (column("frames", "position_m", pa.list_(pa.float64()), [0.0] * 3), "position_m"),
+    "a vector of four": (column("frames", "position_m", pa.list_(pa.float64(), 4), [0.0] * 4), "position_m"),
+    "a vector as text": (column("frames", "rotation_wxyz", pa.string(), "[1,0,0,0]"), "rotation_wxyz"),
+    "a missing column": (table("frames", lambda rows: rows.drop_columns("png_path")), "schema"),
+    "another column": (table("frames", extended("extra")), "schema"),
+    "a column named like a method": (table("frames", extended("__class__")), "schema"),
+    "a column named by HTML": (table("frames", extended("<script>")), "schema"),
+    "a column named by a command": (table("labels", renamed("crater_id", "$(touch canary)")), "schema"),
+    "a column twice": (table("labels", renamed("crater_id", "frame_id")), "schema"),
+    "columns in another order": (table("craters", swapped("x_m", "y_m")), "schema"),
+    "columns under each other's names": (
+        table("craters", lambda rows: swapped("x_m", "y_m")(rows).rename_columns(rows.column_names)),
+        "x_m",
+    ),
+    "no metadata": (table("scenes", lambda rows: rows.replace_schema_metadata(None)), "schema_version"),
+    "another table": (table("scenes", with_metadata(**{"perilune.table": "frames"})), "perilune.table"),
+    "another version": (table("scenes", with_metadata(**{"perilune.schema_version": "\x1b[2J"})), "schema_version"),
+    "another unit": (
+        table("craters", lambda rows: rows.cast(rows.schema.set(2, rows.schema.field(2).with_metadata({"unit": "km"})))),
+        "x_m",
+    ),
+    "null for a number": (table("craters", nulled("x_m")), "x_m"),
+    "null for a name": (table("frames", nulled("frame_id")), "frame_id"),
+    "null for a path": (table("frames", nulled("png_path")), "png_path"),
+    "text of 2000 letters": (column("scenes", "photometry", pa.string(), "a" * 2000), "photometry"),
+    "no rows": (table("frames", lambda rows: rows[:0]), ""),
+    "an empty file": (content("frames", lambda whole: b""), "content"),
+    "a file of its ends": (content("frames", lambda whole: b"PAR1PAR1"), "content"),
+    "a footer longer than its file": (content("frames", lambda whole: whole[:-8] + b"\xff\xff\xff\x7fPAR1"), "content"),
+    "a footer of nothing": (content("frames", lambda whole: whole[:-8] + bytes(4) + b"PAR1"), "content"),
+    "a footer of noise": (
+        content("frames", lambda whole: whole[:-508] + np.random.default_rng(1).bytes(500) + whole[-8:]),
+        "content",
+    ),
+    "an encrypted file": (content("frames", lambda whole: b"PARE" + whole[4:-4] + b"PARE"), "content"),
+    "pages of noise": (
+        content("frames", lambda whole: whole[:4] + np.random.default_rng(1).bytes(2000) + whole[2004:]),
+        "",
+    ),
+    "a CSV file": (content("frames", lambda whole: b"frame_id\n=cmd()\n"), "content"),
+    "a schema nested 100 000 deep": (content("frames", lambda whole: forged.nested(100_000)), "content"),
+    "a schema nested 9000 deep": (content("frames", lambda whole: forged.nested(9000)), ""),
+    "more rows than its groups": (footer("frames", lambda found: forged.put(found, 3, 10**9)), "rows"),
+    "negative rows": (footer("frames", lambda found: forged.put(found, 3, -1)), ""),
+    "negative rows in a group": (footer("frames", every_group(lambda group: forged.put(group, 3, -5))), ""),
+    "10^12 rows in a group": (footer("frames", every_group(lambda group: forged.put(group, 3, 10**12))), "rows"),
+    "groups that lie over each other": (
+        footer("labels", lambda found: [forged.groups(found).extend(forged.groups(found) * 9), forged.put(found, 3, 10**9)]),
+        "rows",
+    ),
+    "columns of no size": (footer("frames", every_column(lambda each: forged.put(each, 6, 0))), "frame_id"),
+    "columns beyond the file": (footer("frames", every_column(lambda each: forged.put(each, 9, 10**9))), ""),
+    "columns before the file": (footer("frames", every_column(lambda each: forged.put(each, 9, -5))), ""),
+    "columns in each other's place": (
+        footer("craters", every_column(lambda each: each.update({9: (6, 4)}))),
+        "",
+    ),
+    "more values than rows": (footer("labels", every_column(lambda each: forged.put(each, 5, 10**9))), ""),
+    "fewer values than rows": (footer("labels", every_column(lambda each: forged.put(each, 5, 1))), ""),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_parts_of_ill_will(name, victim, capsys, monkeypatch):
+    damage, told = CASES[name]
+    damage(victim)
+    assert_refused(victim, "", told, capsys, monkeypatch)
+
+
+def test_what_is_pickled_stays_so(victim, capsys, monkeypatch):
+    """In the file's metadata, a column's, that of pandas and that of a type of Python's own."""
+    bait = victim.parent / "canary" / "made"
+    pickled = pickle.dumps(Pickled(bait))
+    path = part_of(victim, "scenes")
+    rows = pq.read_table(path)
+    fields = [field.with_metadata({**field.metadata, b"pickle": pickled}) for field in rows.schema]
+    fields[-1] = fields[-1].with_metadata(
+        {b"ARROW:extension:name": b"arrow.py_extension_type", b"ARROW:extension:metadata": pickled}
+    )
+    metadata = {**rows.schema.metadata, b"pandas": pickled, b"pickle": pickled, b"huggingface": pickled}
+    pq.write_table(rows.cast(pa.schema(fields, metadata)), path)
+    sealed(lambda root: None)(victim)
+    assert_refused(victim, "manifest/scenes/all.parquet", "scene_id", capsys, monkeypatch)
+    assert not bait.exists()
+    pickle.loads(pickled)
+    assert bait.is_dir()
+
+
+def constant(n, **cells):
+    """Rows of `scenes` that hardly take room."""
+    values = {"string": "a", "int64": 1, "double": 1.0}
+    columns = [pa.array([values[str(field.type)]] * n, field.type) for field in TABLES["scenes"]]
+    rows = pa.table(columns, schema=TABLES["scenes"])
+    for name, value in cells.items():
+        rows = rows.set_column(rows.schema.get_field_index(name), TABLES["scenes"].field(name), value)
+    return rows
+
+
+def scenes(rows, change=None, **options):
+    """The part of `scenes` from other rows, and then with its footer changed."""
+
+    def damage(root):
+        path = part_of(root, "scenes")
+        pq.write_table(rows(), path, **options)
+        if change is not None:
+            forged.forge(path, change)
+
+    return damage
+
+
+def thousandfold(found):
+    """Each group a thousand times, with the sums that go with it."""
+    forged.groups(found)[:] = forged.groups(found) * 1000
+    forged.put(found, 3, found[3][1] * 1000)
+
+
+def small(found):
+    """A footer that says that all columns are small, and without dictionaries."""
+    for group in forged.groups(found):
+        forged.put(group, 2, 1000)
+        for each in forged.columns(group):
+            forged.put(each, 6, 100)
+            each.pop(11, None)
+
+
+def long_text(n, length):
+    return lambda: constant(n, photometry=pa.array(["x" * length + str(i) for i in range(n)]))
+
+
+def repeated_text():
+    words = pa.DictionaryArray.from_arrays(pa.array([0] * 5000, pa.int32()), ["x" * 50_000_000])
+    return constant(5000).drop_columns("photometry").append_column("photometry", words)
+
+
+def long_list(root):
+    """10^8 numbers in one row of a vector."""
+    path = part_of(root, "trajectories")
+    rows = pq.read_table(path)
+    place = rows.schema.get_field_index("nominal_position_m")
+    flat = pa.array(np.zeros(20_000_000))
+    cells = pa.ListArray.from_arrays(pa.array([0, len(flat), len(flat)], pa.int32()), flat)
+    pq.write_table(rows.set_column(place, pa.field("nominal_position_m", cells.type), cells), path)
+
+
+def one_image_repeated(root):
+    rows = pq.read_table(part_of(root, "frames"), columns=["frame_id"])
+    image = pa.array([b"\x89PNG" + bytes(40_000_000)])
+    images = pa.StructArray.from_arrays([image, pa.array(["a"])], fields=list(IMAGES.field("image").type))
+    (root / "images").mkdir()
+    with pq.ParquetWriter(root / "images/00000.parquet", IMAGES, compression="zstd") as writer:
+        for k in range(6):
+            writer.write_table(pa.table([rows["frame_id"].combine_chunks()[k : k + 1], images], schema=IMAGES))
+    edit(lambda found: found.update(images="packed"))(root)
+
+
+BOMBS = {
+    "10^9 rows": (scenes(lambda: constant(1_000_000), thousandfold), "rows"),
+    "10^6 rows in 20 kB": (scenes(lambda: constant(1_000_000)), "rows"),
+    "text of 400 MB in 20 kB": (scenes(long_text(20, 20_000_000), compression="zstd", use_dictionary=False), "size"),
+    "the same with gzip": (scenes(long_text(10, 10_000_000), compression="gzip", use_dictionary=False), "size"),
+    "the same with brotli": (scenes(long_text(10, 10_000_000), compression="brotli", use_dictionary=False), "size"),
+    "the same with a footer that hides it": (
+        scenes(long_text(20, 20_000_000), small, compression="zstd", use_dictionary=False),
+        "unpacked",
+    ),
+    "text of 50 MB in 5000 rows": (scenes(repeated_text, compression="zstd"), ""),
+    "the same with a footer that hides it, by its dictionary": (scenes(repeated_text, small, compression="zstd"), ""),
+    "2 x 10^7 numbers in a row": (long_list, "nominal_position_m"),
+    "images of 240 MB in 60 kB": (one_image_repeated, "size"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_bombs_do_not_go_off(name, victim):
+    damage, told = BOMBS[name]
+    sealed(damage)(victim)
+    assert sum(path.stat().st_size for path in victim.rglob("*") if path.is_file()) < 3_000_000
+    assert told in told_within(victim, 200)
+
+
+def test_a_part_as_large_as_they_come_is_read(tmp_path):
+    """The limits leave room for what the renderer writes: rows of numbers that hardly shrink."""
+    rng = np.random.default_rng(1)
+    columns = [
+        pa.array([f"s000/t000/{i % 1000:06d}" for i in range(300_000)])
+        if field.name == "frame_id"
+        else pa.array(rng.integers(0, 2**40, 300_000) if field.type == pa.int64() else rng.random(300_000))
+        for field in TABLES["labels"]
+    ]
+    pq.write_table(pa.table(columns, schema=TABLES["labels"]), tmp_path / "all.parquet", compression="zstd")
+    assert len(Part(tmp_path / "all.parquet", "labels").read()) == 300_000
+    with pytest.raises(UserError, match="perilune.table"):
+        Part(tmp_path / "all.parquet", "frames")
