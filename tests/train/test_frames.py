@@ -1,3 +1,4 @@
+import json
 import struct
 import zlib
 
@@ -6,7 +7,8 @@ import numpy as np
 import pytest
 
 from perilune_shared.errors import UserError
-from perilune_train.data.frames import decode
+from perilune_shared.manifest import open_dataset
+from perilune_train.data.frames import decode, load_frames
 
 
 @pytest.mark.parametrize("bits", [10, 12, 16])
@@ -36,3 +38,14 @@ def bomb(width, height):
 def test_a_frame_that_is_no_image_is_refused(content, told):
     with pytest.raises(UserError, match=told):
         decode(content, "0.png", 16, 16)
+
+
+def test_frames_that_no_memory_holds_are_refused(make_dataset, tmp_path):
+    """A few bytes of dataset.json and of PNG can ask for any room."""
+    root = make_dataset(tmp_path / "bomb", "detect", side_px=32, splits={"train": 30}, n_frames=100, craters=5)
+    path = root / "dataset.json"
+    content = json.loads(path.read_text())
+    content["camera"].update(width_px=11_500, height_px=11_500)
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match="3000 frames of 11500 x 11500"):
+        load_frames(open_dataset(root), "train")
