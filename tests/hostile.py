@@ -59,7 +59,10 @@ def pack(root: Path, change: Callable[[list[dict]], object] = lambda rows: None,
     """The frames in one shard instead of files, with `change` applied to its rows."""
     frames = pq.read_table(part_of(root, "frames")).to_pylist()
     rows = [
-        {"frame_id": row["frame_id"], "image": {"bytes": (root / row["png_path"]).read_bytes(), "path": row["png_path"]}}
+        {
+            "frame_id": row["frame_id"],
+            "image": {"bytes": (root / row["png_path"]).read_bytes(), "path": row["png_path"]},
+        }
         for row in frames
     ]
     change(rows)
@@ -93,7 +96,7 @@ def read_all(dataset: Dataset) -> None:
 def command(root: Path, name: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> str:
     """Run `perilune-manifest`; what it printed, once it is known that it ended as a user's fault should."""
     monkeypatch.setattr(sys, "argv", ["perilune-manifest", name, str(root)])
-    monkeypatch.setenv("COLUMNS", "250")
+    monkeypatch.setenv("COLUMNS", "1500")
     capsys.readouterr()
     code = 0
     try:
@@ -113,6 +116,14 @@ def command(root: Path, name: str, capsys: pytest.CaptureFixture, monkeypatch: p
     return told
 
 
+def told_by(printed: str) -> Told:
+    """File and column of each fault in the table that `validate` printed, or the line with which it refused."""
+    rows = [[cell.strip() for cell in line.split("│")] for line in printed.splitlines() if line.startswith("│")]
+    assert all(len(row) == 7 and row[4] and row[5] for row in rows), printed
+    refused = [line for line in printed.splitlines() if line.startswith("error: ")]
+    return [(row[1], row[3]) for row in rows] + [(line, line) for line in refused]
+
+
 def told_of(root: Path) -> Told:
     """What opening and validating tells of a dataset. Fails where it raises anything but a user's fault."""
     try:
@@ -127,13 +138,12 @@ def told_of(root: Path) -> Told:
 def assert_refused(root: Path, file: str, column: str, capsys, monkeypatch) -> None:
     """A damaged dataset is refused, naming file and column, by library and command line; nothing beside it changes."""
     before = snapshot(root.parent, root)
-    told = told_of(root)
+    told = told_by(command(root, "validate", capsys, monkeypatch))
     assert any(file in found and column in name for found, name in told), told
     try:
         read_all(open_dataset(root))
     except UserError as error:
         assert "\n" not in str(error)
-    command(root, "validate", capsys, monkeypatch)
     command(root, "stats", capsys, monkeypatch)
     assert snapshot(root.parent, root) == before
 

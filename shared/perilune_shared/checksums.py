@@ -18,7 +18,7 @@ _OWN_FOLDERS = ("manifest", "images")
 
 
 def seal(root: Path) -> None:
-    """Write SHA256SUMS of all that lies in the dataset now; files of odd names and links are left out, and are faults then."""
+    """Write SHA256SUMS of all that lies in the dataset now, but links and odd names, which are faults."""
     names = [name for name in _covered(root) if files.is_plain(name) and not (root / name).is_symlink()]
     lines = [f"{files.sha256_of(root / name)}  {name}\n" for name in names]
     files.write_text(root / SUMS_NAME, "".join(lines))

@@ -82,7 +82,7 @@ class Fault:
             shortened(one_line(file), 300),
             row,
             shortened(one_line(column)),
-            shortened(one_line(found)),
+            shortened(one_line(found)) or "nothing",
             shortened(one_line(wanted), 300),
         )
 

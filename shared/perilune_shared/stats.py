@@ -4,14 +4,20 @@ import numpy as np
 import pandas as pd
 import pyarrow.compute as pc
 
+from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset
 from perilune_shared.parts import Part
 
 
 def summary(dataset: Dataset) -> pd.DataFrame:
-    """One row a split: scenes, trajectories, frames, labels, labels per frame and quantiles of the radius in pixels."""
+    """One row a split: scenes, trajectories, frames, labels, labels per frame and quantiles of the radius in pixels.
+
+    Raises UserError where there are no frames.
+    """
     columns = ["frame_id", "scene_id", "trajectory_id", "split", "png_bytes"]
     frames = dataset.table("frames", columns)
+    if not len(frames):
+        raise UserError(dataset.root, "frames", "none", "a dataset with frames")
     found = {split: _Gathered() for split in sorted(frames["split"].unique().to_pylist())}
     split_of = frames["split"].combine_chunks().dictionary_encode()
     names = np.array(split_of.dictionary.to_pylist(), object)
