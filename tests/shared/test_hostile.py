@@ -5,7 +5,6 @@ import os
 import shutil
 
 import pytest
-from tests.hostile import assert_refused, edit, sealed
 
 from perilune_shared import files
 from perilune_shared.checksums import SUMS_NAME
@@ -13,6 +12,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.info import recipes_of, write_info
 from perilune_shared.manifest import open_dataset
 from perilune_shared.parts import write_part
+from tests.hostile import assert_refused, edit, sealed
 
 
 def raw(content):

@@ -7,13 +7,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from tests import hostile_parquet as forged
-from tests.hostile import assert_refused, edit, part_of, sealed, told_within
 
 from perilune_shared.errors import UserError
 from perilune_shared.parts import Part
 from perilune_shared.schema import IMAGES, TABLES
-
+from tests import hostile_parquet as forged
+from tests.hostile import assert_refused, edit, part_of, sealed, told_within
 
 
 class Pickled:
@@ -74,11 +73,17 @@ def every_column(change):
 
 
 def with_metadata(**more):
-    return lambda rows: rows.replace_schema_metadata({**rows.schema.metadata, **more})
+    return lambda rows: rows.replace_schema_metadata(
+        {**rows.schema.metadata, **{name.encode(): value for name, value in more.items()}}
+    )
 
 
 def renamed(old, new):
-    return lambda rows: rows.rename_columns([new if name == old else name for name in rows.column_names])
+    def change(rows):
+        names = [new if name == old else name for name in rows.column_names]
+        return rows.rename_columns(names).replace_schema_metadata(rows.schema.metadata)
+
+    return change
 
 
 def swapped(a, b):
@@ -122,7 +127,10 @@ CASES = {
     "a number in 32 bits": (column("craters", "z_m", pa.float32(), 1.0), "z_m"),
     "a whole number as a real one": (column("labels", "crater_id", pa.float64(), 1.5), "crater_id"),
     "a whole number as a time": (column("frames", "frame_index", pa.timestamp("ns"), 1), "frame_index"),
-    "a vector as a list of any length": (column("frames", "position_m", pa.list_(pa.float64()), [0.0] * 3), "position_m"),
+    "a vector as a list of any length": (
+        column("frames", "position_m", pa.list_(pa.float64()), [0.0] * 3),
+        "position_m",
+    ),
     "a vector of four": (column("frames", "position_m", pa.list_(pa.float64(), 4), [0.0] * 4), "position_m"),
     "a vector as text": (column("frames", "rotation_wxyz", pa.string(), "[1,0,0,0]"), "rotation_wxyz"),
     "a missing column": (table("frames", lambda rows: rows.drop_columns("png_path")), "schema"),
@@ -133,14 +141,16 @@ CASES = {
     "a column twice": (table("labels", renamed("crater_id", "frame_id")), "schema"),
     "columns in another order": (table("craters", swapped("x_m", "y_m")), "schema"),
     "columns under each other's names": (
-        table("craters", lambda rows: swapped("x_m", "y_m")(rows).rename_columns(rows.column_names)),
-        "x_m",
+        table("craters", lambda rows: rows.set_column(2, rows.schema.field(2), rows["y_m"])),
+        "longitude_deg",
     ),
     "no metadata": (table("scenes", lambda rows: rows.replace_schema_metadata(None)), "schema_version"),
     "another table": (table("scenes", with_metadata(**{"perilune.table": "frames"})), "perilune.table"),
     "another version": (table("scenes", with_metadata(**{"perilune.schema_version": "\x1b[2J"})), "schema_version"),
     "another unit": (
-        table("craters", lambda rows: rows.cast(rows.schema.set(2, rows.schema.field(2).with_metadata({"unit": "km"})))),
+        table(
+            "craters", lambda rows: rows.cast(rows.schema.set(2, rows.schema.field(2).with_metadata({"unit": "km"})))
+        ),
         "x_m",
     ),
     "null for a number": (table("craters", nulled("x_m")), "x_m"),
@@ -163,17 +173,22 @@ CASES = {
     ),
     "a CSV file": (content("frames", lambda whole: b"frame_id\n=cmd()\n"), "content"),
     "a schema nested 100 000 deep": (content("frames", lambda whole: forged.nested(100_000)), "content"),
-    "a schema nested 9000 deep": (content("frames", lambda whole: forged.nested(9000)), ""),
+    "a schema nested 3000 deep": (content("frames", lambda whole: forged.nested(3000)), ""),
     "more rows than its groups": (footer("frames", lambda found: forged.put(found, 3, 10**9)), "rows"),
     "negative rows": (footer("frames", lambda found: forged.put(found, 3, -1)), ""),
     "negative rows in a group": (footer("frames", every_group(lambda group: forged.put(group, 3, -5))), ""),
     "10^12 rows in a group": (footer("frames", every_group(lambda group: forged.put(group, 3, 10**12))), "rows"),
     "groups that lie over each other": (
-        footer("labels", lambda found: [forged.groups(found).extend(forged.groups(found) * 9), forged.put(found, 3, 10**9)]),
+        footer(
+            "labels", lambda found: [forged.groups(found).extend(forged.groups(found) * 9), forged.put(found, 3, 10**9)]
+        ),
         "rows",
     ),
     "columns of no size": (footer("frames", every_column(lambda each: forged.put(each, 6, 0))), "frame_id"),
-    "columns beyond the file": (footer("frames", every_column(lambda each: forged.put(each, 9, 10**9))), ""),
+    "columns beyond the file": (
+        footer("frames", every_column(lambda each: each.update(dict.fromkeys((9, 11), (6, 10**9))))),
+        "",
+    ),
     "columns before the file": (footer("frames", every_column(lambda each: forged.put(each, 9, -5))), ""),
     "columns in each other's place": (
         footer("craters", every_column(lambda each: each.update({9: (6, 4)}))),
@@ -206,7 +221,7 @@ def test_what_is_pickled_stays_so(victim, capsys, monkeypatch):
     sealed(lambda root: None)(victim)
     assert_refused(victim, "manifest/scenes/all.parquet", "scene_id", capsys, monkeypatch)
     assert not bait.exists()
-    pickle.loads(pickled)
+    pickle.loads(pickled)  # noqa: S301 - the bait works
     assert bait.is_dir()
 
 
@@ -252,8 +267,7 @@ def long_text(n, length):
 
 
 def repeated_text():
-    words = pa.DictionaryArray.from_arrays(pa.array([0] * 5000, pa.int32()), ["x" * 50_000_000])
-    return constant(5000).drop_columns("photometry").append_column("photometry", words)
+    return constant(40, photometry=pa.array(["x" * 10_000_000] * 40))
 
 
 def long_list(root):
@@ -280,15 +294,17 @@ def one_image_repeated(root):
 BOMBS = {
     "10^9 rows": (scenes(lambda: constant(1_000_000), thousandfold), "rows"),
     "10^6 rows in 20 kB": (scenes(lambda: constant(1_000_000)), "rows"),
-    "text of 400 MB in 20 kB": (scenes(long_text(20, 20_000_000), compression="zstd", use_dictionary=False), "size"),
+    "text of 100 MB in 20 kB": (scenes(long_text(10, 10_000_000), compression="zstd", use_dictionary=False), "size"),
     "the same with gzip": (scenes(long_text(10, 10_000_000), compression="gzip", use_dictionary=False), "size"),
-    "the same with brotli": (scenes(long_text(10, 10_000_000), compression="brotli", use_dictionary=False), "size"),
     "the same with a footer that hides it": (
-        scenes(long_text(20, 20_000_000), small, compression="zstd", use_dictionary=False),
-        "unpacked",
+        scenes(long_text(10, 10_000_000), small, compression="zstd", use_dictionary=False),
+        "manifest/scenes",
     ),
-    "text of 50 MB in 5000 rows": (scenes(repeated_text, compression="zstd"), ""),
-    "the same with a footer that hides it, by its dictionary": (scenes(repeated_text, small, compression="zstd"), ""),
+    "text of 10 MB in 40 rows": (scenes(repeated_text, dictionary_pagesize_limit=2**30), "photometry"),
+    "the same with a footer that hides it, by its dictionary": (
+        scenes(repeated_text, small, dictionary_pagesize_limit=2**30),
+        "manifest/scenes",
+    ),
     "2 x 10^7 numbers in a row": (long_list, "nominal_position_m"),
     "images of 240 MB in 60 kB": (one_image_repeated, "size"),
 }
@@ -299,7 +315,7 @@ def test_bombs_do_not_go_off(name, victim):
     damage, told = BOMBS[name]
     sealed(damage)(victim)
     assert sum(path.stat().st_size for path in victim.rglob("*") if path.is_file()) < 3_000_000
-    assert told in told_within(victim, 200)
+    assert told in told_within(victim, 80)
 
 
 def test_a_part_as_large_as_they_come_is_read(tmp_path):
@@ -313,5 +329,5 @@ def test_a_part_as_large_as_they_come_is_read(tmp_path):
     ]
     pq.write_table(pa.table(columns, schema=TABLES["labels"]), tmp_path / "all.parquet", compression="zstd")
     assert len(Part(tmp_path / "all.parquet", "labels").read()) == 300_000
-    with pytest.raises(UserError, match="perilune.table"):
+    with pytest.raises(UserError, match=r"perilune\.table"):
         Part(tmp_path / "all.parquet", "frames")
