@@ -1,5 +1,6 @@
 """Small datasets that tests of the manifest share."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -41,3 +42,21 @@ def crowded_packed(crowded, tmp_path_factory) -> Path:
         paths = dict(zip(frames["frame_id"].to_pylist(), frames["png_path"].to_pylist(), strict=True))
         writer.pack_images(((name, paths[name], png) for name, png in source.pngs(frames)), shard_bytes=100_000)
     return out
+
+
+@pytest.fixture(scope="session")
+def little(tmp_path_factory) -> Path:
+    """Two terrains with one descent of three frames of 32 px each. Read only: copy before a change."""
+    root = tmp_path_factory.mktemp("little") / "dataset"
+    return build_dataset(root, "detect", side_px=32, splits={"train": 1, "val": 1}, n_frames=3, craters=300)
+
+
+@pytest.fixture
+def victim(little, tmp_path) -> Path:
+    """A copy of it that a test may damage, and beside it a folder that nobody may touch."""
+    beside = tmp_path / "canary"
+    beside.mkdir()
+    (beside / "secret.txt").write_text("secret")
+    (beside / "frames.parquet").write_bytes((little / "manifest/frames/all.parquet").read_bytes())
+    (beside / "frame.png").write_bytes((little / "frames/s000/t000/000000.png").read_bytes())
+    return Path(shutil.copytree(little, tmp_path / "dataset"))

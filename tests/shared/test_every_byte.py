@@ -35,9 +35,9 @@ def named(root, name):
 
 
 @pytest.fixture(scope="module", params=["files", "packed"])
-def whole(request, drawn, tmp_path_factory):
+def whole(request, little, tmp_path_factory):
     """A dataset that each example damages and mends."""
-    root = Path(shutil.copytree(drawn, tmp_path_factory.mktemp("bytes") / "dataset"))
+    root = Path(shutil.copytree(little, tmp_path_factory.mktemp("bytes") / "dataset"))
     if request.param == "packed":
         sealed(pack)(root)
         shutil.rmtree(root / "frames")
@@ -256,9 +256,9 @@ def oblong(root):
 
 
 @pytest.fixture(scope="module")
-def flat(drawn, tmp_path_factory):
+def flat(little, tmp_path_factory):
     """A dataset of oblong frames. Read only."""
-    root = Path(shutil.copytree(drawn, tmp_path_factory.mktemp("oblong") / "dataset"))
+    root = Path(shutil.copytree(little, tmp_path_factory.mktemp("oblong") / "dataset"))
     sealed(oblong)(root)
     assert validate(open_dataset(root)) == []
     return root
