@@ -15,7 +15,7 @@ import pandas as pd
 import yaml
 from rich.progress import Progress
 
-from perilune_shared.card_pictures import CLEAR_DEPTH_RATIO, TITLES, Gathered, draw, gather
+from perilune_shared.card_pictures import TITLES, Gathered, draw, gather
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.export_croissant import citation_of
 from perilune_shared.info import INFO_NAME, Recipe
@@ -87,7 +87,7 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
         f"{_MARK}\n\n# {code(info.name)}",
         f"Rendered lunar descents with exact crater ellipses and camera poses. {_PURPOSE[info.kind]}{state}",
         f"![Frames with labels, and histograms]({quote(picture_name)})",
-        f"*Labels: green from a depth of {CLEAR_DEPTH_RATIO:.0%} of the diameter on, orange for more worn craters.*",
+        "*Labels: green where the selection `visible` takes them, orange for craters that a frame hardly shows.*",
         "## What it holds\n\n" + _counts(dataset),
         _table(["", "lowest", "5 %", "median", "95 %", "highest"], _quantiles(gathered)),
         "## Scenes\n\n" + _scenes(dataset),
@@ -187,7 +187,8 @@ def _remake(key: str, recipe: Recipe) -> str:
     versions = ", ".join(code(f"{name} {version}") for name, version in recipe.versions.items())
     return (
         f"Recipe {code(key)}: preset {code(recipe.preset)}, seed {recipe.seed}, with {versions}.{source} What the "
-        f"history tells was done after.\n\n```sh\n{unpack}\n{make} --config recipe.yaml --out again\n```"
+        f"history tells was done after. Single frames come again by `perilune-render regenerate`.\n\n"
+        f"```sh\n{unpack}\n{make} --config recipe.yaml --out again\n```"
     )
 
 

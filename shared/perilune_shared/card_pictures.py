@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from perilune_shared.errors import UserError
-from perilune_shared.export import SceneRows, scenes_of
+from perilune_shared.export import SceneRows, by_selection, scenes_of
 from perilune_shared.manifest import Dataset
 from perilune_shared.png import png_header
 from perilune_shared.schema import SPLITS, TABLES
+from perilune_shared.selection import SELECTIONS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,9 +29,7 @@ _COLUMNS = 4
 _COLOURS = {"train": "#4477aa", "val": "#ee9933", "test": "#228855"}
 _LOGARITHMIC = ("radius_px", "visible_fraction", "sunlit_fraction")
 """Measures of which most values lie in one place."""
-_CLEAR, _WORN = "#50dc50", "#ff8c3c"
-CLEAR_DEPTH_RATIO = 0.04
-"""From this depth over diameter on a label is drawn green, below it orange."""
+_CHOSEN, _OTHER = "#50dc50", "#ff8c3c"
 TITLES = {
     "radius_px": "label radius sqrt(a b), px",
     "labels_per_frame": "labels per frame",
@@ -52,7 +51,7 @@ class Gathered:
     measures: dict[str, dict[str, NDArray[np.float32]]]
     """Measure to split to values; names and units in `TITLES`."""
     samples: list[tuple[dict, pd.DataFrame]] = field(default_factory=list)
-    """Rows of frames to show, each with its labels and their `depth_ratio`."""
+    """Rows of frames to show, each with its labels and whether they are `visible` (the selection)."""
 
 
 def gather(dataset: Dataset, progress: Progress) -> Gathered:
@@ -64,7 +63,7 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
     # Spread over the scenes, and from the start of a descent to its end.
     places = np.linspace(0, len(ids) - 1e-9, _N_FRAMES, endpoint=False).astype(int)
     wanted = {ids[place]: np.flatnonzero(places == place) for place in places}
-    for scene in scenes_of(dataset):
+    for scene in scenes_of(dataset, choose=by_selection(SELECTIONS["visible"])):
         ratio = _depth_ratios(dataset, scene)
         for split, frames in scene.frames.groupby("split"):
             own = scene.labels["frame_id"].isin(frames["frame_id"]).to_numpy()
@@ -73,7 +72,7 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
         for k in wanted.get(scene.scene_id, ()):
             row = scene.frames.iloc[round(k / (_N_FRAMES - 1) * (len(scene.frames) - 1))]
             own = (scene.labels["frame_id"] == row["frame_id"]).to_numpy()
-            samples.append((row.to_dict(), scene.labels[own].assign(depth_ratio=ratio[own])))
+            samples.append((row.to_dict(), scene.labels[own].assign(visible=scene.labels["chosen"][own])))
         progress.advance(task)
     measures = {name: {split: np.concatenate(v) for split, v in by.items()} for name, by in collected.items()}
     return Gathered({name: measures[name] for name in TITLES if name in measures}, samples)
@@ -147,7 +146,7 @@ def _draw_frame(axis: "Axes", row: dict, labels: pd.DataFrame, png: bytes) -> No
     except (ValueError, OSError, SyntaxError) as error:
         raise UserError(row["png_path"], "frame", error, f"a grey PNG of {width} x {height} px") from None
     axis.imshow(grey, cmap="gray", vmin=0, vmax=1, extent=(0, width, height, 0), interpolation="nearest")
-    worn = ~(labels["depth_ratio"].to_numpy() >= CLEAR_DEPTH_RATIO)
+    chosen = labels["visible"].to_numpy()
     ellipses = EllipseCollection(
         2 * labels["ellipse_a_px"].to_numpy(),
         2 * labels["ellipse_b_px"].to_numpy(),
@@ -156,7 +155,7 @@ def _draw_frame(axis: "Axes", row: dict, labels: pd.DataFrame, png: bytes) -> No
         offsets=labels[["ellipse_cx_px", "ellipse_cy_px"]].to_numpy(),
         offset_transform=axis.transData,
         facecolors="none",
-        edgecolors=np.where(worn, _WORN, _CLEAR).tolist(),
+        edgecolors=np.where(chosen, _CHOSEN, _OTHER).tolist(),
         linewidths=1.1,
     )
     axis.add_collection(ellipses)

@@ -7,8 +7,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from perilune_shared import cli_export
-from perilune_shared.cli_change import DatasetArgument, register
+from perilune_shared import cli_change, cli_export
+from perilune_shared.cli_change import DatasetArgument
 from perilune_shared.errors import EXIT_USER_ERROR, one_line, run_command_line, shortened
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
@@ -65,7 +65,7 @@ def stats(dataset: DatasetArgument) -> None:
     console.print(", ".join(f"{count} {name}" for name, count in counts.items()))
 
 
-register(app)
+cli_change.add_to(app)
 cli_export.add_to(app)
 
 

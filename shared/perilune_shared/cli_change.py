@@ -49,7 +49,7 @@ ImagesOption = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
+def add_to(app: typer.Typer) -> None:
     """Add the commands to a command line."""
     for command in (merge, subset, split, diff, migrate, pack, unpack, attach):
         app.command()(command)

@@ -8,13 +8,14 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from perilune_shared.cli_change import DatasetArgument
+from perilune_shared.config import nearest
 from perilune_shared.errors import UserError
+from perilune_shared.files import check_free
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
 from perilune_shared.schema import SPLITS
-from perilune_shared.writer import check_free
-
-DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the one that holds dataset.json.")]
+from perilune_shared.selection import SELECTIONS
 
 
 class ExportFormat(StrEnum):
@@ -44,8 +45,13 @@ def export(
         typer.Option(help="New folder; for croissant a .json file in the dataset, croissant.json unless given."),
     ] = None,
     split: Annotated[str | None, typer.Option(help="train, val or test alone (not for croissant).")] = None,
+    selection: Annotated[
+        str,
+        typer.Option(help="Labels to find: all, paper, visible; coco marks others as iscrowd, yolo drops them."),
+    ] = "all",
 ) -> None:
     """Write labels, trajectories or metadata in the form of another field's tools. See docs/export.md."""
+    from perilune_shared.export import by_selection
     from perilune_shared.export_coco import export_coco
     from perilune_shared.export_croissant import export_croissant
     from perilune_shared.export_trajectory import export_kitti, export_tum
@@ -54,6 +60,11 @@ def export(
     opened = open_dataset(dataset)
     if split is not None and split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    if selection not in SELECTIONS:
+        raise UserError("--selection", "selection", selection, nearest(selection, tuple(SELECTIONS)))
+    choose = by_selection(SELECTIONS[selection]) if selection != "all" else None
+    if choose is not None and format not in (ExportFormat.COCO, ExportFormat.YOLO):
+        raise UserError("--selection", "selection", selection, "--format coco or yolo: the others hold no labels")
     if format is ExportFormat.CROISSANT:
         if split is not None:
             raise UserError("--split", "split", split, "none: Croissant describes the whole dataset")
@@ -65,9 +76,9 @@ def export(
     with progress_bar() as progress:
         match format:
             case ExportFormat.COCO:
-                done = f"{export_coco(opened, out, progress, split)} annotations"
+                done = f"{export_coco(opened, out, progress, split, choose)} annotations"
             case ExportFormat.YOLO:
-                done = f"{export_yolo(opened, out, progress, split)} boxes"
+                done = f"{export_yolo(opened, out, progress, split, choose)} boxes"
             case ExportFormat.TUM:
                 done = f"{export_tum(opened, out, progress, split)} descents"
             case ExportFormat.KITTI:

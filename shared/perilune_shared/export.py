@@ -6,12 +6,8 @@ Use::
         print(scene.scene_id, len(scene.frames), len(scene.labels))
 """
 
-import contextlib
-import os
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,12 +17,23 @@ from numpy.typing import NDArray
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset
 from perilune_shared.schema import SPLITS, TABLES
-from perilune_shared.writer import check_free
+from perilune_shared.selection import Selection, selected
 
 Choice = Callable[[Dataset, str, pa.Table], NDArray[np.bool_]]
 """Which labels to take: from the dataset, a scene_id and that scene's labels (N rows, every column), bool (N,)."""
 LABEL_MEASURES = ("visible_fraction", "sunlit_fraction", "contrast")
 """Columns of labels by which users choose; an export carries those that the dataset has."""
+
+
+def by_selection(selection: Selection) -> Choice:
+    """The choice of the labels that a selection takes."""
+
+    def choose(dataset: Dataset, scene_id: str, labels: pa.Table) -> NDArray[np.bool_]:
+        craters = dataset.table("craters", ["crater_id", "depth_m", "diameter_m"], scene_id=scene_id).to_pandas()
+        craters = craters.drop_duplicates("crater_id")
+        return selected(labels.to_pandas().merge(craters, on="crater_id", how="left"), selection)
+
+    return choose
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,22 +94,3 @@ def sizes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
     """Width and height (N, 2) of the frame of each label, pixels."""
     by_id = frames.set_index("frame_id")[["width_px", "height_px"]]
     return by_id.loc[labels["frame_id"]].to_numpy(np.float64).reshape(-1, 2)
-
-
-@contextlib.contextmanager
-def new_folder(out: Path) -> Iterator[Path]:
-    """A hidden folder beside `out`, renamed to `out` on success and removed on any failure.
-
-    Raises UserError where `out` holds something.
-    """
-    check_free(out)
-    aside = out.with_name(f".{out.name}.{os.getpid()}.part")
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir(parents=True)
-    try:
-        yield aside
-        if out.is_dir():
-            out.rmdir()
-        aside.replace(out)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)

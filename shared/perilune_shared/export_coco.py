@@ -14,7 +14,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from perilune_shared.export import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, new_folder, scenes_of, sizes
+from perilune_shared import files
+from perilune_shared.export import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, scenes_of, sizes
 from perilune_shared.manifest import Dataset
 
 CATEGORY = {"id": 1, "name": "crater", "supercategory": "crater"}
@@ -37,7 +38,7 @@ def export_coco(
     """
     task = progress.add_task("coco", total=len(dataset.scene_ids()), unit="scenes")
     opened: dict[str, _SplitFile] = {}
-    with new_folder(out) as folder:
+    with files.new_folder(out) as folder:
         try:
             for scene in scenes_of(dataset, split, choose):
                 annotations = _annotations(scene)

@@ -16,7 +16,7 @@ import pandas as pd
 from rich.progress import Progress, TaskID
 
 from perilune_shared import files
-from perilune_shared.export import new_folder, scenes_of
+from perilune_shared.export import scenes_of
 from perilune_shared.frames import Array, matrix_from_quaternion
 from perilune_shared.manifest import Dataset
 
@@ -34,7 +34,7 @@ def export_tum(dataset: Dataset, out: Path, progress: Progress, split: str | Non
     """
     n_descents = 0
     task = progress.add_task("tum", total=len(dataset.scene_ids()), unit="scenes")
-    with new_folder(out) as folder:
+    with files.new_folder(out) as folder:
         for scene_id, trajectory_id, frames in _descents(dataset, progress, task, split):
             # Conjugated, since the manifest holds rotation_camera_from_site.
             w, x, y, z = np.stack(frames["rotation_wxyz"].to_list()).T
@@ -52,7 +52,7 @@ def export_kitti(dataset: Dataset, out: Path, progress: Progress, split: str | N
     """
     n_descents = 0
     task = progress.add_task("kitti", total=len(dataset.scene_ids()), unit="scenes")
-    with new_folder(out) as folder:
+    with files.new_folder(out) as folder:
         for scene_id, trajectory_id, frames in _descents(dataset, progress, task, split):
             poses = poses_site_from_camera(frames)
             relative = np.linalg.inv(poses[0]) @ poses

@@ -17,7 +17,7 @@ from rich.progress import Progress
 
 from perilune_shared import files
 from perilune_shared.errors import UserError
-from perilune_shared.export import Choice, clipped_boxes, new_folder, scenes_of, sizes
+from perilune_shared.export import Choice, clipped_boxes, scenes_of, sizes
 from perilune_shared.manifest import Dataset
 from perilune_shared.schema import SPLITS
 
@@ -35,7 +35,7 @@ def export_yolo(
     task = progress.add_task("yolo", total=len(dataset.scene_ids()), unit="scenes")
     lists: dict[str, list[str]] = defaultdict(list)
     n_boxes = 0
-    with new_folder(out) as folder:
+    with files.new_folder(out) as folder:
         for scene in scenes_of(dataset, split, choose):
             labels = scene.labels[scene.labels["chosen"]]
             boxes = clipped_boxes(labels, scene.frames) / np.tile(sizes(labels, scene.frames), 2)

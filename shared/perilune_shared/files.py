@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import os
 import re
+import shutil
 import stat
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
@@ -80,3 +81,28 @@ def check_plain_file(path: Path) -> int:
         found = "a link" if stat.S_ISLNK(state.st_mode) else "a folder, a pipe or a device"
         raise UserError(path, "file", found, "a file of the dataset's own")
     return state.st_size
+
+
+@contextlib.contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A hidden folder beside `out`, renamed to `out` on success and removed on any failure.
+
+    Raises UserError where `out` holds something.
+    """
+    check_free(out)
+    aside = out.with_name(f".{out.name}.{os.getpid()}.part")
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    try:
+        yield aside
+        if out.is_dir():
+            out.rmdir()
+        aside.replace(out)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def check_free(out: Path) -> None:
+    """Raises UserError where a folder for a new dataset holds something."""
+    if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
+        raise UserError(out, "--out", "something that is there", "a new or empty folder")

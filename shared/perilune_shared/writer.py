@@ -31,11 +31,10 @@ _IMAGES_A_GROUP = 128
 
 
 class DatasetWriter:
-    """Collects a dataset in a hidden folder beside `out`; `written` renames it at the end."""
+    """Collects a dataset in a folder; see `written`."""
 
-    def __init__(self, out: Path, info: DatasetInfo, *, whole_tables: bool = False):
-        self.out, self.info = out, info
-        self.root = out.with_name(f".{out.name}.{os.getpid()}.part")
+    def __init__(self, root: Path, info: DatasetInfo, *, whole_tables: bool = False):
+        self.root, self.info = root, info
         self.whole_tables = whole_tables
         self._rows = dict.fromkeys(TABLES, 0)
         self._kept: dict[str, list[pa.Table]] = defaultdict(list)
@@ -115,8 +114,10 @@ class DatasetWriter:
         if writer is not None:
             writer.close()
 
-    def finish(self) -> None:
-        """Write what remains, dataset.json and the checksums."""
+    def finish(self, out: Path) -> None:
+        """Write what remains, dataset.json and the checksums. Raises UserError about `out` where no frame came."""
+        if not self._rows["frames"]:
+            raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
         for name, pieces in self._kept.items():
             if name in _PER_DESCENT:
                 pieces = [_sorted_by(piece, "frame_id") for piece in pieces]
@@ -137,28 +138,12 @@ def written(out: Path, info: DatasetInfo, *, whole_tables: bool = False) -> Iter
     `info` gives all that does not follow from the rows; a dataset of no frames is refused. Raises UserError where `out`
     holds something.
     """
-    check_free(out)
-    # A copy of an info with fields replaced was never checked.
-    checked_info(json.loads(info.model_dump_json()), out)
-    writer = DatasetWriter(out, info, whole_tables=whole_tables)
-    shutil.rmtree(writer.root, ignore_errors=True)
-    writer.root.mkdir(parents=True)
-    try:
+    with files.new_folder(out) as aside:
+        # A copy of an info with fields replaced was never checked.
+        checked_info(json.loads(info.model_dump_json()), out)
+        writer = DatasetWriter(aside, info, whole_tables=whole_tables)
         yield writer
-        if not writer._rows["frames"]:
-            raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
-        writer.finish()
-        if out.is_dir():
-            out.rmdir()
-        writer.root.replace(out)
-    finally:
-        shutil.rmtree(writer.root, ignore_errors=True)
-
-
-def check_free(out: Path) -> None:
-    """Raises UserError where a folder for a new dataset holds something."""
-    if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
-        raise UserError(out, "--out", "something that is there", "a new or empty folder")
+        writer.finish(out)
 
 
 def _settled(trajectories: pa.Table, frames: pa.Table) -> pa.Table:

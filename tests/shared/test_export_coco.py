@@ -14,12 +14,15 @@ import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 from rich.progress import Progress
+from typer.testing import CliRunner
 
+from perilune_shared.cli import app
 from perilune_shared.errors import UserError
 from perilune_shared.export_coco import area_of, cut_at_edges, export_coco
 from perilune_shared.manifest import open_dataset
 from perilune_shared.parts import read_part
 from perilune_shared.schema import TABLES
+from perilune_shared.selection import SELECTIONS, read_labels, selected
 
 SMALLEST_PX = 4.0
 
@@ -181,3 +184,15 @@ def test_a_path_out_of_the_dataset_is_refused(crowded, tmp_path):
     with pytest.raises(UserError, match="inside the dataset"):
         exported(root, tmp_path / "coco")
     assert not (tmp_path / "coco").exists()
+
+
+def test_a_selection_by_its_name(crowded, tmp_path):
+    command = ["export", str(crowded), "--format", "coco", "--selection", "visible", "--out", str(tmp_path / "coco")]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    labels = read_labels(open_dataset(crowded), split="train")
+    wanted = selected(labels, SELECTIONS["visible"])
+    annotations = json.loads((tmp_path / "coco/instances_train.json").read_text())["annotations"]
+    assert 0 < sum(not each["iscrowd"] for each in annotations) == wanted.sum() < len(labels) == len(annotations)
+    with pytest.raises(UserError, match="visible"):
+        CliRunner().invoke(app, [*command[:-3], "visibel", *command[-2:]], catch_exceptions=False)
