@@ -80,8 +80,15 @@ def dataset(
         Path | None,
         typer.Option(help="Folder for the datasets `detect` and `nav`; data/<preset> unless given."),
     ] = None,
+    manifest: Annotated[
+        Path | None,
+        typer.Option(help="Render somebody's manifest or plan into --out, in place of a preset."),
+    ] = None,
 ) -> None:
-    """Render a preset's datasets. Stopped at any moment, the same command goes on where it was."""
+    """Render a preset's datasets, or a manifest's. Stopped at any moment, the same command goes on where it was."""
+    if manifest is not None:
+        _render_manifest(manifest, out, dem, catalogue, any((config, setting)))
+        return
     resolved = _resolve(preset, config, setting, dem, catalogue)
     folder = out or Path("data") / preset
     from perilune_render.dataset import (
@@ -98,6 +105,22 @@ def dataset(
             f"look at {folder / name / 'overview.png'}",
             soft_wrap=True,
         )
+
+
+def _render_manifest(manifest: Path, out: Path | None, dem: Path | None, catalogue: Path | None, changed: bool) -> None:
+    if out is None or changed:
+        raise UserError("--manifest", "options", "no --out" if out is None else "--config or --set", "--out alone")
+    given = open_dataset(manifest)
+    from perilune_render.dataset import render_plan
+    from perilune_render.manifest_plan import as_before, plan_of
+
+    plan, config, info = plan_of(given, dem, catalogue)
+    with progress_bar() as progress:
+        made = render_plan(plan, config, info, out, progress)
+    same, known, other_scenes = as_before(given, made)
+    told = f"; {same} of {known} frames are the manifest's byte for byte" if known else ""
+    told += f"; {other_scenes} scenes came out otherwise" if other_scenes else "; the ground came out as it says"
+    Console().print(f"{out}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{told}", soft_wrap=True)
 
 
 @app.command()

@@ -16,7 +16,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.frame import Shot, Studio
 from perilune_render.labels import RimCircles
 from perilune_render.output import begin_or_go_on, info_of, write_overview
-from perilune_render.plan import ScenePlan, TrajectoryPlan, make_plan
+from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
 from perilune_render.recipe import recipe_of
 from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.cache import cached_scene
@@ -24,7 +24,7 @@ from perilune_render.terrain.scene import Scene, check_ground
 from perilune_shared.checksums import seal
 from perilune_shared.errors import UserError
 from perilune_shared.frames import sun_direction
-from perilune_shared.info import write_info
+from perilune_shared.info import DatasetInfo, write_info
 from perilune_shared.manifest import Dataset, count_rows, open_dataset
 from perilune_shared.parts import read_part, write_part
 from perilune_shared.schema import Kind
@@ -36,8 +36,14 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
     Raises UserError where `out` holds something else.
     """
     plan = make_plan(config, kind)
+    return render_plan(plan, config, info_of(config, plan, recipe_of(config, kind, preset)), out, progress)
+
+
+def render_plan(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, progress: Progress) -> Dataset:
+    """Render a plan into `out`, going on where an earlier call stopped; `info` is the dataset.json to begin with."""
+    kind = info.recipe().kind
     check_ground(config, plan.exr_camera, config.kind(kind).flight)
-    info = begin_or_go_on(out, info_of(config, plan, recipe_of(config, kind, preset)))
+    info = begin_or_go_on(out, info)
     if info.complete:
         return open_dataset(out)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)

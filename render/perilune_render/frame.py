@@ -36,16 +36,16 @@ class Shot:
     """Camera, O_L, metres per second (3,)."""
 
     @classmethod
-    def planned(cls, trajectory: TrajectoryPlan, index: int) -> "Shot":
-        """A frame of a planned descent."""
+    def planned(cls, trajectory: TrajectoryPlan, place: int) -> "Shot":
+        """The frame at a place in a planned descent."""
         flight = trajectory.flight
         return cls(
-            trajectory.frame_id(index),
-            index,
+            trajectory.frame_id(place),
+            trajectory.frame_index[place],
             trajectory.seed,
-            flight.position_m[index],
-            flight.rotation_camera_from_site[index],
-            flight.velocity_mps[index],
+            flight.position_m[place],
+            flight.rotation_camera_from_site[place],
+            flight.velocity_mps[place],
         )
 
     @classmethod

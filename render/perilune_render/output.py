@@ -54,7 +54,7 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
         write_info(out, info)
         return info
     existing = open_dataset(out).info
-    if len(existing.recipes) != 1 or existing.history:
+    if len(existing.recipes) != 1 or existing.history != info.history:
         raise UserError(out, "--out", f"a dataset put together otherwise: {existing.name}", "another folder")
     for name in ("kind", "config", "versions", "developed_from"):
         theirs, ours = (_compared(each.recipe(), name) for each in (existing, info))

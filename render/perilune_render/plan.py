@@ -42,14 +42,16 @@ class TrajectoryPlan:
     """Unique in its scene."""
     seed: int
     """Of the descent's own streams."""
+    frame_index: tuple[int, ...]
+    """Place of each frame in the descent, from 0; with gaps where only some of its frames are wanted."""
     splits: tuple[str, ...]
     """Split of each frame."""
     flight: Flight
     """True motion."""
 
-    def frame_id(self, index: int) -> str:
-        """Unique in the dataset."""
-        return f"{self.scene_id}/{self.trajectory_id}/{index:06d}"
+    def frame_id(self, place: int) -> str:
+        """The name, unique in the dataset, of the frame at a place in these lists."""
+        return f"{self.scene_id}/{self.trajectory_id}/{self.frame_index[place]:06d}"
 
     @property
     def split(self) -> str | None:
@@ -121,9 +123,8 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
         for t in range(settings.trajectories_per_scene):
             own = derived_seed(seed, "trajectory", t)
             flight = fly(settings.flight, settings.n_frames, own)
-            trajectories.append(
-                TrajectoryPlan(scenes[-1].scene_id, f"trajectory-{t:04d}", own, tuple(splits[s, t]), flight)
-            )
+            name, places = f"trajectory-{t:04d}", tuple(range(settings.n_frames))
+            trajectories.append(TrajectoryPlan(scenes[-1].scene_id, name, own, places, tuple(splits[s, t]), flight))
     return Plan(camera, camera.covering_pinhole(), tuple(scenes), tuple(trajectories))
 
 

@@ -118,7 +118,7 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
         "frame_id": [trajectory.frame_id(i) for i in range(n)],
         "scene_id": [trajectory.scene_id] * n,
         "trajectory_id": [trajectory.trajectory_id] * n,
-        "frame_index": np.arange(n),
+        "frame_index": np.array(trajectory.frame_index),
         "time_s": flight.time_s,
         "split": list(trajectory.splits),
         **{name: [getattr(camera, name)] * n for name in _CAMERA},

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
@@ -73,6 +74,32 @@ def test_a_plan_is_the_dataset_before_it_is_rendered(tiny, plan, tmp_path):
     assert outcome.same_ground and outcome.state == "new"
     path = f"frames/{frame_id}.png"
     assert (tmp_path / path).read_bytes() == (tiny / "detect" / path).read_bytes()
+
+
+def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
+    """Names, splits and gaps are the manifest's; frames and labels are those of the whole dataset."""
+    cut = ["frame_index % 3 == 1", "split != 'val'"]
+    subset(open_dataset(tiny / "detect"), tmp_path / "hashed", cut, images="plan")
+    split_dataset(open_dataset(tmp_path / "hashed"), tmp_path / "s", by="trajectory", val_share=0, test_share=0.5)
+    made = run("dataset", "--manifest", tmp_path / "s", "--out", tmp_path / "out")
+    assert made.returncode == 0, made.stderr
+    n = len(open_dataset(tmp_path / "s").table("frames"))
+    assert f"{n} of {n} frames are the manifest's byte for byte; the ground came out as it says" in made.stdout
+    new, old = open_dataset(tmp_path / "out"), open_dataset(tiny / "detect")
+    assert validate(new) == [] and new.info.counts.scenes == 2
+    ids = new.table("frames", ["frame_id"])["frame_id"]
+    labels = old.table("labels").filter(pc.is_in(old.table("labels")["frame_id"], ids.combine_chunks()))
+    assert new.table("labels").equals(labels)
+    assert set(new.table("frames")["split"].to_pylist()) == {"train", "test"}
+    again = run("dataset", "--manifest", tmp_path / "s", "--out", tmp_path / "out")
+    assert again.returncode == 0 and f"{n} of {n}" in again.stdout
+    for arguments, told in (
+        (["--manifest", tmp_path / "s", "--set", "dataset.seed=3", "--out", tmp_path / "o"], "--set"),
+        (["--manifest", tmp_path / "s"], "--out"),
+        (["--manifest", tmp_path / "none", "--out", tmp_path / "o"], "no such file"),
+    ):
+        refused = run("dataset", *arguments)
+        assert refused.returncode == 2 and told in refused.stderr and not (tmp_path / "o").exists()
 
 
 def test_developed_frames_are_made_again_with_the_first_camera_ground(tiny, tmp_path):
