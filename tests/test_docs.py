@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from perilune_shared.schema import TABLES
+
 DOCS = Path(__file__).parent.parent / "docs"
 BLOCKS = [
     (page.name, block)
@@ -14,7 +16,11 @@ BLOCKS = [
 
 
 @pytest.mark.parametrize(("page", "block"), BLOCKS)
-def test_example_runs(page, block):
+def test_example_runs(page, block, tiny, tmp_path, monkeypatch):
+    """In a folder where `make dataset PRESET=tiny` was run."""
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/tiny").symlink_to(tiny)
+    monkeypatch.chdir(tmp_path)
     exec(compile(block, page, "exec"), {})  # noqa: S102 - our own page
 
 
@@ -26,3 +32,14 @@ def test_links_between_pages_lead_somewhere():
     for page in [*DOCS.glob("*.md"), DOCS.parent / "README.md"]:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_manifest_page_has_every_column_as_the_schema_has_it():
+    page = (DOCS / "manifest.md").read_text(encoding="utf-8")
+    rows = {}
+    for name, part in re.findall(r"### (\w+)\n(.*?)(?=\n##)", page, re.DOTALL):
+        rows[name] = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", part, re.MULTILINE)
+    for name, schema in TABLES.items():
+        told = [(column, unit.strip(), meaning, "or null" in kind) for column, kind, unit, meaning in rows[name]]
+        wanted = [(f.name, f.metadata[b"unit"].decode(), f.metadata[b"meaning"].decode(), f.nullable) for f in schema]
+        assert told == wanted, f"{name}: run scripts/describe_columns.py with a dataset"
