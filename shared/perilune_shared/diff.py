@@ -89,4 +89,6 @@ def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Differen
 
 
 def _text(value: object) -> str:
+    if isinstance(value, tuple):
+        value = " ".join(map(str, value))
     return shortened(one_line(value), 60)

@@ -161,9 +161,11 @@ def _chosen(
     prefix = f"{scene_id}/{trajectory_id}/" if trajectory_id is not None else f"{scene_id}/"
     groups = None
     if part.path.stem == WHOLE_TABLE and scene_id is not None:
-        # "0" comes after "/" and "~" after every character of a name.
-        low, high = (prefix, prefix[:-1] + "0") if by_frame else (scene_id, scene_id + "\x00")
-        groups = part.groups_within("frame_id" if by_frame else "scene_id", low, high)
+        # Among frame ids all with a prefix come from it on and before the same with "0", which follows "/", at its end.
+        if "frame_id" in columns:
+            groups = part.groups_within("frame_id", prefix, prefix[:-1] + "0")
+        else:
+            groups = part.groups_within("scene_id", scene_id, scene_id + "\x00")
     rows = part.read(list(dict.fromkeys([*names, *equal, *(["frame_id"] if by_frame else [])])), groups)
     for name, value in equal.items():
         rows = rows.filter(pc.equal(rows[name], value))

@@ -50,6 +50,7 @@ def subset(
     told = [*(f"where {text}" for text in where)]
     told += [f"{n_frames} frames"] if n_frames is not None else []
     told += [f"{megabytes:g} MB"] if megabytes is not None else []
+    told += ["no craters and labels"] if images == "plan" else []
     info = source.info.changed("subset: " + ("; ".join(told) or "all").replace("<", " lt ").replace(">", " gt "))
     rewrite(source, out, info, change, images, progress)
 
