@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,6 +17,10 @@ settings.load_profile("patient")
 # Scenes are grown anew by the tests, and the user's own cache is left alone.
 _cache = tempfile.TemporaryDirectory(prefix="perilune-test-cache-")
 os.environ["PERILUNE_CACHE"] = _cache.name
+
+
+# A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
