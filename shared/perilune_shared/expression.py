@@ -44,10 +44,10 @@ class Condition:
             if len(text) > _LONGEST:
                 raise ValueError(f"{len(text)} characters")
             self._tree = ast.parse(text.strip(), mode="eval").body
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            self.columns: set[tuple[str, str]] = set()
+            self._walk(self._tree, None)
+        except (SyntaxError, TypeError, ValueError, RecursionError, MemoryError) as error:
             raise self._fault(text, f"a condition such as radius_px > 5 and split == 'test' ({error})") from None
-        self.columns: set[tuple[str, str]] = set()
-        self._walk(self._tree, None)
         if not self.columns:
             raise self._fault(text, "a condition on columns")
 
@@ -61,7 +61,7 @@ class Condition:
         try:
             with np.errstate(all="ignore"):
                 result = np.asarray(self._walk(self._tree, columns))
-        except (TypeError, ValueError, IndexError) as error:
+        except (TypeError, ValueError, IndexError, ArithmeticError, RecursionError) as error:
             raise self._fault(self.text, f"numbers with numbers and text with text ({error})") from None
         if result.dtype != np.bool_ or result.shape not in ((), (n_rows,)):
             raise self._fault(self.text, "a condition that is true or false for each row")
@@ -89,6 +89,8 @@ class Condition:
             return None if checking else ~_truth(value) if isinstance(node.op, ast.Not) else operator.neg(value)
         if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
             left, right = walk(node.left), walk(node.right)
+            if not checking and any(np.asarray(value).dtype.kind in "OU" for value in (left, right)):
+                raise TypeError("text takes part in comparisons alone")  # times a number it has no end
             return None if checking else _BINARY[type(node.op)](left, right)
         if isinstance(node, ast.Compare):
             values = [walk(value) for value in (node.left, *node.comparators)]
