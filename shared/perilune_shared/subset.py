@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pyarrow as pa
+import pyarrow.compute as pc
 from rich.progress import Progress
 
 from perilune_shared.errors import UserError
@@ -43,7 +44,7 @@ def subset(
         frames = tables["frames"]
         mask = _holds(on_frames, tables, frames)
         if kept is not None:
-            mask = mask & np.isin(frames["frame_id"].to_numpy(zero_copy_only=False), list(kept))
+            mask = mask & np.asarray(pc.is_in(frames["frame_id"], kept), bool)
         labels = tables["labels"].filter(pa.array(_holds(on_labels, tables, tables["labels"])))
         return {**tables, "frames": frames.filter(pa.array(mask)), "labels": labels}
 
@@ -57,7 +58,7 @@ def subset(
 
 def _first_frames(
     source: Dataset, on_frames: Sequence[Condition], n_frames: int | None, megabytes: float | None
-) -> set[str]:
+) -> pa.Array:
     """frame_id of whole descents, in turn from each scene, up to a number or size."""
     if (n_frames is not None and n_frames < 1) or (megabytes is not None and not megabytes > 0):
         raise UserError("--frames or --mb", "size", n_frames if n_frames is not None else megabytes, "above 0")
@@ -66,6 +67,8 @@ def _first_frames(
         tables = {name: source.table(name, scene_id=scene_id) for name in ("scenes", "trajectories", "frames")}
         frames = tables["frames"].filter(pa.array(_holds(on_frames, tables, tables["frames"])))
         pieces.append(frames.select(["frame_id", "scene_id", "trajectory_id", "frame_index", "png_bytes"]).to_pandas())
+    if not pieces:
+        raise UserError(source.root, "scenes", "none", "a dataset with frames")
     table = pd.concat(pieces, ignore_index=True)
     if megabytes is not None and table["png_bytes"].isna().any():
         raise UserError(source.root, "png_bytes", "null", "--frames: the size of frames never rendered is not known")
@@ -75,7 +78,7 @@ def _first_frames(
         table = table.iloc[:n_frames]
     if megabytes is not None:
         table = table[table["png_bytes"].cumsum() <= megabytes * 1e6]
-    return set(table["frame_id"])
+    return pa.array(table["frame_id"], pa.string())
 
 
 def _holds(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
