@@ -11,7 +11,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo, joined_licence
 from perilune_shared.manifest import Dataset
 from perilune_shared.rewrite import ImageMode, bare, check_complete, state_of, with_column
-from perilune_shared.writer import SceneTables, written
+from perilune_shared.writer import SceneTables, check_scene, written
 
 _CHANGING = ("scene_id", "trajectory_id", "n_frames", "split")
 
@@ -31,7 +31,7 @@ def merge(
     one frame was rendered in two ways.
     """
     info = _joined_info(sources, name, state_of(list(sources), images))
-    groups = _same_scenes(sources)
+    groups = _same_scenes(sources, planned=info.images == "planned")
     task = progress.add_task("merging", total=len(groups), unit="scenes", note="") if progress else None
     with written(out, info) as writer:
         for scene_id, members in groups.items():
@@ -68,16 +68,19 @@ def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetI
     return info.changed("merge of " + ", ".join(source.info.name for source in sources))
 
 
-def _same_scenes(sources: Sequence[Dataset]) -> dict[str, list[tuple[int, str]]]:
-    """For each scene of the result, the sources (by place) and names under which it comes."""
+def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list[tuple[int, str]]]:
+    """For each scene of the result, the sources (by place) and names under which it comes.
+
+    In a plan, which has no labels, the numbers of craters do not count.
+    """
     groups: dict[str, list[tuple[int, str]]] = {}
     known: dict[tuple, str] = {}
     for i, source in enumerate(sources):
         for row in sorted(source.table("scenes").to_pylist(), key=lambda row: row["scene_id"]):
             own = row.pop("scene_id")
             # Ids are part of what labels say, so that they must be the same too.
-            craters = source.table("craters", ["crater_id"], scene_id=own)["crater_id"]
-            key = (*row.values(), tuple(craters.to_pylist()) if source.info.images != "planned" else ())
+            craters = [] if planned else source.table("craters", ["crater_id"], scene_id=own)["crater_id"].to_pylist()
+            key = (*row.values(), tuple(craters))
             if key not in known or any(place == i for place, _ in groups[known[key]]):
                 known[key] = free_name(own, groups)
                 groups[known[key]] = []
@@ -104,6 +107,7 @@ def _join(
     first: SceneTables = {}
     for source, own in members:
         tables = source.scene(own)
+        check_scene(source.root, tables)
         if not first:
             first = {name: with_column(tables[name], "scene_id", [scene_id] * len(tables[name])) for name in _GROUND}
         new_ids, rows = _descents(tables["trajectories"], descents)
@@ -161,9 +165,4 @@ def _renamed(frames: pa.Table, scene_id: str, new_ids: dict[str, str], names: di
     ids = [names[frame_id] for frame_id in frames["frame_id"].to_pylist()]
     frames = with_column(frames, "scene_id", [scene_id] * len(frames))
     frames = with_column(frames, "trajectory_id", [new_ids[name] for name in frames["trajectory_id"].to_pylist()])
-    frames = with_column(frames, "frame_id", ids)
-    for kind in ("png", "exr"):
-        known = frames[f"{kind}_path"].to_pylist()
-        paths = [f"frames/{name}.{kind}" if path is not None else None for name, path in zip(ids, known, strict=True)]
-        frames = with_column(frames, f"{kind}_path", paths)
-    return frames
+    return with_column(frames, "frame_id", ids)

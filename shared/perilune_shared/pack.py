@@ -1,5 +1,6 @@
 """A dataset in few large files, and back: frames as PNG bytes in images/*.parquet, each table as one part."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo
 from perilune_shared.manifest import Dataset
 from perilune_shared.rewrite import check_complete, rewrite, with_column
-from perilune_shared.writer import written
+from perilune_shared.writer import frame_path, written
 
 _EXR = ("exr_path", "exr_sha256", "exr_bytes")
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
@@ -22,8 +23,8 @@ def pack(source: Dataset, out: Path, shard_mb: float = 1000, progress: Progress 
     A dataset without frames is packed as its tables alone. EXRs stay behind: their columns become null.
     """
     check_complete(source)
-    if not shard_mb > 0:
-        raise UserError("--shard-mb", "size", shard_mb, "above 0")
+    if not 0 < shard_mb < math.inf:
+        raise UserError("--shard-mb", "size", shard_mb, "above 0, and finite")
     packed = source.info.images in ("files", "packed")
     info = source.info
     if packed:
@@ -39,9 +40,8 @@ def pack(source: Dataset, out: Path, shard_mb: float = 1000, progress: Progress 
 
 
 def _images(source: Dataset, frames: pa.Table, progress: Progress | None, task) -> Iterator[tuple[str, str, bytes]]:
-    path_of = dict(zip(frames["frame_id"].to_pylist(), frames["png_path"].to_pylist(), strict=True))
     for frame_id, png in source.pngs(frames):
-        yield frame_id, path_of[frame_id], png
+        yield frame_id, frame_path(frame_id, "png"), png
         if progress is not None:
             progress.advance(task)
 

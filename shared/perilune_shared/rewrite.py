@@ -49,9 +49,13 @@ def rewrite(
 
 
 def check_complete(source: Dataset) -> None:
-    """Raises UserError on a dataset that is still being rendered."""
+    """Raises UserError on a dataset that is still being rendered, or has frames of scenes that it does not list."""
     if not source.info.complete:
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
+    odd = set(source.table("frames", ["scene_id"])["scene_id"].unique().to_pylist()) - set(source.scene_ids())
+    if odd:
+        wanted = "the scene of every frame; see `perilune-manifest validate`"
+        raise UserError(source.root, "scenes", f"no {min(odd)}", wanted)
 
 
 def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:

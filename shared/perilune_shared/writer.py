@@ -43,13 +43,18 @@ class DatasetWriter:
         self._recipes: set[str] = set()
 
     def add_scene(self, tables: SceneTables) -> None:
-        """Append one scene, whose frames are not empty; descents get their number of frames and their split anew."""
-        frames = tables["frames"]
+        """Append one scene, whose frames are not empty.
+
+        Descents get their number of frames and their split anew, frames the paths at which `add_images` puts them.
+        Raises UserError where the scene has not one row, or a frame is of a descent that has none.
+        """
+        check_scene("the dataset given", tables)
+        frames = _placed(tables["frames"])
         splits = frames["split"].to_numpy(zero_copy_only=False)
         terrain = tables["scenes"]["content_sha256"][0].as_py()
         self._splits_of_terrain[terrain] |= set(splits)
         self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
-        tables = {**tables, "trajectories": _settled(tables["trajectories"], frames)}
+        tables = {**tables, "frames": frames, "trajectories": _settled(tables["trajectories"], frames)}
         self._frames_split |= tables["trajectories"]["split"].null_count > 0
         scene_id = tables["scenes"]["scene_id"][0].as_py()
         for name, rows in tables.items():
@@ -72,14 +77,14 @@ class DatasetWriter:
         by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path"]).to_pylist()}
         if source.info.images == "packed":
             for frame_id, png in source.pngs(frames):
-                files.write_bytes(files.inside(self.root, f"frames/{names[frame_id]}.png"), png)
+                files.write_bytes(files.inside(self.root, frame_path(names[frame_id], "png")), png)
         else:
             for row in frames.select(["frame_id", "png_path"]).to_pylist():
                 by_id[row["frame_id"]]["png_path"] = row["png_path"]
         for frame_id, row in by_id.items():
             for kind in ("png", "exr"):
                 if row.get(f"{kind}_path") is not None:
-                    to = files.inside(self.root, f"frames/{names[frame_id]}.{kind}")
+                    to = files.inside(self.root, frame_path(names[frame_id], kind))
                     _bring(source.file(row[f"{kind}_path"]), to, link=link)
 
     def pack_images(self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int) -> None:
@@ -146,6 +151,35 @@ def written(out: Path, info: DatasetInfo, *, whole_tables: bool = False) -> Iter
         writer.finish(out)
 
 
+def check_scene(where: object, tables: SceneTables) -> None:
+    """Raises UserError about a dataset (`where`) where a scene has not one row, or a descent with frames has none."""
+    scenes, frames = tables["scenes"]["scene_id"], tables["frames"]
+    if len(scenes) != 1:
+        found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"
+        raise UserError(where, "scenes", found, "one row each; see `perilune-manifest validate`")
+    odd = set(frames["trajectory_id"].to_pylist()) - set(tables["trajectories"]["trajectory_id"].to_pylist())
+    if odd:
+        found = f"no {scenes[0].as_py()}/{min(odd)}"
+        raise UserError(where, "trajectories", found, "the descent of every frame; see `perilune-manifest validate`")
+
+
+def frame_path(frame_id: str, kind: str) -> str:
+    """Where the PNG or EXR of a frame lies in every dataset that is written here."""
+    return f"frames/{frame_id}.{kind}"
+
+
+def _placed(frames: pa.Table) -> pa.Table:
+    """Frames with the paths of their files here; another's dataset may keep them elsewhere."""
+    ids = frames["frame_id"].to_pylist()
+    for kind in ("png", "exr"):
+        name = f"{kind}_path"
+        known = frames[name].to_pylist()
+        paths = [None if path is None else frame_path(key, kind) for key, path in zip(ids, known, strict=True)]
+        place = frames.schema.get_field_index(name)
+        frames = frames.set_column(place, frames.schema.field(place), pa.array(paths, pa.string()))
+    return frames
+
+
 def _settled(trajectories: pa.Table, frames: pa.Table) -> pa.Table:
     """The descents that have frames, with the number and the common split of these."""
     counted = frames.group_by("trajectory_id").aggregate(
@@ -176,6 +210,7 @@ def _bring(path: Path, to: Path, *, link: bool) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     if link:
         with contextlib.suppress(OSError):
-            os.link(path, to)
+            # A link to a link would lead to what need not be here.
+            os.link(path.resolve(), to)
             return
     shutil.copyfile(path, to)
