@@ -63,7 +63,11 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
             found[f"{kind}_bytes"].append(path.stat().st_size if there and path is not None else None)
             found[f"{kind}_path"].append(row[f"{kind}_path"] if there else None)
         with source.file(row["png_path"]).open("rb") as stream:
-            header = png_header(stream.read(64))
+            head = stream.read(64)
+        try:
+            header = png_header(head)
+        except ValueError as error:
+            raise UserError(source.root / row["png_path"], "frame", error, "a grey PNG") from None
         if (header.width_px, header.height_px) != (camera.width_px, camera.height_px):
             size = f"{header.width_px} x {header.height_px}"
             raise UserError(row["png_path"], "size", size, f"{camera.width_px} x {camera.height_px} pixels")

@@ -149,7 +149,8 @@ def _scenes(dataset: Dataset) -> str:
 
 def _splits(dataset: Dataset) -> str:
     frames = dataset.table("frames", ["scene_id", "split"]).to_pandas()
-    terrain = dataset.table("scenes", ["scene_id", "content_sha256"]).to_pandas().set_index("scene_id")
+    terrain = dataset.table("scenes", ["scene_id", "content_sha256"]).to_pandas()
+    terrain = terrain.drop_duplicates("scene_id").set_index("scene_id")
     splits = frames.groupby(terrain["content_sha256"].reindex(frames["scene_id"]).to_numpy())["split"].nunique()
     shared = int((splits > 1).sum())
     by = f"Split by {dataset.info.split_by}: that is what no two splits share. "

@@ -57,6 +57,8 @@ class Gathered:
 def gather(dataset: Dataset, progress: Progress) -> Gathered:
     """Read every scene once. Raises UserError where there is no frame."""
     ids = dataset.scene_ids()
+    if not ids:
+        raise UserError(dataset.root, "scenes", "none", "a dataset with frames")
     task = progress.add_task("card", total=len(ids), unit="scenes")
     collected: dict[str, dict[str, list[np.ndarray]]] = {}
     samples: list[tuple[dict, pd.DataFrame]] = []

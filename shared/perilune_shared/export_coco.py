@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 
 from perilune_shared import files
+from perilune_shared.errors import UserError
 from perilune_shared.export import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, scenes_of, sizes
 from perilune_shared.manifest import Dataset
 
@@ -34,8 +35,10 @@ def export_coco(
     """Write `out`/instances_<split>.json for each split, or for one; returns the number of annotations.
 
     `file_name` is the frame's png_path, so that the image folder is the dataset's. Raises UserError where `out` holds
-    something, a png_path leads out of the dataset or no frame is of the split.
+    something, the dataset is only planned, a png_path leads out of it or no frame is of the split.
     """
+    if dataset.info.images == "planned":
+        raise UserError(dataset.root, "images", "planned", "a rendered dataset: a plan has no labels")
     task = progress.add_task("coco", total=len(dataset.scene_ids()), unit="scenes")
     opened: dict[str, _SplitFile] = {}
     with files.new_folder(out) as folder:

@@ -90,6 +90,7 @@ def new_folder(out: Path) -> Iterator[Path]:
     Raises UserError where `out` holds something.
     """
     check_free(out)
+    out = out.absolute()  # "." has no name to put another beside
     aside = out.with_name(f".{out.name}.{os.getpid()}.part")
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
