@@ -15,7 +15,7 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
 from perilune_render.frame import Shot, Studio
 from perilune_render.labels import RimCircles
-from perilune_render.output import begin_or_go_on, info_of, write_overview
+from perilune_render.output import begin_or_go_on, check_begun, info_of, open_finished, write_overview
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
 from perilune_render.recipe import recipe_of
 from perilune_render.sensor import FixedPattern
@@ -44,8 +44,9 @@ def render_plan(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path,
     kind = info.recipe().kind
     check_ground(config, plan.exr_camera, config.kind(kind).flight)
     info = begin_or_go_on(out, info)
+    check_begun(out, plan)
     if info.complete:
-        return open_dataset(out)
+        return open_finished(out)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
     task = progress.add_task(
         f"{kind} frames", total=sum(len(t.splits) for t in plan.trajectories), unit="frames", note=""

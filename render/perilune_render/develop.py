@@ -17,7 +17,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.exr import read_radiance
 from perilune_render.frame import Shot, Studio
 from perilune_render.labels import Labels, RimCircles
-from perilune_render.output import begin_or_go_on, first_difference, write_overview
+from perilune_render.output import begin_or_go_on, first_difference, open_finished, write_overview
 from perilune_render.plan import camera_of
 from perilune_render.recipe import versions
 from perilune_render.sensor import FixedPattern
@@ -49,7 +49,7 @@ def develop_dataset(
     made_of = Origin(
         name=source.info.name,
         sha256=files.sha256_of(source.root / "dataset.json"),
-        camera_config=old.config["camera"],
+        camera_config=old.config.get("camera", {}),
     )
     recipe = old.model_copy(
         update={
@@ -62,6 +62,7 @@ def develop_dataset(
         update={
             "name": f"{source.info.name}-developed",
             "complete": False,
+            "images": "files",
             "camera": source.info.camera.model_copy(update=asdict(camera)),
             "exr_camera": None,
             "recipes": recipes_of(recipe),
@@ -71,9 +72,11 @@ def develop_dataset(
     )
     if source.table("frames", ["exr_path"])["exr_path"].null_count:
         raise UserError(source.root, "exr_path", "null", "a dataset rendered with dataset.render.exr=true")
+    if source.info.images != "files":
+        raise UserError(source.root, "images", source.info.images, "a dataset with its EXRs")
     info = begin_or_go_on(out, info)
     if info.complete:
-        return open_dataset(out)
+        return open_finished(out)
     task = progress.add_task("develop", total=source.info.counts.frames, unit="frames", note="")
     pattern = FixedPattern.draw(config.sensor, camera, config.seed)
     for scene_id in source.scene_ids():

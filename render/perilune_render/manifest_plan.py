@@ -8,9 +8,10 @@ from perilune_render.config import DatasetConfig
 from perilune_render.flight import Flight
 from perilune_render.output import info_of
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
-from perilune_render.recipe import config_of, recipe_of
+from perilune_render.recipe import config_of, recipe_of, same_source
 from perilune_shared.descent import NominalDescent
 from perilune_shared.errors import UserError
+from perilune_shared.files import sha256_of
 from perilune_shared.info import DatasetInfo
 from perilune_shared.manifest import Dataset
 
@@ -21,7 +22,8 @@ def plan_of(
     """The plan of a manifest's scenes, descents and frames, its settings, and the dataset.json to begin with.
 
     Names, seeds, poses and splits are the manifest's; files that its recipe names are given by the user. Raises
-    UserError where it has several recipes (merged of different datasets), or its frames were developed again.
+    UserError where it has several recipes (merged of different datasets), its frames were developed again, or the
+    elevation model is another.
     """
     info, where = manifest.info, manifest.root / "dataset.json"
     if len(info.recipes) != 1:
@@ -32,6 +34,7 @@ def plan_of(
         wanted = "a rendered dataset; render its source, then `perilune-render develop`"
         raise UserError(where, "developed_from", recipe.developed_from.name, wanted)
     config = config_of(recipe, where, dem, catalogue)
+    _check_dem(manifest, config)
     camera = camera_of(config.camera)
     if camera != info.camera.intrinsics():
         raise UserError(where, "camera", info.camera.intrinsics(), f"that of its recipe, {camera}")
@@ -44,6 +47,16 @@ def plan_of(
     begun = info_of(config, plan, recipe_of(config, recipe.kind, recipe.preset))
     kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     return plan, config, begun.model_copy(update=kept)
+
+
+def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
+    dem = Path(config.terrain.dem) if config.terrain.dem is not None else None
+    if dem is None or not dem.is_file():  # whoever opens it tells
+        return
+    found = f"sha256:{sha256_of(dem)}"
+    for wanted in manifest.table("scenes", ["dem_source"])["dem_source"].unique().to_pylist():
+        if not same_source(found, wanted):
+            raise UserError("--dem", "elevation model", found, wanted)
 
 
 def _descents(manifest: Dataset, scene_id: str) -> list[TrajectoryPlan]:

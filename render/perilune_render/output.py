@@ -10,15 +10,18 @@ from perilune_render.labels import Labels
 from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_render.plan import Plan
 from perilune_shared import files
+from perilune_shared.checksums import SUMS_NAME, seal
 from perilune_shared.errors import UserError
 from perilune_shared.info import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.manifest import Dataset, open_dataset
+from perilune_shared.parts import read_part
 from perilune_shared.schema import SCHEMA_VERSION
 from perilune_shared.selection import SELECTIONS, selected
 
 LICENCE = "CC-BY-4.0"
 _SHEET_FRAMES = 12
 _MEANS = ("threads", "cache_gib")
+_SAME_PLACE_M = 1e-6
 
 
 def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
@@ -56,6 +59,8 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
     existing = open_dataset(out).info
     if len(existing.recipes) != 1 or existing.history != info.history:
         raise UserError(out, "--out", f"a dataset put together otherwise: {existing.name}", "another folder")
+    if existing.images != info.images:
+        raise UserError(out, "--out", f"a dataset whose frames are {existing.images}", "another folder")
     for name in ("kind", "config", "versions", "developed_from"):
         theirs, ours = (_compared(each.recipe(), name) for each in (existing, info))
         if theirs != ours:
@@ -66,6 +71,36 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
                 "the settings that this dataset was begun with, or another --out",
             )
     return existing
+
+
+def check_begun(out: Path, plan: Plan) -> None:
+    """Raises UserError where descents that a dataset holds already are not those of the plan it is to go on with.
+
+    Two manifests may tell of the same settings and differ in their descents, frames and splits.
+    """
+    planned = {f"{t.scene_id}.{t.trajectory_id}": t for t in plan.trajectories}
+    for part in sorted(out.joinpath("manifest", "frames").glob("[A-Za-z0-9]*.parquet")):
+        own = planned.get(part.stem)
+        rows = read_part(part, "frames", ["frame_index", "split", "position_m"])
+        if (
+            own is None
+            or rows["frame_index"].to_pylist() != list(own.frame_index)
+            or rows["split"].to_pylist() != list(own.splits)
+            or not np.allclose(rows["position_m"].to_pylist(), own.flight.position_m, rtol=0, atol=_SAME_PLACE_M)
+        ):
+            raise UserError(part, "frames", "those of another plan", "the manifest that it was begun with")
+    for part in sorted(out.joinpath("manifest", "trajectories").glob("[A-Za-z0-9]*.parquet")):
+        found = read_part(part, "trajectories", ["trajectory_id", "seed", "n_frames", "split"]).to_pydict()
+        wanted = [(t.trajectory_id, t.seed, len(t.splits), t.split) for t in plan.of_scene(part.stem)]
+        if list(zip(*found.values(), strict=True)) != wanted:
+            raise UserError(part, "trajectories", "those of another plan", "the manifest that it was begun with")
+
+
+def open_finished(out: Path) -> Dataset:
+    """A complete dataset; its checksums are written where it was stopped just before they were."""
+    if not (out / SUMS_NAME).exists():
+        seal(out)
+    return open_dataset(out)
 
 
 def _compared(recipe: Recipe, name: str) -> object:
@@ -108,15 +143,14 @@ def file_columns(root: Path, kind: str, path: str) -> dict[str, str | int]:
 
 def write_overview(dataset: Dataset) -> None:
     """overview.png: frames from the whole dataset, each beside itself with its labels, green where they are visible."""
-    frames = dataset.table("frames", ["frame_id", "scene_id", "png_path"]).to_pandas()
+    frames = dataset.table("frames", ["frame_id", "scene_id", "trajectory_id", "png_path"]).to_pandas()
     chosen = frames.iloc[np.unique(np.linspace(0, len(frames) - 1, _SHEET_FRAMES).astype(int))]
-    labels = dataset.table("labels").to_pandas()
-    craters = dataset.table("craters", ["scene_id", "crater_id", "depth_m", "diameter_m"]).to_pandas()
     pictures = []
     for frame in chosen.itertuples():
         image = cv2.imread(str(dataset.file(frame.png_path)), cv2.IMREAD_GRAYSCALE)
-        own = labels[labels["frame_id"] == frame.frame_id]
-        own = own.merge(craters[craters["scene_id"] == frame.scene_id], on="crater_id")
+        labels = dataset.table("labels", scene_id=frame.scene_id, trajectory_id=frame.trajectory_id).to_pandas()
+        craters = dataset.table("craters", ["crater_id", "depth_m", "diameter_m"], scene_id=frame.scene_id).to_pandas()
+        own = labels[labels["frame_id"] == frame.frame_id].merge(craters, on="crater_id")
         drawn = draw_labels(image, Labels.from_table(own), selected(own, SELECTIONS["visible"]))
         pictures += [enlarge(image, 2), drawn]
     write_sheet(dataset.root / "overview.png", pictures, 6)

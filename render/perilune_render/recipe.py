@@ -36,6 +36,11 @@ def recipe_of(config: DatasetConfig, kind: Kind, preset: str) -> Recipe:
     return Recipe(preset=preset, kind=kind, seed=config.seed, config=plain, versions=versions())
 
 
+def same_source(first: str, second: str) -> bool:
+    """Whether two scenes' `dem_source` are of one content, whatever the file was called."""
+    return first.rpartition("sha256:")[2] == second.rpartition("sha256:")[2]
+
+
 def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue: Path | None = None) -> DatasetConfig:
     """The configuration of a recipe, with the user's own copies of the files that it names.
 
@@ -43,7 +48,10 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
     one is needed and not given, or the configuration is none of this version.
     """
     given = {"dem": dem, "catalogue": catalogue}
-    terrain = dict(recipe.config.get("terrain", {}))
+    terrain = recipe.config.get("terrain", {})
+    if not isinstance(terrain, dict):
+        raise UserError(where, "terrain", repr(terrain), "settings")
+    terrain = dict(terrain)
     for name in _FILES:
         if terrain.get(name) is not None:
             if given[name] is None:

@@ -21,7 +21,7 @@ from perilune_render.exr import read_exr
 from perilune_render.frame import Shot, Studio
 from perilune_render.labels import RimCircles
 from perilune_render.plan import camera_of
-from perilune_render.recipe import config_of
+from perilune_render.recipe import config_of, same_source
 from perilune_render.sensor import FixedPattern
 from perilune_render.tables import ground_tables
 from perilune_render.terrain.cache import cached_scene
@@ -31,6 +31,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import sha256_of
 from perilune_shared.info import Recipe
 from perilune_shared.manifest import Dataset
+from perilune_shared.png import png_header
 
 GREY_TOLERANCE = 2
 """Grey levels of 255 by which pixels may differ."""
@@ -71,11 +72,14 @@ def regenerate(
     dem: Path | None = None,
     catalogue: Path | None = None,
 ) -> list[Outcome]:
-    """Make frames again under `out`, with the manifest's own relative paths, and compare them.
+    """Make frames again as `out`/frames/<frame_id>.png and .exr, and compare them.
 
     `dem` and `catalogue` are this machine's copies of files that the recipes name; the manifest's own paths are never
-    opened. Raises UserError on frames that the manifest has not, and on recipes that this version cannot follow.
+    opened. Raises UserError on frames that the manifest has not, on recipes that this version cannot follow, and where
+    `out` is a dataset.
     """
+    if (out / "dataset.json").exists():
+        raise UserError(out, "--out", "a dataset, whose frames would be replaced", "another folder")
     frames = dataset.table("frames")
     known = set(frames["frame_id"].to_pylist())
     for frame_id in frame_ids:
@@ -101,8 +105,15 @@ def spread(dataset: Dataset, n_frames: int) -> list[str]:
 def _of_scene(
     dataset: Dataset, scene: dict, rows: list[dict], out: Path, dem: Path | None, catalogue: Path | None, advance
 ) -> list[Outcome]:
-    recipe = dataset.info.recipes[scene["recipe"]]
     where = dataset.root / "dataset.json"
+    recipe = dataset.info.recipes.get(scene["recipe"])
+    if recipe is None:
+        raise UserError(where, "recipes", f"no {scene['recipe']}", f"the recipe of {scene['scene_id']}")
+    seeds = dataset.table("trajectories", ["trajectory_id", "seed"], scene_id=scene["scene_id"]).to_pydict()
+    seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
+    for row in rows:
+        if row["trajectory_id"] not in seed_of:
+            raise UserError(dataset.root, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
     config = config_of(recipe, where, dem, catalogue)
     ground_config = _ground_config(recipe, config, where)
     camera, flight = camera_of(config.camera), ground_config.kind(recipe.kind).flight
@@ -110,15 +121,13 @@ def _of_scene(
     if camera != dataset.info.camera.intrinsics():
         raise UserError(where, "camera", dataset.info.camera.intrinsics(), f"that of its recipe, {camera}")
     ground = cached_scene(ground_config, exr_camera, flight, scene["seed"])
-    if ground.dem_source != scene["dem_source"]:
+    if not same_source(ground.dem_source, scene["dem_source"]):
         raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
     tables = ground_tables(scene["scene_id"], ground)
     same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
     sun = np.array(rows[0]["sun_direction"])
     pattern = FixedPattern.draw(config.sensor, camera, config.seed)
     studio = Studio(config, camera, exr_camera, pattern, RimCircles.of_scene(ground), sun)
-    seeds = dataset.table("trajectories", ["trajectory_id", "seed"], scene_id=scene["scene_id"]).to_pydict()
-    seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
     outcomes = []
     with Renderer(ground, ground_config, exr_camera, sun) as renderer:
         for row in rows:
@@ -170,6 +179,12 @@ def _state(far: float) -> State:
 
 def png_far(first: bytes, second: bytes) -> float:
     """Share of the pixels of two PNGs that differ by more than GREY_TOLERANCE; 1 where they are not of one shape."""
+    try:
+        # A small file may unpack to any size.
+        if png_header(first) != png_header(second):
+            return 1.0
+    except ValueError:
+        return 1.0
     one, two = (cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) for png in (first, second))
     if one is None or two is None or one.shape != two.shape or one.dtype != two.dtype:
         return 1.0
