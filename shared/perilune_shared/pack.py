@@ -1,6 +1,5 @@
 """A dataset in few large files, and back: frames as PNG bytes in images/*.parquet, each table as one part."""
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +13,8 @@ from perilune_shared.rewrite import check_complete, rewrite, with_column
 from perilune_shared.writer import frame_path, written
 
 _EXR = ("exr_path", "exr_sha256", "exr_bytes")
+_LARGEST_SHARD_MB = 8000
+"""Larger files are refused when they are read (perilune_shared.parts)."""
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
 
 
@@ -23,8 +24,8 @@ def pack(source: Dataset, out: Path, shard_mb: float = 1000, progress: Progress 
     A dataset without frames is packed as its tables alone. EXRs stay behind: their columns become null.
     """
     check_complete(source)
-    if not 0 < shard_mb < math.inf:
-        raise UserError("--shard-mb", "size", shard_mb, "above 0, and finite")
+    if not 0 < shard_mb <= _LARGEST_SHARD_MB:
+        raise UserError("--shard-mb", "size", shard_mb, f"above 0, at most {_LARGEST_SHARD_MB}")
     packed = source.info.images in ("files", "packed")
     info = source.info
     if packed:

@@ -27,7 +27,7 @@ from perilune_shared.schema import IMAGES, TABLES, SplitUnit
 SceneTables = dict[str, pa.Table]
 """Every table of one scene, by name."""
 _PER_DESCENT = ("frames", "labels")
-_IMAGES_A_GROUP = 128
+_IMAGES_A_GROUP, _BYTES_A_GROUP = 128, 2**28
 
 
 class DatasetWriter:
@@ -89,12 +89,12 @@ class DatasetWriter:
 
     def pack_images(self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int) -> None:
         """Write frames (frame_id, png_path, PNG bytes) into shards images/*.parquet of about `shard_bytes`."""
-        shard, size, writer = 0, 0, None
+        shard, size, held, writer = 0, 0, 0, None
         waiting: list[tuple[str, str, bytes]] = []
         self.root.joinpath("images").mkdir(parents=True, exist_ok=True)
 
         def flush() -> None:
-            nonlocal writer, waiting
+            nonlocal writer, waiting, held
             if not waiting:
                 return
             if writer is None:
@@ -103,7 +103,7 @@ class DatasetWriter:
                 writer = pq.ParquetWriter(path, IMAGES, compression="none", use_dictionary=["frame_id"])
             rows = [{"frame_id": name, "image": {"bytes": png, "path": path}} for name, path, png in waiting]
             writer.write_table(pa.Table.from_pylist(rows, schema=IMAGES))
-            waiting = []
+            waiting, held = [], 0
 
         for name, path, png in images:
             if size and size + len(png) > shard_bytes:
@@ -113,7 +113,8 @@ class DatasetWriter:
                 shard, size, writer = shard + 1, 0, None
             waiting.append((name, path, png))
             size += len(png)
-            if len(waiting) == _IMAGES_A_GROUP:
+            held += len(png)
+            if len(waiting) == _IMAGES_A_GROUP or held > _BYTES_A_GROUP:
                 flush()
         flush()
         if writer is not None:

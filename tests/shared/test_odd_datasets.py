@@ -109,9 +109,10 @@ def test_what_is_no_picture_is_not_attached(little, tmp_path):
         attach(open_dataset(tmp_path / "absent"), tmp_path / "made", tmp_path / "out", rehash=True)
 
 
-def test_shards_have_a_size(little, tmp_path):
-    with pytest.raises(UserError, match="finite"):
-        pack(open_dataset(little), tmp_path / "out", shard_mb=float("inf"))
+@pytest.mark.parametrize("size", [float("inf"), float("nan"), 0, 9000])
+def test_shards_are_of_a_size_that_can_be_read(little, tmp_path, size):
+    with pytest.raises(UserError, match="at most"):
+        pack(open_dataset(little), tmp_path / "out", shard_mb=size)
 
 
 def test_the_working_folder_can_be_the_new_one(tmp_path, monkeypatch):
