@@ -26,13 +26,17 @@ _SAME_PLACE_M = 1e-6
 
 def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
     """The dataset.json of a dataset that is begun."""
+    settings = config.kind(recipe.kind)
+    split_by = settings.split_by
+    if split_by == "scene" and config.terrain.dem is not None and settings.n_scenes > 1:
+        split_by = "trajectory"  # all scenes are of the elevation model's one ground
     return DatasetInfo(
         name=f"perilune-{recipe.preset}-{recipe.kind}",
         kind=recipe.kind,
         schema_version=SCHEMA_VERSION,
         complete=False,
         images="files",
-        split_by=config.kind(recipe.kind).split_by,
+        split_by=split_by,
         camera=CameraInfo.of(plan.camera),
         exr_camera=CameraInfo.of(plan.exr_camera) if config.render.exr else None,
         recipes=recipes_of(recipe),

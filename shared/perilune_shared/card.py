@@ -16,6 +16,7 @@ import yaml
 from rich.progress import Progress
 
 from perilune_shared.card_pictures import TITLES, Gathered, draw, gather
+from perilune_shared.content import terrain_of
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.export_croissant import citation_of
 from perilune_shared.info import INFO_NAME, Recipe
@@ -149,9 +150,9 @@ def _scenes(dataset: Dataset) -> str:
 
 def _splits(dataset: Dataset) -> str:
     frames = dataset.table("frames", ["scene_id", "split"]).to_pandas()
-    terrain = dataset.table("scenes", ["scene_id", "content_sha256"]).to_pandas()
-    terrain = terrain.drop_duplicates("scene_id").set_index("scene_id")
-    splits = frames.groupby(terrain["content_sha256"].reindex(frames["scene_id"]).to_numpy())["split"].nunique()
+    scenes = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pylist()
+    terrain = {row["scene_id"]: terrain_of(row["dem_source"], row["content_sha256"]) for row in scenes}
+    splits = frames.groupby(frames["scene_id"].map(terrain).to_numpy())["split"].nunique()
     shared = int((splits > 1).sum())
     by = f"Split by {dataset.info.split_by}: that is what no two splits share. "
     if shared:

@@ -9,6 +9,8 @@ import hashlib
 import numpy as np
 import pyarrow as pa
 
+PROCEDURAL = "procedural"
+"""`dem_source` of scenes without an elevation model."""
 _CRATER = ("x_m", "y_m", "z_m", "diameter_m", "depth_m")
 _BOULDER = ("x_m", "y_m", "z_m", "diameter_m")
 
@@ -23,3 +25,11 @@ def content_sha256(craters: pa.Table, boulders: pa.Table) -> str:
             millimetres = np.rint(np.nan_to_num(table[name].to_numpy()[order]) * 1000)
             digest.update(millimetres.astype("<i8").tobytes())
     return digest.hexdigest()
+
+
+def terrain_of(dem_source: str, content_sha256: str) -> str:
+    """What scenes of the same ground have in common: their elevation model, else their craters and boulders.
+
+    Scenes over one elevation model differ in the small craters that were added; the ground that it shows is the same.
+    """
+    return content_sha256 if dem_source == PROCEDURAL else dem_source.rpartition("sha256:")[2]

@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 from rich.progress import Progress
 
+from perilune_shared.content import terrain_of
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset
 from perilune_shared.rewrite import ImageMode, rewrite, with_column
@@ -27,16 +28,18 @@ def split_dataset(
 ) -> None:
     """Write a dataset whose whole scenes, descents or single frames are dealt to train, val and test at random.
 
-    Scenes with the same ground, whatever their names and Suns, go together. `frame` with shares of 0.1 is the paper's
-    protocol: the same ground in all three splits, which flatters the test, as `split_by` in dataset.json then says.
-    At least one unit goes to each split with a share above 0. Raises UserError where there are too few.
+    Scenes with the same ground, whatever their names and Suns, go together, as do all over one elevation model. `frame`
+    with shares of 0.1 is the paper's protocol: the same ground in all three splits, which flatters the test, as
+    `split_by` in dataset.json then says. At least one unit goes to each split with a share above 0. Raises UserError
+    where there are too few.
     """
     if not (0 <= val_share < 1 and 0 <= test_share < 1 and val_share + test_share < 1):
         raise UserError("--val and --test", "shares", f"{val_share}, {test_share}", "from 0 to less than 1 in all")
     frames = source.table("frames", ["frame_id", "scene_id", "trajectory_id"]).to_pandas()
-    scenes = source.table("scenes", ["scene_id", "content_sha256"]).to_pandas()
+    scenes = source.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pandas()
+    scenes["terrain"] = [terrain_of(*row) for row in zip(scenes["dem_source"], scenes["content_sha256"], strict=True)]
     frames = frames.merge(scenes, on="scene_id").sort_values("frame_id", ignore_index=True)
-    key = {"scene": "content_sha256", "trajectory": "trajectory", "frame": "frame_id"}[by]
+    key = {"scene": "terrain", "trajectory": "trajectory", "frame": "frame_id"}[by]
     frames["trajectory"] = frames["scene_id"] + "/" + frames["trajectory_id"]
     units = frames[key].drop_duplicates().to_numpy()
     n_val, n_test = (int(np.ceil(share * len(units))) for share in (val_share, test_share))

@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 from rich.progress import Progress
 
 from perilune_shared import checksums, files
-from perilune_shared.content import content_sha256
+from perilune_shared.content import content_sha256, terrain_of
 from perilune_shared.errors import UserError
 from perilune_shared.faults import Fault, part_faults
 from perilune_shared.frames import selenographic_from_site
@@ -87,7 +87,9 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
             continue
         used.add(scene["recipe"][0].as_py())
         frame_splits = dataset.table("frames", ["split"], scene_id=scene_id)["split"]
-        splits_of_terrain[scene["content_sha256"][0].as_py()] |= set(frame_splits.unique().to_pylist())
+        row = scene.to_pylist()[0]
+        terrain = terrain_of(row["dem_source"], row["content_sha256"])
+        splits_of_terrain[terrain] |= set(frame_splits.unique().to_pylist())
         seen["scenes"] += len(scene)
         yield from _scene(dataset, scene_id, scene, seen, told)
         if progress is not None and task is not None:

@@ -18,6 +18,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from perilune_shared import checksums, files
+from perilune_shared.content import terrain_of
 from perilune_shared.errors import UserError
 from perilune_shared.info import Counts, DatasetInfo, checked_info, write_info
 from perilune_shared.manifest import Dataset
@@ -51,12 +52,12 @@ class DatasetWriter:
         check_scene("the dataset given", tables)
         frames = _placed(tables["frames"])
         splits = frames["split"].to_numpy(zero_copy_only=False)
-        terrain = tables["scenes"]["content_sha256"][0].as_py()
-        self._splits_of_terrain[terrain] |= set(splits)
+        scene = tables["scenes"].to_pylist()[0]
+        self._splits_of_terrain[terrain_of(scene["dem_source"], scene["content_sha256"])] |= set(splits)
         self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
         tables = {**tables, "frames": frames, "trajectories": _settled(tables["trajectories"], frames)}
         self._frames_split |= tables["trajectories"]["split"].null_count > 0
-        scene_id = tables["scenes"]["scene_id"][0].as_py()
+        scene_id = scene["scene_id"]
         for name, rows in tables.items():
             self._rows[name] += len(rows)
             rows = rows.cast(TABLES[name])

@@ -6,6 +6,7 @@ import pytest
 from rich.progress import Progress
 
 from perilune_render import tables
+from perilune_render.config import KindConfig, TerrainConfig
 from perilune_render.develop import develop_dataset
 from perilune_render.output import begin_or_go_on, check_begun, info_of, open_finished
 from perilune_render.plan import make_plan
@@ -97,3 +98,11 @@ def test_an_elevation_model_goes_by_its_content():
 def test_what_is_no_picture_is_far_from_one(drawn):
     png = (drawn / "frames/s000/t000/000000.png").read_bytes()
     assert png_far(png, png) == 0 and png_far(b"no picture", png) == 1
+
+
+def test_scenes_over_one_elevation_model_share_terrain():
+    scenes = KindConfig(n_scenes=3, trajectories_per_scene=1, n_frames=4, split_by="scene")
+    for dem, told in ((None, "scene"), ("a.tif", "trajectory")):
+        config = config_with(detect=scenes, terrain=TerrainConfig(dem=dem))
+        info = info_of(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
+        assert info.split_by == told

@@ -17,6 +17,7 @@ from perilune_shared.merge import merge
 from perilune_shared.pack import pack, unpack
 from perilune_shared.parts import write_part
 from perilune_shared.rewrite import with_column
+from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset
 from perilune_shared.validate import validate
 
@@ -138,3 +139,15 @@ def test_the_working_folder_can_be_the_new_one(tmp_path, monkeypatch):
 def test_conditions_without_end_or_value_are_refused(little, tmp_path, where):
     with pytest.raises(UserError, match="condition"):
         subset(open_dataset(little), tmp_path / "out", [where])
+
+
+def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
+    """Added craters differ with the seed; the ground that the model shows does not."""
+    scenes = rows_of(victim, "scenes")
+    replaced(victim, "scenes", with_column(scenes, "dem_source", ["a.tif sha256:" + "1" * 64] * len(scenes)))
+    (fault,) = validate(open_dataset(victim))
+    assert fault.column == "split" and "common terrain" in fault.wanted
+    subset(open_dataset(victim), tmp_path / "same")
+    assert open_dataset(tmp_path / "same").info.split_by == "trajectory"
+    with pytest.raises(UserError, match="1 of scene"):
+        split_dataset(open_dataset(victim), tmp_path / "split", by="scene", val_share=0.5, test_share=0)
