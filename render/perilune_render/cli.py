@@ -57,6 +57,12 @@ def _first(kind: Kind) -> Literal["detect", "nav"]:
     return "nav" if kind is Kind.NAV else "detect"
 
 
+def _one(kind: Kind) -> Literal["detect", "nav"]:
+    if kind is Kind.BOTH:
+        raise UserError("--kind", "kind", "both", "detect or nav: one dataset")
+    return _first(kind)
+
+
 def _resolve(
     preset: str, config: Path | None, setting: list[str] | None, dem: Path | None, catalogue: Path | None
 ) -> DatasetConfig:
@@ -70,6 +76,7 @@ def _resolve(
 
 @app.command()
 def dataset(
+    context: typer.Context,
     preset: Preset = "small",
     config: Config = None,
     setting: Setting = None,
@@ -87,7 +94,8 @@ def dataset(
 ) -> None:
     """Render a preset's datasets, or a manifest's. Stopped at any moment, the same command goes on where it was."""
     if manifest is not None:
-        _render_manifest(manifest, out, dem, catalogue, any((config, setting)))
+        given = [name for name in ("preset", "config", "setting", "kind") if _was_given(context, name)]
+        _render_manifest(manifest, out, dem, catalogue, given)
         return
     resolved = _resolve(preset, config, setting, dem, catalogue)
     folder = out or Path("data") / preset
@@ -107,9 +115,18 @@ def dataset(
         )
 
 
-def _render_manifest(manifest: Path, out: Path | None, dem: Path | None, catalogue: Path | None, changed: bool) -> None:
-    if out is None or changed:
-        raise UserError("--manifest", "options", "no --out" if out is None else "--config or --set", "--out alone")
+def _was_given(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def _render_manifest(
+    manifest: Path, out: Path | None, dem: Path | None, catalogue: Path | None, others: list[str]
+) -> None:
+    if out is None or others:
+        found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
+        wanted = "--out, and --dem and --catalogue where its recipe names them; the rest is the manifest's"
+        raise UserError("--manifest", "options", found, wanted)
     given = open_dataset(manifest)
     from perilune_render.dataset import render_plan
     from perilune_render.manifest_plan import as_before, plan_of
@@ -158,7 +175,7 @@ def plan(
     from perilune_render.planned import write_plan
 
     with progress_bar() as progress:
-        write_plan(resolved, _first(kind), preset, out, progress)
+        write_plan(resolved, _one(kind), preset, out, progress)
     counts = open_dataset(out).info.counts
     Console().print(f"{out}: {counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames planned")
 
@@ -185,6 +202,8 @@ def regenerate(
     from perilune_render.regenerate import State, spread
     from perilune_render.regenerate import regenerate as make_again
 
+    if frames and everything:
+        raise UserError("regenerate", "options", "--frames and --all", "one of them")
     ids = list(dict.fromkeys(frames or ())) or spread(dataset, dataset.info.counts.frames if everything else sample)
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         outcomes = make_again(dataset, ids, out or Path(folder), progress, dem, catalogue)

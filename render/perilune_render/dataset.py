@@ -14,6 +14,7 @@ from perilune_render import tables
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
 from perilune_render.frame import Shot, Studio
+from perilune_render.interrupts import interrupts_held
 from perilune_render.labels import RimCircles
 from perilune_render.output import begin_or_go_on, check_begun, info_of, open_finished, write_overview
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
@@ -58,7 +59,8 @@ def render_plan(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path,
         if not waiting:
             continue
         progress.update(task, note=f"{scene_plan.scene_id}: growing")
-        scene = cached_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
+        with interrupts_held():
+            scene = cached_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
         _write_scene(out, scene_plan, scene, config, info.recipe().key, trajectories)
         progress.update(task, note=scene_plan.scene_id)
         sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)

@@ -7,6 +7,7 @@ from rich.progress import Progress
 
 from perilune_render import tables
 from perilune_render.config import DatasetConfig
+from perilune_render.interrupts import interrupts_held
 from perilune_render.output import info_of
 from perilune_render.plan import make_plan
 from perilune_render.recipe import recipe_of
@@ -29,7 +30,8 @@ def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progre
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes", note="")
     with written(out, info, whole_tables=True) as writer:
         for scene_plan in plan.scenes:
-            scene = grow_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
+            with interrupts_held():
+                scene = grow_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
             sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
             trajectories = plan.of_scene(scene_plan.scene_id)
             paths = ("png", "exr") if config.render.exr else ("png",)

@@ -53,6 +53,8 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
         raise UserError(where, "terrain", repr(terrain), "settings")
     terrain = dict(terrain)
     for name in _FILES:
+        if terrain.get(name) is None and given[name] is not None:
+            raise UserError(f"--{name}", name, given[name], "no such option: the recipe is of procedural ground")
         if terrain.get(name) is not None:
             if given[name] is None:
                 raise UserError(where, f"terrain.{name}", terrain[name], f"--{name} with this machine's copy of it")

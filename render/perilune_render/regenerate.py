@@ -19,6 +19,7 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig
 from perilune_render.exr import read_exr
 from perilune_render.frame import Shot, Studio
+from perilune_render.interrupts import interrupts_held
 from perilune_render.labels import RimCircles
 from perilune_render.plan import camera_of
 from perilune_render.recipe import config_of, same_source
@@ -120,7 +121,8 @@ def _of_scene(
     exr_camera = camera_of(ground_config.camera).covering_pinhole()
     if camera != dataset.info.camera.intrinsics():
         raise UserError(where, "camera", dataset.info.camera.intrinsics(), f"that of its recipe, {camera}")
-    ground = cached_scene(ground_config, exr_camera, flight, scene["seed"])
+    with interrupts_held():
+        ground = cached_scene(ground_config, exr_camera, flight, scene["seed"])
     if not same_source(ground.dem_source, scene["dem_source"]):
         raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
     tables = ground_tables(scene["scene_id"], ground)
@@ -164,12 +166,15 @@ def _compared(dataset: Dataset, row: dict, kind: str, out: Path) -> State:
         return "new"
     if sha256_of(new) == row[f"{kind}_sha256"]:
         return "identical"
-    if kind == "png" and dataset.info.images in ("files", "packed"):
-        frames = dataset.table("frames", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
-        old = dict(dataset.pngs(frames.filter(pc.equal(frames["frame_id"], row["frame_id"]))))[row["frame_id"]]
-        return _state(png_far(old, new.read_bytes()))
-    if kind == "exr" and dataset.info.images == "files" and row["exr_path"] is not None:
-        return _state(exr_far(read_exr(dataset.file(row["exr_path"])), read_exr(new)))
+    try:
+        if kind == "png" and dataset.info.images in ("files", "packed"):
+            frames = dataset.table("frames", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
+            old = dict(dataset.pngs(frames.filter(pc.equal(frames["frame_id"], row["frame_id"]))))[row["frame_id"]]
+            return _state(png_far(old, new.read_bytes()))
+        if kind == "exr" and dataset.info.images == "files":
+            return _state(exr_far(read_exr(dataset.file(row["exr_path"])), read_exr(new)))
+    except UserError:
+        pass  # the old file is missing or damaged, and the hash differs
     return "different"
 
 

@@ -9,7 +9,7 @@ from perilune_shared import files
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset
 from perilune_shared.png import png_header
-from perilune_shared.rewrite import check_complete, with_column
+from perilune_shared.rewrite import check_source, with_column
 from perilune_shared.writer import written
 
 
@@ -23,7 +23,7 @@ def attach(
     where all of a scene's are there. Raises UserError where a frame is missing or another, and on a plan, which has no
     labels.
     """
-    check_complete(manifest)
+    check_source(manifest, out)
     if manifest.info.images != "absent":
         wanted = "absent: a manifest with labels and without frames"
         raise UserError(manifest.root, "images", manifest.info.images, wanted)

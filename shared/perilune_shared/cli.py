@@ -25,7 +25,7 @@ app = typer.Typer(
 
 @app.command()
 def validate(
-    dataset: DatasetArgument, most: Annotated[int, typer.Option(help="Show at most this many faults.")] = 50
+    dataset: DatasetArgument, most: Annotated[int, typer.Option(min=1, help="Show at most this many faults.")] = 50
 ) -> None:
     """Check schema, ranges, keys, splits, labels against poses, and the hash of every file. Exit code 2 on a fault."""
     with progress_bar() as progress:
@@ -38,7 +38,8 @@ def validate(
     for fault in faults[:most]:
         row = "" if fault.row is None else str(fault.row)
         # As Text, since brackets would be read as markup; so with all that a stranger may have named.
-        table.add_row(*map(Text, (fault.file, row, fault.column, fault.found, fault.wanted)))
+        cells = (fault.file, row, fault.column, fault.found, fault.wanted)
+        table.add_row(*(Text(cell, overflow="fold") for cell in cells))
     console.print(table)
     raise typer.Exit(EXIT_USER_ERROR)
 

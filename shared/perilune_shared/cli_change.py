@@ -14,7 +14,7 @@ from perilune_shared import diff as differing
 from perilune_shared import merge as merging
 from perilune_shared import migrate as migrating
 from perilune_shared import pack as packing
-from perilune_shared.manifest import Dataset, open_dataset
+from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
 from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset as choose
@@ -55,15 +55,14 @@ def add_to(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def _tell(out: Path) -> Dataset:
-    made = open_dataset(out)
-    counts = made.info.counts
-    Console().print(
-        Text(f"{out}: {counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames, "
-             f"{counts.labels} labels, frames {made.info.images}, split by {made.info.split_by}"),
-        soft_wrap=True,
-    )  # fmt: skip
-    return made
+def _tell(out: Path) -> None:
+    """What was made, and whether its splits share terrain."""
+    info = open_dataset(out).info
+    counts = info.counts
+    leak = "" if info.split_by == "scene" else ": splits share terrain, so that test figures flatter"
+    told = f"{counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames, {counts.labels} labels"
+    line = f"{out}: {told}, frames {info.images}, split by {info.split_by}{leak}"
+    Console().print(Text(line), soft_wrap=True)
 
 
 def merge(
@@ -109,9 +108,7 @@ def split(
     """Deal train, val and test anew, by scene, descent or frame."""
     with progress_bar() as progress:
         split_dataset(open_dataset(dataset), out, by.value, val, test, seed, images.value, progress)
-    made = _tell(out)
-    if made.info.split_by != "scene":
-        Console().print("the splits share terrain: figures of the test flatter")
+    _tell(out)
 
 
 def diff(first: DatasetArgument, second: DatasetArgument) -> None:
@@ -123,7 +120,7 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
     table = Table("where", "column", "rows", "for example", "first", "second")
     for each in found:
         cells = (each.place, each.column, str(each.rows), each.example, each.first, each.second)
-        table.add_row(*map(Text, cells))
+        table.add_row(*(Text(cell, overflow="fold") for cell in cells))
     Console().print(table)
     raise typer.Exit(EXIT_DIFFERENT)
 

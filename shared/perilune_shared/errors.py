@@ -16,6 +16,8 @@ _DISK_FAULTS = (
     errno.EPERM,
     errno.EROFS,
     errno.ENOTDIR,
+    errno.ENOENT,
+    errno.EEXIST,
     errno.EISDIR,
     errno.ENAMETOOLONG,
     errno.ELOOP,

@@ -16,7 +16,7 @@ from perilune_shared import files
 from perilune_shared.errors import UserError
 from perilune_shared.info import Counts, DatasetInfo, read_info
 from perilune_shared.parts import WHOLE_TABLE, Part
-from perilune_shared.schema import IMAGES, TABLES
+from perilune_shared.schema import IMAGES, SPLITS, TABLES
 
 LARGEST_FRAME_BYTES = 2**30
 """Of a PNG or an EXR."""
@@ -49,6 +49,8 @@ class Dataset:
         column is not known.
         """
         _check_names(table, columns)
+        if split is not None and split not in SPLITS:
+            raise UserError(table, "split", split, "one of " + ", ".join(SPLITS))
         if trajectory_id is not None and scene_id is None:
             raise UserError("table", "scene_id", "None", "the scene too: names of descents repeat in each scene")
         names = list(columns) if columns is not None else TABLES[table].names
@@ -86,7 +88,8 @@ class Dataset:
         is missing.
         """
         if self.info.images in ("absent", "planned"):
-            wanted = "a dataset with its frames; `perilune-render regenerate` makes them"
+            made = "regenerate" if self.info.images == "absent" else "dataset --manifest"
+            wanted = f"a dataset with its frames; `perilune-render {made}` makes them"
             raise UserError(self.root, "images", self.info.images, wanted)
         rows = frames.select(["frame_id", "png_path"]).to_pydict()
         paths = dict(zip(rows["frame_id"], rows["png_path"], strict=True))

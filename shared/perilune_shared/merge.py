@@ -10,7 +10,7 @@ from rich.progress import Progress
 from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo, joined_licence
 from perilune_shared.manifest import Dataset
-from perilune_shared.rewrite import ImageMode, bare, check_complete, state_of, with_column
+from perilune_shared.rewrite import ImageMode, bare, check_source, state_of, with_column
 from perilune_shared.writer import SceneTables, check_scene, written
 
 _CHANGING = ("scene_id", "trajectory_id", "n_frames", "split")
@@ -30,7 +30,7 @@ def merge(
     splits and what the splits share are reckoned from the rows. Raises UserError where kinds or cameras differ, or
     one frame was rendered in two ways.
     """
-    info = _joined_info(sources, name, state_of(list(sources), images))
+    info = _joined_info(sources, out, name, state_of(list(sources), images))
     groups = _same_scenes(sources, planned=info.images == "planned")
     task = progress.add_task("merging", total=len(groups), unit="scenes", note="") if progress else None
     with written(out, info) as writer:
@@ -45,12 +45,12 @@ def merge(
                 progress.advance(task)
 
 
-def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetInfo:
+def _joined_info(sources: Sequence[Dataset], out: Path, name: str, images: str) -> DatasetInfo:
     if len(sources) < 2:
         raise UserError("merge", "datasets", len(sources), "at least two")
     first = sources[0].info
     for source in sources:
-        check_complete(source)
+        check_source(source, out)
         for field in ("kind", "camera"):
             if getattr(source.info, field) != getattr(first, field):
                 raise UserError(source.root, field, "another", f"the {field} of {sources[0].root}")

@@ -14,6 +14,9 @@ def check_sums(dataset: Dataset, paths: Iterable[Path]) -> bool:
     The sums of all other files must be right before, since nobody would notice a fault after: UserError where one is
     not. A dataset that is not complete is sealed by whoever completes it.
     """
+    for path in paths:
+        if any(path.resolve().is_relative_to((dataset.root / folder).resolve()) for folder in ("manifest", "images")):
+            raise UserError(path, "--out", "a file among the dataset's tables", "another place")
     own = {path.name for path in paths if path.resolve().parent == dataset.root.resolve()}
     if not own or not dataset.info.complete:
         return False

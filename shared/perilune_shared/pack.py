@@ -9,7 +9,7 @@ from rich.progress import Progress
 from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo
 from perilune_shared.manifest import Dataset
-from perilune_shared.rewrite import check_complete, rewrite, with_column
+from perilune_shared.rewrite import check_source, rewrite, with_column
 from perilune_shared.writer import frame_path, written
 
 _EXR = ("exr_path", "exr_sha256", "exr_bytes")
@@ -23,7 +23,7 @@ def pack(source: Dataset, out: Path, shard_mb: float = 1000, progress: Progress 
 
     A dataset without frames is packed as its tables alone. EXRs stay behind: their columns become null.
     """
-    check_complete(source)
+    check_source(source, out)
     if not 0 < shard_mb <= _LARGEST_SHARD_MB:
         raise UserError("--shard-mb", "size", shard_mb, f"above 0, at most {_LARGEST_SHARD_MB}")
     packed = source.info.images in ("files", "packed")

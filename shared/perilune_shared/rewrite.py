@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from rich.progress import Progress
 
+from perilune_shared import checksums
 from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo
 from perilune_shared.manifest import Dataset
@@ -29,7 +30,7 @@ def rewrite(
     progress: Progress | None = None,
 ) -> None:
     """Write every scene of `source` as `change` gives it; scenes and labels without frames fall away."""
-    check_complete(source)
+    check_source(source, out)
     info = info.model_copy(update={"images": state_of([source], images)})
     scene_ids = source.scene_ids()
     task = progress.add_task("writing", total=len(scene_ids), unit="scenes", note="") if progress else None
@@ -48,10 +49,18 @@ def rewrite(
                 progress.advance(task)
 
 
-def check_complete(source: Dataset) -> None:
-    """Raises UserError on a dataset that is still being rendered, or has frames of scenes that it does not list."""
+def check_source(source: Dataset, out: Path) -> None:
+    """Raises UserError on a dataset whose rows are not to be handed on into `out`.
+
+    That is one that is still being rendered, whose files are not those of its SHA256SUMS (new sums would hide it for
+    good), that has frames of scenes which it does not list, or in whose folder `out` lies.
+    """
     if not source.info.complete:
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
+    if out.resolve().is_relative_to(source.root.resolve()):
+        raise UserError(out, "--out", f"a folder in {source.root}", "one outside the dataset")
+    for name, found, wanted in checksums.faults_of(source.root):
+        raise UserError(source.root / name, "SHA-256", found, f"{wanted}; see `perilune-manifest validate`")
     odd = set(source.table("frames", ["scene_id"])["scene_id"].unique().to_pylist()) - set(source.scene_ids())
     if odd:
         wanted = "the scene of every frame; see `perilune-manifest validate`"

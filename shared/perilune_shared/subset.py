@@ -36,6 +36,10 @@ def subset(
     conditions = [Condition(text) for text in where]
     on_frames = [condition for condition in conditions if not condition.on_labels]
     on_labels = [condition for condition in conditions if condition.on_labels]
+    planned = source.info.images == "planned" or images == "plan"
+    if on_labels and planned:
+        wanted = "conditions on frames, trajectories and scenes: a plan has no labels"
+        raise UserError("--where", "condition", on_labels[0].text, wanted)
     kept = None
     if n_frames is not None or megabytes is not None:
         kept = _first_frames(source, on_frames, n_frames, megabytes)

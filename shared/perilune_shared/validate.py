@@ -78,6 +78,7 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
     told: set[tuple[str, str]] = set()
     seen = dict.fromkeys(TABLES, 0)
     splits_of_terrain: dict[str, set[str]] = defaultdict(set)
+    splits_of_descent: dict[tuple[str, object], set[str]] = defaultdict(set)
     task = progress.add_task("checking", total=len(scene_ids), unit="scenes", note="") if progress else None
     for scene_id in dict.fromkeys(scene_ids):
         scene = dataset.table("scenes", scene_id=scene_id)
@@ -86,10 +87,14 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
             yield Fault.of("manifest/scenes", None, "part", f"{scene_id} elsewhere", wanted)
             continue
         used.add(scene["recipe"][0].as_py())
-        frame_splits = dataset.table("frames", ["split"], scene_id=scene_id)["split"]
+        frame_splits = dataset.table("frames", ["trajectory_id", "split"], scene_id=scene_id)
         row = scene.to_pylist()[0]
         terrain = terrain_of(row["dem_source"], row["content_sha256"])
-        splits_of_terrain[terrain] |= set(frame_splits.unique().to_pylist())
+        splits_of_terrain[terrain] |= set(frame_splits["split"].unique().to_pylist())
+        seeds = dataset.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pydict()
+        seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
+        for trajectory_id, split in {tuple(each.values()) for each in frame_splits.to_pylist()}:
+            splits_of_descent[terrain, seed_of.get(trajectory_id, trajectory_id)].add(split)
         seen["scenes"] += len(scene)
         yield from _scene(dataset, scene_id, scene, seen, told)
         if progress is not None and task is not None:
@@ -104,6 +109,10 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
         if len(splits) > 1 and dataset.info.split_by == "scene":
             found = f"terrain {terrain[:12]} in {' and '.join(sorted(map(str, splits)))}"
             yield Fault.of("manifest/frames", None, "split", found, "one split for each scene: no common terrain")
+    for (terrain, _), splits in splits_of_descent.items():
+        if len(splits) > 1 and dataset.info.split_by != "frame":
+            found = f"a descent over terrain {terrain[:12]} in {' and '.join(sorted(map(str, splits)))}"
+            yield Fault.of("manifest/frames", None, "split", found, "one split for each descent, whatever its name")
 
 
 def _scene(

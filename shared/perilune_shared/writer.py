@@ -40,7 +40,8 @@ class DatasetWriter:
         self._rows = dict.fromkeys(TABLES, 0)
         self._kept: dict[str, list[pa.Table]] = defaultdict(list)
         self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
-        self._frames_split = False
+        self._splits_of_descent: dict[tuple[str, int], set[str]] = defaultdict(set)
+        self._has_exr = False
         self._recipes: set[str] = set()
 
     def add_scene(self, tables: SceneTables) -> None:
@@ -53,10 +54,14 @@ class DatasetWriter:
         frames = _placed(tables["frames"])
         splits = frames["split"].to_numpy(zero_copy_only=False)
         scene = tables["scenes"].to_pylist()[0]
-        self._splits_of_terrain[terrain_of(scene["dem_source"], scene["content_sha256"])] |= set(splits)
+        terrain = terrain_of(scene["dem_source"], scene["content_sha256"])
+        self._splits_of_terrain[terrain] |= set(splits)
+        for descent in tables["trajectories"].select(["trajectory_id", "seed"]).to_pylist():
+            own = np.asarray(pc.equal(frames["trajectory_id"], descent["trajectory_id"]), bool)
+            self._splits_of_descent[terrain, descent["seed"]] |= set(splits[own])
+        self._has_exr |= frames["exr_path"].null_count < len(frames)
         self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
         tables = {**tables, "frames": frames, "trajectories": _settled(tables["trajectories"], frames)}
-        self._frames_split |= tables["trajectories"]["split"].null_count > 0
         scene_id = scene["scene_id"]
         for name, rows in tables.items():
             self._rows[name] += len(rows)
@@ -130,10 +135,15 @@ class DatasetWriter:
                 pieces = [_sorted_by(piece, "frame_id") for piece in pieces]
             rows = pa.concat_tables(pieces)
             write_part(self.root, name, WHOLE_TABLE, rows, max(1000, len(rows) // 200))
+        # A descent may come twice: rendered, and developed again with another sensor.
+        torn = any(len(splits) > 1 for splits in self._splits_of_descent.values())
         shared = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
-        unit: SplitUnit = "frame" if self._frames_split else "trajectory" if shared else "scene"
+        unit: SplitUnit = "frame" if torn else "trajectory" if shared else "scene"
+        exr_camera = self.info.exr_camera if self._has_exr else None
         recipes = {key: recipe for key, recipe in self.info.recipes.items() if key in self._recipes}
-        info = self.info.model_copy(update={"split_by": unit, "recipes": recipes, "counts": Counts(**self._rows)})
+        info = self.info.model_copy(
+            update={"split_by": unit, "recipes": recipes, "exr_camera": exr_camera, "counts": Counts(**self._rows)}
+        )
         write_info(self.root, info)
         checksums.seal(self.root)
 

@@ -1,8 +1,10 @@
 """Datasets that are right but unusual, and such as are damaged in their rows: a right result, or one line."""
 
+import json
 import shutil
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
 
@@ -12,11 +14,13 @@ from perilune_shared.checksums import seal
 from perilune_shared.errors import UserError
 from perilune_shared.export_coco import export_coco
 from perilune_shared.files import new_folder
+from perilune_shared.info import Recipe, write_info
 from perilune_shared.manifest import open_dataset
 from perilune_shared.merge import merge
 from perilune_shared.pack import pack, unpack
 from perilune_shared.parts import write_part
 from perilune_shared.rewrite import with_column
+from perilune_shared.schema import TABLES
 from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset
 from perilune_shared.validate import validate
@@ -151,3 +155,64 @@ def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
     assert open_dataset(tmp_path / "same").info.split_by == "trajectory"
     with pytest.raises(UserError, match="1 of scene"):
         split_dataset(open_dataset(victim), tmp_path / "split", by="scene", val_share=0.5, test_share=0)
+
+
+def test_a_damaged_table_is_not_handed_on(drawn, tmp_path):
+    """New checksums would make a fault look right for good."""
+    broken = shutil.copytree(drawn, tmp_path / "broken")
+    part = broken / "manifest/labels/all.parquet"
+    rows = pq.read_table(part).to_pandas()
+    rows.loc[3, "contrast"] = 777.0
+    pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["labels"], preserve_index=False), part)
+    dataset, out = open_dataset(broken), tmp_path / "out"
+    for act in (
+        lambda: subset(dataset, out),
+        lambda: split_dataset(dataset, out),
+        lambda: pack(dataset, out),
+        lambda: merge([open_dataset(drawn), dataset], out),
+    ):
+        with pytest.raises(UserError, match=r"labels/all\.parquet: SHA-256"):
+            act()
+    assert not out.exists()
+
+
+def test_a_descent_developed_twice_is_one_descent(drawn, tmp_path):
+    """Under two recipes, as a dataset and what was developed of it: its frames may not be split apart unseen."""
+    other = shutil.copytree(drawn, tmp_path / "other")
+    info = json.loads((other / "dataset.json").read_text())
+    (recipe,) = info["recipes"].values()
+    recipe["versions"]["perilune_shared"] = "0.0"
+    key = Recipe.model_validate(recipe).key
+    (other / "dataset.json").write_text(json.dumps({**info, "recipes": {key: recipe}}))
+    part = other / "manifest/scenes/all.parquet"
+    rows = pq.read_table(part).to_pandas().assign(recipe=key)
+    pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["scenes"], preserve_index=False), part)
+    seal(other)
+    split_dataset(open_dataset(other), tmp_path / "dealt", val_share=0.2, test_share=0.2, seed=1)
+    merge([open_dataset(drawn), open_dataset(tmp_path / "dealt")], tmp_path / "m")
+    made = open_dataset(tmp_path / "m")
+    assert made.info.counts.scenes == 10 and made.info.split_by == "frame" and validate(made) == []
+    boast = made.info.model_copy(update={"split_by": "trajectory"})
+    write_info(made.root, boast)
+    seal(made.root)
+    assert "one split for each descent" in validate(open_dataset(made.root))[0].wanted
+
+
+@pytest.mark.parametrize("inside", ["", "frames", "new/folder"])
+def test_no_dataset_is_written_into_another(drawn, inside):
+    before = sorted(drawn.rglob("*"))
+    with pytest.raises(UserError, match="one outside the dataset"):
+        subset(open_dataset(drawn), drawn / inside)
+    assert sorted(drawn.rglob("*")) == before
+
+
+def test_conditions_on_labels_of_a_plan_are_refused(drawn, tmp_path):
+    with pytest.raises(UserError, match="a plan has no labels"):
+        subset(open_dataset(drawn), tmp_path / "p", ["radius_px > 3"], images="plan")
+    subset(open_dataset(drawn), tmp_path / "p", images="plan")
+    with pytest.raises(UserError, match="a plan has no labels"):
+        subset(open_dataset(tmp_path / "p"), tmp_path / "q", ["depth_m > 3"])
+    with pytest.raises(UserError, match="train, val, test"):
+        open_dataset(drawn).table("labels", split="tset")
+    with pytest.raises(UserError, match="dataset --manifest"):
+        list(open_dataset(tmp_path / "p").pngs(open_dataset(drawn).table("frames")))

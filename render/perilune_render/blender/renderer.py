@@ -4,9 +4,7 @@ import contextlib
 import errno
 import os
 import shutil
-import signal
 import tempfile
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +16,7 @@ import numpy as np
 from perilune_render.blender import stage as blender_stage
 from perilune_render.config import DatasetConfig, LightConfig, RenderConfig
 from perilune_render.exr import Radiance, read_exr
+from perilune_render.interrupts import interrupts_held
 from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
@@ -54,7 +53,7 @@ class Renderer:
         blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
         path = Path(self._folder.name) / "frame.exr"
         try:
-            with _interrupts_held():
+            with interrupts_held():
                 radiance = render_through(path, self.stage, seed)
                 if not self._exact:
                     return radiance
@@ -151,22 +150,6 @@ def _radiance(path: Path) -> Radiance:
     # Where light comes from elsewhere too, the pass of direct light over colour tells where the Sun reaches.
     sunlit = by_pass.get("DiffDir.R", radiance_factor) > _LIT
     return Radiance(radiance_factor, np.where(depth > _FAR_M, np.float32(np.inf), depth), normal, sunlit)
-
-
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Answer Ctrl-C after the frame: Cycles' own Python callback would swallow it, and the rendering would go on."""
-    asked = []
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, lambda *_: asked.append(True))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if asked:
-        raise KeyboardInterrupt
 
 
 class quiet:

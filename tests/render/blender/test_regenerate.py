@@ -2,8 +2,10 @@
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -96,6 +98,8 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
     for arguments, told in (
         (["--manifest", tmp_path / "s", "--set", "dataset.seed=3", "--out", tmp_path / "o"], "--set"),
         (["--manifest", tmp_path / "s"], "--out"),
+        (["--manifest", tmp_path / "s", "--preset", "tiny", "--out", tmp_path / "o"], "--preset"),
+        (["--manifest", tmp_path / "s", "--dem", __file__, "--out", tmp_path / "o"], "procedural"),
         (["--manifest", tmp_path / "none", "--out", tmp_path / "o"], "no such file"),
     ):
         refused = run("dataset", *arguments)
@@ -146,6 +150,7 @@ def test_another_ground_is_told(tiny_detect):
     [
         (["--verify", "--frames", "scene-0001/trajectory-0000/000099"], "a frame of the manifest, such as scene-0000"),
         (["--frames", "scene-0001/trajectory-0000/000001"], "--out"),
+        (["--frames", "scene-0001/trajectory-0000/000001", "--all", "--out", "x"], "one of them"),
         ([], "--verify"),
     ],
 )
@@ -214,3 +219,19 @@ def test_nothing_is_left_of_a_failed_plan(tmp_path):
     shutil.copy(__file__, tmp_path / "full")
     made = run("plan", "--preset", "tiny", "--out", tmp_path / "full")
     assert made.returncode == 2 and "--out" in made.stderr
+
+
+def test_ctrl_c_in_a_plan_leaves_nothing(tmp_path):
+    """At any moment, growing included, where code that Numba compiled must not be torn."""
+    out = tmp_path / "p"
+    for seconds in (0.0, 0.4, 0.8):
+        command = [RENDER, "plan", "--preset", "small", "--out", str(out)]
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+        deadline = time.monotonic() + 60
+        while not any(tmp_path.iterdir()) and time.monotonic() < deadline:
+            time.sleep(0.005)
+        time.sleep(seconds)
+        process.send_signal(signal.SIGINT)
+        told = process.communicate(timeout=60)[1]
+        assert process.returncode == 130 and "Traceback" not in told
+        assert list(tmp_path.iterdir()) == []
