@@ -44,10 +44,17 @@ class Pool:
         self.root, self.numbers = root, itertools.count()
         self.made: dict[tuple, Path | None] = {}
         for seed in (1, 2):
-            splits = {"train": 2, "val": 1, "test": 1}
-            # Two descents over each terrain, so that not every split is one by scene.
+            splits = {"train": 1, "val": 1, "test": 1}
+            # More descents than terrains, so that not every split is one by scene.
             self.made["drawn", seed] = build_dataset(
-                root / f"drawn{seed}", "detect", side_px=64, splits=splits, scenes=2, n_frames=2, craters=30, seed=seed
+                root / f"drawn{seed}",
+                "detect",
+                side_px=64,
+                splits=splits,
+                scenes=seed,
+                n_frames=2,
+                craters=30,
+                seed=seed,
             )
 
     def of(self, key: tuple, make) -> Path | None:
@@ -116,7 +123,7 @@ def test_chains(pool):
     chains = []
 
     @settings(max_examples=1000, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
-    @given(st.sampled_from([1, 2]), st.lists(STEPS, min_size=1, max_size=4))
+    @given(st.sampled_from([1, 2]), st.lists(STEPS, min_size=1, max_size=3))
     def run(start, steps):
         key, folder = ("drawn", start), pool.made["drawn", start]
         earlier = [(("drawn", n), pool.made["drawn", n]) for n in (1, 2)]
@@ -127,5 +134,4 @@ def test_chains(pool):
 
     run()
     made = [folder for folder in pool.made.values() if folder is not None]
-    assert len(chains) >= 1000 and len(made) > 300
-    print(len(made), sum(chains))
+    assert len(chains) >= 1000 and len(made) > 200
