@@ -29,6 +29,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.info import Counts, Origin, Recipe, recipes_of, write_info
 from perilune_shared.manifest import Dataset, count_rows, open_dataset
 from perilune_shared.parts import write_part
+from perilune_shared.writer import with_column
 
 
 def develop_dataset(
@@ -166,6 +167,5 @@ def _copy_scene(source: Dataset, out: Path, scene_id: str, recipe: Recipe) -> No
         if not (out / "manifest" / name / f"{scene_id}.parquet").exists():
             rows = source.table(name, scene_id=scene_id)
             if name == "scenes":
-                place = rows.schema.get_field_index("recipe")
-                rows = rows.set_column(place, rows.schema.field(place), [[recipe.key] * len(rows)])
+                rows = with_column(rows, "recipe", [recipe.key] * len(rows))
             write_part(out, name, scene_id, rows)

@@ -9,8 +9,8 @@ from perilune_shared import files
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset
 from perilune_shared.png import png_header
-from perilune_shared.rewrite import check_source, with_column
-from perilune_shared.writer import written
+from perilune_shared.rewrite import check_source
+from perilune_shared.writer import with_column, written
 
 
 def attach(
@@ -19,9 +19,8 @@ def attach(
     """Write a dataset of a manifest without frames and the frames under `frames_root`, at the manifest's own paths.
 
     Every PNG must have the hash that the manifest states. With `rehash` frames are taken as they are and their own
-    hashes written down: those of another kind of machine, or of a manifest that was never rendered. EXRs come along
-    where all of a scene's are there. Raises UserError where a frame is missing or another, and on a plan, which has no
-    labels.
+    hashes written down, as for those of another kind of machine. EXRs come along where all of a scene's are there.
+    Raises UserError where a frame is missing or another, and on a plan, which has no labels.
     """
     check_source(manifest, out)
     if manifest.info.images != "absent":

@@ -51,8 +51,7 @@ def stats(dataset: DatasetArgument) -> None:
     frame = summary(opened)
     info = opened.info
     state = "" if info.complete else ", not complete"
-    leak = "" if info.split_by == "scene" else ": splits share terrain, so that test figures flatter"
-    table = Table(title=f"{info.name}{state}", caption=f"split by {info.split_by}{leak}")
+    table = Table(title=f"{info.name}{state}", caption=f"split by {info.split_by}{info.leak}")
     # A measure a row, so that the table fits a narrow terminal.
     measures = frame.set_index("split").astype(object).T
     table.add_column("")

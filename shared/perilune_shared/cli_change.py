@@ -59,9 +59,8 @@ def _tell(out: Path) -> None:
     """What was made, and whether its splits share terrain."""
     info = open_dataset(out).info
     counts = info.counts
-    leak = "" if info.split_by == "scene" else ": splits share terrain, so that test figures flatter"
     told = f"{counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames, {counts.labels} labels"
-    line = f"{out}: {told}, frames {info.images}, split by {info.split_by}{leak}"
+    line = f"{out}: {told}, frames {info.images}, split by {info.split_by}{info.leak}"
     Console().print(Text(line), soft_wrap=True)
 
 

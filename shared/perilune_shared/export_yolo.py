@@ -5,8 +5,6 @@ A trainer finds the labels of `images/a/b.png` in `labels/a/b.txt`. Boxes end at
 ignore a crater: labels that are not chosen are left out.
 """
 
-import contextlib
-import os
 from collections import defaultdict
 from pathlib import Path
 
@@ -16,7 +14,6 @@ import pyarrow as pa
 from rich.progress import Progress
 
 from perilune_shared import files
-from perilune_shared.errors import UserError
 from perilune_shared.export import Choice, clipped_boxes, scenes_of, sizes
 from perilune_shared.manifest import Dataset
 from perilune_shared.schema import SPLITS
@@ -61,20 +58,11 @@ def export_yolo(
 
 def _bring_images(dataset: Dataset, frames: pd.DataFrame, folder: Path) -> None:
     """The PNGs of frames as images/<frame_id>.png."""
-    left = []
-    for row in frames[["frame_id", "png_path"]].to_dict("records"):
-        to = files.inside(folder, f"images/{row['frame_id']}.png")
-        to.parent.mkdir(parents=True, exist_ok=True)
-        linked = False
-        if dataset.info.images == "files":
-            source = dataset.file(row["png_path"])
-            if not source.is_file():
-                raise UserError(source, "frame", "no such file", "the PNG that the manifest names")
-            with contextlib.suppress(OSError):
-                os.link(source, to)
-                linked = True
-        if not linked:
-            left.append(row)
-    if left:
-        for frame_id, png in dataset.pngs(pa.Table.from_pylist(left)):
-            files.write_bytes(files.inside(folder, f"images/{frame_id}.png"), png)
+    rows = frames[["frame_id", "png_path"]]
+    if dataset.info.images == "files":
+        for row in rows.to_dict("records"):
+            to = files.inside(folder, f"images/{row['frame_id']}.png")
+            files.bring(dataset.file(row["png_path"]), to, link=True)
+        return
+    for frame_id, png in dataset.pngs(pa.Table.from_pandas(rows, preserve_index=False)):
+        files.write_bytes(files.inside(folder, f"images/{frame_id}.png"), png)

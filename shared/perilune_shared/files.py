@@ -107,3 +107,19 @@ def check_free(out: Path) -> None:
     """Raises UserError where a folder for a new dataset holds something."""
     if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
         raise UserError(out, "--out", "something that is there", "a new or empty folder")
+
+
+def bring(path: Path, to: Path, *, link: bool) -> None:
+    """Make a frame's file present at `to` too: linked where asked for and the disk allows it, else copied.
+
+    Raises UserError where it is missing.
+    """
+    if not path.is_file():
+        raise UserError(path, "frame", "no such file", "the file that the manifest names")
+    to.parent.mkdir(parents=True, exist_ok=True)
+    if link:
+        with contextlib.suppress(OSError):
+            # A link to a link would lead to what need not be here.
+            os.link(path.resolve(), to)
+            return
+    shutil.copyfile(path, to)

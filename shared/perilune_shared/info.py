@@ -165,6 +165,11 @@ class DatasetInfo(_Info):
     licence: Name
     """SPDX expression."""
 
+    @property
+    def leak(self) -> str:
+        """What to say behind the split's unit where the splits share terrain; else nothing."""
+        return "" if self.split_by == "scene" else ": splits share terrain, so that test figures flatter"
+
     def recipe(self) -> Recipe:
         """The only recipe of a dataset that was rendered at one go. Raises ValueError where there are more."""
         (recipe,) = self.recipes.values()

@@ -1,6 +1,6 @@
 """Several datasets as one."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -10,10 +10,14 @@ from rich.progress import Progress
 from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo, joined_licence
 from perilune_shared.manifest import Dataset
-from perilune_shared.rewrite import ImageMode, bare, check_source, state_of, with_column
-from perilune_shared.writer import SceneTables, check_scene, written
+from perilune_shared.rewrite import ImageMode, bare, check_source, state_of
+from perilune_shared.writer import SceneTables, check_scene, with_column, written
 
+_GROUND = ("scenes", "craters", "boulders")
 _CHANGING = ("scene_id", "trajectory_id", "n_frames", "split")
+"""Of a descent: what may differ though it is the same."""
+_RENDERED = ("position_m", "rotation_wxyz", "time_s", "png_sha256")
+"""Of a frame: what may not differ where it is the same."""
 
 
 def merge(
@@ -35,8 +39,7 @@ def merge(
     task = progress.add_task("merging", total=len(groups), unit="scenes", note="") if progress else None
     with written(out, info) as writer:
         for scene_id, members in groups.items():
-            descents: list[tuple[dict, str]] = []
-            tables, brought = _join(scene_id, [(sources[i], own) for i, own in members], descents)
+            tables, brought = _join(scene_id, [(sources[i], own) for i, own in members])
             writer.add_scene(bare(tables) if info.images == "planned" else tables)
             for source, frames, names in brought:
                 if info.images == "files" and len(frames):
@@ -88,21 +91,22 @@ def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list
     return groups
 
 
-def free_name(name: str, taken: object) -> str:
+def free_name(name: str, taken: Container[str]) -> str:
     """A name that is not taken yet: the same, or with -2, -3 and so on at its end."""
     tried, number = name, 1
-    while tried in taken:  # type: ignore[operator]
+    while tried in taken:
         number += 1
         tried = f"{name[:56]}-{number}"
     return tried
 
 
 def _join(
-    scene_id: str, members: Sequence[tuple[Dataset, str]], descents: list[tuple[dict, str]]
+    scene_id: str, members: Sequence[tuple[Dataset, str]]
 ) -> tuple[SceneTables, list[tuple[Dataset, pa.Table, dict[str, str]]]]:
     """The tables of a joined scene, and of each member the frames taken (as its own rows) with their new names."""
     joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels")}
     brought: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
+    descents: list[tuple[dict, str]] = []
     taken: dict[str, dict] = {}
     first: SceneTables = {}
     for source, own in members:
@@ -133,12 +137,11 @@ def _join(
     return first | {name: pa.concat_tables(pieces) for name, pieces in joined.items()}, brought
 
 
-_GROUND = ("scenes", "craters", "boulders")
-_RENDERED = ("position_m", "rotation_wxyz", "time_s", "png_sha256")
-
-
 def _descents(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tuple[dict[str, str], pa.Table]:
-    """New ids of a member's descents, by old; and the rows of those that were not known before, renamed."""
+    """New ids of a member's descents, by old; and the rows of those that were not known before, renamed.
+
+    `known` holds the descents of the members before, by content and new id; the new ones are added to it.
+    """
     names: dict[str, str] = {}
     new = []
     for row in trajectories.to_pylist():

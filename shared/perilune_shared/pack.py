@@ -9,8 +9,8 @@ from rich.progress import Progress
 from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo
 from perilune_shared.manifest import Dataset
-from perilune_shared.rewrite import check_source, rewrite, with_column
-from perilune_shared.writer import frame_path, written
+from perilune_shared.rewrite import check_source, rewrite
+from perilune_shared.writer import frame_path, with_column, written
 
 _EXR = ("exr_path", "exr_sha256", "exr_bytes")
 _LARGEST_SHARD_MB = 8000

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-import pyarrow as pa
 import pyarrow.compute as pc
 from rich.progress import Progress
 
@@ -85,11 +84,3 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
 def bare(tables: SceneTables) -> SceneTables:
     """A scene without the rows that follow from its seed and poses."""
     return tables | {name: tables[name].slice(0, 0) for name in _FOLLOWING}
-
-
-def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
-    """A table with one column replaced."""
-    place = table.schema.get_field_index(name)
-    field = table.schema.field(place)
-    array = values if isinstance(values, pa.Array | pa.ChunkedArray) else pa.array(values, field.type)
-    return table.set_column(place, field, array)

@@ -10,8 +10,8 @@ from rich.progress import Progress
 from perilune_shared.content import terrain_of
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset
-from perilune_shared.rewrite import ImageMode, rewrite, with_column
-from perilune_shared.writer import SceneTables
+from perilune_shared.rewrite import ImageMode, rewrite
+from perilune_shared.writer import SceneTables, with_column
 
 SplitBy = Literal["scene", "trajectory", "frame"]
 

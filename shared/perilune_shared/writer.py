@@ -6,8 +6,6 @@ its split, and what the splits do not share.
 
 import contextlib
 import json
-import os
-import shutil
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -91,7 +89,7 @@ class DatasetWriter:
             for kind in ("png", "exr"):
                 if row.get(f"{kind}_path") is not None:
                     to = files.inside(self.root, frame_path(names[frame_id], kind))
-                    _bring(source.file(row[f"{kind}_path"]), to, link=link)
+                    files.bring(source.file(row[f"{kind}_path"]), to, link=link)
 
     def pack_images(self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int) -> None:
         """Write frames (frame_id, png_path, PNG bytes) into shards images/*.parquet of about `shard_bytes`."""
@@ -175,6 +173,14 @@ def check_scene(where: object, tables: SceneTables) -> None:
         raise UserError(where, "trajectories", found, "the descent of every frame; see `perilune-manifest validate`")
 
 
+def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
+    """A table with one column replaced."""
+    place = table.schema.get_field_index(name)
+    field = table.schema.field(place)
+    array = values if isinstance(values, pa.Array | pa.ChunkedArray) else pa.array(values, field.type)
+    return table.set_column(place, field, array)
+
+
 def frame_path(frame_id: str, kind: str) -> str:
     """Where the PNG or EXR of a frame lies in every dataset that is written here."""
     return f"frames/{frame_id}.{kind}"
@@ -187,8 +193,7 @@ def _placed(frames: pa.Table) -> pa.Table:
         name = f"{kind}_path"
         known = frames[name].to_pylist()
         paths = [None if path is None else frame_path(key, kind) for key, path in zip(ids, known, strict=True)]
-        place = frames.schema.get_field_index(name)
-        frames = frames.set_column(place, frames.schema.field(place), pa.array(paths, pa.string()))
+        frames = with_column(frames, name, paths)
     return frames
 
 
@@ -201,28 +206,12 @@ def _settled(trajectories: pa.Table, frames: pa.Table) -> pa.Table:
     ids = trajectories["trajectory_id"].to_pylist()
     trajectories = trajectories.filter(pa.array(name in rows for name in ids))
     own = [rows[name] for name in ids if name in rows]
-    values = {
-        "n_frames": pa.array([row["frame_id_count"] for row in own], pa.int64()),
-        "split": pa.array([row["split_min"] if row["split_count_distinct"] == 1 else None for row in own], pa.string()),
-    }
-    for name, column in values.items():
-        place = trajectories.schema.get_field_index(name)
-        trajectories = trajectories.set_column(place, trajectories.schema.field(place), column)
-    return trajectories
+    n_frames = [row["frame_id_count"] for row in own]
+    splits = [row["split_min"] if row["split_count_distinct"] == 1 else None for row in own]
+    trajectories = with_column(trajectories, "n_frames", n_frames)
+    return with_column(trajectories, "split", splits)
 
 
 def _sorted_by(table: pa.Table, column: str) -> pa.Table:
     order = np.argsort(table[column].to_numpy(zero_copy_only=False), kind="stable")
     return table.take(pa.array(order))
-
-
-def _bring(path: Path, to: Path, *, link: bool) -> None:
-    if not path.is_file():
-        raise UserError(path, "frame", "no such file", "the file that the manifest names")
-    to.parent.mkdir(parents=True, exist_ok=True)
-    if link:
-        with contextlib.suppress(OSError):
-            # A link to a link would lead to what need not be here.
-            os.link(path.resolve(), to)
-            return
-    shutil.copyfile(path, to)

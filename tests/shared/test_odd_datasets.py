@@ -19,11 +19,11 @@ from perilune_shared.manifest import open_dataset
 from perilune_shared.merge import merge
 from perilune_shared.pack import pack, unpack
 from perilune_shared.parts import write_part
-from perilune_shared.rewrite import with_column
 from perilune_shared.schema import TABLES
 from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset
 from perilune_shared.validate import validate
+from perilune_shared.writer import with_column
 
 
 def replaced(root, table, rows):
