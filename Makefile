@@ -66,10 +66,10 @@ nav-frames: setup
 
 train-detect: detect-frames ## train and evaluate crater detection
 	@test -f $(DETECT) && echo "$(DETECT) is there; remove its folder to train again" || \
-	  $(BIN)/perilune-train detect $(TRAIN) --dataset $(DATA)/detect --resume
+	  $(BIN)/perilune-train detect train $(TRAIN) --dataset $(DATA)/detect --resume
 
 train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
-	@$(BIN)/perilune-train detect $(COMMON) --set detect.attention=none --out $(RUNS) --name $(NAME)-none --dataset $(DATA)/detect --resume
+	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out $(RUNS) --name $(NAME)-none --dataset $(DATA)/detect --resume
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f $(DETECT) || $(MAKE) --no-print-directory train-detect

@@ -30,9 +30,9 @@ def test_help_names_the_commands():
         assert command in result.output
 
 
-@pytest.mark.parametrize("command", ["detect", "navigate", "explain"])
+@pytest.mark.parametrize("command", ["detect train", "navigate", "explain"])
 def test_each_command_tells_its_options(command):
-    result = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+    result = CliRunner().invoke(app, [*command.split(), "--help"], env={"COLUMNS": "200"})
     assert result.exit_code == 0
     for option in ("--preset", "--config", "--set", "--dataset", "--runs", "--name"):
         assert option in result.output
@@ -51,7 +51,7 @@ def test_each_command_tells_its_options(command):
     ],
 )
 def test_a_mistake_gets_one_line_exit_code_2_and_leaves_nothing(tmp_path, arguments, words):
-    result = call("detect", *arguments, cwd=tmp_path)
+    result = call("detect", "train", *arguments, cwd=tmp_path)
     assert result.returncode == 2
     lines = result.stderr.strip().splitlines()
     assert len(lines) == 1, result.stderr
@@ -63,6 +63,7 @@ def test_a_mistake_gets_one_line_exit_code_2_and_leaves_nothing(tmp_path, argume
 def test_detect_runs(tmp_path, dataset_detect):
     result = call(
         "detect",
+        "train",
         "--preset",
         "tiny",
         "--dataset",

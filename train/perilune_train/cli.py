@@ -3,7 +3,7 @@
 import typer
 
 from perilune_shared.errors import run_command_line
-from perilune_train.detect.command import detect
+from perilune_train.detect.command import app as detect
 from perilune_train.explain.command import explain
 from perilune_train.navigate.command import navigate
 
@@ -13,7 +13,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-app.command("detect")(detect)
+app.add_typer(detect, name="detect")
 app.command("navigate")(navigate)
 app.command("explain")(explain)
 

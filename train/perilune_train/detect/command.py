@@ -1,4 +1,4 @@
-"""`perilune-train detect`."""
+"""`perilune-train detect`: its subcommands; here `train`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -9,8 +9,15 @@ from perilune_shared.config import resolve
 from perilune_shared.progress import console
 from perilune_train.detect.config import DetectConfig
 
+app = typer.Typer(
+    help="Crater detection: train, judge, find craters in images, export for flight.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
 
-def detect(
+
+@app.command()
+def train(
     preset: Annotated[str, typer.Option(help="tiny, small, paper or large: the settings to start from.")] = "small",
     config: Annotated[Path | None, typer.Option(help="YAML file whose section `detect` overrides the preset.")] = None,
     set_: Annotated[
@@ -29,7 +36,7 @@ def detect(
     Leaves runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, detections.parquet,
     detections.png, precision_recall.png and TensorBoard events. A run of the same name is replaced, unless --resume.
 
-    The baseline without attention: perilune-train detect --set detect.attention=none --name small-plain
+    The baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
     """
     settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(set_ or ()))
     # Torch and Lightning take seconds to load: not for a wrong key.

@@ -79,7 +79,7 @@ class EvaluationSettings(Section):
     """Of two detections that overlap more than this, the weaker goes."""
     min_score: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Detections below this score are dropped before anything else (the floor of the precision-recall curve)."""
-    max_detections: Count = 500
+    max_detections: Count = 2000
     """Most detections kept in a frame; the usual 100 would truncate crowded frames."""
 
 
