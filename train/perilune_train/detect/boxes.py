@@ -30,5 +30,5 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, most: in
     if not len(boxes):
         return np.empty(0, np.intp)
     corner_and_size = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
-    kept = cv2.dnn.NMSBoxes(corner_and_size, scores, 0.0, threshold_iou)  # type: ignore[arg-type, call-overload]
+    kept = cv2.dnn.NMSBoxes(corner_and_size, scores, 0.0, threshold_iou)  # type: ignore[arg-type]
     return np.asarray(kept, np.intp).reshape(-1)[:most]
