@@ -20,6 +20,7 @@ from perilune_train.detect.data import (
     augment,
     load_split,
     loader,
+    rescale,
     turn,
     unlabelled_craters,
 )
@@ -124,19 +125,60 @@ def test_the_eight_turns_differ():
     assert len({turn(image, np.zeros((0, 4)), kind)[0].tobytes() for kind in range(8)}) == 8
 
 
+def changed(split, settings, seed=0, index=0):
+    image, labels = split.frames.images[index], split.labels[index]
+    pixels, boxes, wanted = augment(
+        image, labels.boxes, labels.wanted, split.radius_px, settings, np.random.default_rng(seed)
+    )
+    return image, labels, pixels, boxes, wanted
+
+
 def test_augmentation_off_changes_nothing(split):
-    image, boxes = split.frames.images[0], split.labels[0].boxes
-    pixels, moved = augment(image, boxes, PLAIN, np.random.default_rng(0))
+    image, labels, pixels, boxes, wanted = changed(split, PLAIN)
     np.testing.assert_allclose(pixels, image, atol=1e-3)
-    np.testing.assert_array_equal(moved, boxes)
+    np.testing.assert_array_equal(boxes, labels.boxes)
+    np.testing.assert_array_equal(wanted, labels.wanted)
 
 
 @pytest.mark.parametrize("setting", [{"gain": 0.5}, {"gamma": 0.5}, {"blur_px": 3.0}, {"noise": 5.0}])
 def test_each_augmentation_changes_the_pixels_alone(split, setting):
-    image, boxes = split.frames.images[0], split.labels[0].boxes
-    pixels, moved = augment(image, boxes, PLAIN.model_copy(update=setting), np.random.default_rng(1))
+    image, labels, pixels, boxes, wanted = changed(split, PLAIN.model_copy(update=setting), 1)
     assert np.abs(pixels - image).mean() > 0.3
-    np.testing.assert_array_equal(moved, boxes)
+    np.testing.assert_array_equal(boxes, labels.boxes)
+    np.testing.assert_array_equal(wanted, labels.wanted)
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.0, 1.37, 2.5])
+@pytest.mark.parametrize("place", [(0.1, 0.3), (0.35, 0.6)])
+def test_rescaling_moves_boxes_with_the_pixels(factor, place):
+    image = np.zeros((96, 128), np.float32)
+    image[40:52, 30:46] = 200
+    scaled, boxes = rescale(image, np.array([[30.0, 40.0, 46.0, 52.0]]), factor, place)
+    # The bright rectangle, its mass and its middle, in pixels counted from the image's edge.
+    x0, y0, x1, y1 = boxes[0].clip(0, [128, 96, 128, 96])
+    bright = np.clip(scaled - image.mean() * (factor < 1), 0, None)
+    rows, columns = np.indices(scaled.shape) + 0.5
+    inside = (columns > x0 - 2) & (columns < x1 + 2) & (rows > y0 - 2) & (rows < y1 + 2)
+    weight = bright * inside
+    assert weight.sum() / 200 == pytest.approx((x1 - x0) * (y1 - y0), rel=0.06)
+    assert (weight * columns).sum() / weight.sum() == pytest.approx((x0 + x1) / 2, abs=0.1)
+    assert (weight * rows).sum() / weight.sum() == pytest.approx((y0 + y1) / 2, abs=0.1)
+
+
+def test_what_rescaling_takes_out_of_range_or_off_the_image_is_wanted_no_more(split):
+    for seed in range(8):
+        settings = PLAIN.model_copy(update={"scale": (0.5, 2.0)})
+        _, labels, pixels, boxes, wanted = changed(split, settings, seed)
+        assert pixels.shape == split.frames.images[0].shape
+        centre, radius = (boxes[:, :2] + boxes[:, 2:]) / 2, np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(1)) / 2
+        assert 0 < len(boxes) <= len(labels.boxes)
+        assert ((centre[wanted] >= 0) & (centre[wanted] < 96)).all()
+        assert (radius[wanted] >= split.radius_px[0]).all() and wanted.any()
+
+
+def test_scales_are_least_and_largest():
+    with pytest.raises(ValueError, match="least first"):
+        AugmentSettings(scale=(2.0, 1.0))
 
 
 def test_an_epoch_follows_from_seed_and_number_alone(split):

@@ -71,9 +71,9 @@ def assign(
     Deviation from YOLOv3, which makes one predictor of one scale positive for each label: every anchor of every
     scale within the factor `ratio` is, in the cell that holds the label's centre and in the two cells nearest to the
     centre beside it (as later members of the family do): about nine times as many positives, so that a short
-    training suffices. Free are predictors with a matching anchor whose cell touches the middle half of a label's
-    box: for ignored labels all of them, for wanted ones those that are not positive. This takes the place of
-    YOLOv3's rule (IoU of the prediction above 0.5), at a small part of its cost.
+    training suffices. Free are predictors with a matching anchor whose cell touches the middle half of an ignored
+    label's box. All others are negative, also those around a wanted label: YOLOv3 leaves them free where their boxes
+    overlap it by more than 0.5, and then nothing tells their scores from those of the boxes that sit well.
     """
     matches = matching_anchors(targets.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
     centre = (targets.boxes[:, :2] + targets.boxes[:, 2:]) / 2
@@ -85,8 +85,9 @@ def assign(
         at = centre[label] / stride
         limit = at.new_tensor([width, height])
         grid = (frames, anchors.shape[1], height, width)
-        free = _cells_touched(targets.frame[label], anchor, at, size[label] / stride, grid)
         wanted = targets.wanted[label]
+        ignored = label[~wanted]
+        free = _cells_touched(targets.frame[ignored], anchor[~wanted], at[~wanted], size[ignored] / stride, grid)
         label, anchor, at = label[wanted], anchor[wanted], at[wanted]
         cell = at.floor()
         side = torch.where(at - cell < 0.5, -1.0, 1.0)

@@ -47,6 +47,8 @@ class AugmentSettings(Section):
 
     flips_and_turns: bool = True
     """The eight flips and quarter turns of a square frame, each as likely."""
+    scale: tuple[Annotated[float, Field(ge=0.25, le=4)], Annotated[float, Field(ge=0.25, le=4)]] = (1.0, 1.0)
+    """Least and largest factor by which a frame is shrunk or enlarged, even in logarithm."""
     gain: Share = 0.3
     """Contrast and brightness change by up to this factor, up or down."""
     gamma: Share = 0.3
@@ -56,12 +58,20 @@ class AugmentSettings(Section):
     noise: Annotated[float, Field(ge=0, le=100)] = 4.0
     """Largest standard deviation of Gaussian noise, grey levels of 255."""
 
+    @model_validator(mode="after")
+    def _ordered(self) -> "AugmentSettings":
+        if self.scale[0] > self.scale[1]:
+            raise ValueError("scale: least first, largest second")
+        return self
+
 
 class LossSettings(Section):
     """L = lambda_iou L_ciou + lambda_obj L_obj (paper, eq. "loss")."""
 
     aspect: Literal["circular", "standard"] = "circular"
     """Aspect term of CIoU: against a circle (the paper's), or against the label's own aspect ratio."""
+    objectness: Literal["hard", "iou"] = "iou"
+    """What the objectness of a predictor that answers for a label is to become: 1, or the IoU of its box with it."""
     lambda_iou: Positive = 0.05
     """Weight of L_ciou."""
     lambda_obj: Positive = 1.0

@@ -26,6 +26,9 @@ _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _CRATER = ["scene_id", "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 
+_MARGIN = np.sqrt(0.5)
+"""Craters below the least radius are ignored down to this share of it: no box in range overlaps smaller ones by half."""
+
 
 @dataclass(frozen=True)
 class FrameLabels:
@@ -58,8 +61,11 @@ class DetectSplit:
         return len(self.labels)
 
 
-def load_split(dataset: Dataset, split: str, settings: LabelSettings) -> DetectSplit:
-    """Frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take."""
+def load_split(dataset: Dataset, split: str, settings: LabelSettings, enlarged: float = 1.0) -> DetectSplit:
+    """Frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take.
+
+    `enlarged` is the largest factor by which frames will be enlarged: what is ignored reaches down accordingly.
+    """
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
         if size % 32:
@@ -76,7 +82,7 @@ def load_split(dataset: Dataset, split: str, settings: LabelSettings) -> DetectS
         known = by_frame.get(frame["frame_id"], labels.iloc[:0])
         others = by_scene.get(frame["scene_id"], craters.iloc[:0])
         others = others[~others["crater_id"].isin(known["crater_id"])]
-        rows = unlabelled_craters(others, camera.intrinsics(), frame, radius_px)
+        rows = unlabelled_craters(others, camera.intrinsics(), frame, radius_px, enlarged)
         part = pd.concat([known, rows]) if len(rows) else known
         parts.append(
             FrameLabels(
@@ -97,16 +103,17 @@ def _labelled_range(dataset: Dataset) -> tuple[float, float]:
 
 
 def unlabelled_craters(
-    craters: pd.DataFrame, camera: Camera, frame: dict[Any, Any], radius_px: tuple[float, float]
+    craters: pd.DataFrame, camera: Camera, frame: dict[Any, Any], radius_px: tuple[float, float], enlarged: float = 1.0
 ) -> pd.DataFrame:
     """Craters of the scene that a frame shows just outside what is labelled, as rows to be ignored.
 
     A crater of 1.9 px looks like one of 2.1 px: with only the second in the table, half of what is labelled near the
     limit would be trained away as background, and finding the first would count as false. So, as COCO does with
     objects outside its area range, craters within a factor of sqrt(2) of the range (beyond that no box within the
-    range overlaps them by half) and those whose centre is off the image are ignored. `frame` is a row of the table.
+    range overlaps them by half) and those whose centre is off the image are ignored; smaller ones too where frames
+    will be `enlarged` by up to a factor. `frame` is a row of the table.
     """
-    low, high = radius_px[0] / np.sqrt(2), radius_px[1] * np.sqrt(2)
+    low, high = radius_px[0] * _MARGIN / enlarged, radius_px[1] / _MARGIN
     rotation = matrix_from_quaternion(frame["rotation_wxyz"])
     centre = camera_from_site(craters[["x_m", "y_m", "z_m"]].to_numpy(np.float64), frame["position_m"], rotation)
     radius_m = craters["diameter_m"].to_numpy(np.float64) / 2
@@ -141,14 +148,51 @@ def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
     return image, np.stack([x0, y0, x1, y1], axis=1)
 
 
+def rescale(image: NDArray, boxes: Array, factor: float, place: tuple[float, float]) -> tuple[NDArray, Array]:
+    """A frame (height, width) and its boxes (M, 4), enlarged or shrunk to an image of the same size.
+
+    `place` in [0, 1] tells, in x and y, which part of an enlarged frame is kept, or where a shrunk one lies; around
+    that is the frame's mean grey.
+    """
+    height, width = image.shape
+    shift = np.array([width, height]) * (1 - 1 / factor) * np.array(place)
+    if factor < 1:
+        image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / factor**2 - 1))
+    # OpenCV counts from the middle of the first pixel, boxes from its edge.
+    origin = shift + 0.5 / factor - 0.5
+    matrix = np.array([[1 / factor, 0, origin[0]], [0, 1 / factor, origin[1]]])
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    scaled = cv2.warpAffine(image, matrix, (width, height), flags=how, borderValue=float(image.mean()))
+    return scaled, (boxes - np.tile(shift, 2)) * factor
+
+
 def augment(
-    image: NDArray[np.uint8], boxes: Array, settings: AugmentSettings, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], Array]:
-    """A changed frame (height, width), grey levels as float32, and its boxes (M, 4)."""
+    image: NDArray[np.uint8],
+    boxes: Array,
+    wanted: NDArray[np.bool_],
+    radius_px: tuple[float, float],
+    settings: AugmentSettings,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
+    """A changed frame (height, width), grey levels as float32, its boxes (M, 4), and which of them are wanted (M,).
+
+    A crater that rescaling moves out of the range `radius_px`, or its centre off the image, is wanted no more; one
+    that becomes much smaller is left out.
+    """
     turned: NDArray = image
     if settings.flips_and_turns:
         square = image.shape[0] == image.shape[1]
         turned, boxes = turn(image, boxes, int(rng.integers(8 if square else 4)))
+    low, high = settings.scale
+    if high > low:
+        factor = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        turned, boxes = rescale(np.ascontiguousarray(turned), boxes, factor, (rng.random(), rng.random()))
+        size = np.array(turned.shape[::-1])
+        centre, radius = (boxes[:, :2] + boxes[:, 2:]) / 2, np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(1)) / 2
+        seen = ((boxes[:, 2:] > 0) & (boxes[:, :2] < size)).all(1) & (radius >= radius_px[0] * _MARGIN)
+        boxes, wanted, centre, radius = boxes[seen], wanted[seen], centre[seen], radius[seen]
+        inside = ((centre >= 0) & (centre < size)).all(1)
+        wanted = wanted & inside & (radius >= radius_px[0]) & (radius <= radius_px[1])
     gain = np.exp(rng.uniform(-1, 1) * np.log1p(settings.gain))
     gamma = np.exp(rng.uniform(-1, 1) * settings.gamma)
     levels = (255 * np.minimum(gain * (np.arange(256) / 255) ** gamma, 1)).astype(np.float32)
@@ -159,7 +203,7 @@ def augment(
     noise = rng.uniform(0, settings.noise)
     if noise > 0:
         pixels = pixels + np.float32(noise) * rng.standard_normal(pixels.shape, np.float32)
-    return pixels, boxes
+    return pixels, boxes, wanted
 
 
 Batch = tuple[Tensor, Targets]
@@ -179,8 +223,9 @@ class TrainingFrames(torch_data.Dataset):
         index = int(self.order[place])
         labels = self.split.labels[index]
         rng = np.random.default_rng([*self.key, index])
-        pixels, boxes = augment(self.split.frames.images[index], labels.boxes, self.settings, rng)
-        return normalised(pixels), boxes, labels.wanted
+        image, split = self.split.frames.images[index], self.split
+        pixels, boxes, wanted = augment(image, labels.boxes, labels.wanted, split.radius_px, self.settings, rng)
+        return normalised(pixels), boxes, wanted
 
 
 class EvaluationFrames(torch_data.Dataset):

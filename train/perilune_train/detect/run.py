@@ -97,7 +97,10 @@ def run_detect(
     dataset = open_dataset(dataset_root)
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
-    splits = {split: load_split(dataset, split, config.labels) for split in ("train", "val", "test")}
+    enlarged = {"train": max(config.augment.scale[1], 1.0)}
+    splits = {
+        split: load_split(dataset, split, config.labels, enlarged.get(split, 1.0)) for split in ("train", "val", "test")
+    }
     sizes = label_sizes(splits["train"])
     network = build_network(config, sizes, dataset.root)
     if config.init_from is not None:
