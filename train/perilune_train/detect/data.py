@@ -27,7 +27,7 @@ _CRATER = ["scene_id", "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y",
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 
 _MARGIN = np.sqrt(0.5)
-"""Craters below the least radius are ignored down to this share of it: no box in range overlaps smaller ones by half."""
+"""Craters below the least radius are ignored down to this share of it: no box in range overlaps lesser ones by half."""
 
 
 @dataclass(frozen=True)
