@@ -45,3 +45,8 @@ def best_possible_recall(sizes_px: Array, anchors: Array, ratio: float) -> float
     """Share of sizes (N, 2) that have an anchor within the factor `ratio` in width and in height."""
     quotient = np.asarray(sizes_px)[:, None] / anchors[None]
     return float((np.maximum(quotient, 1 / quotient).max(axis=2) < ratio).any(axis=1).mean())
+
+
+def mean_best_iou(sizes_px: Array, anchors: Array) -> float:
+    """Mean over sizes (N, 2) of the IoU with the anchor that fits best, both centred on one point."""
+    return float(size_iou(np.asarray(sizes_px, np.float64), anchors).max(axis=1).mean())

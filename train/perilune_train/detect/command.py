@@ -8,12 +8,14 @@ import typer
 from perilune_shared.config import resolve
 from perilune_shared.progress import console
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.weights_command import weights
 
 app = typer.Typer(
     help="Crater detection: train, judge, find craters in images, export for flight.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+app.command("weights")(weights)
 
 
 @app.command()

@@ -112,7 +112,8 @@ class DetectConfig(Section):
     """First epochs with the backbone frozen, its attention gates excepted. They count only with `init_from`: a
     backbone of random weights, frozen, teaches nothing, so without it training starts unfrozen."""
     init_from: str | None = None
-    """best.ckpt of an earlier detect run whose backbone (and gates, where both have them) to start from."""
+    """best.ckpt of an earlier detect run whose backbone (and gates, where both have them) to start from, or a Darknet
+    file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads too); these need width 1, in_channels 3."""
     batch_size: Count = 8
     """Frames in a step."""
     learning_rate: Positive = 1e-3

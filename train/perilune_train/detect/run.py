@@ -14,12 +14,14 @@ from perilune_shared.files import written_aside
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
 from perilune_train import runs
-from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors
+from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors, mean_best_iou
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import DetectSplit, load_split
 from perilune_train.detect.figures import draw_curve, draw_detections
 from perilune_train.detect.metrics import Detections, Matches, curve, figures, match_split
 from perilune_train.detect.task import DetectTask, detect_frames
+from perilune_train.detect.transfer import start_from_darknet
+from perilune_train.models.darknet_weights import is_darknet
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 
 _ANCHOR_STREAM = 1
@@ -43,7 +45,13 @@ def build_network(config: DetectConfig, sizes_px: np.ndarray, where: Path) -> YO
 
 
 def start_backbone(network: YOLOv3, path: Path, config: DetectConfig) -> None:
-    """Give the network the backbone of an earlier detect run; gates that the other lacks stay as they are."""
+    """Give the network the backbone of an earlier detect run, or what a Darknet file has for it (detect/transfer.py).
+
+    Gates that the other lacks stay as they are.
+    """
+    if is_darknet(path):
+        start_from_darknet(network, path, config)
+        return
     content = runs.load_weights(path)
     wanted = {"in_channels": config.in_channels, "width": config.width}
     runs.check_architecture(path, content["architecture"], wanted)
@@ -123,13 +131,13 @@ def run_detect(
         device=config.device,
     )
     seconds = time.perf_counter() - started
+    anchors = network.anchors.flatten(0, 1).double().cpu().numpy()
     metrics: dict[str, float | int | str | None] = {
         "train/seconds": round(seconds, 1),
         "train/epochs": config.epochs,
         "train/images_per_s": round(task.images_seen / seconds, 2),
-        "anchors/best_possible_recall": best_possible_recall(
-            sizes, network.anchors.flatten(0, 1).double().cpu().numpy(), config.anchor_ratio
-        ),
+        "anchors/best_possible_recall": best_possible_recall(sizes, anchors, config.anchor_ratio),
+        "anchors/mean_best_iou": mean_best_iou(sizes, anchors),
         "parameters": sum(p.numel() for p in network.parameters()),
     }
     metrics |= selection_used(config, splits["test"])

@@ -1,0 +1,178 @@
+"""Darknet's weight files: `darknet53.conv.74` (the backbone) and `yolov3.weights` (the whole network).
+
+A file is a header and then float32, little endian, convolution by convolution in the order of the network's cfg:
+with batch norm bias, scale, mean, variance, weights (out, in, k, k); without it bias, weights. The header is int32
+major, minor, revision, then the number of images seen: 8 bytes if major * 10 + minor >= 2 (and both < 1000), else 4.
+Source: the files that Redmon & Farhadi 2018 (arXiv 1804.02767) published, as Darknet reads them.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from perilune_shared.errors import UserError
+from perilune_shared.files import write_bytes
+from perilune_train.models.darknet import UNITS, AttentionDarknet53
+from perilune_train.models.yolo import ANCHORS_PER_SCALE, OUTPUTS, YOLOv3
+
+COCO_FILTERS = 255
+"""Channels of an output layer of yolov3.weights: 3 anchors x (box, objectness, 80 classes). Ours have 15."""
+_FILTERS = ANCHORS_PER_SCALE * OUTPUTS
+_VERSION = struct.Struct("<3i")
+_NEW_HEADER = _VERSION.pack(0, 2, 0) + struct.pack("<Q", 0)
+_CHECKPOINT_START = b"PK\x03\x04"
+_TENSORS_WITH_NORM = ("bias", "scale", "mean", "variance", "weights")
+_TENSORS_WITHOUT = ("bias", "weights")
+
+
+@dataclass(frozen=True)
+class DarknetFile:
+    """Content of a file; `write_darknet` gives the same bytes again."""
+
+    header: bytes
+    """Version and number of images seen, 16 or 20 bytes."""
+    values: NDArray[np.float32]
+    """All floats in the order of the file (N,)."""
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A place in the file, and the tensor of a network that belongs there."""
+
+    name: str
+    """For messages: number of the convolution, from 0, and which of its tensors."""
+    tensor: Tensor
+    """The network's own tensor."""
+    floats: int
+    """Length in the file; that of an output layer depends on the number of classes."""
+
+
+def backbone_slots(backbone: AttentionDarknet53) -> list[Slot]:
+    """The backbone's tensors in the order of darknet53.conv.74; attention gates have no place in it."""
+    return _numbered(_backbone_blocks(backbone))
+
+
+def network_slots(network: YOLOv3, filters: int = _FILTERS) -> list[Slot]:
+    """All tensors of a network with strides 8, 16, 32 in the order of yolov3.cfg, its output layers `filters` wide.
+
+    The order is that of execution: after the backbone, for strides 32, 16 and 8, the branch, the head and, but for
+    the last, the lateral convolution to the next. Raises ValueError for other strides.
+    """
+    if network.strides != (8, 16, 32):
+        raise ValueError(f"strides are {network.strides}, not (8, 16, 32)")
+    blocks = _backbone_blocks(network.backbone)
+    for stride in ("32", "16", "8"):
+        blocks += [*network.branches[stride], *network.heads[stride]]  # type: ignore[misc]
+        if stride in network.laterals:
+            blocks.append(network.laterals[stride][0])  # type: ignore[index]
+    return _numbered(blocks, filters)
+
+
+def count_floats(slots: Sequence[Slot]) -> int:
+    """Number of floats in a file of these slots."""
+    return sum(slot.floats for slot in slots)
+
+
+def is_darknet(path: Path) -> bool:
+    """Whether to read a file as Darknet's: by its first bytes, and where these say nothing by its name."""
+    start = b""
+    if path.is_file():
+        with path.open("rb") as stream:
+            start = stream.read(_VERSION.size)
+    if start.startswith(_CHECKPOINT_START):
+        return False
+    if path.name.endswith((".weights", ".conv.74")):
+        return True
+    return len(start) == _VERSION.size and all(0 <= number < 1000 for number in _VERSION.unpack(start))
+
+
+def read_darknet(path: Path, wanted: Sequence[int]) -> DarknetFile:
+    """Read a file that holds one of the `wanted` numbers of floats; its size is known before it is read.
+
+    Raises UserError where it is missing, shorter or longer, or holds a number that is not finite.
+    """
+    if not path.is_file():
+        raise UserError(path, "weights", "no such file", "darknet53.conv.74 or yolov3.weights")
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        header = stream.read(_VERSION.size)
+        if len(header) == _VERSION.size:
+            header += stream.read(_seen_bytes(path, header))
+        whole, rest = divmod(size - len(header), 4)
+        if len(header) < 16 or rest or whole not in wanted:
+            found = f"{size} bytes: a header and {whole} floats" + (f" and {rest} bytes" if rest else "")
+            raise UserError(path, "size", found, f"{' or '.join(map(str, wanted))} floats")
+        values = np.fromfile(stream, "<f4", whole).astype(np.float32, copy=False)
+    finite = np.isfinite(values)
+    if not finite.all():
+        first = int(finite.argmin())
+        raise UserError(path, f"float {first}", values[first], "finite numbers")
+    return DarknetFile(header, values)
+
+
+def write_darknet(path: Path, content: DarknetFile) -> None:
+    """Write a file, whole or not at all."""
+    write_bytes(path, content.header + content.values.astype("<f4", copy=False).tobytes())
+
+
+@torch.no_grad()
+def fill(slots: Sequence[Slot], content: DarknetFile, path: Path) -> None:
+    """Copy the first floats of a file into a network; output layers of another width than ours stay as they are.
+
+    Raises UserError (`path` is for its message) and copies nothing where a variance is negative.
+    """
+    parts = np.split(content.values[: count_floats(slots)], np.cumsum([slot.floats for slot in slots])[:-1])
+    for slot, part in zip(slots, parts, strict=True):
+        if slot.name.endswith("variance") and part.min() < 0:
+            raise UserError(path, slot.name, part.min(), "variances from 0")
+    for slot, part in zip(slots, parts, strict=True):
+        if slot.floats == slot.tensor.numel():
+            slot.tensor.copy_(torch.from_numpy(part).view(slot.tensor.shape))
+
+
+def content_of(slots: Sequence[Slot]) -> DarknetFile:
+    """A file of a network's tensors, of version 0.2.0 and no images seen."""
+    values = [slot.tensor.detach().float().cpu().contiguous().flatten().numpy() for slot in slots]
+    return DarknetFile(_NEW_HEADER, np.concatenate(values))
+
+
+def _seen_bytes(path: Path, version: bytes) -> int:
+    major, minor, revision = _VERSION.unpack(version)
+    if min(major, minor, revision) < 0:
+        raise UserError(path, "version", f"{major}.{minor}.{revision}", "a Darknet file's header")
+    return 8 if major * 10 + minor >= 2 and major < 1000 and minor < 1000 else 4
+
+
+def _backbone_blocks(backbone: AttentionDarknet53) -> list[Any]:
+    blocks: list[Any] = [backbone.stem]
+    for i, down in enumerate(backbone.downs):
+        blocks.append(down)
+        for j in range(UNITS[i]):
+            unit: Any = backbone.units[f"B_{i + 1}{j + 1}"]
+            blocks += [unit.reduce, unit.expand]
+    return blocks
+
+
+def _numbered(blocks: Sequence[Any], filters: int = _FILTERS) -> list[Slot]:
+    """Slots of convolutions with batch norm (`conv_block`) and without (an output layer)."""
+    slots = []
+    for number, block in enumerate(blocks):
+        if hasattr(block, "norm"):
+            norm = block.norm
+            tensors = (norm.bias, norm.weight, norm.running_mean, norm.running_var, block.conv.weight)
+            named = zip(_TENSORS_WITH_NORM, tensors, strict=True)
+            slots += [Slot(f"convolution {number} {name}", tensor, tensor.numel()) for name, tensor in named]
+        else:
+            named = zip(_TENSORS_WITHOUT, (block.bias, block.weight), strict=True)
+            slots += [
+                Slot(f"convolution {number} {name}", tensor, tensor.numel() // _FILTERS * filters)
+                for name, tensor in named
+            ]
+    return slots
