@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 import torch
+from tests.train.models import darknet_by_hand as by_hand
 
 from perilune_shared.errors import UserError
 from perilune_train.models.darknet import AttentionDarknet53
@@ -21,7 +22,6 @@ from perilune_train.models.darknet_weights import (
     write_darknet,
 )
 from perilune_train.models.yolo import YOLOv3
-from tests.train.models import darknet_by_hand as by_hand
 
 WIDTH = 0.25
 HEADERS = {
@@ -138,7 +138,7 @@ def test_a_negative_variance_is_refused_and_nothing_is_loaded(tmp_path, backbone
     spoilt[count_floats(slots[:at])] = -0.5
     path = tmp_path / "x.weights"
     path.write_bytes(by_hand.HEADER + spoilt.tobytes())
-    with pytest.raises(UserError, match="x.weights: convolution 51 variance: found -0.5"):
+    with pytest.raises(UserError, match=r"x.weights: convolution 51 variance: found -0.5"):
         fill(slots, read_darknet(path, (len(values),)), path)
     assert all(torch.equal(value, before[key]) for key, value in backbone.state_dict().items())
 
@@ -148,7 +148,7 @@ def test_a_negative_version_and_a_missing_file_are_refused(tmp_path):
     path.write_bytes(struct.pack("<3iQ", 0, -2, 0, 0))
     with pytest.raises(UserError, match=r"version: found 0.-2.0"):
         read_darknet(path, (1,))
-    with pytest.raises(UserError, match="absent.weights: weights: found no such file"):
+    with pytest.raises(UserError, match=r"absent.weights: weights: found no such file"):
         read_darknet(tmp_path / "absent.weights", (1,))
 
 
