@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors, size_iou
+from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors, mean_best_iou, size_iou
 
 
 def test_size_iou_by_hand():
@@ -37,3 +37,24 @@ def test_no_sizes():
 def test_best_possible_recall_by_hand():
     sizes = np.array([[10.0, 10.0], [19.0, 10.0], [21.0, 10.0], [4.9, 10.0]])
     assert best_possible_recall(sizes, np.array([[10.0, 10.0]]), 2.0) == 0.5
+
+
+def test_mean_best_iou_by_hand():
+    # 4 x 4 in 8 x 8: 16 / 64. 8 x 8 fits. 8 x 4 is half of 8 x 8; against 2 x 2 it would be 4 / 32.
+    sizes = np.array([[4.0, 4.0], [8.0, 8.0], [8.0, 4.0]])
+    assert mean_best_iou(sizes, np.array([[8.0, 8.0], [2.0, 2.0]])) == pytest.approx((0.25 + 1 + 0.5) / 3)
+    assert mean_best_iou(sizes, sizes) == 1.0
+
+
+def test_clusters_fit_better_than_evenly_spaced_squares():
+    sizes = np.random.default_rng(2).lognormal(2.3, 0.6, (3000, 2))
+    area = np.log(sizes.prod(axis=1))
+    side = np.exp(np.linspace(area.min(), area.max(), 9) / 2)
+    found = kmeans_anchors(sizes, 9, np.random.default_rng(0))
+    assert mean_best_iou(sizes, found) > mean_best_iou(sizes, np.stack([side, side], 1)) + 0.05
+
+
+def test_the_seed_alone_decides_which_sizes_are_drawn():
+    sizes = np.random.default_rng(1).lognormal(2.5, 0.5, (25_000, 2))
+    one, same, other = (kmeans_anchors(sizes, 9, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    assert np.array_equal(one, same) and not np.array_equal(one, other)

@@ -44,6 +44,7 @@ def test_a_run_leaves_all_its_files(finished):
     assert metrics["test/strict/precision"] <= metrics["test/precision"]
     assert metrics["test/frames"] == 8
     assert metrics["train/epochs"] == 2
+    assert 0 < metrics["anchors/mean_best_iou"] <= 1 and 0 < metrics["anchors/best_possible_recall"] <= 1
     assert parse_yaml(finished.config.read_text(), "")["detect"]["strides"] == [4, 8, 16]
 
 
