@@ -193,7 +193,7 @@ def test_a_whole_file_holds_no_gates_and_no_finer_strides(tmp_path):
     with torch.device("meta"):
         network = YOLOv3()
     shape = {"in_channels": 3, "width": 1.0, "attention": "cbam", "strides": [8, 16, 32]}
-    with pytest.raises(UserError, match="best.ckpt: attention: found cbam; wanted none"):
+    with pytest.raises(UserError, match=r"best.ckpt: attention: found cbam; wanted none"):
         darknet_content(network, shape, Path("best.ckpt"), whole=True)
     with pytest.raises(UserError, match=r"strides: found \[4, 8, 16\]; wanted \[8, 16, 32\]"):
         darknet_content(network, {**shape, "strides": [4, 8, 16]}, Path("best.ckpt"), whole=True)
