@@ -18,6 +18,7 @@ from perilune_train.detect.data import (
     EvaluationFrames,
     TrainingFrames,
     augment,
+    grey_levels,
     load_split,
     loader,
     rescale,
@@ -174,6 +175,20 @@ def test_what_rescaling_takes_out_of_range_or_off_the_image_is_wanted_no_more(sp
         assert 0 < len(boxes) <= len(labels.boxes)
         assert ((centre[wanted] >= 0) & (centre[wanted] < 96)).all()
         assert (radius[wanted] >= split.radius_px[0]).all() and wanted.any()
+
+
+def test_stretching_clips_the_given_share_at_most(split):
+    image = split.frames.images[0]
+    shares = []
+    for seed in range(20):
+        levels = grey_levels(image, PLAIN.model_copy(update={"stretch": 0.2}), np.random.default_rng(seed))
+        assert (np.diff(levels) >= 0).all() and levels.min() == 0 and levels.max() == 255
+        # A level that holds the quantile belongs to neither side.
+        shares.append([(image < np.flatnonzero(levels > 0)[0] - 1).mean(), (levels[image] == 255).mean()])
+    shares = np.array(shares)
+    assert 0.1 < shares[:, 0].max() <= 0.2
+    assert 0.1 < shares[:, 1].max() < 0.25
+    assert np.ptp(shares, axis=0).min() > 0.05
 
 
 def test_scales_are_least_and_largest():

@@ -53,6 +53,9 @@ class AugmentSettings(Section):
     """Contrast and brightness change by up to this factor, up or down."""
     gamma: Share = 0.3
     """Exponent of the grey values, up to this far from 1 in logarithm."""
+    stretch: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
+    """Largest share of a frame's darkest, and of its brightest, pixels that become black and white: published images
+    are often stretched so."""
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.8
     """Largest standard deviation of a Gaussian blur, pixels."""
     noise: Annotated[float, Field(ge=0, le=100)] = 4.0

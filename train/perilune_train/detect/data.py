@@ -166,6 +166,18 @@ def rescale(image: NDArray, boxes: Array, factor: float, place: tuple[float, flo
     return scaled, (boxes - np.tile(shift, 2)) * factor
 
 
+def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.random.Generator) -> NDArray[np.float32]:
+    """What each of the 256 grey levels of a frame becomes: stretched, brightened, bent, clipped at 255."""
+    level = np.arange(256) / 255
+    if settings.stretch:
+        below = np.bincount(image.ravel(), minlength=256).cumsum() / image.size
+        black, white = np.searchsorted(below, [rng.uniform(0, settings.stretch), 1 - rng.uniform(0, settings.stretch)])
+        level = np.clip((np.arange(256) - black) / max(white - black, 1), 0, 1)
+    gain = np.exp(rng.uniform(-1, 1) * np.log1p(settings.gain))
+    gamma = np.exp(rng.uniform(-1, 1) * settings.gamma)
+    return (255 * np.minimum(gain * level**gamma, 1)).astype(np.float32)
+
+
 def augment(
     image: NDArray[np.uint8],
     boxes: Array,
@@ -193,10 +205,7 @@ def augment(
         boxes, wanted, centre, radius = boxes[seen], wanted[seen], centre[seen], radius[seen]
         inside = ((centre >= 0) & (centre < size)).all(1)
         wanted = wanted & inside & (radius >= radius_px[0]) & (radius <= radius_px[1])
-    gain = np.exp(rng.uniform(-1, 1) * np.log1p(settings.gain))
-    gamma = np.exp(rng.uniform(-1, 1) * settings.gamma)
-    levels = (255 * np.minimum(gain * (np.arange(256) / 255) ** gamma, 1)).astype(np.float32)
-    pixels = levels[turned]
+    pixels = grey_levels(turned, settings, rng)[turned]
     sigma_px = rng.uniform(0, settings.blur_px)
     if sigma_px > 0.3:
         pixels = cv2.GaussianBlur(pixels, (0, 0), sigma_px).astype(np.float32, copy=False)
