@@ -98,9 +98,10 @@ def test_headers_are_kept_byte_for_byte(tmp_path, backbone, values, name):
 @pytest.mark.parametrize(
     ("size", "found"),
     [
-        (0, "0 bytes"),
-        (11, "11 bytes"),
-        (17, "17 bytes"),
+        (0, "0 bytes: no whole header"),
+        (11, "11 bytes: no whole header"),
+        (15, "15 bytes: no whole header"),
+        (19, "19 bytes: no whole header"),
         (20, "20 bytes: a header and 0 floats"),
         (-1, "floats and 3 bytes"),
         (-4, "floats"),
@@ -112,7 +113,7 @@ def test_headers_are_kept_byte_for_byte(tmp_path, backbone, values, name):
 def test_a_file_of_another_size_is_refused_by_name(tmp_path, size, found, n_floats):
     path = tmp_path / "x.weights"
     path.write_bytes(by_hand.HEADER)
-    os.truncate(path, size if size in (0, 11, 17, 20) else 20 + 4 * n_floats + size)
+    os.truncate(path, size if size in (0, 11, 15, 19, 20) else 20 + 4 * n_floats + size)
     with pytest.raises(UserError) as caught:
         read_darknet(path, (40_620_640, 62_001_757))
     told = str(caught.value)

@@ -15,7 +15,6 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-app.command("weights")(weights)
 
 
 @app.command()
@@ -46,3 +45,6 @@ def train(
 
     run = run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, resume)
     console.print(f"{run.root}: metrics.json, detections.png, precision_recall.png")
+
+
+app.command("weights")(weights)

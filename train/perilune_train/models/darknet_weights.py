@@ -102,12 +102,13 @@ def read_darknet(path: Path, wanted: Sequence[int]) -> DarknetFile:
         raise UserError(path, "weights", "no such file", "darknet53.conv.74 or yolov3.weights")
     size = path.stat().st_size
     with path.open("rb") as stream:
-        header = stream.read(_VERSION.size)
-        if len(header) == _VERSION.size:
-            header += stream.read(_seen_bytes(path, header))
-        whole, rest = divmod(size - len(header), 4)
-        if len(header) < 16 or rest or whole not in wanted:
-            found = f"{size} bytes: a header and {whole} floats" + (f" and {rest} bytes" if rest else "")
+        version = stream.read(_VERSION.size)
+        length = _header_bytes(path, version)
+        header = version + stream.read(length - len(version))
+        whole, rest = divmod(size - length, 4)
+        if size < length or rest or whole not in wanted:
+            content = "no whole header" if size < length else f"a header and {whole} floats and {rest} bytes"
+            found = f"{size} bytes: {content.removesuffix(' and 0 bytes')}"
             raise UserError(path, "size", found, f"{' or '.join(map(str, wanted))} floats")
         values = np.fromfile(stream, "<f4", whole).astype(np.float32, copy=False)
     finite = np.isfinite(values)
@@ -143,11 +144,13 @@ def content_of(slots: Sequence[Slot]) -> DarknetFile:
     return DarknetFile(_NEW_HEADER, np.concatenate(values))
 
 
-def _seen_bytes(path: Path, version: bytes) -> int:
+def _header_bytes(path: Path, version: bytes) -> int:
+    if len(version) < _VERSION.size:
+        return 16
     major, minor, revision = _VERSION.unpack(version)
     if min(major, minor, revision) < 0:
         raise UserError(path, "version", f"{major}.{minor}.{revision}", "a Darknet file's header")
-    return 8 if major * 10 + minor >= 2 and major < 1000 and minor < 1000 else 4
+    return 20 if major * 10 + minor >= 2 and major < 1000 and minor < 1000 else 16
 
 
 def _backbone_blocks(backbone: AttentionDarknet53) -> list[Any]:
