@@ -24,10 +24,12 @@ from perilune_shared.files import write_text
 from perilune_shared.frames import Array
 from perilune_shared.manifest import Dataset, open_dataset
 from perilune_shared.selection import SELECTIONS, read_labels, selected
+from perilune_train.detect.bins import RADIUS_BINS_PX
 from perilune_train.detect.boxes import iou_matrix
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data import load_split
-from perilune_train.detect.metrics import RADIUS_BINS_PX, Detections, figures, match_split
+from perilune_train.detect.matching import Detections, match_split
+from perilune_train.detect.metrics import figures
 
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
@@ -100,7 +102,7 @@ def judge(dataset: Dataset, detections: dict[str, Detections], threshold: float)
         found = [detections.get(frame, none) for frame in split.frames.table["frame_id"]]
         height, width = split.frames.images.shape[1:]
         matches = match_split(found, split.labels, (width, height), 0.5, split.radius_px)
-        result[name] = {"labels": len(matches.wanted_radius_px), **figures(matches, threshold)}
+        result[name] = {"labels": len(matches.wanted_frame), **figures(matches, threshold)}
     return result
 
 

@@ -4,19 +4,8 @@ import numpy as np
 import pytest
 
 from perilune_train.detect.data import FrameLabels
-from perilune_train.detect.metrics import (
-    FALSE,
-    FOUND,
-    IGNORED,
-    Curve,
-    Detections,
-    Matches,
-    at_threshold,
-    curve,
-    figures,
-    match_frame,
-    match_split,
-)
+from perilune_train.detect.matching import FALSE, FOUND, IGNORED, Detections, Matches, find_overlaps, match_split
+from perilune_train.detect.metrics import Curve, at_threshold, curve, figures
 
 
 def square(x, y, side=10.0):
@@ -32,6 +21,10 @@ def labels(boxes, wanted=None):
 def detections(boxes, scores=None):
     boxes = np.array(boxes, float).reshape(-1, 4)
     return Detections(boxes, np.linspace(0.9, 0.1, len(boxes)) if scores is None else np.array(scores))
+
+
+def match_frame(found, truth, match_iou):
+    return find_overlaps([found], [truth], [[100, 100]]).match(match_iou, (2.0, 50.0)).label
 
 
 def judge(found, truth):
@@ -67,7 +60,8 @@ def test_what_no_one_can_judge_is_left_out_unless_strict():
 
 def outcomes(*kinds, wanted):
     count = len(kinds)
-    return Matches(np.linspace(0.9, 0.1, count), np.array(kinds, np.int8), np.full(count, 5.0), np.full(wanted, 5.0))
+    none = np.zeros(count, np.intp)
+    return Matches(np.linspace(0.9, 0.1, count), np.array(kinds, np.int8), none, none, np.zeros(wanted, np.intp))
 
 
 def test_average_precision_by_hand():
@@ -106,11 +100,9 @@ def test_nothing_found_and_nothing_wanted():
     assert curve(nothing_wanted).average_precision() == 0
 
 
-def test_recall_by_radius():
-    truth = labels([square(0, 0, 8), square(20, 0, 8), square(40, 40, 30)])
-    result = figures(judge(detections([square(0, 0, 8), square(40, 40, 30)], [0.9, 0.2]), truth), threshold=0.5)
-    assert result["recall_radius_3_5_px"] == 0.5
-    assert result["recall_radius_10_20_px"] == 0
-    assert "recall_radius_5_10_px" not in result
-    assert result["recall"] == pytest.approx(1 / 3)
-    assert result["ap50"] == pytest.approx(2 / 3)
+def test_figures_of_both_accounts():
+    truth = labels([square(0, 0, 8), square(20, 0, 8), square(40, 40, 30)], [True, True, False])
+    result = figures(judge(detections([square(0, 0, 8), square(40, 40, 30)], [0.9, 0.8]), truth), threshold=0.5)
+    assert result["recall"] == result["strict/recall"] == result["ap50"] == 0.5
+    assert (result["precision"], result["strict/precision"]) == (1, 0.5)
+    assert result["f1"] == pytest.approx(2 / 3)

@@ -44,6 +44,8 @@ class FrameLabels:
     """False for a crater that is ignored: hardly visible, or not labelled (M,)."""
     labelled: NDArray[np.bool_]
     """False for a crater that is not in the manifest's labels: a little too small, too large, or off the image (M,)."""
+    depth_ratio: Array | None = None
+    """Depth over diameter (M,), by which a crater is fresh or worn; NaN or None where it is not known."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,7 @@ def load_split(dataset: Dataset, split: str, settings: LabelSettings, enlarged: 
                 part[_ELLIPSE].to_numpy(np.float64),
                 part["wanted"].to_numpy(np.bool_),
                 part["labelled"].to_numpy(np.bool_),
+                (part["depth_m"] / part["diameter_m"]).to_numpy(np.float64),
             )
         )
     return DetectSplit(frames, parts, radius_px)

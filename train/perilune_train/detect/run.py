@@ -11,14 +11,17 @@ import torch
 
 from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
-from perilune_shared.manifest import open_dataset
+from perilune_shared.manifest import Dataset, open_dataset
 from perilune_shared.progress import console, progress_bar
 from perilune_train import runs
 from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors, mean_best_iou
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import DetectSplit, load_split
-from perilune_train.detect.figures import draw_curve, draw_detections
-from perilune_train.detect.metrics import Detections, Matches, curve, figures, match_split
+from perilune_train.detect.evaluation import Evaluation, evaluate_detections, protocol_of
+from perilune_train.detect.facts import facts_of
+from perilune_train.detect.matching import Detections, Matches, match_split
+from perilune_train.detect.metrics import curve, figures
+from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.task import DetectTask, detect_frames
 from perilune_train.detect.transfer import start_from_darknet
 from perilune_train.models.darknet_weights import is_darknet
@@ -141,37 +144,78 @@ def run_detect(
         "parameters": sum(p.numel() for p in network.parameters()),
     }
     metrics |= selection_used(config, splits["test"])
-    metrics |= evaluate(run, config, splits, device, bf16)
+    metrics |= told_of(dataset, "test") | evaluate(run, config, dataset, splits, device, bf16)
     runs.write_metrics(run, metrics)
     return run
 
 
-def evaluate(
-    run: runs.RunFolder, config: DetectConfig, splits: dict[str, DetectSplit], device: str, bf16: bool
-) -> dict[str, float]:
-    """Judge the best weights on val and test, write table and pictures; the threshold is chosen on val alone."""
-    network = load_detector(run.best)
-    found: dict[str, list[Detections]] = {}
-    with progress_bar() as progress:
-        for split in ("val", "test"):
-            bar = progress.add_task(f"detect {split}", total=len(splits[split]), unit="frames", note="")
-            started = time.perf_counter()
-            found[split] = detect_frames(
-                network, splits[split].frames, config, device, bf16, lambda n, bar=bar: progress.advance(bar, n)
-            )
-            rate = len(splits[split]) / (time.perf_counter() - started)
-    matches = {split: judge(splits[split], found[split], config) for split in found}
-    threshold = curve(matches["val"]).best_threshold()
-    metrics = {f"{split}/{key}": value for split in found for key, value in figures(matches[split], threshold).items()}
-    metrics |= {
-        "test/threshold": threshold,
-        "test/images_per_s": round(rate, 2),
-        "test/frames": len(splits["test"]),
-        "test/labels": len(matches["test"].wanted_radius_px),
+def told_of(dataset: Dataset, split: str) -> dict[str, float | int | str | None]:
+    """Of the judged data, for metrics.json."""
+    return {
+        "dataset/name": dataset.info.name,
+        "dataset/split_by": dataset.info.split_by,
+        "dataset/protocol": protocol_of(dataset.info),
+        "evaluation/split": split,
     }
-    write_detections(run.root / "detections.parquet", splits["test"], found["test"])
-    draw_curve(
-        {"usual": curve(matches["test"]), "strict": curve(matches["test"].strict())}, run.root / "precision_recall.png"
+
+
+def detect_split(
+    network: YOLOv3, split: DetectSplit, name: str, config: DetectConfig, device: str, bf16: bool
+) -> tuple[list[Detections], float]:
+    """Detections of all frames of a split, and frames a second."""
+    with progress_bar() as progress:
+        bar = progress.add_task(f"detect {name}", total=len(split), unit="frames", note="")
+        started = time.perf_counter()
+        found = detect_frames(network, split.frames, config, device, bf16, lambda n: progress.advance(bar, n))
+        return found, len(split) / (time.perf_counter() - started)
+
+
+def judge_in_full(split: DetectSplit, found: list[Detections], config: DetectConfig, threshold: float) -> Evaluation:
+    """Everything that is told of a split's detections."""
+    return evaluate_detections(
+        found,
+        split.labels,
+        facts_of(split.frames),
+        threshold,
+        radius_px=split.radius_px,
+        match_iou=config.evaluation.match_iou,
+        seed=config.seed,
     )
-    draw_detections(splits["test"], found["test"], threshold, run.root / "detections.png")
-    return metrics
+
+
+def about(dataset: Dataset, split: str, config: DetectConfig, protocol: str, run: str, chosen_on: str) -> list[str]:
+    """What was judged and how, for the head of a report."""
+    settings = config.evaluation
+    thresholds = config.labels.model_dump(exclude={"selection"}, exclude_none=True)
+    return [
+        f"run `{run}`, best weights; dataset `{dataset.info.name}`, split {split}; protocol: {protocol}",
+        f"wanted: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
+        f"threshold {chosen_on}",
+        f"detections below a score of {settings.min_score:g} are dropped, suppression at IoU {settings.nms_iou:g}, "
+        f"at most {settings.max_detections} are kept in a frame",
+    ]
+
+
+def evaluate(
+    run: runs.RunFolder,
+    config: DetectConfig,
+    dataset: Dataset,
+    splits: dict[str, DetectSplit],
+    device: str,
+    bf16: bool,
+) -> dict[str, float | int | str | None]:
+    """Judge the best weights on val and test, write tables and pictures; the threshold is chosen on val alone."""
+    network = load_detector(run.best)
+    found_val, _ = detect_split(network, splits["val"], "val", config, device, bf16)
+    found, rate = detect_split(network, splits["test"], "test", config, device, bf16)
+    matches = judge(splits["val"], found_val, config)
+    threshold = curve(matches).best_threshold()
+    evaluation = judge_in_full(splits["test"], found, config, threshold)
+    write_detections(run.root / "detections.parquet", splits["test"], found)
+    told = about(dataset, "test", config, protocol_of(dataset.info), run.root.name, "of best F1 on val")
+    write_evaluation(run.root, evaluation, list(splits["test"].frames.images), told)
+    metrics: dict[str, float | int | str | None] = {
+        f"val/{key}": value for key, value in figures(matches, threshold).items()
+    }
+    metrics |= {f"test/{key}": value for key, value in evaluation.figures().items()}
+    return metrics | {"test/images_per_s": round(rate, 2)}

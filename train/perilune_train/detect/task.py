@@ -13,7 +13,8 @@ from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig, EvaluationSettings
 from perilune_train.detect.data import Batch, DetectSplit, EvaluationFrames, TrainingFrames, loader, network_input
 from perilune_train.detect.loss import detection_loss
-from perilune_train.detect.metrics import Detections, at_threshold, curve, match_split
+from perilune_train.detect.matching import Detections, match_split
+from perilune_train.detect.metrics import at_threshold, curve
 from perilune_train.models.yolo import YOLOv3
 
 _FINAL_RATE = 0.01

@@ -1,0 +1,164 @@
+"""Figures by the size of craters, altitude, Sun and freshness.
+
+Altitude and Sun are of a frame: a bin holds whole frames. The radius is of a label: a bin follows COCO's rule for
+areas, so it is matched anew with the labels of other bins ignored, and detections that find nothing are ignored where
+their own radius is outside the bin. Freshness, depth over diameter, is of a label too, but a false detection has
+none: there only recall is defined.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_train.detect.bootstrap import (
+    Interval,
+    Resamples,
+    at_threshold_resampled,
+    average_precisions,
+    interval,
+    resampled_wanted,
+)
+from perilune_train.detect.facts import FrameFacts
+from perilune_train.detect.matching import Matches, Overlaps
+from perilune_train.detect.metrics import at_threshold, curve
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+RADIUS_BINS_PX = (2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+ALTITUDE_BINS_M = (200.0, 500.0, 1000.0, 1500.0)
+SUN_BINS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
+DEPTH_RATIO_BINS = (0.0, 0.04, 0.06, 0.08, 0.1, 0.15, 1.0)
+_ALTITUDE_MARGIN = 0.1
+_UNDEFINED = (float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class BinFigures:
+    """Figures of one bin, at the run's threshold; NaN where not defined."""
+
+    by: str
+    """radius, altitude, sun or depth_ratio."""
+    unit: str
+    """px, m, deg or nothing."""
+    low: float
+    """Least value."""
+    high: float
+    """Values below this, in the last bin up to it."""
+    frames: int
+    """Frames with a wanted label in the bin."""
+    labels: int
+    """Wanted labels."""
+    ap50: float
+    """All points."""
+    ap50_interval: Interval
+    """95 %, by bootstrap."""
+    precision: float
+    """In the usual account."""
+    recall: float
+    """Share of the wanted labels found."""
+    recall_interval: Interval
+    """95 %, by bootstrap."""
+    f1: float
+    """Of precision and recall."""
+
+    @property
+    def key(self) -> str:
+        """Under which metrics.json has its figures, for example radius_2_3_px."""
+        return "_".join([self.by, f"{self.low:g}", f"{self.high:g}"] + [self.unit] * bool(self.unit))
+
+
+def within(values: Array, low: float, high: float, last: bool) -> Flags:
+    """Whether values lie in a bin; NaN lies in none."""
+    return (values >= low) & ((values <= high) if last else (values < high))
+
+
+def figures_by_bin(
+    overlaps: Overlaps,
+    matches: Matches,
+    facts: FrameFacts,
+    match_iou: float,
+    radius_px: tuple[float, float],
+    threshold: float,
+    resamples: Resamples,
+) -> list[BinFigures]:
+    """Figures of every bin that holds wanted labels. `matches` are at `match_iou` with the judged `radius_px`.
+
+    Frames up to a tenth beyond the first and the last altitude count in the outer bins: descents end near the
+    nominal altitude, not at it.
+    """
+    made = []
+    for low, high in pairwise(RADIUS_BINS_PX):
+        own = within(overlaps.label_radius_px, low, high, high == RADIUS_BINS_PX[-1])
+        judged = max(low, radius_px[0]), min(high, radius_px[1])
+        part = overlaps.match(match_iou, judged, overlaps.label_wanted & own)
+        made.append(_of_matches("radius", "px", low, high, part, threshold, resamples))
+    margins = {ALTITUDE_BINS_M[0]: 1 - _ALTITUDE_MARGIN, ALTITUDE_BINS_M[-1]: 1 + _ALTITUDE_MARGIN}
+    for low, high in pairwise(ALTITUDE_BINS_M):
+        chosen = within(facts.altitude_m, low * margins.get(low, 1), high * margins.get(high, 1), high in margins)
+        made.append(_of_matches("altitude", "m", low, high, matches.of_frames(chosen), threshold, resamples))
+    for low, high in pairwise(SUN_BINS_DEG):
+        chosen = within(facts.sun_elevation_deg, low, high, high == SUN_BINS_DEG[-1])
+        made.append(_of_matches("sun", "deg", low, high, matches.of_frames(chosen), threshold, resamples))
+    for low, high in pairwise(DEPTH_RATIO_BINS):
+        own = within(overlaps.label_depth_ratio, low, high, high == DEPTH_RATIO_BINS[-1]) & overlaps.label_wanted
+        made.append(_of_labels(low, high, own, overlaps, matches, threshold, resamples))
+    return [one for one in made if one.labels]
+
+
+def _of_matches(
+    by: str, unit: str, low: float, high: float, matches: Matches, threshold: float, resamples: Resamples
+) -> BinFigures:
+    precision, recall, f1 = at_threshold(matches, threshold)
+    drawn = at_threshold_resampled(matches, threshold, resamples)
+    return BinFigures(
+        by,
+        unit,
+        low,
+        high,
+        len(np.unique(matches.wanted_frame)),
+        len(matches.wanted_frame),
+        curve(matches).average_precision(),
+        interval(average_precisions(matches, resamples)),
+        precision,
+        recall,
+        interval(drawn["recall"]),
+        f1,
+    )
+
+
+def _of_labels(
+    low: float,
+    high: float,
+    own: Flags,
+    overlaps: Overlaps,
+    matches: Matches,
+    threshold: float,
+    resamples: Resamples,
+) -> BinFigures:
+    """Recall of the labels `own` (L,) as they were matched among all."""
+    hit = np.zeros(len(own), np.bool_)
+    hit[matches.label[(matches.label >= 0) & (matches.scores >= threshold)]] = True
+    frames = overlaps.label_frame[own]
+    found = resamples.weights @ np.bincount(
+        resamples.of_frame[overlaps.label_frame[own & hit]], minlength=resamples.count
+    )
+    wanted = resampled_wanted(frames, resamples)
+    drawn = np.divide(found, wanted, out=np.full(len(wanted), np.nan), where=wanted > 0)
+    nan = float("nan")
+    recall = float(hit[own].mean()) if own.any() else nan
+    return BinFigures(
+        "depth_ratio",
+        "",
+        low,
+        high,
+        len(np.unique(frames)),
+        len(frames),
+        nan,
+        _UNDEFINED,
+        nan,
+        recall,
+        interval(drawn),
+        nan,
+    )

@@ -1,0 +1,181 @@
+"""Judging detections: everything that is computed, over plain data.
+
+For rendered datasets and real images alike::
+
+    evaluation = evaluate_detections(found, labels, facts, threshold, radius_px=(2.0, 50.0))
+    figures = evaluation.figures()                       # flat keys, for metrics.json
+    write_evaluation(folder, evaluation, images, about)  # report.py: report.md, pictures
+
+with `found` a list of Detections, `labels` a list of FrameLabels (real images: all wanted and labelled, ellipses of the
+boxes), `facts` a FrameFacts (`unknown_facts` where nothing is known), one entry a frame each.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.info import DatasetInfo
+from perilune_train.detect.bins import BinFigures, figures_by_bin
+from perilune_train.detect.bootstrap import (
+    Interval,
+    Resamples,
+    at_threshold_resampled,
+    average_precisions,
+    draw_resamples,
+    interval,
+)
+from perilune_train.detect.data import FrameLabels
+from perilune_train.detect.facts import FrameFacts
+from perilune_train.detect.matching import COCO_IOUS, FALSE, FOUND, Detections, Matches, Overlaps, find_overlaps
+from perilune_train.detect.metrics import figures, figures_over_ious
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Detections judged, with all that a report tells."""
+
+    found: list[Detections]
+    """One entry a frame."""
+    labels: list[FrameLabels]
+    """One entry a frame."""
+    facts: FrameFacts
+    """Of the frames."""
+    threshold: float
+    """Score from which a detection counts in precision, recall and F1."""
+    match_iou: float
+    """Least IoU of a find, in everything that is not over several."""
+    overlaps: Overlaps
+    """Which detection may be which label."""
+    matches: Matches
+    """At match_iou."""
+    by_iou: list[Matches]
+    """At COCO_IOUS."""
+    bins: list[BinFigures]
+    """By radius, altitude, Sun, freshness; only bins that hold labels."""
+    intervals: dict[str, Interval]
+    """95 % of ap50, ap50_95, precision, recall and f1, and of the strict ap50, by bootstrap over `resamples.unit`."""
+    resamples: Resamples
+    """What the intervals are drawn from."""
+
+    @cached_property
+    def errors(self) -> dict[str, float]:
+        """Centre and radius errors of what was found, see `errors_of_found`."""
+        return errors_of_found(self.overlaps, self.matches, self.threshold)
+
+    def figures(self) -> dict[str, float | int | str | None]:
+        """Flat keys: those of `metrics.figures` and `figures_over_ious`, <name>_low and _high of the intervals,
+        <bin>/ap50 and others, recall_radius_..., errors. What is not defined is NaN."""
+        result: dict[str, float | int | str | None] = {
+            **figures(self.matches, self.threshold),
+            **figures_over_ious(self.by_iou),
+            "threshold": self.threshold,
+            "match_iou": self.match_iou,
+            "frames": len(self.facts),
+            "labels": len(self.matches.wanted_frame),
+            "intervals_over": self.resamples.unit,
+            "intervals_units": self.resamples.count,
+            **self.errors,
+        }
+        for name, (low, high) in self.intervals.items():
+            result |= {f"{name}_low": low, f"{name}_high": high}
+        for part in self.bins:
+            result |= {f"{part.key}/recall": part.recall, f"{part.key}/labels": part.labels}
+            if part.by != "depth_ratio":
+                result |= {f"{part.key}/{name}": getattr(part, name) for name in ("ap50", "precision", "f1")}
+                result |= {
+                    f"{part.key}/ap50_low": part.ap50_interval[0],
+                    f"{part.key}/ap50_high": part.ap50_interval[1],
+                }
+            if part.by == "radius":
+                result[f"recall_{part.key}"] = part.recall
+        for by in ("radius", "altitude", "sun"):
+            result[f"lowest_ap50_by_{by}"] = min((part.ap50 for part in self.bins if part.by == by), default=None)
+        return result
+
+    def frame_f1(self) -> Array:
+        """F1 of every frame (N,) at the threshold; NaN without wanted labels."""
+        n_frames = len(self.facts)
+        strong = self.matches.scores >= self.threshold
+        hits, false = (
+            np.bincount(self.matches.frame[strong & (self.matches.outcome == kind)], minlength=n_frames)
+            for kind in (FOUND, FALSE)
+        )
+        wanted = np.bincount(self.matches.wanted_frame, minlength=n_frames)
+        return np.divide(2 * hits, hits + false + wanted, out=np.full(n_frames, np.nan), where=wanted > 0)
+
+
+def evaluate_detections(
+    found: list[Detections],
+    labels: list[FrameLabels],
+    facts: FrameFacts,
+    threshold: float,
+    *,
+    radius_px: tuple[float, float],
+    match_iou: float = 0.5,
+    seed: int = 0,
+) -> Evaluation:
+    """Judge the detections of all frames; `radius_px` is the range of radii that is labelled.
+
+    `threshold` must come from other frames (validation). `seed` is of the bootstrap alone.
+    """
+    overlaps = find_overlaps(found, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
+    matches = overlaps.match(match_iou, radius_px)
+    by_iou = [overlaps.match(iou, radius_px) for iou in COCO_IOUS]
+    resamples = draw_resamples(facts, np.random.default_rng(seed))
+    drawn = {
+        "ap50": average_precisions(matches, resamples),
+        "strict/ap50": average_precisions(matches.strict(), resamples),
+        "ap50_95": np.mean([average_precisions(part, resamples) for part in by_iou], axis=0),
+        **at_threshold_resampled(matches, threshold, resamples),
+    }
+    return Evaluation(
+        found,
+        labels,
+        facts,
+        threshold,
+        match_iou,
+        overlaps,
+        matches,
+        by_iou,
+        figures_by_bin(overlaps, matches, facts, match_iou, radius_px, threshold, resamples),
+        {name: interval(values) for name, values in drawn.items()},
+        resamples,
+    )
+
+
+def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> dict[str, float]:
+    """Errors of found craters, in pixels and (`_relative`) over the label's radius; NaN where none was found.
+
+    The centre is that of the box, the radius sqrt(w h) / 2 of the detection's box against the same of the label's box:
+    for an ellipse that lies askew a little more than its sqrt(a b), which no box tells. Bias is mean found minus true.
+    """
+    own = (matches.label >= 0) & (matches.scores >= threshold)
+    ours, truth = overlaps.boxes[own], overlaps.label_boxes[matches.label[own]]
+    radius, true_radius = (np.sqrt(np.prod(box[:, 2:] - box[:, :2], axis=1)) / 2 for box in (ours, truth))
+    centre_error = np.linalg.norm((ours[:, :2] + ours[:, 2:] - truth[:, :2] - truth[:, 2:]) / 2, axis=1)
+    difference = radius - true_radius
+    result: dict[str, float] = {}
+    for ending, scale in (("px", np.ones_like(true_radius)), ("relative", true_radius)):
+        for name, values in (("centre", centre_error / scale), ("radius", np.abs(difference) / scale)):
+            result[f"{name}_error_{ending}_median"] = _or_nan(values, np.median)
+            result[f"{name}_error_{ending}_p95"] = _or_nan(values, lambda known: np.percentile(known, 95))
+        result[f"radius_bias_{ending}"] = _or_nan(difference / scale, np.mean)
+    return result
+
+
+def protocol_of(info: DatasetInfo) -> str:
+    """What a dataset's splits share, and so what its test figures say."""
+    kinds = {
+        "scene": "unseen scenes",
+        "trajectory": "unseen descents over known terrain",
+        "frame": "random split of frames (the paper's)",
+    }
+    return kinds[info.split_by] + info.leak
+
+
+def _or_nan(values: Array, statistic) -> float:
+    return float(statistic(values)) if len(values) else float("nan")

@@ -1,0 +1,169 @@
+"""What an evaluation leaves in a folder: report.md, pictures, and the curve as a table. Needs no dataset."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from perilune_shared.files import write_text, written_aside
+from perilune_train.detect.bins import BinFigures
+from perilune_train.detect.bootstrap import RESAMPLES, Interval
+from perilune_train.detect.evaluation import Evaluation
+from perilune_train.detect.figures import draw_bins, draw_curves, draw_frames
+from perilune_train.detect.matching import COCO_IOUS
+from perilune_train.detect.metrics import Curve, curve
+
+CURVE_FILE = "precision_recall.parquet"
+WRITTEN = "report.md, precision_recall.png, bins.png, detections.png"
+_CURVE_POINTS = 1000
+_ROWS = {
+    "ap50": "AP, all points",
+    "ap50_101": "AP, COCO's 101 points",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+}
+
+
+def write_evaluation(
+    folder: Path, evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], about: Sequence[str]
+) -> None:
+    """Write report.md, precision_recall.png and .parquet, bins.png (where there are bins) and detections.png.
+
+    `images` are the frames (height, width), grey; `about` are lines of Markdown that say what was judged and how.
+    """
+    write_text(folder / "report.md", markdown(evaluation, about))
+    curves = {f"IoU {COCO_IOUS[k]:.1f}": curve(evaluation.by_iou[k]) for k in (0, 2, 4, 6, 8)}
+    strict = {f"IoU {evaluation.match_iou:g}, strict": curve(evaluation.matches.strict())}
+    draw_curves(curves, folder / "precision_recall.png", dashed=strict)
+    write_curve(folder / CURVE_FILE, curve(evaluation.matches))
+    draw_bins(evaluation.bins, folder / "bins.png")
+    draw_frames(evaluation, images, folder / "detections.png")
+
+
+def write_curve(path: Path, points: Curve) -> None:
+    """Table score, precision, recall: at most 1000 points, evenly along the curve, by which runs are compared."""
+    count = len(points.scores)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _CURVE_POINTS)).astype(int)) if count else np.empty(0, int)
+    columns = {name: pa.array(getattr(points, f)[chosen]) for name, f in _CURVE_COLUMNS.items()}
+    with written_aside(path) as aside:
+        pq.write_table(pa.table(columns), aside, compression="zstd")
+
+
+_CURVE_COLUMNS = {"score": "scores", "precision": "precision", "recall": "recall"}
+
+
+def number(value: object) -> str:
+    """A figure with three digits behind the point; a dash where it is not defined."""
+    return f"{value:.3f}" if isinstance(value, int | float) and math.isfinite(value) else "-"
+
+
+def with_interval(value: object, interval: Interval | None) -> str:
+    """A figure with its interval, where both are defined."""
+    if interval is None or not all(math.isfinite(end) for end in interval):
+        return number(value)
+    return f"{number(value)} ({interval[0]:.3f} to {interval[1]:.3f})"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table; an upright bar within a cell is escaped."""
+    lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
+    lines.insert(1, ["---"] * len(head))
+    return ["| " + " | ".join(row) + " |" for row in lines]
+
+
+def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
+    """The whole report."""
+    figures, intervals, unit = evaluation.figures(), evaluation.intervals, evaluation.resamples
+    fullest = max((len(part.scores) for part in evaluation.found), default=0)
+    lines = ["# Crater detection, judged", "", *[f"- {line}" for line in about]]
+    lines += [
+        f"- {figures['frames']} frames, {figures['labels']} wanted labels; most detections in a frame: {fullest}",
+        f"- match at IoU {evaluation.match_iou:g}; precision, recall and F1 at a score of {evaluation.threshold:.4f}",
+        f"- in brackets: 95 % intervals, {RESAMPLES} resamples of {unit.count} {unit.unit}s"
+        + (f" (few {unit.unit}s: rough)" if unit.count < 5 else ""),
+        "- usual account: finds on ignored craters, outside the range of radii or centred off the image do not count; "
+        "strict account: they are false",
+        "",
+        "## All frames",
+        "",
+    ]
+    rows = [
+        [title, with_interval(figures[key], intervals.get(key)), _strict(figures, intervals, key)]
+        for key, title in _ROWS.items()
+    ]
+    rows += [
+        ["AP over IoU 0.50:0.95, all points", with_interval(figures["ap50_95"], intervals["ap50_95"]), ""],
+        ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_101"]), ""],
+        ["AP at IoU 0.75, all points", number(figures["ap75"]), ""],
+    ]
+    lines += [*table(["", "usual", "strict"], rows), ""]
+    for by, title in (("radius", "Radius"), ("altitude", "Altitude"), ("sun", "Sun elevation")):
+        lines += _bins(title, [part for part in evaluation.bins if part.by == by])
+    lines += _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
+    lines += ["## Errors of found craters", ""]
+    errors = evaluation.errors
+    rows = [
+        [name, *(number(errors[f"{key}_{ending}{which}"]) for ending in ("px", "relative"))]
+        for name, key, which in (
+            ("centre, median", "centre_error", "_median"),
+            ("centre, 95th percentile", "centre_error", "_p95"),
+            ("radius, median", "radius_error", "_median"),
+            ("radius, 95th percentile", "radius_error", "_p95"),
+            ("radius, bias (found less true)", "radius_bias", ""),
+        )
+    ]
+    lines += [*table(["", "px", "over the radius"], rows), ""]
+    return "\n".join(lines)
+
+
+def _strict(figures: dict, intervals: dict[str, Interval], key: str) -> str:
+    return with_interval(figures[f"strict/{key}"], intervals.get(f"strict/{key}"))
+
+
+def _range(part: BinFigures) -> str:
+    return f"{part.low:g} to {part.high:g} {part.unit}".rstrip()
+
+
+def _bins(title: str, parts: list[BinFigures]) -> list[str]:
+    if not parts:
+        return []
+    rows = [
+        [
+            _range(part),
+            str(part.frames),
+            str(part.labels),
+            with_interval(part.ap50, part.ap50_interval),
+            number(part.precision),
+            with_interval(part.recall, part.recall_interval),
+            number(part.f1),
+        ]
+        for part in parts
+    ]
+    least = min(parts, key=lambda part: part.ap50)
+    return [
+        f"## {title}",
+        "",
+        f"Lowest AP: {number(least.ap50)} at {_range(least)}.",
+        "",
+        *table([title.lower(), "frames", "labels", "AP", "precision", "recall", "F1"], rows),
+        "",
+    ]
+
+
+def _freshness(parts: list[BinFigures]) -> list[str]:
+    if not parts:
+        return []
+    rows = [[_range(part), str(part.labels), with_interval(part.recall, part.recall_interval)] for part in parts]
+    return [
+        "## Freshness",
+        "",
+        "Depth over diameter. A false detection has none, so only recall is defined.",
+        "",
+        *table(["depth over diameter", "labels", "recall"], rows),
+        "",
+    ]
