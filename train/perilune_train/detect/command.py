@@ -1,13 +1,10 @@
-"""`perilune-train detect`: its subcommands; here `train`."""
-
-from pathlib import Path
-from typing import Annotated
+"""`perilune-train detect`: its subcommands."""
 
 import typer
 
-from perilune_shared.config import resolve
-from perilune_shared.progress import console
-from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.compare_command import compare
+from perilune_train.detect.evaluate_command import evaluate
+from perilune_train.detect.train_command import train
 from perilune_train.detect.weights_command import weights
 
 app = typer.Typer(
@@ -15,36 +12,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-
-
-@app.command()
-def train(
-    preset: Annotated[str, typer.Option(help="tiny, small, paper or large: the settings to start from.")] = "small",
-    config: Annotated[Path | None, typer.Option(help="YAML file whose section `detect` overrides the preset.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="One setting, for example detect.attention=none; wins over file and preset. Repeatable."
-        ),
-    ] = None,
-    dataset: Annotated[Path | None, typer.Option(help="Folder of the dataset. [default: data/<preset>/detect]")] = None,
-    runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
-    name: Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
-) -> None:
-    """Train the crater detector (attention YOLOv3) and judge it on the test split.
-
-    Leaves runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, detections.parquet,
-    detections.png, precision_recall.png and TensorBoard events. A run of the same name is replaced, unless --resume.
-
-    The baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
-    """
-    settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(set_ or ()))
-    # Torch and Lightning take seconds to load: not for a wrong key.
-    from perilune_train.detect.run import run_detect
-
-    run = run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, resume)
-    console.print(f"{run.root}: metrics.json, detections.png, precision_recall.png")
-
-
+app.command("train")(train)
+app.command("evaluate")(evaluate)
+app.command("compare")(compare)
 app.command("weights")(weights)

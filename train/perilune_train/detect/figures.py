@@ -30,15 +30,14 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] | None = None) -> None:
     """Precision against recall, a line for each curve with its AP (all points)."""
-    figure = Figure(figsize=(6, 4.8), layout="constrained")
+    figure = Figure(figsize=(7.5, 4.8), layout="constrained")
     axes = figure.subplots()
     for group, style in ((curves, "-"), (dashed or {}, "--")):
         for name, points in group.items():
             axes.plot(points.recall, points.precision, style, label=f"{name}: AP {points.average_precision():.3f}")
     axes.set(xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
     axes.grid(alpha=0.3)
-    # Below the curves nothing is drawn: they leave the lower left corner last.
-    axes.legend(loc="lower left", fontsize=8)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8)
     save_figure(figure, path)
 
 
@@ -51,16 +50,17 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
         axes = figure.add_subplot(1, len(drawn), place + 1)
         heights = np.array([part.ap50 for part in parts])
         ends = np.array([part.ap50_interval for part in parts])
-        reach = np.nan_to_num(np.clip(np.abs(ends.T - heights), 0, None))
+        reach = np.abs(ends.T - heights)
         colours = ["#3b7dd8" if part.ap50 >= _GOAL else "#d8873b" for part in parts]
         axes.bar(range(len(parts)), heights, color=colours, yerr=reach, capsize=3, ecolor="#404040")
         axes.axhline(_GOAL, linestyle="--", color="black", linewidth=0.8)
-        for x, part in enumerate(parts):
-            text = f"{part.ap50:.2f}\n{part.labels}"
-            axes.text(x, 0.02, text, ha="center", va="bottom", fontsize=7, color="white")
+        for x, height in enumerate(heights):
+            axes.text(x - 0.36, 0.02, f"{height:.2f}", fontsize=8, color="white")
         axes.set(xlabel=title, ylim=(0, 1), ylabel="AP" if place == 0 else "")
-        axes.set_xticks(range(len(parts)), [f"{part.low:g}-{part.high:g}" for part in parts], fontsize=8)
-    figure.suptitle("AP (number of labels below), 95 % intervals; dashed: the goal, 0.85", fontsize=9)
+        axes.set_xticks(range(len(parts)), [f"{part.low:g}-{part.high:g}\n{part.labels}" for part in parts], fontsize=8)
+    figure.suptitle(
+        "AP with 95 % intervals; below each bin its number of labels; dashed and blue: the goal of 0.85", fontsize=9
+    )
     save_figure(figure, path)
 
 
@@ -94,7 +94,7 @@ def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], pat
     rows = [(name, index) for name, part in chosen.items() for index in part]
     f1 = evaluation.frame_f1()
     columns = 2 * count
-    figure = Figure(figsize=(4.2 * columns, 4.4 * 3 + 0.5), layout="constrained")
+    figure = Figure(figsize=(5 * columns, 5.2 * 3 + 0.5), layout="constrained")
     places = {"best": 0, "typical": 1, "worst": 2}
     for name, index in rows:
         place = places[name] * columns + 2 * chosen[name].index(index)
@@ -108,7 +108,9 @@ def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], pat
         drawn.set_title(_title(evaluation, index), fontsize=8)
         _draw_marks(drawn, evaluation, index)
     figure.suptitle(
-        "labels: red, ignored yellow; detections: found cyan, false magenta, not counted white", fontsize=10
+        "labels (circles): red, bold where missed; ignored yellow. Detections (boxes): found cyan, false magenta, "
+        "not counted white",
+        fontsize=10,
     )
     save_figure(figure, path)
 
@@ -125,13 +127,16 @@ def _title(evaluation: Evaluation, index: int) -> str:
 
 def _draw_marks(axes: Axes, evaluation: Evaluation, index: int) -> None:
     labels, matches, overlaps = evaluation.labels[index], evaluation.matches, evaluation.overlaps
+    own = (matches.frame == index) & (matches.scores >= evaluation.threshold)
+    missed = labels.wanted.copy()
+    missed[matches.label[own & (matches.label >= 0)] - np.searchsorted(overlaps.label_frame, index)] = False
     known = labels.labelled
-    for (cx, cy, a, b, theta), wanted in zip(labels.ellipses[known], labels.wanted[known], strict=True):
-        colour, width = (_LABEL, 1.0) if wanted else (_IGNORED, 0.6)
+    for ellipse, wanted, lost in zip(labels.ellipses[known], labels.wanted[known], missed[known], strict=True):
+        cx, cy, a, b, theta = ellipse
+        colour, width = (_LABEL, 1.4 if lost else 0.5) if wanted else (_IGNORED, 0.6)
         axes.add_patch(
             Ellipse((cx, cy), 2 * a, 2 * b, angle=np.degrees(theta), fill=False, linewidth=width, color=colour)
         )
-    own = (matches.frame == index) & (matches.scores >= evaluation.threshold)
     for box, outcome in zip(overlaps.boxes[own], matches.outcome[own], strict=True):
         colour = {FOUND: _FOUND, FALSE: _FALSE}.get(int(outcome), "white")
         axes.add_patch(Rectangle(box[:2], *(box[2:] - box[:2]), fill=False, linewidth=0.8, color=colour))

@@ -1,0 +1,77 @@
+"""Judging a finished run once more."""
+
+import json
+import math
+from pathlib import Path
+
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import open_dataset
+from perilune_train import runs
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data import load_split
+from perilune_train.detect.evaluation import protocol_of
+from perilune_train.detect.report import write_evaluation
+from perilune_train.detect.run import (
+    about,
+    detect_split,
+    judge_in_full,
+    load_detector,
+    selection_used,
+    told_of,
+    write_detections,
+)
+
+
+def read_metrics(folder: Path) -> dict[str, float | int | str | None]:
+    """metrics.json of a run or of an evaluation. Raises UserError where it is missing or no flat table of figures."""
+    path = folder / "metrics.json"
+    if not path.is_file():
+        raise UserError(path, "metrics", "no such file", "the folder of a finished run")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UserError(path, "metrics", error, "JSON") from None
+    plain = (float, int, str, type(None))
+    if not isinstance(content, dict) or not all(isinstance(value, plain) for value in content.values()):
+        raise UserError(path, "metrics", "something else", "flat keys with numbers and text")
+    return content
+
+
+def threshold_of(run: Path) -> float:
+    """The score threshold that a run chose on its validation split. Raises UserError where it has none."""
+    found = read_metrics(run).get("test/threshold")
+    if isinstance(found, bool) or not isinstance(found, float | int) or not math.isfinite(found):
+        raise UserError(run / "metrics.json", "test/threshold", found, "a number; or give --threshold")
+    return float(found)
+
+
+def evaluate_again(
+    run: Path, config: DetectConfig, dataset_root: Path, split: str, threshold: float | None, out: Path | None
+) -> Path:
+    """Judge a run's best weights on a split of a dataset; everything it leaves is in the returned folder."""
+    folder = out or run / "evaluation"
+    if folder.resolve() == run.resolve():
+        raise UserError(folder, "--out", "the run's own folder", "another: its figures stay as training left them")
+    chosen = threshold_of(run) if threshold is None else threshold
+    chosen_on = "of best F1 on the run's own val" if threshold is None else "given by hand"
+    known = read_metrics(run).get("dataset/name") if threshold is None else None
+    dataset = open_dataset(dataset_root)
+    protocol = protocol_of(dataset.info)
+    if known is not None and known != dataset.info.name:
+        protocol = f"another dataset than the run's own ({known}), of itself split by {dataset.info.split_by}"
+    if split != "test":
+        protocol += f"; {split} frames, which training {'saw' if split == 'train' else 'was steered by'}"
+    device = runs.choose_device(config.device)
+    bf16 = runs.choose_bf16(config.precision, device)
+    network = load_detector(runs.RunFolder(run).best)
+    frames = load_split(dataset, split, config.labels)
+    found, rate = detect_split(network, frames, split, config, device, bf16)
+    evaluation = judge_in_full(frames, found, config, chosen)
+    write_detections(folder / "detections.parquet", frames, found)
+    told = about(dataset, split, config, protocol, run.resolve().name, chosen_on)
+    write_evaluation(folder, evaluation, list(frames.frames.images), told)
+    metrics = selection_used(config, frames) | told_of(dataset, split) | {"dataset/protocol": protocol}
+    metrics |= {f"{split}/{key}": value for key, value in evaluation.figures().items()}
+    metrics[f"{split}/images_per_s"] = round(rate, 2)
+    runs.write_metrics(runs.RunFolder(folder), metrics)
+    return folder

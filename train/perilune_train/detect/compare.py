@@ -1,0 +1,82 @@
+"""Several evaluations in one table and one picture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from perilune_shared.errors import UserError
+from perilune_shared.files import write_text
+from perilune_train.detect.again import read_metrics
+from perilune_train.detect.figures import draw_curves
+from perilune_train.detect.metrics import Curve
+from perilune_train.detect.report import CURVE_FILE, number, table, with_interval
+
+_COLUMNS = {
+    "ap50": "AP",
+    "strict/ap50": "strict AP",
+    "ap50_95": "AP 0.50:0.95",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+}
+_LOWEST = {f"lowest_ap50_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
+
+
+def compare_folders(folders: Sequence[Path], out: Path) -> str:
+    """Write compare.md and precision_recall.png into `out`; returns the table.
+
+    Raises UserError where a folder lacks its metrics or its curve.
+    """
+    rows, curves = [], {}
+    for folder in folders:
+        metrics = read_metrics(folder)
+        split = str(metrics.get("evaluation/split", "test"))
+        figures = {
+            key.removeprefix(f"{split}/"): value for key, value in metrics.items() if key.startswith(f"{split}/")
+        }
+        name = _name(folder)
+        cells = [name, _text(metrics.get("dataset/name")), split, _text(metrics.get("dataset/protocol"))]
+        cells += [_text(metrics.get("labels/selection")), _text(figures.get("frames")), _text(figures.get("labels"))]
+        cells += [with_interval(figures.get(key), _interval(figures, key)) for key in _COLUMNS]
+        rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
+        label, again = name, 2
+        while label in curves:
+            label, again = f"{name} ({again})", again + 1
+        curves[label] = read_curve(folder / CURVE_FILE)
+    head = ["run", "dataset", "split", "protocol", "wanted", "frames", "labels", *_COLUMNS.values(), *_LOWEST.values()]
+    text = "\n".join(table(head, rows)) + "\n"
+    write_text(out / "compare.md", "# Runs side by side\n\nIn brackets: 95 % intervals.\n\n" + text)
+    draw_curves(curves, out / "precision_recall.png")
+    return text
+
+
+def read_curve(path: Path) -> Curve:
+    """The curve that an evaluation left. Raises UserError where it is missing or another table."""
+    if not path.is_file():
+        raise UserError(path, "curve", "no such file", "one that `perilune-train detect evaluate` writes")
+    try:
+        columns = pq.read_table(path, columns=["score", "precision", "recall"])
+    except (pa.ArrowException, OSError, KeyError) as error:
+        raise UserError(path, "curve", error, "columns score, precision and recall") from None
+    if any(not pa.types.is_float64(column.type) for column in columns.columns) or columns.num_columns != 3:
+        raise UserError(path, "curve", columns.schema.to_string(), "columns score, precision and recall, float64")
+    return Curve(*(np.asarray(columns[name]) for name in ("score", "precision", "recall")))
+
+
+def _name(folder: Path) -> str:
+    """A run by its own name, an evaluation of it as run/evaluation."""
+    parts = folder.resolve().parts
+    return "/".join(parts[-2:]) if not (folder / "checkpoints").is_dir() else parts[-1]
+
+
+def _text(value: object) -> str:
+    return "-" if value is None else " ".join(str(value).split())
+
+
+def _interval(figures: dict, key: str) -> tuple[float, float] | None:
+    ends = figures.get(f"{key}_low"), figures.get(f"{key}_high")
+    low, high = ends
+    return (float(low), float(high)) if isinstance(low, float) and isinstance(high, float) else None

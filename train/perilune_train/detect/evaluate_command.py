@@ -1,0 +1,67 @@
+"""`perilune-train detect evaluate`: judge a finished run again, also on another dataset or other labels."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.config import parse_setting, read_config_file, resolve_over
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console
+from perilune_shared.schema import SPLITS
+from perilune_train.detect.config import DetectConfig
+
+_MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
+
+
+def evaluate(
+    run: Annotated[Path, typer.Option(help="Folder of a finished detect run, for example runs/detect/small.")],
+    dataset: Annotated[
+        Path | None, typer.Option(help="Folder of the dataset. [default: data/<name of the run>/detect]")
+    ] = None,
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="One setting of detect.evaluation or detect.labels in place of the run's. Repeatable."
+        ),
+    ] = None,
+    threshold: Annotated[
+        float | None, typer.Option(help="Score threshold. [default: the run's, chosen on its validation split]")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation]")] = None,
+) -> None:
+    """Judge a run's best weights: report.md, metrics.json, detections.parquet and pictures.
+
+    The threshold is the run's own, chosen on the validation split it was trained beside, unless --threshold gives one.
+    """
+    if split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    if threshold is not None and not 0 <= threshold <= 1:
+        raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
+    config = config_of_run(run, tuple(set_ or ()))
+    # Torch takes seconds to load: not for a wrong key.
+    from perilune_train.detect.again import evaluate_again
+
+    folder = evaluate_again(run, config, dataset or Path("data", run.resolve().name, "detect"), split, threshold, out)
+    console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")
+
+
+def config_of_run(run: Path, settings: tuple[str, ...]) -> DetectConfig:
+    """The settings of a run, with single ones of judging replaced. Raises UserError on any that would change the
+    network: that would be another run."""
+    path = run / "config.yaml"
+    section = read_config_file(path).get("detect")
+    if section is None:
+        raise UserError(path, "detect", "no such section", "config.yaml of a detect run")
+    for text in settings:
+        keys, _ = parse_setting(text)
+        if keys[0] != "detect" or keys[1] not in _MAY_CHANGE:
+            raise UserError(
+                "--set", ".".join(keys), "not a setting of judging", "detect.evaluation... or detect.labels..."
+            )
+    named = any(text.startswith("detect.labels.selection=") for text in settings)
+    if named:
+        # The run stores every threshold of its own selection; another name brings its own.
+        section = {key: value for key, value in section.items() if key != "labels"}
+    return resolve_over(DetectConfig, "detect", str(path), section, None, settings)
