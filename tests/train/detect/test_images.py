@@ -1,0 +1,197 @@
+"""Images and boxes of other people: what is read, and what is refused in one line."""
+
+import json
+import os
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from perilune_shared.errors import UserError
+from perilune_train.detect.images import read_images, read_table
+from perilune_train.detect.pictures import picture_size, read_grey
+
+
+def picture(path, width=40, height=30):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (height, width), np.uint8)).save(path)
+    return path
+
+
+@pytest.mark.parametrize("separator", [",", "\t"])
+def test_tables_with_commas_and_tabs(tmp_path, separator):
+    picture(tmp_path / "b.png")
+    picture(tmp_path / "a.png", 50, 60)
+    rows = ["ID,X,Y,W,H,C_X,CY", "0,-5.0,2,20,10,5,7", "", "1,30,20,8.0,8.0,34,24", "2,35,10,20,20,45,20"]
+    for name in "ab":
+        text = "\n".join(rows).replace(",", separator)
+        tmp_path.joinpath(f"{name}.txt").write_text(text, encoding="utf-8-sig")
+    found = read_images(tmp_path)
+    assert not found.ends_at_edges
+    assert [image.path.name for image in found.images] == ["a.png", "b.png"]
+    image = found.images[1]
+    assert (image.width_px, image.height_px) == (40, 30)
+    assert image.boxes.tolist() == [[-5, 2, 15, 12], [30, 20, 38, 28], [35, 10, 55, 30]]
+    assert image.sizes_px == pytest.approx([200**0.5, 8, 20])
+    # The third is centred off the image.
+    assert image.wanted(8.0).tolist() == [True, True, False]
+    assert image.wanted(8.1).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "line 1: found no header; wanted a column X"),
+        ("ID,X,Y,W\n0,1,2,3", "line 1: found ID,X,Y,W; wanted a column H"),
+        ("X,Y,W,H\n1,2,3,4\n1,2,3", "line 3: found 3 values; wanted 4"),
+        ("X,Y,W,H\n1,2,three,4", "line 2: found ['1', '2', 'three', '4']; wanted four numbers"),
+        ("X,Y,W,H\n1,2,nan,4", "line 2: found ['1', '2', 'nan', '4']; wanted a width and height above 0"),
+        ("X,Y,W,H\n1,2,3,-4", "line 2: found"),
+        ("X,Y,W,H\n1e9,2,3,4", "line 2: found"),
+    ],
+)
+def test_broken_tables_are_named_with_their_line(tmp_path, text, told):
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        read_table(path)
+    assert f"a.txt: {told}" in str(caught.value)
+
+
+def test_tables_that_are_missing_or_no_text(tmp_path):
+    picture(tmp_path / "a.png")
+    with pytest.raises(UserError, match=r"a\.txt: boxes: found no such file"):
+        read_images(tmp_path)
+    (tmp_path / "a.txt").write_bytes(b"X,Y,W,H\n\xff\xfe")
+    with pytest.raises(UserError, match=r"a\.txt: boxes: found bytes that are no text"):
+        read_images(tmp_path)
+
+
+def test_folders_without_images(tmp_path):
+    with pytest.raises(UserError, match="no PNG, TIFF or JPEG"):
+        read_images(tmp_path)
+    with pytest.raises(UserError, match="no such folder"):
+        read_images(tmp_path / "absent")
+
+
+def coco(tmp_path, **changes):
+    picture(tmp_path / "pictures" / "a b.png")
+    content = {
+        "images": [{"id": 7, "file_name": "pictures/a b.png", "width": 40, "height": 30}],
+        "annotations": [
+            {"id": 1, "image_id": 7, "category_id": 1, "bbox": [2, 3, 10, 12]},
+            {"id": 2, "image_id": 7, "category_id": 1, "bbox": [1, 1, 20, 20], "iscrowd": 1},
+            {"id": 3, "image_id": 7, "category_id": 1, "bbox": [4, 4, 9, 9.5], "ignore": 1},
+            {"id": 4, "image_id": 7, "category_id": 2, "bbox": [4, 4, 9, 9]},
+        ],
+        "categories": [{"id": 1, "name": "Crater"}, {"id": 2, "name": "boulder"}],
+    }
+    path = tmp_path / "annotations.json"
+    path.write_text(json.dumps({**content, **changes}))
+    return path
+
+
+def test_coco(tmp_path):
+    path = coco(tmp_path)
+    for place in (path, tmp_path):
+        found = read_images(place)
+        (image,) = found.images
+        assert found.ends_at_edges
+        assert image.path == tmp_path.resolve() / "pictures" / "a b.png"
+        assert image.boxes.tolist() == [[2, 3, 12, 15], [1, 1, 21, 21], [4, 4, 13, 13.5]]
+        assert image.wanted(8.0).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"images": [{"id": 7, "file_name": "../x.png"}]}, r"images\[0\].file_name: found ../x.png"),
+        ({"images": [{"id": 7, "file_name": "/etc/passwd"}]}, r"images\[0\].file_name: found /etc/passwd"),
+        ({"images": [{"id": 7, "file_name": 3}]}, r"images\[0\].file_name: found 3"),
+        ({"images": [{"id": 7, "file_name": "absent.png"}]}, r"absent.png: image: found no such file"),
+        ({"images": [{"id": 7, "file_name": "pictures/a b.png", "width": 41}]}, "size: found 40 x 30; wanted 41 x 30"),
+        ({"images": [{"file_name": "pictures/a b.png"}]}, r"images\[0\].id: found None"),
+        ({"images": []}, "images: found none"),
+        ({"images": 3}, "images: found int; wanted a list of objects"),
+        ({"categories": [{"id": 1, "name": "cat"}, {"id": 2, "name": "dog"}]}, "categories: found cat, dog"),
+        ({"annotations": [{"image_id": 8, "category_id": 1, "bbox": [1, 2, 3, 4]}]}, r"annotations\[0\].image_id"),
+        ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, 3]}]}, r"annotations\[0\].bbox"),
+        ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, 0, 4]}]}, "above 0"),
+        ({"annotations": [{"image_id": 7, "category_id": 1}]}, r"annotations\[0\].bbox: found None"),
+    ],
+)
+def test_odd_coco_files_are_refused_in_one_line(tmp_path, changes, told):
+    with pytest.raises(UserError, match=told) as caught:
+        read_images(coco(tmp_path, **changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_coco_does_not_follow_a_link_out_of_its_folder(tmp_path):
+    picture(tmp_path / "outside.png")
+    inner = tmp_path / "inner"
+    path = coco(inner, images=[{"id": 7, "file_name": "link.png"}])
+    (inner / "link.png").symlink_to(tmp_path / "outside.png")
+    with pytest.raises(UserError, match=r"file_name: found link.png"):
+        read_images(path)
+
+
+@pytest.mark.parametrize("text", ["[", "[]", "[" * 100_000, '"x"'])
+def test_files_that_are_no_coco(tmp_path, text):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(UserError, match="JSON: found"):
+        read_images(path)
+
+
+def test_pictures_of_every_depth_become_8_bit_grey(tmp_path):
+    rng = np.random.default_rng(1)
+    grey = rng.integers(0, 256, (20, 30), np.uint8)
+    for name in ("a.png", "a.tif"):
+        Image.fromarray(grey).save(tmp_path / name)
+        assert np.array_equal(read_grey(tmp_path / name), grey)
+        assert picture_size(tmp_path / name) == (30, 20)
+    deep = grey.astype(np.uint16) * 8 + 100
+    for name, pixels in (("d.png", deep), ("d.tif", deep), ("f.tif", deep.astype(np.float32))):
+        assert cv2.imwrite(str(tmp_path / name), pixels)
+        read = read_grey(tmp_path / name)
+        assert read.dtype == np.uint8 and (read.min(), read.max()) == (0, 255)
+        assert np.corrcoef(read.ravel(), grey.ravel())[0, 1] > 0.9999
+    holes = deep.astype(np.float32)
+    holes[:3], holes[3] = np.nan, np.inf
+    assert cv2.imwrite(str(tmp_path / "h.tif"), holes)
+    assert (read_grey(tmp_path / "h.tif")[:4] == 0).all()
+    assert np.corrcoef(read_grey(tmp_path / "h.tif")[4:].ravel(), grey[4:].ravel())[0, 1] > 0.9999
+    Image.fromarray(np.dstack([grey] * 3)).save(tmp_path / "c.png")
+    assert np.array_equal(read_grey(tmp_path / "c.png"), grey)
+    Image.fromarray(np.full((20, 30, 3), 77, np.uint8)).save(tmp_path / "c.jpg")
+    assert np.abs(read_grey(tmp_path / "c.jpg").astype(int) - 77).max() <= 1
+
+
+def test_pictures_that_are_damaged_or_none(tmp_path):
+    whole = picture(tmp_path / "a.png", 300, 300).read_bytes()
+    cut = tmp_path / "cut.png"
+    cut.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UserError, match=r"cut\.png: image"):
+        read_grey(cut)
+    (tmp_path / "text.tif").write_text("<VRTDataset/>")
+    with pytest.raises(UserError, match="does not decode"):
+        read_grey(tmp_path / "text.tif")
+    with pytest.raises(UserError, match="no such file"):
+        read_grey(tmp_path / "absent.png")
+    header = b"IHDR" + (2**17).to_bytes(4, "big") * 2 + whole[24:29]
+    (tmp_path / "bomb.png").write_bytes(whole[:12] + header + zlib.crc32(header).to_bytes(4, "big") + whole[33:])
+    with pytest.raises(UserError, match=r"bomb\.png: size: found 131072 x 131072"):
+        read_grey(tmp_path / "bomb.png")
+
+
+def test_the_real_crops_are_read():
+    if "PERILUNE_REAL_NAC" not in os.environ:
+        pytest.skip("PERILUNE_REAL_NAC names no folder of real crops")
+    images = read_images(Path(os.environ["PERILUNE_REAL_NAC"])).images
+    assert len(images) == 12
+    assert all((image.width_px, image.height_px) == (800, 800) for image in images)
+    assert sum(len(image.boxes) for image in images) == 13453
+    assert any((image.boxes[:, :2] < 0).any() for image in images)
