@@ -1,0 +1,155 @@
+"""Detection in images of any size: overlapping tiles, several scales, one list of boxes.
+
+The network was trained on frames of one size, normalised each by its own mean and deviation; so an image is cut into
+tiles of that size, each normalised for itself. A crater that a tile shows only in part is left to the tile that shows
+more of it: its box comes with a guess of what lies beyond the border.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_train.data.frames import normalised
+from perilune_train.detect.boxes import suppress
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data import network_input
+from perilune_train.detect.metrics import Detections
+from perilune_train.detect.task import detections_of
+from perilune_train.models.yolo import YOLOv3
+
+Array = NDArray[np.float64]
+_STEP = 32
+"""The network's coarsest stride, of which the sides of its input are multiples."""
+_CLEAR_PX = 4.0
+"""A box at least this far from the tile's inner borders is whole, pixels of the tile."""
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How an image is cut."""
+
+    tile_px: int = 256
+    """Side of a tile: that of the training frames, pixels."""
+    overlap_px: int = 64
+    """Least overlap of two neighbours, pixels: craters up to this size are whole in at least one tile."""
+    scales: tuple[float, ...] = (1.0,)
+    """Factors by which the image is enlarged or shrunk before it is cut. Above 1 for smaller craters than those
+    trained on, below 1 for larger ones; what several scales find is merged."""
+
+    def check(self) -> None:
+        """Raise UserError on what cannot be cut."""
+        if self.tile_px < _STEP or self.tile_px % _STEP:
+            raise UserError("--tile", "pixels", self.tile_px, f"a multiple of {_STEP}")
+        if not 0 <= self.overlap_px < self.tile_px:
+            raise UserError("--overlap", "pixels", self.overlap_px, f"0 to {self.tile_px - 1}, less than a tile")
+        if not self.scales or not all(0.05 <= scale <= 8 for scale in self.scales):
+            raise UserError("--scale", "factor", list(self.scales), "0.05 to 8")
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A trained network and how it is run."""
+
+    network: YOLOv3
+    """The network, in evaluation mode, on the device."""
+    config: DetectConfig
+    """The run's settings."""
+    device: str
+    """cpu or cuda."""
+    bf16: bool
+    """Whether it computes in bfloat16."""
+
+
+def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
+    """Where tiles begin along a side: evenly, the first at 0, the last ending at the side's end."""
+    if length_px <= tile_px:
+        return np.zeros(1, np.intp)
+    count = -(-(length_px - overlap_px) // (tile_px - overlap_px))
+    return np.rint(np.linspace(0, length_px - tile_px, count)).astype(np.intp)
+
+
+def padded(image: NDArray[np.uint8], tile_px: int) -> NDArray[np.uint8]:
+    """The image with reflected pixels at right and bottom where a side is shorter than a tile and no multiple of 32."""
+    more = [max(0, min(tile_px, -(-side // _STEP) * _STEP) - side) for side in image.shape]
+    return np.pad(image, [(0, more[0]), (0, more[1])], mode="reflect") if any(more) else image
+
+
+def count_tiles(height_px: int, width_px: int, tiling: Tiling) -> int:
+    """Number of tiles of an image at all scales."""
+    return sum(
+        len(tile_starts(round(height_px * s), tiling.tile_px, tiling.overlap_px))
+        * len(tile_starts(round(width_px * s), tiling.tile_px, tiling.overlap_px))
+        for s in tiling.scales
+    )
+
+
+def detect_image(
+    detector: Detector, image: NDArray[np.uint8], tiling: Tiling, advance: Callable[[int], object] = lambda n: None
+) -> Detections:
+    """Craters of an image (height, width) of any size, best first; `advance(n)` is called after n more tiles.
+
+    An image of the size of one tile gets what `detect_frames` finds.
+    """
+    height, width = image.shape
+    boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
+    for scale in tiling.scales:
+        size = max(round(width * scale), 1), max(round(height * scale), 1)
+        # Averaging, when shrinking, keeps noise from aliasing into craters.
+        how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+        scaled = image if size == (width, height) else np.asarray(cv2.resize(image, size, interpolation=how), np.uint8)
+        whole = padded(scaled, tiling.tile_px)
+        for found in _detect_tiles(detector, whole, tiling, advance):
+            own = np.ones(len(found.scores), bool)
+            if whole.shape != scaled.shape:
+                # Craters of the reflection are none.
+                own = ((found.boxes[:, :2] + found.boxes[:, 2:]) / 2 < size).all(axis=1)
+            boxes.append(found.boxes[own] / np.tile([size[0] / width, size[1] / height], 2))
+            scores.append(found.scores[own])
+    all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
+    kept = suppress(all_boxes, all_scores, detector.config.evaluation.nms_iou, len(all_boxes))
+    return Detections(all_boxes[kept], all_scores[kept])
+
+
+def _detect_tiles(
+    detector: Detector, image: NDArray[np.uint8], tiling: Tiling, advance: Callable[[int], object]
+) -> Iterator[Detections]:
+    """What each tile of an image finds, in pixels of the image, without what another tile sees better."""
+    tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)
+    places = [(int(top), int(left)) for top in tops for left in lefts]
+    tile_h, tile_w = (min(tiling.tile_px, side) for side in image.shape)
+    for first in range(0, len(places), detector.config.batch_size):
+        batch = places[first : first + detector.config.batch_size]
+        tiles = np.stack([image[top : top + tile_h, left : left + tile_w] for top, left in batch])
+        for place, found in zip(batch, detect_batch(detector, tiles), strict=True):
+            boxes = found.boxes + np.tile(place[::-1], 2)
+            clear = [
+                _clearance(boxes[:, [axis, axis + 2]], starts, length, image.shape[1 - axis])
+                for axis, starts, length in ((0, lefts, tile_w), (1, tops, tile_h))
+            ]
+            column, row = int(np.searchsorted(lefts, place[1])), int(np.searchsorted(tops, place[0]))
+            own = np.minimum(clear[0][:, column], clear[1][:, row])
+            best = np.minimum(clear[0].max(axis=1), clear[1].max(axis=1))
+            kept = (own >= _CLEAR_PX) | (own >= best)
+            yield Detections(boxes[kept], found.scores[kept])
+        advance(len(batch))
+
+
+def _clearance(spans: Array, starts: NDArray[np.intp], tile_px: int, length_px: int) -> Array:
+    """Least distance (D, T) of spans (D, 2) from the borders of tiles along a side; the image's own edges are none."""
+    low = np.where(starts > 0, spans[:, :1] - starts, np.inf)
+    high = np.where(starts + tile_px < length_px, starts + tile_px - spans[:, 1:], np.inf)
+    return np.minimum(low, high)
+
+
+@torch.no_grad()
+def detect_batch(detector: Detector, tiles: NDArray[np.uint8]) -> list[Detections]:
+    """Detections of tiles (N, height, width), one entry a tile."""
+    images = network_input(normalised(tiles), detector.config.in_channels).to(detector.device)
+    with torch.autocast(detector.device, torch.bfloat16, enabled=detector.bf16):
+        boxes, scores = detector.network.detect(images)
+    return [detections_of(b, s, detector.config.evaluation) for b, s in zip(boxes, scores, strict=True)]
