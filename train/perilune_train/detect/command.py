@@ -4,6 +4,7 @@ import typer
 
 from perilune_train.detect.compare_command import compare
 from perilune_train.detect.evaluate_command import evaluate
+from perilune_train.detect.predict_command import predict
 from perilune_train.detect.train_command import train
 from perilune_train.detect.weights_command import weights
 
@@ -16,3 +17,4 @@ app.command("train")(train)
 app.command("evaluate")(evaluate)
 app.command("compare")(compare)
 app.command("weights")(weights)
+app.command("predict")(predict)

@@ -1,0 +1,24 @@
+"""The folder of a detect run, without the training: random weights, a configuration, a threshold."""
+
+from pathlib import Path
+
+import numpy as np
+
+from perilune_shared.config import resolve
+from perilune_train import runs
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.run import build_network
+
+THRESHOLD = 0.005
+
+
+def store_run(root: Path) -> Path:
+    """A run's folder below `root`; its network finds a little everywhere, at scores around 0.01."""
+    settings = ("width=0.125", "precision=float32", "device=cpu", "evaluation.min_score=0.001")
+    config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, tuple(f"detect.{s}" for s in settings))
+    run = runs.start_run(root, "detect", "stored", config, False)
+    network = build_network(config, np.random.default_rng(0).uniform(4, 40, (500, 2)), root)
+    architecture = {"in_channels": config.in_channels, "width": config.width, "attention": config.attention}
+    runs.save_weights(run.best, {**architecture, "strides": list(config.strides)}, network)
+    runs.write_metrics(run, {"test/threshold": THRESHOLD})
+    return run.root

@@ -1,0 +1,46 @@
+"""`perilune-train detect predict`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console
+
+Scales = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--scale",
+        help="Factor by which images are enlarged or shrunk before the search; repeatable, what several find is merged."
+        " [default: 1]",
+    ),
+]
+TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles: that of the training frames, pixels.")]
+Overlap = Annotated[int, typer.Option(help="Least overlap of two tiles, pixels.")]
+
+
+def predict(
+    images: Annotated[list[Path], typer.Argument(help="PNG, TIFF or JPEG of any size.")],
+    run: Annotated[Path, typer.Option(help="Folder of a detect run.")] = Path("runs/detect/small"),
+    out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("predictions"),
+    threshold: Annotated[
+        float | None, typer.Option(help="Least score. [default: the best on the run's validation split]")
+    ] = None,
+    scale: Scales = None,
+    tile: TileSide = 256,
+    overlap: Overlap = 64,
+) -> None:
+    """Find craters in images.
+
+    Leaves detections.parquet and detections.csv (one row a crater, in pixels of the image, from the outer corner of its
+    top-left pixel), <image>.overlay.png, and detections.geojson where an image has a georeference.
+    """
+    if threshold is not None and not 0 < threshold <= 1:
+        raise UserError("--threshold", "score", threshold, "above 0, at most 1")
+    # Torch takes seconds to load: not for a wrong option.
+    from perilune_train.detect.predict import predict_images
+    from perilune_train.detect.tiles import Tiling
+
+    count = predict_images(images, run, out, threshold, Tiling(tile, overlap, tuple(scale or (1.0,))))
+    console.print(f"{out}: {count} craters in {len(images)} images; detections.parquet, detections.csv, *.overlay.png")
