@@ -16,7 +16,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.frames import MOON_RADIUS_M
 from perilune_train.cli import app
 from perilune_train.detect.georeference import MOON_CRS, features, read_georeference
-from perilune_train.detect.metrics import Detections
+from perilune_train.detect.matching import Detections
 from perilune_train.detect.predict import predict_images
 from perilune_train.detect.tiles import Tiling
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_shared.frames import MOON_RADIUS_M
-from perilune_train.detect.metrics import Detections
+from perilune_train.detect.matching import Detections
 from perilune_train.detect.pictures import picture_format
 
 Array = NDArray[np.float64]

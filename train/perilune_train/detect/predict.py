@@ -16,7 +16,7 @@ from perilune_shared.progress import console, progress_bar
 from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.georeference import Georeference, collection, features, has_rasterio, read_georeference
-from perilune_train.detect.metrics import Detections
+from perilune_train.detect.matching import Detections
 from perilune_train.detect.pictures import picture_size, read_grey
 from perilune_train.detect.run import load_detector
 from perilune_train.detect.tiles import Detector, Tiling, count_tiles, detect_image

@@ -18,7 +18,7 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import network_input
-from perilune_train.detect.metrics import Detections
+from perilune_train.detect.matching import Detections
 from perilune_train.detect.task import detections_of
 from perilune_train.models.yolo import YOLOv3
 
