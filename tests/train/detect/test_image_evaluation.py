@@ -75,7 +75,7 @@ def test_a_folder_is_judged(run, folder, tmp_path):
     assert written["labels"] == sum(wanted) > 40
     assert 0 < written["ap50"] < 1 and written["oracle/f1"] >= written["f1"] > 0
     assert written["ap50"] == pytest.approx(figures["ap50"])
-    for name in ("report.md", "precision_recall.png", "detections.png", "crops.png"):
+    for name in ("report.md", "precision_recall.png", "detections.png", "detections.parquet", "crops.png"):
         assert (out / name).stat().st_size > 0, name
     assert "oracle" in (out / "report.md").read_text()
     # What is found does not hang on the least size, what is wanted does.

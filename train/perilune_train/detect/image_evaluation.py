@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
@@ -23,7 +24,7 @@ from perilune_train.detect.images import ImageSet, LabelledImage, read_images
 from perilune_train.detect.matching import FALSE, FOUND, Detections
 from perilune_train.detect.metrics import at_threshold, curve
 from perilune_train.detect.pictures import read_grey
-from perilune_train.detect.predict import draw_boxes, open_detector, validation_threshold
+from perilune_train.detect.predict import draw_boxes, open_detector, table_of, validation_threshold
 from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.tiles import Tiling, count_tiles, detect_image
 
@@ -38,8 +39,8 @@ def evaluate_images(
 ) -> dict[str, float | int | str | None]:
     """Judge a run on labelled images (a folder or a COCO file); the figures, as written to `out`/metrics.json.
 
-    Leaves report.md, precision_recall.png, bins.png, detections.png and crops.png in `out` too. Raises UserError where
-    anything of it cannot be read; then nothing is written.
+    Leaves report.md, detections.parquet, precision_recall.png, bins.png, detections.png and crops.png in `out` too.
+    Raises UserError where anything of it cannot be read; then nothing is written.
     """
     tiling.check()
     if not 0 < min_size_px < np.inf:
@@ -50,7 +51,8 @@ def evaluate_images(
     chosen_on = "of best F1 on the run's validation split" if threshold is None else "given by hand"
     threshold = validation_threshold(run) if threshold is None else threshold
     images = [read_grey(image.path) for image in given.images]
-    evaluation = judge_images(given, _detect(run, images, tiling), threshold, min_size_px)
+    found = _detect(run, images, tiling)
+    evaluation = judge_images(given, found, threshold, min_size_px)
     best = curve(evaluation.matches).best_threshold()
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
     about = [
@@ -62,6 +64,9 @@ def evaluate_images(
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
     write_evaluation(out, evaluation, images, about)
+    table = pd.concat(table_of(image.path.name, part) for image, part in zip(given.images, found, strict=True))
+    with written_aside(out / "detections.parquet") as aside:
+        table.to_parquet(aside, index=False)
     write_crops(out / "crops.png", images, evaluation)
     figures = evaluation.figures() | {f"oracle/{name}": value for name, value in oracle.items()}
     figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}

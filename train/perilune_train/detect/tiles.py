@@ -1,8 +1,9 @@
 """Detection in images of any size: overlapping tiles, several scales, one list of boxes.
 
 The network was trained on frames of one size, normalised each by its own mean and deviation; so an image is cut into
-tiles of that size, each normalised for itself. A crater that a tile shows only in part is left to the tile that shows
-more of it: its box comes with a guess of what lies beyond the border.
+tiles of that size, each normalised for itself. Where tiles overlap, a box is taken from the tile whose borders are
+farthest from it: near a border the network guesses what lies beyond, and both tiles' boxes together would hold more
+false ones than the rest of the image does.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,8 +26,8 @@ from perilune_train.models.yolo import YOLOv3
 Array = NDArray[np.float64]
 _STEP = 32
 """The network's coarsest stride, of which the sides of its input are multiples."""
-_CLEAR_PX = 4.0
-"""A box at least this far from the tile's inner borders is whole, pixels of the tile."""
+_TOLERANCE_PX = 2.0
+"""Two tiles place one crater a little differently: so far may each leave it to the other before it is lost."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ def _detect_tiles(
             column, row = int(np.searchsorted(lefts, place[1])), int(np.searchsorted(tops, place[0]))
             own = np.minimum(clear[0][:, column], clear[1][:, row])
             best = np.minimum(clear[0].max(axis=1), clear[1].max(axis=1))
-            kept = (own >= _CLEAR_PX) | (own >= best)
+            kept = own >= best - _TOLERANCE_PX
             yield Detections(boxes[kept], found.scores[kept])
         advance(len(batch))
 
