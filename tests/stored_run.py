@@ -7,6 +7,7 @@ import numpy as np
 from perilune_shared.config import resolve
 from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.evaluate_command import config_of_run
 from perilune_train.detect.run import build_network
 
 THRESHOLD = 0.005
@@ -22,3 +23,8 @@ def store_run(root: Path) -> Path:
     runs.save_weights(run.best, {**architecture, "strides": list(config.strides)}, network)
     runs.write_metrics(run, {"test/threshold": THRESHOLD})
     return run.root
+
+
+def settings_of(run: Path) -> DetectConfig:
+    """The stored settings."""
+    return config_of_run(run, ())

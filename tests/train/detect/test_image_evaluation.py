@@ -6,9 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tests.stored_run import THRESHOLD, store_run
+from tests.stored_run import THRESHOLD, settings_of, store_run
+from typer.testing import CliRunner
 
 from perilune_shared.errors import UserError
+from perilune_train.cli import app
 from perilune_train.detect.image_evaluation import evaluate_images, judge_images
 from perilune_train.detect.images import ImageSet, LabelledImage, read_images
 from perilune_train.detect.matching import Detections
@@ -68,7 +70,7 @@ def folder(tmp_path):
 
 def test_a_folder_is_judged(run, folder, tmp_path):
     out = tmp_path / "out"
-    figures = evaluate_images(run, folder, out, Tiling(tile_px=96, overlap_px=32))
+    figures = evaluate_images(run, settings_of(run), folder, out, Tiling(tile_px=96, overlap_px=32))
     written = json.loads((out / "metrics.json").read_text())
     assert written["threshold"] == THRESHOLD and written["frames"] == 2
     wanted = [image.wanted(8.0).sum() for image in read_images(folder).images]
@@ -79,15 +81,27 @@ def test_a_folder_is_judged(run, folder, tmp_path):
         assert (out / name).stat().st_size > 0, name
     assert "oracle" in (out / "report.md").read_text()
     # What is found does not hang on the least size, what is wanted does.
-    larger = evaluate_images(run, folder, tmp_path / "larger", Tiling(tile_px=96, overlap_px=32), 30.0, 0.5)
+    larger = evaluate_images(
+        run, settings_of(run), folder, tmp_path / "larger", Tiling(tile_px=96, overlap_px=32), 30.0, 0.5
+    )
     assert 0 < larger["labels"] < figures["labels"] and larger["threshold"] == 0.5
 
 
 def test_nothing_is_written_for_a_fault(run, folder, tmp_path):
     for arguments in ((Tiling(), 0.0), (Tiling(), 1000.0), (Tiling(tile_px=5), 8.0)):
         with pytest.raises(UserError):
-            evaluate_images(run, folder, tmp_path / "out", *arguments)
+            evaluate_images(run, settings_of(run), folder, tmp_path / "out", *arguments)
     (folder / "b.txt").write_text("X,Y,W,H\n1,2,3\n")
     with pytest.raises(UserError, match=r"b\.txt: line 2"):
-        evaluate_images(run, folder, tmp_path / "out", Tiling())
+        evaluate_images(run, settings_of(run), folder, tmp_path / "out", Tiling())
     assert not (tmp_path / "out").exists()
+
+
+def test_the_command(run, folder, tmp_path):
+    arguments = ["detect", "evaluate", "--run", str(run), "--images", str(folder), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, [*arguments, "--scale", "0.5", "--min-size", "20", "--threshold", "0.02"])
+    assert result.exit_code == 0, result.output
+    written = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert (written["scales"], written["min_size_px"], written["threshold"]) == ("0.5", 20, 0.02)
+    refused = CliRunner().invoke(app, [*arguments, "--dataset", "data"])
+    assert isinstance(refused.exception, UserError)

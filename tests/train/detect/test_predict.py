@@ -9,7 +9,7 @@ import pytest
 import rasterio
 from rasterio.crs import CRS
 from rasterio.transform import from_origin
-from tests.stored_run import THRESHOLD, store_run
+from tests.stored_run import THRESHOLD, settings_of, store_run
 from typer.testing import CliRunner
 
 from perilune_shared.errors import UserError
@@ -47,7 +47,7 @@ def test_everything_is_written(run, tmp_path):
     paths = [geotiff(tmp_path / "g.tif", POLAR, from_origin(1000, 3000, 2, 2)), tmp_path / "a.png", tmp_path / "b.jpg"]
     for path in paths[1:]:
         assert cv2.imwrite(str(path), noise(70, 300))
-    count = predict_images(paths, run, tmp_path / "out", None, Tiling(tile_px=96, overlap_px=32))
+    count = predict_images(paths, run, settings_of(run), tmp_path / "out", None, Tiling(tile_px=96, overlap_px=32))
     names = ["a.png.overlay.png", "b.jpg.overlay.png", "detections.csv", "detections.geojson", "detections.parquet"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [*names, "g.tif.overlay.png"]
     table = pd.read_parquet(tmp_path / "out" / "detections.parquet")
@@ -118,21 +118,21 @@ def test_one_faulty_image_among_several_leaves_nothing(run, tmp_path):
     assert cv2.imwrite(str(good), noise(64, 64))
     bad.write_bytes(good.read_bytes()[:2000])
     with pytest.raises(UserError, match=r"bad\.png: image"):
-        predict_images([good, bad], run, tmp_path / "out", None, Tiling())
+        predict_images([good, bad], run, settings_of(run), tmp_path / "out", None, Tiling())
     (tmp_path / "more").mkdir()
     twin = tmp_path / "more" / "good.png"
     twin.write_bytes(good.read_bytes())
     with pytest.raises(UserError, match=r"more/good\.png: name: found a second image"):
-        predict_images([good, twin], run, tmp_path / "out", None, Tiling())
+        predict_images([good, twin], run, settings_of(run), tmp_path / "out", None, Tiling())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.png", "good.png", "more"]
 
 
-def test_a_folder_that_is_no_run(tmp_path):
+def test_a_run_that_is_not_finished(run, tmp_path):
     assert cv2.imwrite(str(tmp_path / "a.png"), noise(64, 64))
-    with pytest.raises(UserError, match=r"metrics\.json: test/threshold"):
-        predict_images([tmp_path / "a.png"], tmp_path / "absent", tmp_path / "out", None, Tiling())
-    with pytest.raises(UserError, match=r"absent: --run: found no config\.yaml"):
-        predict_images([tmp_path / "a.png"], tmp_path / "absent", tmp_path / "out", 0.5, Tiling())
+    with pytest.raises(UserError, match=r"metrics\.json: metrics: found no such file"):
+        predict_images([tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", None, Tiling())
+    with pytest.raises(UserError, match=r"best\.ckpt: checkpoint: found no such file"):
+        predict_images([tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", 0.5, Tiling())
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 

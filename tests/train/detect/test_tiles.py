@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.stored_run import store_run
+from tests.stored_run import settings_of, store_run
 
 from perilune_shared.errors import UserError
 from perilune_train.data.frames import FrameStore
@@ -33,7 +33,8 @@ class Blobs(torch.nn.Module):
 
 @pytest.fixture(scope="module")
 def detector(tmp_path_factory):
-    return open_detector(store_run(tmp_path_factory.mktemp("runs")))
+    run = store_run(tmp_path_factory.mktemp("runs"))
+    return open_detector(run, settings_of(run))
 
 
 def discs(height, width, spacing, radius):

@@ -10,6 +10,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.progress import console
 from perilune_shared.schema import SPLITS
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.tiling_options import Overlap, Scales, TileSide
 
 _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
@@ -29,7 +30,17 @@ def evaluate(
     threshold: Annotated[
         float | None, typer.Option(help="Score threshold. [default: the run's, chosen on its validation split]")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation]")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation, with --images <run>/images]")
+    ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(help="Real images with boxes in place of a dataset: a folder of pictures and tables, or COCO."),
+    ] = None,
+    min_size: Annotated[float, typer.Option(help="With --images: least crater wanted, sqrt(w h), pixels.")] = 8.0,
+    scale: Scales = None,
+    tile: TileSide = 256,
+    overlap: Overlap = 64,
 ) -> None:
     """Judge a run's best weights: report.md, metrics.json, detections.parquet and pictures.
 
@@ -40,6 +51,16 @@ def evaluate(
     if threshold is not None and not 0 <= threshold <= 1:
         raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
     config = config_of_run(run, tuple(set_ or ()))
+    if images is not None:
+        if dataset is not None:
+            raise UserError("--images", "beside --dataset", images, "one of both")
+        from perilune_train.detect.image_evaluation import evaluate_images
+        from perilune_train.detect.tiles import Tiling
+
+        folder, tiling = out or run / "images", Tiling(tile, overlap, tuple(scale or (1.0,)))
+        evaluate_images(run, config, images, folder, tiling, min_size, threshold)
+        console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
+        return
     # Torch takes seconds to load: not for a wrong key.
     from perilune_train.detect.again import evaluate_again
 

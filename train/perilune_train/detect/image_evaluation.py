@@ -17,6 +17,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
 from perilune_shared.progress import progress_bar
 from perilune_train import runs
+from perilune_train.detect.again import threshold_of
+from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import FrameLabels
 from perilune_train.detect.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.facts import unknown_facts
@@ -24,9 +26,9 @@ from perilune_train.detect.images import ImageSet, LabelledImage, read_images
 from perilune_train.detect.matching import FALSE, FOUND, Detections
 from perilune_train.detect.metrics import at_threshold, curve
 from perilune_train.detect.pictures import read_grey
-from perilune_train.detect.predict import draw_boxes, open_detector, table_of, validation_threshold
+from perilune_train.detect.predict import draw_boxes, open_detector, table_of
 from perilune_train.detect.report import write_evaluation
-from perilune_train.detect.tiles import Tiling, count_tiles, detect_image
+from perilune_train.detect.tiles import Detector, Tiling, count_tiles, detect_image
 
 _CROP_PX = 200
 _PAIRS_A_ROW, _MOST_PAIRS = 3, 12
@@ -35,7 +37,13 @@ _COLOURS = {FOUND: (224, 211, 25), FALSE: (255, 64, 255)}
 
 
 def evaluate_images(
-    run: Path, place: Path, out: Path, tiling: Tiling, min_size_px: float = 8.0, threshold: float | None = None
+    run: Path,
+    config: DetectConfig,
+    place: Path,
+    out: Path,
+    tiling: Tiling,
+    min_size_px: float = 8.0,
+    threshold: float | None = None,
 ) -> dict[str, float | int | str | None]:
     """Judge a run on labelled images (a folder or a COCO file); the figures, as written to `out`/metrics.json.
 
@@ -49,10 +57,10 @@ def evaluate_images(
     if not any(image.wanted(min_size_px).any() for image in given.images):
         raise UserError(place, "boxes", f"none of {min_size_px:g} px or more", "at least one to be found")
     chosen_on = "of best F1 on the run's validation split" if threshold is None else "given by hand"
-    threshold = validation_threshold(run) if threshold is None else threshold
+    threshold = threshold_of(run) if threshold is None else threshold
     images = [read_grey(image.path) for image in given.images]
-    found = _detect(run, images, tiling)
-    evaluation = judge_images(given, found, threshold, min_size_px)
+    found = _detect(open_detector(run, config), images, tiling)
+    evaluation = judge_images(given, found, threshold, min_size_px, config.evaluation.match_iou)
     best = curve(evaluation.matches).best_threshold()
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
     about = [
@@ -83,7 +91,9 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
     return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, image.wanted(min_size_px), every)
 
 
-def judge_images(given: ImageSet, found: list[Detections], threshold: float, min_size_px: float) -> Evaluation:
+def judge_images(
+    given: ImageSet, found: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
+) -> Evaluation:
     """The detections of all images against their boxes; where boxes end at the images' edges, detections do too."""
     sizes = np.array([[image.width_px, image.height_px] for image in given.images])
     if given.ends_at_edges:
@@ -97,11 +107,11 @@ def judge_images(given: ImageSet, found: list[Detections], threshold: float, min
         unknown_facts([image.path.name for image in given.images], sizes),
         threshold,
         radius_px=(min_size_px / 2, np.inf),
+        match_iou=match_iou,
     )
 
 
-def _detect(run: Path, images: list[NDArray[np.uint8]], tiling: Tiling) -> list[Detections]:
-    detector = open_detector(run)
+def _detect(detector: Detector, images: list[NDArray[np.uint8]], tiling: Tiling) -> list[Detections]:
     found = []
     with progress_bar() as progress:
         total = sum(count_tiles(image.shape[0], image.shape[1], tiling) for image in images)

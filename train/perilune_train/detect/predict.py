@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
 from perilune_shared.files import new_folder
 from perilune_shared.progress import console, progress_bar
 from perilune_train import runs
+from perilune_train.detect.again import threshold_of
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.georeference import Georeference, collection, features, has_rasterio, read_georeference
 from perilune_train.detect.matching import Detections
@@ -27,31 +27,16 @@ _LARGEST_OVERLAY_PX = 4096
 _SMALLEST_OVERLAY_PX = 1600
 
 
-def open_detector(root: Path, device: str = "auto") -> Detector:
-    """The best network of a run's folder. Raises UserError where the folder is none of a detect run."""
-    run = runs.RunFolder(root)
-    if not run.config.is_file():
-        raise UserError(root, "--run", "no config.yaml", "the folder of a detect run, as runs/detect/small")
-    # The file holds every setting: which preset lies under it does not matter.
-    config = resolve(DetectConfig, "detect", "perilune_train", "small", run.config)
-    device = runs.choose_device(device)
-    network = load_detector(run.best).to(device)
+def open_detector(root: Path, config: DetectConfig) -> Detector:
+    """The best network of a run's folder. Raises UserError where it has none."""
+    device = runs.choose_device(config.device)
+    network = load_detector(runs.RunFolder(root).best).to(device)
     return Detector(network, config, device, runs.choose_bf16(config.precision, device))
 
 
-def validation_threshold(root: Path) -> float:
-    """The score at which a run's F1 was best on its validation split. Raises UserError where it is not finished."""
-    path = runs.RunFolder(root).metrics
-    try:
-        threshold = json.loads(path.read_text(encoding="utf-8"))["test/threshold"]
-        if not 0 < threshold <= 1:
-            raise ValueError
-    except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(path, "test/threshold", "none", "metrics.json of a finished run, or --threshold") from None
-    return float(threshold)
-
-
-def predict_images(paths: list[Path], run: Path, out: Path, threshold: float | None, tiling: Tiling) -> int:
+def predict_images(
+    paths: list[Path], run: Path, config: DetectConfig, out: Path, threshold: float | None, tiling: Tiling
+) -> int:
     """Find craters in images; returns their number. Everything is in the new folder `out`, or nothing.
 
     Raises UserError on the first image that cannot be read, before any is searched.
@@ -71,8 +56,8 @@ def predict_images(paths: list[Path], run: Path, out: Path, threshold: float | N
             references.append(_reference(path))
             n_tiles += count_tiles(height, width, tiling)
             progress.advance(check)
-        threshold = validation_threshold(run) if threshold is None else threshold
-        detector = open_detector(run)
+        threshold = threshold_of(run) if threshold is None else threshold
+        detector = open_detector(run, config)
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes = [], []
         for path, reference in zip(paths, references, strict=True):

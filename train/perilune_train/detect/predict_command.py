@@ -7,17 +7,8 @@ import typer
 
 from perilune_shared.errors import UserError
 from perilune_shared.progress import console
-
-Scales = Annotated[
-    list[float] | None,
-    typer.Option(
-        "--scale",
-        help="Factor by which images are enlarged or shrunk before the search; repeatable, what several find is merged."
-        " [default: 1]",
-    ),
-]
-TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles: that of the training frames, pixels.")]
-Overlap = Annotated[int, typer.Option(help="Least overlap of two tiles, pixels.")]
+from perilune_train.detect.evaluate_command import config_of_run
+from perilune_train.detect.tiling_options import Overlap, Scales, TileSide
 
 
 def predict(
@@ -38,9 +29,10 @@ def predict(
     """
     if threshold is not None and not 0 < threshold <= 1:
         raise UserError("--threshold", "score", threshold, "above 0, at most 1")
+    config = config_of_run(run, ())
     # Torch takes seconds to load: not for a wrong option.
     from perilune_train.detect.predict import predict_images
     from perilune_train.detect.tiles import Tiling
 
-    count = predict_images(images, run, out, threshold, Tiling(tile, overlap, tuple(scale or (1.0,))))
+    count = predict_images(images, run, config, out, threshold, Tiling(tile, overlap, tuple(scale or (1.0,))))
     console.print(f"{out}: {count} craters in {len(images)} images; detections.parquet, detections.csv, *.overlay.png")

@@ -1,0 +1,16 @@
+"""Options of the commands that cut images into tiles."""
+
+from typing import Annotated
+
+import typer
+
+Scales = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--scale",
+        help="Factor by which images are enlarged or shrunk before the search; repeatable, what several find is merged."
+        " [default: 1]",
+    ),
+]
+TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles: that of the training frames, pixels.")]
+Overlap = Annotated[int, typer.Option(help="Least overlap of two tiles, pixels.")]
