@@ -4,6 +4,7 @@ import typer
 
 from perilune_train.detect.compare_command import compare
 from perilune_train.detect.evaluate_command import evaluate
+from perilune_train.detect.export_command import export
 from perilune_train.detect.predict_command import predict
 from perilune_train.detect.train_command import train
 from perilune_train.detect.weights_command import weights
@@ -16,5 +17,6 @@ app = typer.Typer(
 app.command("train")(train)
 app.command("evaluate")(evaluate)
 app.command("compare")(compare)
-app.command("weights")(weights)
 app.command("predict")(predict)
+app.command("export")(export)
+app.command("weights")(weights)

@@ -1,0 +1,88 @@
+"""One detector, several engines: each becomes a function from images to boxes and scores."""
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from perilune_shared.errors import UserError
+
+Array = NDArray[np.float32]
+Engine = Callable[[Array], tuple[Array, Array]]
+"""Normalised images (N, C, H, W) in float32 to boxes (N, K, 4) in pixels and scores (N, K)."""
+Precision = Literal["f32", "bf16"]
+
+
+def _package(name: str) -> Any:
+    try:
+        return __import__(name)
+    except ImportError:
+        raise UserError("perilune-train", name, "not installed", "pip install 'perilune-train[export]'") from None
+
+
+def torch_engine(network: nn.Module, precision: Precision = "f32") -> Engine:
+    """A network whose call gives boxes and scores, channels last, on as many threads as torch is set to."""
+    network = network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+    @torch.inference_mode()
+    def run(images: Array) -> tuple[Array, Array]:
+        given = torch.as_tensor(images).contiguous(memory_format=torch.channels_last)
+        with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
+            boxes, scores = network(given)
+        return boxes.float().numpy(), scores.float().numpy()
+
+    return run
+
+
+def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
+    """A written .onnx file by ONNX Runtime; 0 threads are as many as there are cores."""
+    onnxruntime = _package("onnxruntime")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    with _readable(path):
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return lambda images: tuple(session.run(["boxes", "scores"], {"images": images}))
+
+
+def openvino_engine(path: Path, precision: Precision = "f32", threads: int = 0, batch: int | None = None) -> Engine:
+    """A written .onnx or .xml file by OpenVINO; with `batch` for that many images only, which is faster.
+
+    Left alone OpenVINO takes bfloat16 where the processor has it; here `precision` says so.
+    """
+    openvino = _package("openvino")
+    core = openvino.Core()
+    with _readable(path):
+        model = core.read_model(str(path))
+    if batch is not None:
+        model.reshape({0: [batch, *(side.get_length() for side in list(model.input(0).partial_shape)[1:])]})
+    settings = {"INFERENCE_PRECISION_HINT": precision, "PERFORMANCE_HINT": "LATENCY"}
+    if threads:
+        settings["INFERENCE_NUM_THREADS"] = str(threads)
+    request = core.compile_model(model, "CPU", settings).create_infer_request()
+
+    def run(images: Array) -> tuple[Array, Array]:
+        found = request.infer({"images": images})
+        return found["boxes"].copy(), found["scores"].copy()
+
+    return run
+
+
+def has_bf16() -> bool:
+    """Whether OpenVINO computes in bfloat16 on this processor."""
+    return "BF16" in _package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Any:
+    """A file that an engine refuses, told in one line; both engines raise RuntimeErrors of kinds of their own."""
+    if not path.is_file():
+        raise UserError(path, "network", "no such file", "a file of `perilune-train detect export`")
+    try:
+        yield
+    except Exception as error:
+        raise UserError(path, "network", error, "a file of `perilune-train detect export`") from None
