@@ -26,7 +26,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-infer clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -41,7 +41,7 @@ $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pypr
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV) (some minutes the first time)"
 	@$(BIN)/python -m pip install -q -c constraints.txt setuptools wheel torch
-	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e train -r requirements-dev.txt
+	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[export]" -r requirements-dev.txt
 	@touch $@
 
 demo: setup ## everything: set-up, datasets, detection, navigation, explanation (PRESET=small)
@@ -111,6 +111,9 @@ bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/
 
 bench-contrast: setup ## how well contrast tells craters that the detector finds; writes runs/bench/contrast.json
 	@$(BIN)/python benchmarks/contrast.py $(DATA)/detect $(RUNS)/detect/$(NAME)
+
+bench-infer: setup ## time of the detector by engine, one image, two cores; writes runs/bench/infer.json
+	@$(BIN)/python benchmarks/infer.py
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

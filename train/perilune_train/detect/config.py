@@ -81,6 +81,8 @@ class LossSettings(Section):
     """Weight of L_obj."""
     lambda_noobj: Positive = 1.0
     """Weight of empty predictors within L_obj."""
+    lambda_teacher: Positive = 1.0
+    """Weight of what the `teacher` says, in which box and objectness have the weights above."""
 
 
 class EvaluationSettings(Section):
@@ -117,6 +119,8 @@ class DetectConfig(Section):
     init_from: str | None = None
     """best.ckpt of an earlier detect run whose backbone (and gates, where both have them) to start from, or a Darknet
     file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads too); these need width 1, in_channels 3."""
+    teacher: str | None = None
+    """best.ckpt of a detect run, usually wider, to learn from beside the labels; its strides, channels and anchors."""
     batch_size: Count = 8
     """Frames in a step."""
     learning_rate: Positive = 1e-3

@@ -61,8 +61,10 @@ def fold(network: nn.Module) -> None:
     for name, child in list(network.named_children()):
         if isinstance(child, CBAM):
             setattr(network, name, FlightCBAM(child))
-        elif isinstance(getattr(child, "norm", None), nn.BatchNorm2d):
-            child.conv = fuse_conv_bn_eval(child.conv, child.norm)  # type: ignore[arg-type]
+            continue
+        conv, norm = getattr(child, "conv", None), getattr(child, "norm", None)
+        if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+            child.conv = fuse_conv_bn_eval(conv, norm)
             del child.norm
         else:
             fold(child)

@@ -25,7 +25,7 @@ MOST_LOSS = 0.005
 """Average precision on the validation split that int8 may lose: half a point."""
 _CALIBRATION_FRAMES = 64
 _TIMED = 30
-_KEPT_FLOAT = ("/attentions.", "/heads.")
+_KEPT_FLOAT = ("/squeeze", "/excite", "/spatial", "/heads.")
 """Parts of the graph that stay in floating point: the gates, which are cheap, and the layers that the boxes are."""
 
 

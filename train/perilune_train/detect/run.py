@@ -17,6 +17,7 @@ from perilune_train import runs
 from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors, mean_best_iou
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import DetectSplit, load_split
+from perilune_train.detect.distill import Teacher
 from perilune_train.detect.evaluation import Evaluation, evaluate_detections, protocol_of
 from perilune_train.detect.facts import facts_of
 from perilune_train.detect.matching import Detections, Matches, match_split
@@ -25,6 +26,7 @@ from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.task import DetectTask, detect_frames
 from perilune_train.detect.transfer import start_from_darknet
 from perilune_train.models.darknet_weights import is_darknet
+from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 
 _ANCHOR_STREAM = 1
@@ -78,6 +80,14 @@ def load_detector(path: Path) -> YOLOv3:
     return network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
+def load_teacher(path: Path, config: DetectConfig) -> Teacher:
+    """The network to learn from. Raises UserError where its input channels or strides are not the student's."""
+    network = load_detector(path)
+    wanted = {"in_channels": config.in_channels, "strides": list(config.strides)}
+    runs.check_architecture(path, runs.load_weights(path)["architecture"], wanted)
+    return Teacher(network.requires_grad_(False))
+
+
 def judge(split: DetectSplit, found: list[Detections], config: DetectConfig) -> Matches:
     """The detections of a split against its labels."""
     height, width = split.frames.images.shape[1:]
@@ -116,11 +126,14 @@ def run_detect(
     network = build_network(config, sizes, dataset.root)
     if config.init_from is not None:
         start_backbone(network, Path(config.init_from), config)
+    teacher = None if config.teacher is None else load_teacher(Path(config.teacher), config)
+    if teacher is not None:
+        network.anchors.copy_(teacher.network.anchors)
     run = runs.start_run(runs_root, "detect", name, config, resume)
     frozen_epochs = config.frozen_epochs if config.init_from is not None else 0
     if config.frozen_epochs and not frozen_epochs:
         console.print("frozen_epochs without init_from: nothing to freeze, the whole network trains from the start")
-    task = DetectTask(network, config, splits["train"], splits["val"], frozen_epochs)
+    task = DetectTask(network, config, splits["train"], splits["val"], frozen_epochs, teacher)
     started = time.perf_counter()
     runs.fit(
         run,
@@ -142,6 +155,7 @@ def run_detect(
         "anchors/best_possible_recall": best_possible_recall(sizes, anchors, config.anchor_ratio),
         "anchors/mean_best_iou": mean_best_iou(sizes, anchors),
         "parameters": sum(p.numel() for p in network.parameters()),
+        "multiply_adds": multiply_adds(network, (1, config.in_channels, *splits["test"].frames.images.shape[1:])),
     }
     metrics |= selection_used(config, splits["test"])
     metrics |= told_of(dataset, "test") | evaluate(run, config, dataset, splits, device, bf16)

@@ -12,6 +12,7 @@ from perilune_train.data.frames import FrameStore, normalised
 from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig, EvaluationSettings
 from perilune_train.detect.data import Batch, DetectSplit, EvaluationFrames, TrainingFrames, loader, network_input
+from perilune_train.detect.distill import Teacher, distill_loss
 from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.matching import Detections, match_split
 from perilune_train.detect.metrics import at_threshold, curve
@@ -53,9 +54,17 @@ class DetectTask(lightning.LightningModule):
     While frozen, the backbone keeps its weights and batch statistics, and only its attention gates learn.
     """
 
-    def __init__(self, network: YOLOv3, config: DetectConfig, train: DetectSplit, val: DetectSplit, frozen_epochs: int):
+    def __init__(
+        self,
+        network: YOLOv3,
+        config: DetectConfig,
+        train: DetectSplit,
+        val: DetectSplit,
+        frozen_epochs: int,
+        teacher: Teacher | None = None,
+    ):
         super().__init__()
-        self.config, self.frozen_epochs = config, frozen_epochs
+        self.config, self.frozen_epochs, self.teacher = config, frozen_epochs, teacher
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.evaluated = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.architecture = {
@@ -105,7 +114,13 @@ class DetectTask(lightning.LightningModule):
             outputs, targets, self.network.anchors, self.network.strides, self.config.anchor_ratio, settings
         )
         self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(images))
-        return settings.lambda_iou * box + settings.lambda_obj * confidence
+        loss = settings.lambda_iou * box + settings.lambda_obj * confidence
+        if self.teacher is not None:
+            told = self.teacher(images)
+            box, confidence = distill_loss(outputs, told, self.network.anchors, self.network.strides)
+            self.log_dict({"train/teacher_ciou": box, "train/teacher_objectness": confidence}, batch_size=len(images))
+            loss = loss + settings.lambda_teacher * (settings.lambda_iou * box + settings.lambda_obj * confidence)
+        return loss
 
     def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
         # Early on the average forgets faster, or it would carry the random start through a short training.

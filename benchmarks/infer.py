@@ -1,0 +1,140 @@
+"""Time of one image of 256 x 256 pixels by every engine, on two cores: what a flight computer of that size would need.
+
+Networks of full and half width, without and with attention, of both strides, with random weights (their speed does
+not depend on them), or that of a run. Every engine is warmed up, then all are called in turn, so that what else runs
+on the machine slows all alike. Writes runs/bench/infer.json.
+"""
+
+import json
+import os
+import statistics
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+
+from perilune_shared.errors import run_command_line
+from perilune_shared.files import write_text
+from perilune_shared.progress import progress_bar
+from perilune_train.detect.engines import Engine, has_bf16, onnxruntime_engine, openvino_engine, torch_engine
+from perilune_train.detect.export import load_trained, write_onnx
+from perilune_train.detect.flight import FlightDetector
+from perilune_train.detect.int8 import interleaved, quantise
+from perilune_train.models.size import multiply_adds
+from perilune_train.models.yolo import YOLOv3
+
+CORES, SIZE_PX, WARM_UP = 2, 256, 5
+GOALS_S = {1.0: 0.030, 0.5: 0.010}
+"""Of the best engine, by width."""
+
+
+class Eager(torch.nn.Module):
+    """The network as it is trained, called as the trainer calls it."""
+
+    def __init__(self, network: YOLOv3):
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.network.detect(images)
+
+
+def engines(network: YOLOv3, folder: Path) -> dict[str, Engine]:
+    """All engines for one network; its files are written into `folder`."""
+    channels = network.backbone.stem[0].in_channels
+    flight = FlightDetector(network, SIZE_PX)
+    plain, small = folder / "network.onnx", folder / "network-int8.onnx"
+    write_onnx(flight, plain, {}, channels, SIZE_PX)
+    quantise(plain, small, np.random.default_rng(0).standard_normal((2, channels, SIZE_PX, SIZE_PX), np.float32))
+    traced = torch.jit.optimize_for_inference(torch.jit.trace(flight, torch.zeros(1, channels, SIZE_PX, SIZE_PX)))
+    made = {
+        "torch f32": torch_engine(Eager(network)),
+        "torch folded f32": torch_engine(flight),
+        "torch jit f32": torch_engine(traced),
+        "onnxruntime f32": onnxruntime_engine(plain, CORES),
+        "onnxruntime int8": onnxruntime_engine(small, CORES),
+        "openvino f32": openvino_engine(plain, "f32", CORES, 1),
+        "openvino int8 f32": openvino_engine(small, "f32", CORES, 1),
+    }
+    if has_bf16():
+        made["torch bf16"] = torch_engine(Eager(network), "bf16")
+        made["torch folded bf16"] = torch_engine(flight, "bf16")
+        made["openvino bf16"] = openvino_engine(plain, "bf16", CORES, 1)
+        made["openvino int8 bf16"] = openvino_engine(small, "bf16", CORES, 1)
+    return made
+
+
+def measure(network: YOLOv3, rounds: int) -> dict:
+    """Least and median time of every engine, the best of them, and the goal."""
+    channels = network.backbone.stem[0].in_channels
+    image = np.random.default_rng(1).standard_normal((1, channels, SIZE_PX, SIZE_PX), np.float32)
+    with tempfile.TemporaryDirectory() as folder:
+        seconds = interleaved(engines(network, Path(folder)), image, rounds, WARM_UP)
+    table = {name: {"median_s": statistics.median(part), "least_s": min(part)} for name, part in seconds.items()}
+    best = min(table, key=lambda name: table[name]["median_s"])
+    exact = min((name for name in table if "int8" not in name), key=lambda name: table[name]["median_s"])
+    return {
+        "multiply_adds": multiply_adds(network, image.shape),
+        "engines": table,
+        "best": best,
+        "best_s": table[best]["median_s"],
+        "best_without_int8": exact,
+        "best_without_int8_s": table[exact]["median_s"],
+    }
+
+
+def main(
+    run: Annotated[Path | None, typer.Option(help="A finished detect run, instead of the random networks.")] = None,
+    width: Annotated[list[float] | None, typer.Option(help="Only these widths; repeatable.")] = None,
+    rounds: Annotated[int, typer.Option(help="Calls of each engine.", min=3)] = 40,
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Measure all networks, or a run's."""
+    os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:CORES]))
+    torch.set_num_threads(CORES)
+    networks: list[tuple[float, str, tuple[int, ...], YOLOv3 | None]] = []
+    if run is not None:
+        trained = load_trained(run)
+        networks.append((trained.config.width, trained.config.attention, trained.config.strides, trained.network))
+    else:
+        for factor in width or (1.0, 0.5):
+            for attention in ("none", "cbam_identity"):
+                networks += [(factor, attention, strides, None) for strides in ((8, 16, 32), (4, 8, 16))]
+    rows = []
+    with progress_bar() as bar:
+        task = bar.add_task("networks", total=len(networks), unit="networks", note="")
+        for factor, attention, strides, network in networks:
+            torch.manual_seed(0)
+            made = network or YOLOv3(torch.full((3, 3, 2), 12.0), 1, factor, attention, strides).eval()  # type: ignore[arg-type]
+            row = {"width": factor, "attention": attention, "strides": list(strides), **measure(made, rounds)}
+            goal = GOALS_S.get(factor)
+            rows.append({**row, "goal_s": goal, "reached": None if goal is None else row["best_s"] <= goal})
+            bar.advance(task)
+    load = os.getloadavg()[0]
+    figures = {"cores": CORES, "size_px": SIZE_PX, "rounds": rounds, "load_average": load, "networks": rows}
+    path = out / ("infer.json" if run is None else f"infer-{run.name}.json")
+    write_text(path, json.dumps(figures, indent=1) + "\n")
+    print_table(rows)
+    print(path)
+
+
+def print_table(rows: list[dict]) -> None:
+    """Milliseconds, median (least), as Markdown."""
+    heads = [f"{row['width']:g} {row['attention']} {' '.join(map(str, row['strides']))}" for row in rows]
+    print("| Engine, ms | " + " | ".join(heads) + " |\n|---|" + "---|" * len(rows))
+    for name in rows[0]["engines"]:
+        cells = [row["engines"][name] for row in rows]
+        print(
+            f"| {name} | " + " | ".join(f"{1e3 * c['median_s']:.1f} ({1e3 * c['least_s']:.1f})" for c in cells) + " |"
+        )
+    for head, row in zip(heads, rows, strict=True):
+        if row["goal_s"] is not None:
+            words = "reached" if row["reached"] else "missed"
+            print(f"{head}: {row['best']} {1e3 * row['best_s']:.1f} ms, goal {1e3 * row['goal_s']:.0f} ms {words}")
+
+
+if __name__ == "__main__":
+    run_command_line(lambda: typer.run(main))

@@ -1,0 +1,223 @@
+"""The folded network, the exported files, and the command that writes them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from typer.testing import CliRunner
+
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import open_dataset
+from perilune_train import runs
+from perilune_train.cli import app
+from perilune_train.data.frames import load_frames, normalised
+from perilune_train.detect import export, int8
+from perilune_train.detect.engines import onnxruntime_engine, openvino_engine, torch_engine
+from perilune_train.detect.flight import FlightDetector
+from perilune_train.models.yolo import YOLOv3
+
+onnx = pytest.importorskip("onnx", reason="the extra `export` is not installed")
+SIZE = 96
+
+
+def lively(attention="cbam_identity", strides=(4, 8, 16), in_channels=1):
+    """A network whose every weight and statistic matters, in evaluation mode."""
+    torch.manual_seed(3)
+    network = YOLOv3(3 + 20 * torch.rand(3, 3, 2), in_channels, 0.125, attention, strides).eval()
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.momentum = 0.8
+            nn.init.uniform_(module.weight, 0.5, 1.5)
+            nn.init.uniform_(module.bias, -0.5, 0.5)
+        elif isinstance(module, nn.Linear) or (isinstance(module, nn.Conv2d) and not module.weight.any()):
+            nn.init.normal_(module.weight, std=0.1)
+    for head in network.heads.values():
+        nn.init.normal_(head[1].weight, std=0.5)
+        nn.init.constant_(head[1].bias, -1.0)
+    with torch.no_grad():
+        network.train()(torch.randn(4, in_channels, SIZE, SIZE))
+    return network.eval()
+
+
+@pytest.fixture(scope="module")
+def images(dataset_detect):
+    frames = load_frames(open_dataset(dataset_detect), "val").images
+    return normalised(frames[:3])[:, None]
+
+
+@pytest.mark.parametrize(
+    ("attention", "strides"), [("none", (8, 16, 32)), ("cbam", (4, 8, 16)), ("cbam_identity", (4, 8, 16))]
+)
+def test_folding_changes_nothing(attention, strides, images):
+    network = lively(attention, strides)
+    before = network.state_dict()
+    folded = FlightDetector(network, SIZE)
+    assert not [m for m in folded.modules() if isinstance(m, nn.BatchNorm2d)]
+    assert network.state_dict().keys() == before.keys()
+    boxes, scores = network.detect(torch.as_tensor(images))
+    found_boxes, found_scores = torch_engine(folded)(images)
+    assert scores.max() - scores.min() > 0.2
+    np.testing.assert_allclose(found_boxes, boxes, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(found_scores, scores, atol=1e-4)
+
+
+def test_a_size_that_no_stride_divides():
+    with pytest.raises(ValueError, match="100"):
+        FlightDetector(lively(), 100)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """A run as training leaves it, with lively weights."""
+    run = runs.RunFolder(tmp_path_factory.mktemp("runs") / "detect" / "a")
+    told = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [4, 8, 16]}
+    runs.save_weights(run.best, told, lively())
+    text = "detect:\n  width: 0.125\n  in_channels: 1\n  attention: cbam_identity\n  strides: [4, 8, 16]\n"
+    run.config.write_text(text, encoding="utf-8")
+    runs.write_metrics(run, {"test/threshold": 0.4})
+    return run.root
+
+
+@pytest.fixture(scope="module")
+def exported(run_folder, dataset_detect, tmp_path_factory):
+    out = tmp_path_factory.mktemp("export") / "flight"
+    export.export_run(run_folder, out, size_px=SIZE, dataset=dataset_detect)
+    return out
+
+
+def test_files_give_torchs_boxes_for_any_number_of_images(exported, images):
+    boxes, scores = (part.numpy() for part in lively().detect(torch.as_tensor(images)))
+    for engine in (
+        onnxruntime_engine(exported / "detector.onnx", 1),
+        openvino_engine(exported / "detector.xml", threads=1),
+        openvino_engine(exported / "detector.onnx", threads=1),
+    ):
+        for n in (3, 1):
+            found_boxes, found_scores = engine(images[:n])
+            np.testing.assert_allclose(found_scores, scores[:n], atol=1e-4)
+            counts = scores[:n] > 0.01
+            np.testing.assert_allclose(found_boxes[counts], boxes[:n][counts], atol=1e-3, rtol=1e-5)
+    one = openvino_engine(exported / "detector.xml", threads=1, batch=1)
+    np.testing.assert_allclose(one(images[1:2])[1], scores[1:2], atol=1e-4)
+
+
+def test_no_batch_norm_remains_and_the_facts_are_inside(exported):
+    model = onnx.load(str(exported / "detector.onnx"))
+    kinds = {node.op_type for node in model.graph.node}
+    assert "Conv" in kinds
+    assert "BatchNormalization" not in kinds
+    told = json.loads((exported / "detector.json").read_text())
+    inside = {entry.key: json.loads(entry.value) for entry in model.metadata_props}
+    for key in ("anchors_px", "strides", "score_threshold", "input", "outputs", "nms_iou"):
+        assert inside[key] == told[key], key
+    assert told["score_threshold"] == 0.4
+    assert told["strides"] == [4, 8, 16]
+    np.testing.assert_allclose(told["anchors_px"], lively().anchors, rtol=1e-6)
+    assert told["compared_on"] == "validation frames"
+    assert set(told["files"]) == {"detector.onnx", "detector.xml", "detector.bin"}
+    for found in told["differences_from_torch"].values():
+        assert found["largest_px"] <= 1e-3
+
+
+def test_the_readmes_program_finds_what_we_find(exported, dataset_detect, images):
+    program = (exported / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    grey = load_frames(open_dataset(dataset_detect), "val").images[0]
+    np.save(exported.parent / "grey.npy", grey)
+    program += (
+        "\nboxes, scores = detect(np.load('../grey.npy'))\nprint(json.dumps([boxes.tolist(), scores.tolist()]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=exported, capture_output=True, text=True, check=True)
+    boxes, scores = map(np.array, json.loads(done.stdout))
+    from perilune_train.detect.config import EvaluationSettings
+    from perilune_train.detect.task import detections_of
+
+    own = detections_of(
+        *(part[0] for part in lively().detect(torch.as_tensor(images[:1]))), EvaluationSettings(min_score=0.4)
+    )
+    assert len(own.scores) > 3
+    np.testing.assert_allclose(boxes, own.boxes, atol=1e-3)
+    np.testing.assert_allclose(scores, own.scores, atol=1e-4)
+
+
+def test_a_file_that_differs_is_not_left(run_folder, tmp_path, monkeypatch):
+    original = export.FlightDetector
+
+    def wrong(network, size_px):
+        made = original(network, size_px)
+        made.network.heads["8"][1].bias.data[2] += 0.01
+        return made
+
+    monkeypatch.setattr(export, "FlightDetector", wrong)
+    with pytest.raises(UserError, match=r"detector.onnx: onnxruntime: found boxes 0.*px.*wanted 0.001 px"):
+        export.export_run(run_folder, tmp_path / "flight", ("onnx",), SIZE)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_int8_is_judged_and_kept_only_if_worth_it(run_folder, dataset_detect, tmp_path, monkeypatch):
+    verdict = export.export_run(run_folder, tmp_path / "a", ("onnx",), SIZE, dataset_detect, int8=True)
+    kept = (tmp_path / "a" / "detector-int8.onnx").exists()
+    assert (
+        kept == verdict.kept == (verdict.ap50_float - verdict.ap50_int8 <= 0.005 and verdict.int8_s < verdict.float_s)
+    )
+    assert json.loads((tmp_path / "a" / "detector.json").read_text())["int8"]["kept"] == kept
+    assert not (tmp_path / "a" / "detector.xml").exists()
+
+
+def test_quantised_files_hold_integers_but_for_gates_and_heads(exported, images, tmp_path):
+    int8.quantise(exported / "detector.onnx", tmp_path / "q.onnx", images)
+    graph = onnx.load(str(tmp_path / "q.onnx")).graph
+    made = {output: node.op_type for node in graph.node for output in node.output}
+    quantised = {n.name for n in graph.node if n.op_type == "Conv" and made.get(n.input[0]) == "DequantizeLinear"}
+    every = {n.name for n in graph.node if n.op_type == "Conv"}
+    assert "/network/backbone/stem/conv/Conv" in every
+    assert len(quantised) > 50
+    assert not [name for name in quantised if "squeeze" in name or "spatial" in name or "heads.4.1" in name]
+    boxes, scores = onnxruntime_engine(tmp_path / "q.onnx", 1)(images)
+    _, exact = lively().detect(torch.as_tensor(images))
+    assert 1e-4 < np.abs(scores - exact.numpy()).mean() < 0.1
+    assert np.isfinite(boxes).all()
+
+
+@pytest.mark.parametrize(
+    ("loss", "seconds", "kept"), [(0.004, 0.5, True), (0.006, 0.5, False), (0.004, 1.1, False), (-0.1, 0.9, True)]
+)
+def test_when_int8_is_worth_it(loss, seconds, kept):
+    verdict = int8.Int8Verdict(0.8, 0.8 - loss, 1.0, seconds, "f32")
+    assert verdict.kept == kept
+    assert verdict.words().startswith("int8 kept" if kept else "int8 not kept")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--formats", "onnx,tflite"], "--formats: found onnx,tflite"),
+        (["--int8"], "--int8: found no --dataset"),
+        (["--size-px", "100"], "--size-px: found 100; wanted a multiple of 32"),
+        (["--run", "nowhere"], "nowhere: --run: found no metrics.json"),
+    ],
+)
+def test_wrong_options_leave_nothing(run_folder, tmp_path, options, words):
+    result = CliRunner().invoke(app, ["detect", "export", "--run", run_folder, "--out", tmp_path / "x", *options])
+    assert isinstance(result.exception, UserError)
+    assert words in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_of_another_size(run_folder, dataset_detect, tmp_path):
+    with pytest.raises(UserError, match="frames: found 96 x 96; wanted 256 x 256"):
+        export.export_run(run_folder, tmp_path / "x", ("onnx",), 256, dataset_detect)
+
+
+def test_engines_refuse_what_is_no_network(tmp_path):
+    path = Path(tmp_path, "detector.onnx")
+    path.write_bytes(b"nothing of the kind")
+    for engine in (onnxruntime_engine, openvino_engine):
+        with pytest.raises(UserError, match=r"detector.onnx: network: found "):
+            engine(path)
+        with pytest.raises(UserError, match="no such file"):
+            engine(tmp_path / "absent.onnx")
