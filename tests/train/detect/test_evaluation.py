@@ -1,0 +1,193 @@
+"""Bins, errors, intervals and the report, by hand."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from perilune_train.detect.bootstrap import average_precisions, draw_resamples, interval
+from perilune_train.detect.data import FrameLabels
+from perilune_train.detect.evaluation import evaluate_detections
+from perilune_train.detect.facts import FrameFacts, unknown_facts
+from perilune_train.detect.figures import choose_frames
+from perilune_train.detect.matching import FALSE, FOUND, Detections, Matches
+from perilune_train.detect.metrics import curve
+from perilune_train.detect.report import write_evaluation
+
+
+def circles(*rows):
+    """Boxes (N, 4) of circles given by centre and radius."""
+    x, y, radius = np.array(rows, float).reshape(-1, 3).T
+    return np.stack([x - radius, y - radius, x + radius, y + radius], axis=1)
+
+
+def labels(*rows, wanted=None, depth_ratio=None):
+    boxes = circles(*rows)
+    radius = (boxes[:, 2] - boxes[:, 0]) / 2
+    wanted = np.ones(len(boxes), bool) if wanted is None else np.array(wanted)
+    ellipses = np.stack([*(boxes[:, :2] + radius[:, None]).T, radius, radius, 0 * radius], axis=1)
+    ratio = None if depth_ratio is None else np.array(depth_ratio)
+    return FrameLabels(boxes, radius, ellipses, wanted, np.ones(len(boxes), bool), ratio)
+
+
+def found(*rows):
+    return Detections(circles(*[row[:3] for row in rows]), np.array([row[3] for row in rows], float))
+
+
+def facts(scenes, altitude_m=None, sun_deg=None):
+    count = len(scenes)
+    names = [f"{scene}/0/{k}" for k, scene in enumerate(scenes)]
+    return FrameFacts(
+        names,
+        np.full((count, 2), 200),
+        list(scenes),
+        [f"{scene}/0" for scene in scenes],
+        np.array(altitude_m or [np.nan] * count, float),
+        np.array(sun_deg or [np.nan] * count, float),
+    )
+
+
+def by_key(evaluation):
+    return {part.key: part for part in evaluation.bins}
+
+
+def test_radius_bins_ignore_the_labels_and_the_detections_of_other_bins():
+    truth = [labels((20, 20, 4), (60, 60, 8), (100, 100, 12))]
+    # Both smaller are found; in the open lie a false one of 4 px and one of 15 px.
+    ours = [found((20, 20, 4, 0.9), (60, 60, 8, 0.8), (150, 20, 4, 0.85), (150, 150, 15, 0.7))]
+    bins = by_key(evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0)))
+    assert set(bins) == {"radius_3_5_px", "radius_5_10_px", "radius_10_20_px"}
+    assert (bins["radius_3_5_px"].precision, bins["radius_3_5_px"].recall, bins["radius_3_5_px"].ap50) == (0.5, 1, 1)
+    assert (bins["radius_5_10_px"].precision, bins["radius_5_10_px"].ap50) == (1, 1)
+    assert (bins["radius_10_20_px"].precision, bins["radius_10_20_px"].recall) == (0, 0)
+
+
+def test_a_find_of_another_size_counts_for_the_labels_bin():
+    truth, ours = [labels((50, 50, 4.8))], [found((50, 50, 5.2, 0.9))]
+    bins = by_key(evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0)))
+    assert bins["radius_3_5_px"].ap50 == 1 and set(bins) == {"radius_3_5_px"}
+
+
+def test_altitude_and_sun_bins_hold_whole_frames():
+    truth = [labels((20, 20, 5)), labels((20, 20, 5)), labels((20, 20, 5))]
+    ours = [found((20, 20, 5, 0.9)), found((90, 90, 5, 0.9)), found((20, 20, 5, 0.4))]
+    known = facts("aab", altitude_m=[190, 500, 5000], sun_deg=[20, 29.9, 90])
+    evaluation = evaluate_detections(ours, truth, known, 0.5, radius_px=(2.0, 50.0))
+    bins = by_key(evaluation)
+    # 190 m is within a tenth of the first bin, 5000 m is in none.
+    assert (bins["altitude_200_500_m"].ap50, bins["altitude_500_1000_m"].ap50) == (1, 0)
+    assert "altitude_1000_1500_m" not in bins
+    assert bins["sun_20_30_deg"].labels == 2 and bins["sun_60_90_deg"].recall == 0 and bins["sun_60_90_deg"].ap50 == 1
+    figures = evaluation.figures()
+    assert (figures["lowest_ap50_by_altitude"], figures["altitude_200_500_m/ap50"]) == (0, 1)
+    assert figures["intervals_over"] == "scene" and figures["intervals_units"] == 2
+
+
+def test_freshness_has_recall_alone():
+    ratio = [0.05, 0.05, 0.12, np.nan, 0.01]
+    truth = [
+        labels(*[(20 + 30 * k, 20, 5) for k in range(5)], depth_ratio=ratio, wanted=[True, True, True, True, False])
+    ]
+    ours = [found((20, 20, 5, 0.9), (50, 20, 5, 0.2), (80, 20, 5, 0.9))]
+    evaluation = evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0))
+    bins = {key: part for key, part in by_key(evaluation).items() if part.by == "depth_ratio"}
+    assert {key: (part.labels, part.recall) for key, part in bins.items()} == {
+        "depth_ratio_0.04_0.06": (2, 0.5),
+        "depth_ratio_0.1_0.15": (1, 1.0),
+    }
+    assert "depth_ratio_0.1_0.15/ap50" not in evaluation.figures()
+
+
+def test_errors_of_found_craters():
+    truth = [labels((50, 50, 10), (100, 100, 20), (150, 150, 10))]
+    ours = [found((53, 54, 10, 0.9), (100, 100, 22, 0.9), (150, 150, 10, 0.1))]
+    errors = evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0)).errors
+    # Two found above the threshold: 5 px off, and 2 px too large.
+    assert errors["centre_error_px_median"] == pytest.approx(2.5)
+    assert errors["centre_error_relative_p95"] == pytest.approx(0.95 * 0.5)
+    assert errors["radius_error_px_median"] == errors["radius_bias_px"] == pytest.approx(1)
+    assert errors["radius_bias_relative"] == pytest.approx(0.05)
+    nothing = evaluate_detections([found()], truth, facts("a"), 0.5, radius_px=(2.0, 50.0)).errors
+    assert all(np.isnan(value) for value in nothing.values())
+
+
+def random_matches(seed, n_frames, n_detections, n_wanted):
+    rng = np.random.default_rng(seed)
+    hit = rng.random(n_detections) < 0.7
+    frame = np.sort(rng.integers(0, n_frames, n_detections))
+    scores = np.clip(rng.normal(0.5, 0.15, n_detections) + 0.2 * hit, 0.01, 0.99)
+    outcome = np.where(hit, FOUND, FALSE).astype(np.int8)
+    return Matches(scores, outcome, np.zeros(n_detections, np.intp), frame, rng.integers(0, n_frames, n_wanted))
+
+
+@pytest.mark.parametrize(("n_detections", "tolerance"), [(1500, 1e-12), (30_000, 5e-4)])
+def test_resampled_average_precision_is_that_of_the_frames_repeated(n_detections, tolerance):
+    matches = random_matches(0, 12, n_detections, n_detections)
+    known = facts("aaabbbcccddd")
+    resamples = draw_resamples(known, np.random.default_rng(1), count=5)
+    drawn = average_precisions(matches, resamples)
+    for weights, value in zip(resamples.weights, drawn, strict=True):
+        times = weights[resamples.of_frame].astype(int)
+        rows, wanted = (np.repeat(np.arange(len(f)), times[f]) for f in (matches.frame, matches.wanted_frame))
+        repeated = Matches(
+            matches.scores[rows],
+            matches.outcome[rows],
+            matches.label[rows],
+            matches.frame[rows],
+            matches.wanted_frame[wanted],
+        )
+        assert value == pytest.approx(curve(repeated).average_precision(), abs=tolerance)
+
+
+def test_the_unit_of_resampling():
+    rng = np.random.default_rng(0)
+    assert draw_resamples(facts("aab"), rng).unit == "scene"
+    one_scene = FrameFacts(["x", "y"], np.ones((2, 2)), ["a", "a"], ["a/0", "a/1"], np.zeros(2), np.zeros(2))
+    assert draw_resamples(one_scene, rng).unit == "descent"
+    assert draw_resamples(facts("aaa"), rng).unit == "frame"
+    nothing_known = draw_resamples(unknown_facts(["x.png", "y.png"], np.ones((2, 2))), rng)
+    assert (nothing_known.unit, nothing_known.count) == ("frame", 2)
+    assert (nothing_known.weights.sum(axis=1) == 2).all()
+
+
+def test_one_unit_with_labels_gives_no_interval():
+    matches = random_matches(0, 2, 100, 100)
+    alone = matches.of_frames(np.array([True, False]))
+    resamples = draw_resamples(facts("ab"), np.random.default_rng(0))
+    assert np.isnan(interval(average_precisions(alone, resamples))).all()
+    low, high = interval(average_precisions(matches, resamples))
+    assert low <= curve(matches).average_precision() <= high
+
+
+def test_best_typical_and_worst_frames():
+    f1 = np.array([0.9, 0.91, np.nan, 0.5, 0.1, 0.12, 0.55, 0.2])
+    chosen = choose_frames(f1, ["a", "a", "a", "b", "c", "c", "c", "d"], 2)
+    # Frames 1 and 0 are of one descent, and so are 4 and 5; nearest to the median of 0.5, and not yet taken, is 0.12.
+    assert chosen == {"best": [1, 6], "typical": [3, 5], "worst": [4, 7]}
+    assert choose_frames(np.array([np.nan]), ["a"], 2) == {"best": [], "typical": [], "worst": []}
+
+
+def test_the_report_of_images_of_which_nothing_is_known(tmp_path: Path):
+    """As of real images: sizes differ, no scene, no Sun, a frame without labels and one without detections."""
+    sizes = [(64, 48), (100, 80), (64, 64)]
+    truth = [labels((20, 20, 5), (40, 30, 8)), labels((50, 50, 6)), labels()]
+    ours = [found((20, 20, 5, 0.9), (50, 20, 4, 0.8)), found(), found((30, 30, 5, 0.6))]
+    known = unknown_facts(["one|x.png", "two.png", "three.png"], np.array(sizes))
+    evaluation = evaluate_detections(ours, truth, known, 0.5, radius_px=(2.0, 50.0))
+    images = [np.full((height, width), 90, np.uint8) for width, height in sizes]
+    write_evaluation(tmp_path, evaluation, images, ["made by hand"])
+    report = (tmp_path / "report.md").read_text()
+    assert "made by hand" in report and "3 frames, 3 wanted labels" in report and "of 3 frames" in report
+    assert "| precision | 0.333" in report
+    assert "## Radius" in report and "## Sun" not in report and "## Freshness" not in report
+    assert "nan" not in report
+    for name in ("precision_recall.png", "bins.png", "detections.png"):
+        assert cv2.imread(str(tmp_path / name)).std() > 5, name
+
+
+def test_nothing_at_all(tmp_path: Path):
+    evaluation = evaluate_detections([found()], [labels()], facts("a"), 0.5, radius_px=(2.0, 50.0))
+    assert evaluation.bins == [] and evaluation.figures()["ap50"] == 0
+    write_evaluation(tmp_path, evaluation, [np.zeros((64, 64), np.uint8)], [])
+    assert (tmp_path / "report.md").is_file()
