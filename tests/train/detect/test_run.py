@@ -32,6 +32,9 @@ def test_a_run_leaves_all_its_files(finished):
         "detections.parquet",
         "detections.png",
         "precision_recall.png",
+        "precision_recall.parquet",
+        "bins.png",
+        "report.md",
         "checkpoints/best.ckpt",
         "checkpoints/last.ckpt",
     ):

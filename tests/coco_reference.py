@@ -1,0 +1,42 @@
+"""Average precision by pycocotools, an independent implementation."""
+
+import contextlib
+import io
+
+import numpy as np
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+
+IGNORED_AREA = 1e12
+
+
+def coco_evaluation(found, labels, copies=1):
+    """COCOeval with maxDets raised and one range of areas; ignored labels lie outside that range, and
+    each is there `copies` times. AP at each of COCO's IoUs, by 101 points and by all points."""
+    images, annotations, results, averages = [], [], [], []
+    for frame, (ours, truth) in enumerate(zip(found, labels, strict=True), start=1):
+        images.append({"id": frame})
+        for (x0, y0, x1, y1), wanted in zip(truth.boxes.tolist(), truth.wanted, strict=True):
+            for _ in range(1 if wanted else copies):
+                box, area = [x0, y0, x1 - x0, y1 - y0], (x1 - x0) * (y1 - y0) if wanted else IGNORED_AREA
+                number = len(annotations) + 1
+                annotations.append(
+                    {"id": number, "image_id": frame, "category_id": 1, "bbox": box, "area": area, "iscrowd": 0}
+                )
+        for (x0, y0, x1, y1), score in zip(ours.boxes.tolist(), ours.scores.tolist(), strict=True):
+            results.append({"image_id": frame, "category_id": 1, "bbox": [x0, y0, x1 - x0, y1 - y0], "score": score})
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth_set = COCO()
+        truth_set.dataset = {"images": images, "annotations": annotations, "categories": [{"id": 1}], "info": {}}
+        truth_set.createIndex()
+        evaluation = COCOeval(truth_set, truth_set.loadRes(results), "bbox")
+        evaluation.params.maxDets = [100_000]
+        evaluation.params.areaRng, evaluation.params.areaRngLbl = [[0, 1e10]], ["all"]
+        wanted = sum(int(part.wanted.sum()) for part in labels)
+        # At the 101 recalls; and at every recall that can be reached, over which the mean is the area under all points.
+        for recalls in (np.linspace(0, 1, 101), np.arange(1, wanted + 1) / wanted):
+            evaluation.params.recThrs = recalls
+            evaluation.evaluate()
+            evaluation.accumulate()
+            averages.append(evaluation.eval["precision"][:, :, 0, 0, 0].mean(axis=1))
+    return averages
