@@ -37,11 +37,11 @@ def read_metrics(folder: Path) -> dict[str, float | int | str | None]:
     return content
 
 
-def threshold_of(run: Path) -> float:
+def threshold_of(metrics: dict[str, float | int | str | None], path: Path) -> float:
     """The score threshold that a run chose on its validation split. Raises UserError where it has none."""
-    found = read_metrics(run).get("test/threshold")
+    found = metrics.get("test/threshold")
     if isinstance(found, bool) or not isinstance(found, float | int) or not math.isfinite(found):
-        raise UserError(run / "metrics.json", "test/threshold", found, "a number; or give --threshold")
+        raise UserError(path, "test/threshold", found, "a number; or give --threshold")
     return float(found)
 
 
@@ -52,9 +52,10 @@ def evaluate_again(
     folder = out or run / "evaluation"
     if folder.resolve() == run.resolve():
         raise UserError(folder, "--out", "the run's own folder", "another: its figures stay as training left them")
-    chosen = threshold_of(run) if threshold is None else threshold
+    earlier = read_metrics(run)
+    chosen = threshold_of(earlier, run / "metrics.json") if threshold is None else threshold
     chosen_on = "of best F1 on the run's own val" if threshold is None else "given by hand"
-    known = read_metrics(run).get("dataset/name") if threshold is None else None
+    known = earlier.get("dataset/name")
     dataset = open_dataset(dataset_root)
     protocol = protocol_of(dataset.info)
     if known is not None and known != dataset.info.name:
