@@ -8,10 +8,18 @@ from tests.stored_run import settings_of, store_run
 
 from perilune_shared.errors import UserError
 from perilune_train.data.frames import FrameStore
-from perilune_train.detect.boxes import iou_matrix
+from perilune_train.detect.boxes import iou_matrix, suppress
 from perilune_train.detect.predict import open_detector
 from perilune_train.detect.task import detect_frames
-from perilune_train.detect.tiles import Detector, Tiling, count_tiles, detect_image, padded, tile_starts
+from perilune_train.detect.tiles import (
+    Detector,
+    Tiling,
+    count_tiles,
+    detect_image,
+    padded,
+    suppress_in_blocks,
+    tile_starts,
+)
 
 
 class Blobs(torch.nn.Module):
@@ -101,3 +109,14 @@ def test_tiles_cover_a_side_with_enough_overlap(length):
 def test_what_cannot_be_cut_is_refused(tiling):
     with pytest.raises(UserError):
         tiling.check()
+
+
+def test_many_boxes_are_suppressed_as_few_are():
+    rng = np.random.default_rng(6)
+    corner = rng.uniform(-5, 1600, (6_000, 2))
+    boxes = np.concatenate([corner, corner + rng.uniform(4, 60, (6_000, 1))], axis=1)
+    scores = rng.permutation(6_000) / 6_000 + 1e-5
+    kept = suppress_in_blocks(boxes, scores, 0.3)
+    wanted = suppress(boxes, scores, 0.3, len(boxes))
+    assert 1000 < len(wanted) < 5_500
+    assert np.array_equal(kept, wanted)
