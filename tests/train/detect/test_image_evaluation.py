@@ -19,7 +19,7 @@ from perilune_train.detect.tiles import Tiling
 
 def given(boxes, ends_at_edges=False):
     boxes = np.array(boxes, float)
-    return ImageSet([LabelledImage(Path("a.png"), 100, 100, boxes, np.ones(len(boxes), bool))], ends_at_edges)
+    return ImageSet([LabelledImage("a.png", Path("a.png"), 100, 100, boxes, np.ones(len(boxes), bool))], ends_at_edges)
 
 
 def detections(boxes):

@@ -100,6 +100,7 @@ def test_coco(tmp_path):
         found = read_images(place)
         (image,) = found.images
         assert found.ends_at_edges
+        assert image.name == "pictures/a b.png"
         assert image.path == tmp_path.resolve() / "pictures" / "a b.png"
         assert image.boxes.tolist() == [[2, 3, 12, 15], [1, 1, 21, 21], [4, 4, 13, 13.5]]
         assert image.wanted(8.0).tolist() == [True, False, False]

@@ -72,7 +72,7 @@ def evaluate_images(
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
     write_evaluation(out, evaluation, images, about)
-    table = pd.concat(table_of(image.path.name, part) for image, part in zip(given.images, found, strict=True))
+    table = pd.concat(table_of(image.name, part) for image, part in zip(given.images, found, strict=True))
     with written_aside(out / "detections.parquet") as aside:
         table.to_parquet(aside, index=False)
     write_crops(out / "crops.png", images, evaluation)
@@ -104,7 +104,7 @@ def judge_images(
     return evaluate_detections(
         found,
         [frame_labels(image, min_size_px) for image in given.images],
-        unknown_facts([image.path.name for image in given.images], sizes),
+        unknown_facts([image.name for image in given.images], sizes),
         threshold,
         radius_px=(min_size_px / 2, np.inf),
         match_iou=match_iou,

@@ -27,6 +27,8 @@ _LARGEST_PX = 1e6
 class LabelledImage:
     """One image and what people marked on it; its pixels stay in the file."""
 
+    name: str
+    """Its path within the folder, by which tables and pictures name it."""
     path: Path
     """The picture."""
     width_px: int
@@ -74,7 +76,7 @@ def read_images(place: Path) -> ImageSet:
     images = []
     for path in paths:
         boxes = read_table(path.with_suffix(".txt"))
-        images.append(LabelledImage(path, *picture_size(path), boxes, np.ones(len(boxes), bool)))
+        images.append(LabelledImage(path.name, path, *picture_size(path), boxes, np.ones(len(boxes), bool)))
     return ImageSet(images, ends_at_edges=False)
 
 
@@ -150,7 +152,7 @@ def _read_coco(path: Path) -> ImageSet:
         if told != size:
             raise UserError(picture, "size", f"{size[0]} x {size[1]}", f"{told[0]} x {told[1]}, as {path.name} says")
         own = np.array(boxes[k], np.float64).reshape(-1, 4)
-        result.append(LabelledImage(picture, *size, own, np.array(marked[k], bool)))
+        result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(marked[k], bool)))
     return ImageSet(result, ends_at_edges=True)
 
 
