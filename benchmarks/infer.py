@@ -9,6 +9,7 @@ import json
 import os
 import statistics
 import tempfile
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -56,15 +57,31 @@ def engines(network: YOLOv3, folder: Path) -> dict[str, Engine]:
         "torch jit f32": torch_engine(traced),
         "onnxruntime f32": onnxruntime_engine(plain, CORES),
         "onnxruntime int8": onnxruntime_engine(small, CORES),
-        "openvino f32": openvino_engine(plain, "f32", CORES, 1),
-        "openvino int8 f32": openvino_engine(small, "f32", CORES, 1),
+        **openvino_engines(plain, small, CORES),
     }
     if has_bf16():
         made["torch bf16"] = torch_engine(Eager(network), "bf16")
         made["torch folded bf16"] = torch_engine(flight, "bf16")
-        made["openvino bf16"] = openvino_engine(plain, "bf16", CORES, 1)
-        made["openvino int8 bf16"] = openvino_engine(small, "bf16", CORES, 1)
     return made
+
+
+def openvino_engines(plain: Path, small: Path, threads: int) -> dict[str, Engine]:
+    """OpenVINO's engines for the files in floating point and in int8."""
+    made = {}
+    for precision in ("f32", "bf16") if has_bf16() else ("f32",):
+        made[f"openvino {precision}"] = openvino_engine(plain, precision, threads, 1)
+        made[f"openvino int8 {precision}"] = openvino_engine(small, precision, threads, 1)
+    return made
+
+
+def cpu_seconds(engine: Engine, image: np.ndarray, rounds: int) -> float:
+    """Median processor time of a call on one thread, which other programs hardly change."""
+    seconds = []
+    for _ in range(WARM_UP + rounds):
+        start = time.process_time()
+        engine(image)
+        seconds.append(time.process_time() - start)
+    return statistics.median(seconds[WARM_UP:])
 
 
 def measure(network: YOLOv3, rounds: int) -> dict:
@@ -73,12 +90,15 @@ def measure(network: YOLOv3, rounds: int) -> dict:
     image = np.random.default_rng(1).standard_normal((1, channels, SIZE_PX, SIZE_PX), np.float32)
     with tempfile.TemporaryDirectory() as folder:
         seconds = interleaved(engines(network, Path(folder)), image, rounds, WARM_UP)
+        single = openvino_engines(Path(folder) / "network.onnx", Path(folder) / "network-int8.onnx", 1)
+        one_thread = {name: cpu_seconds(engine, image, rounds) for name, engine in single.items()}
     table = {name: {"median_s": statistics.median(part), "least_s": min(part)} for name, part in seconds.items()}
     best = min(table, key=lambda name: table[name]["median_s"])
     exact = min((name for name in table if "int8" not in name), key=lambda name: table[name]["median_s"])
     return {
         "multiply_adds": multiply_adds(network, image.shape),
         "engines": table,
+        "one_thread_cpu_s": one_thread,
         "best": best,
         "best_s": table[best]["median_s"],
         "best_without_int8": exact,
@@ -130,6 +150,9 @@ def print_table(rows: list[dict]) -> None:
         print(
             f"| {name} | " + " | ".join(f"{1e3 * c['median_s']:.1f} ({1e3 * c['least_s']:.1f})" for c in cells) + " |"
         )
+    for name in rows[0]["one_thread_cpu_s"]:
+        cells = [f"{1e3 * row['one_thread_cpu_s'][name]:.1f}" for row in rows]
+        print(f"| {name}, processor time on one thread | " + " | ".join(cells) + " |")
     for head, row in zip(heads, rows, strict=True):
         if row["goal_s"] is not None:
             words = "reached" if row["reached"] else "missed"
