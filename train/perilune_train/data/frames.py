@@ -1,7 +1,10 @@
 """A dataset's frames in memory: pixels as 8-bit grey, beside their rows of the manifest."""
 
 import os
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -12,6 +15,9 @@ from perilune_shared.errors import UserError
 from perilune_shared.manifest import Dataset
 from perilune_shared.png import png_header
 from perilune_shared.progress import progress_bar
+
+_AT_ONCE = 256
+"""Packed frames that wait for a free thread."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +69,24 @@ def load_frames(dataset: Dataset, split: str) -> FrameStore:
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
     place = {frame_id: i for i, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()
-    with progress_bar() as progress:
+
+    def unpack(frame: tuple[str, bytes]) -> None:
+        i = place[frame[0]]
+        images[i] = decode(frame[1], f"{dataset.root}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
+
+    # OpenCV lets go of Python's lock while it decodes.
+    with progress_bar() as progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as threads:
         task = progress.add_task(f"load {split}", total=len(table), unit="frames", note="")
-        for frame_id, png in dataset.pngs(rows):
-            i = place[frame_id]
-            images[i] = decode(png, f"{dataset.root}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
-            progress.advance(task)
+        for some in _portions(dataset.pngs(rows), _AT_ONCE):
+            for _ in threads.map(unpack, some):
+                progress.advance(task)
     return FrameStore(table, images)
+
+
+def _portions(frames: Iterable[tuple[str, bytes]], size: int) -> Iterator[list[tuple[str, bytes]]]:
+    rest = iter(frames)
+    while some := list(islice(rest, size)):
+        yield some
 
 
 def normalised(images: NDArray) -> NDArray[np.float32]:
