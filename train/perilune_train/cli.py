@@ -21,3 +21,7 @@ app.command("explain")(explain)
 def main() -> None:
     """Entry point of the command line."""
     run_command_line(app)
+
+
+if __name__ == "__main__":
+    main()

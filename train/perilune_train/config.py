@@ -10,6 +10,8 @@ Precision = Literal["auto", "bf16", "float32"]
 """auto: bfloat16 where the hardware has it."""
 Device = Literal["auto", "cpu", "cuda"]
 """auto: the GPU where there is one."""
+Strategy = Literal["auto", "ddp", "ddp_find_unused_parameters_true"]
+"""auto: one process as it is, several by ddp, where some weights are frozen with unused parameters looked for."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]

@@ -4,8 +4,10 @@ import io
 import json
 import logging
 import math
+import os
 import pickle
 import shutil
+import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,8 +16,9 @@ from typing import Any, Literal
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
 from perilune_shared.config import Section, to_yaml
@@ -23,6 +26,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import write_bytes, write_text
 from perilune_shared.progress import progress_bar
 from perilune_train.config import Precision
+
+_STEPS_BETWEEN_LOOKS = 20
 
 
 @dataclass(frozen=True)
@@ -49,13 +54,18 @@ class RunFolder:
 
     @property
     def last(self) -> Path:
-        """The whole state after the last finished epoch, from which a run is resumed."""
+        """The whole state when it was last kept, from which a run is resumed."""
         return self.root / "checkpoints" / "last.ckpt"
 
     @property
     def finished(self) -> bool:
         """Whether the run came to its end."""
         return self.metrics.is_file()
+
+
+def is_first_process() -> bool:
+    """Whether this process writes files and says things: the only one, or of several that train together the first."""
+    return int(rank_zero_only.rank) == 0
 
 
 def start_run(runs: Path, task: str, name: str, config: Section, resume: bool) -> RunFolder:
@@ -166,7 +176,41 @@ class KeepBest(Callback):
         value = self.sign * float(trainer.callback_metrics[self.monitor])
         if value > self.best or not self.run.best.is_file():
             self.best = value if math.isfinite(value) else self.best
-            save_weights(self.run.best, pl_module.architecture, pl_module.evaluated)
+            if is_first_process():
+                save_weights(self.run.best, pl_module.architecture, pl_module.evaluated)
+
+
+class KeepLast(Callback):
+    """Saves the whole state after every epoch and, with `minutes`, within an epoch at this interval.
+
+    A run that begins again within an epoch has its `on_train_epoch_start` called, which Lightning leaves out.
+    """
+
+    def __init__(self, run: RunFolder, minutes: float | None):
+        self.run, self.minutes = run, minutes
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self.saved = time.monotonic()
+        if trainer.fit_loop.restarted_mid_epoch:
+            pl_module.on_train_epoch_start()
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
+        # At the last batch the validation is still to come, and the epoch's own checkpoint after it.
+        if self.minutes is None or trainer.is_last_batch:
+            return
+        # Several processes agree on the time by asking the first, which costs a wait.
+        if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_LOOKS == 0:
+            due = time.monotonic() - self.saved >= 60 * self.minutes
+            if trainer.strategy.broadcast(due):
+                self.save(trainer)
+
+    def on_train_epoch_end(self, trainer, pl_module) -> None:
+        self.save(trainer)
+
+    def save(self, trainer: lightning.Trainer) -> None:
+        """Write last.ckpt; an older one stays whole until the new one is."""
+        trainer.save_checkpoint(self.run.last)
+        self.saved = time.monotonic()
 
 
 class Bar(Callback):
@@ -184,9 +228,11 @@ class Bar(Callback):
         self.progress.start()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        loss = float(outputs["loss"])
-        note = f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, loss {loss:.3f}"
-        self.progress.update(self.task, advance=1, note=note)
+        self.progress.advance(self.task)
+        # A look at the loss makes a GPU wait.
+        if batch_idx % _STEPS_BETWEEN_LOOKS == 0:
+            note = f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, loss {float(outputs['loss']):.3f}"
+            self.progress.update(self.task, note=note)
 
     def on_train_end(self, trainer, pl_module) -> None:
         self.progress.stop()
@@ -194,6 +240,14 @@ class Bar(Callback):
     def on_exception(self, trainer, pl_module, exception) -> None:
         if hasattr(self, "progress"):
             self.progress.stop()
+
+
+def machines(devices: int, num_nodes: int) -> tuple[int, int]:
+    """Processes on each machine and machines: what torchrun says in the environment, or else what is asked for."""
+    if torch.distributed.is_torchelastic_launched():
+        local = int(os.environ["LOCAL_WORLD_SIZE"])
+        return local, int(os.environ["WORLD_SIZE"]) // local
+    return devices, num_nodes
 
 
 def fit(
@@ -208,15 +262,21 @@ def fit(
     gradient_clip: float = 10.0,
     precision: Precision = "auto",
     device: str = "auto",
+    devices: int = 1,
+    num_nodes: int = 1,
+    strategy: str = "auto",
+    checkpoint_minutes: float | None = None,
 ) -> None:
     """Train `task` for a fixed number of epochs, keeping the best weights and the last state in the run's folder.
 
     The task gives its own loaders, asked for anew before every epoch (so that order and augmentation can follow
-    from seed and epoch alone), logs `monitor` in validation, and has `architecture` and `evaluated` (see KeepBest).
-    With `resume` training goes on after the last finished epoch, if the run has one, and repeats exactly what an
-    uninterrupted run does.
+    from seed and epoch alone; with several processes each gives its share), logs `monitor` in validation, and has
+    `architecture` and `evaluated` (see KeepBest). With `resume` training goes on from last.ckpt, if the run has one,
+    and repeats exactly what an uninterrupted run does. That is kept after every epoch, and with `checkpoint_minutes`
+    within epochs too; then the task's training batches must go on where the checkpoint was made.
     """
     device = choose_device(device)
+    devices, num_nodes = machines(devices, num_nodes)
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -225,7 +285,10 @@ def fit(
             default_root_dir=run.root,
             max_epochs=epochs,
             accelerator="gpu" if device == "cuda" else "cpu",
-            devices=1,
+            devices=devices,
+            num_nodes=num_nodes,
+            strategy=strategy if devices * num_nodes > 1 else "auto",
+            use_distributed_sampler=False,
             precision="bf16-mixed" if choose_bf16(precision, device) else "32-true",
             deterministic="warn",
             gradient_clip_val=gradient_clip,
@@ -235,16 +298,12 @@ def fit(
             log_every_n_steps=10,
             enable_progress_bar=False,
             enable_model_summary=False,
+            enable_checkpointing=False,
             callbacks=[
-                Bar(label),
+                *([Bar(label)] if is_first_process() else []),
+                LearningRateMonitor("step"),
                 KeepBest(run, monitor, mode),
-                ModelCheckpoint(
-                    run.last.parent,
-                    filename=run.last.stem,
-                    save_top_k=1,
-                    enable_version_counter=False,
-                    save_on_train_epoch_end=True,
-                ),
+                KeepLast(run, checkpoint_minutes),
             ],
         )
         resume_from = str(run.last) if resume and run.last.is_file() else None

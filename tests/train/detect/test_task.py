@@ -13,7 +13,7 @@ from perilune_train.detect.data import EvaluationFrames, load_split, loader
 from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.run import build_network, judge, label_sizes
-from perilune_train.detect.task import DetectTask, detections_of, learning_rate_factor, update_average
+from perilune_train.detect.task import DetectTask, detections_of, learning_rate_factor, pairs, update_average
 
 
 def test_learning_rate_by_hand():
@@ -28,7 +28,7 @@ def test_moving_average_by_hand():
     nn.init.constant_(new.weight, 3.0)
     new.running_mean.fill_(10.0)
     new.num_batches_tracked.fill_(7)
-    update_average(old, new, 0.9)
+    update_average(pairs(old, new), 0.9)
     assert old.weight.item() == pytest.approx(0.9 * 1 + 0.1 * 3)
     assert old.running_mean.item() == pytest.approx(1.0)
     assert old.num_batches_tracked.item() == 7

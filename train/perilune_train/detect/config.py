@@ -6,7 +6,7 @@ from pydantic import Field, field_validator, model_validator
 
 from perilune_shared.config import Section, nearest
 from perilune_shared.selection import SELECTIONS, Selection
-from perilune_train.config import Attention, Count, Device, Positive, Precision, Share
+from perilune_train.config import Attention, Count, Device, Positive, Precision, Share, Strategy
 
 
 class LabelSettings(Selection):
@@ -129,6 +129,8 @@ class DetectConfig(Section):
     """Steps in which the learning rate rises."""
     weight_decay: Annotated[float, Field(ge=0)] = 0.01
     """AdamW's, per step and learning rate."""
+    gradient_clip: Positive = 10.0
+    """Largest norm of all gradients together; longer ones are shortened to it."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
     """Moving average of the weights, per step; the average is what is judged and kept."""
     anchor_ratio: Annotated[float, Field(gt=1)] = 2.0
@@ -145,6 +147,14 @@ class DetectConfig(Section):
     """Of the arithmetic."""
     device: Device = "auto"
     """Where it runs."""
+    devices: Count = 1
+    """Processes on each machine, each with its own GPU or share of the CPU; `torchrun --nproc-per-node` wins."""
+    num_nodes: Count = 1
+    """Machines; `torchrun --nnodes` wins."""
+    strategy: Strategy = "auto"
+    """How several processes train together, by Lightning's names: auto takes what the settings need."""
+    checkpoint_minutes: Annotated[float, Field(ge=0)] = 10.0
+    """Within an epoch the state is kept this often, for --resume; 0: after every step. It always is after an epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0
     """Processes that augment frames beside the training; 0 does it in between, best on few cores."""
 

@@ -1,5 +1,6 @@
 """Frames and labels for the detector: what to find, what to ignore, augmentation, batches."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ Array = NDArray[np.float64]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _CRATER = ["scene_id", "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
+_SHAPE = [*_BOX, "radius_px", *_ELLIPSE]
 
 _MARGIN = np.sqrt(0.5)
 """Craters below the least radius are ignored down to this share of it: no box in range overlaps lesser ones by half."""
@@ -74,29 +76,51 @@ def load_split(dataset: Dataset, split: str, settings: LabelSettings, enlarged: 
             raise UserError(dataset.root, field, size, "a multiple of 32, the network's coarsest stride")
     frames = load_frames(dataset, split)
     labels = read_labels(dataset, [*_BOX, *_ELLIPSE], split)
-    labels["labelled"], labels["wanted"] = True, selected(labels, settings)
     radius_px = settings.radius_px or _labelled_range(dataset)
+    shapes, ids = labels[_SHAPE].to_numpy(np.float64), labels["crater_id"].to_numpy()
+    wanted, depth_ratio = selected(labels, settings), (labels["depth_m"] / labels["diameter_m"]).to_numpy(np.float64)
+    rows_of = labels.groupby("frame_id").indices
     craters = dataset.table("craters", _CRATER).to_pandas()
-    by_frame = {str(name): part for name, part in labels.groupby("frame_id")}
-    by_scene = {str(name): part for name, part in craters.groupby("scene_id")}
+    by_scene = {str(name): (part, *_places(part)) for name, part in craters.groupby("scene_id")}
+    nowhere = (craters.iloc[:0], *_places(craters.iloc[:0]))
     parts = []
     for frame in frames.table.to_dict("records"):
-        known = by_frame.get(frame["frame_id"], labels.iloc[:0])
-        others = by_scene.get(frame["scene_id"], craters.iloc[:0])
-        others = others[~others["crater_id"].isin(known["crater_id"])]
-        rows = unlabelled_craters(others, camera.intrinsics(), frame, radius_px, enlarged)
-        part = pd.concat([known, rows]) if len(rows) else known
-        parts.append(
-            FrameLabels(
-                part[_BOX].to_numpy(np.float64),
-                part["radius_px"].to_numpy(np.float64),
-                part[_ELLIPSE].to_numpy(np.float64),
-                part["wanted"].to_numpy(np.bool_),
-                part["labelled"].to_numpy(np.bool_),
-                (part["depth_m"] / part["diameter_m"]).to_numpy(np.float64),
-            )
-        )
+        rows = rows_of.get(frame["frame_id"], np.empty(0, np.intp))
+        # Of the hundred thousand craters of a scene, those of the right size first: the rest is then cheap.
+        scene, points, radius_m = by_scene.get(frame["scene_id"], nowhere)
+        near = _right_size(points, radius_m, camera.intrinsics(), frame, _ignored_range(radius_px, enlarged))
+        others = scene[near]
+        others = others[~others["crater_id"].isin(ids[rows])]
+        ignored = unlabelled_craters(others, camera.intrinsics(), frame, radius_px, enlarged)
+        shape = np.concatenate([shapes[rows], ignored[_SHAPE].to_numpy(np.float64)])
+        labelled = np.arange(len(shape)) < len(rows)
+        chosen = np.zeros(len(shape), np.bool_)
+        chosen[: len(rows)] = wanted[rows]
+        ratio = np.concatenate([depth_ratio[rows], np.full(len(ignored), np.nan)])
+        parts.append(FrameLabels(shape[:, :4], shape[:, 4], shape[:, 5:], chosen, labelled, ratio))
     return DetectSplit(frames, parts, radius_px)
+
+
+def _places(craters: pd.DataFrame) -> tuple[Array, Array]:
+    """Centres (N, 3) and radii (N,) in metres."""
+    return craters[["x_m", "y_m", "z_m"]].to_numpy(np.float64), craters["diameter_m"].to_numpy(np.float64) / 2
+
+
+def _ignored_range(radius_px: tuple[float, float], enlarged: float) -> tuple[float, float]:
+    return radius_px[0] * _MARGIN / enlarged, radius_px[1] / _MARGIN
+
+
+def _right_size(
+    points_m: Array, radius_m: Array, camera: Camera, frame: dict[Any, Any], range_px: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Craters (N,) before the camera whose radius in the frame may lie in a range, from their depth alone.
+
+    Exact for level ground under a level camera; what a tilt changes stays well within the margins.
+    """
+    forward = matrix_from_quaternion(frame["rotation_wxyz"])[2]
+    depth_m = points_m @ forward - np.asarray(frame["position_m"], np.float64) @ forward
+    scaled = camera.fx_px * radius_m
+    return (depth_m > 0) & (scaled > 0.8 * range_px[0] * depth_m) & (scaled < 2 * range_px[1] * depth_m)
 
 
 def _labelled_range(dataset: Dataset) -> tuple[float, float]:
@@ -116,16 +140,14 @@ def unlabelled_craters(
     range overlaps them by half) and those whose centre is off the image are ignored; smaller ones too where frames
     will be `enlarged` by up to a factor. `frame` is a row of the table.
     """
-    low, high = radius_px[0] * _MARGIN / enlarged, radius_px[1] / _MARGIN
+    low, high = _ignored_range(radius_px, enlarged)
+    points, radius_m = _places(craters)
+    sized = _right_size(points, radius_m, camera, frame, (low, high))
+    craters, points, radius_m = craters[sized], points[sized], radius_m[sized]
     rotation = matrix_from_quaternion(frame["rotation_wxyz"])
-    centre = camera_from_site(craters[["x_m", "y_m", "z_m"]].to_numpy(np.float64), frame["position_m"], rotation)
-    radius_m = craters["diameter_m"].to_numpy(np.float64) / 2
-    middle = camera.project(centre)
-    with np.errstate(divide="ignore"):
-        rough_px = camera.fx_px * radius_m / np.abs(centre[:, 2])
-    # Exact for level ground under a level camera; what a tilt changes stays well within the margins.
-    near = (centre[:, 2] > 0) & (rough_px > 0.8 * low) & (rough_px < 2 * high)
-    near &= (middle > -2 * rough_px[:, None]).all(1)
+    centre = camera_from_site(points, frame["position_m"], rotation)
+    middle, rough_px = camera.project(centre), camera.fx_px * radius_m / centre[:, 2]
+    near = (middle > -2 * rough_px[:, None]).all(1)
     near &= (middle < np.array([camera.width_px, camera.height_px]) + 2 * rough_px[:, None]).all(1)
     normals = craters[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float64)[near] @ rotation.T
     shapes = project_circles(camera, centre[near], normals, radius_m[near])
@@ -241,15 +263,16 @@ class TrainingFrames(torch_data.Dataset):
 
 
 class EvaluationFrames(torch_data.Dataset):
-    """A split as it is, in order."""
+    """A split as it is, in order; of several `processes` each sees every n-th frame."""
 
-    def __init__(self, split: DetectSplit):
-        self.split = split
+    def __init__(self, split: DetectSplit, process: int = 0, processes: int = 1):
+        self.split, self.own = split, range(process, len(split), processes)
 
     def __len__(self) -> int:
-        return len(self.split)
+        return len(self.own)
 
-    def __getitem__(self, index: int) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
+    def __getitem__(self, place: int) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
+        index = self.own[place]
         labels = self.split.labels[index]
         return normalised(self.split.frames.images[index]), labels.boxes, labels.wanted
 
@@ -260,8 +283,33 @@ def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Ten
     return stacked.contiguous(memory_format=torch.channels_last)
 
 
-def loader(frames: TrainingFrames | EvaluationFrames, config: DetectConfig) -> torch_data.DataLoader:
-    """Batches (images (N, in_channels, H, W), Targets) in the given order."""
+class Share(torch_data.Sampler[list[int]]):
+    """The places in an epoch's order that one of `processes` takes, batch by batch.
+
+    In every step the processes together take the next `size * processes` places, each an equal part, so that all
+    have equally many batches and each place is taken once. Only of a last step with fewer places than processes
+    nothing is taken (at most processes - 1 frames of an epoch, other ones in each).
+
+    Iterates from batch `start` on; the length is that of the whole epoch.
+    """
+
+    def __init__(self, count: int, size: int, process: int = 0, processes: int = 1, start: int = 0):
+        self.count, self.size, self.process, self.processes, self.start = count, size, process, processes, start
+
+    def __len__(self) -> int:
+        whole, rest = divmod(self.count, self.size * self.processes)
+        return whole + (rest >= self.processes)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        step = self.size * self.processes
+        for first in range(self.start * step, len(self) * step, step):
+            yield list(range(first, min(first + step, self.count)))[self.process :: self.processes]
+
+
+def loader(
+    frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: Share | None = None
+) -> torch_data.DataLoader:
+    """Batches (images (N, in_channels, H, W), Targets) in the given order; of a share where there is one."""
 
     def collate(samples: list) -> Batch:
         images, boxes, wanted = zip(*samples, strict=True)
@@ -272,4 +320,5 @@ def loader(frames: TrainingFrames | EvaluationFrames, config: DetectConfig) -> t
             torch.as_tensor(np.concatenate(wanted)),
         )
 
-    return torch_data.DataLoader(frames, config.batch_size, num_workers=config.workers, collate_fn=collate)
+    batches = share or Share(len(frames), config.batch_size)
+    return torch_data.DataLoader(frames, batch_sampler=batches, num_workers=config.workers, collate_fn=collate)

@@ -115,6 +115,7 @@ def run_detect(
     config: DetectConfig, dataset_root: Path, runs_root: Path, name: str, resume: bool = False
 ) -> runs.RunFolder:
     """Train and evaluate a detector; everything it leaves is in the returned folder."""
+    console.quiet = not runs.is_first_process()
     dataset = open_dataset(dataset_root)
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
@@ -143,15 +144,22 @@ def run_detect(
         monitor="val/ap50",
         mode="max",
         resume=resume,
+        gradient_clip=config.gradient_clip,
         precision=config.precision,
         device=config.device,
+        devices=config.devices,
+        num_nodes=config.num_nodes,
+        strategy="ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy,
+        checkpoint_minutes=config.checkpoint_minutes,
     )
+    if not runs.is_first_process():
+        return run
     seconds = time.perf_counter() - started
     anchors = network.anchors.flatten(0, 1).double().cpu().numpy()
     metrics: dict[str, float | int | str | None] = {
         "train/seconds": round(seconds, 1),
         "train/epochs": config.epochs,
-        "train/images_per_s": round(task.images_seen / seconds, 2),
+        "train/images_per_s": round(task.images_seen * task.process[1] / seconds, 2),
         "anchors/best_possible_recall": best_possible_recall(sizes, anchors, config.anchor_ratio),
         "anchors/mean_best_iou": mean_best_iou(sizes, anchors),
         "parameters": sum(p.numel() for p in network.parameters()),

@@ -11,7 +11,15 @@ from torch import Tensor, nn
 from perilune_train.data.frames import FrameStore, normalised
 from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig, EvaluationSettings
-from perilune_train.detect.data import Batch, DetectSplit, EvaluationFrames, TrainingFrames, loader, network_input
+from perilune_train.detect.data import (
+    Batch,
+    DetectSplit,
+    EvaluationFrames,
+    Share,
+    TrainingFrames,
+    loader,
+    network_input,
+)
 from perilune_train.detect.distill import Teacher, distill_loss
 from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.matching import Detections, match_split
@@ -30,14 +38,27 @@ def learning_rate_factor(step: int, warmup_steps: int, total_steps: int) -> floa
     return _FINAL_RATE + (1 - _FINAL_RATE) * (1 + math.cos(math.pi * min(progress, 1.0))) / 2
 
 
+Pairs = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]
+
+
+def pairs(average: nn.Module, network: nn.Module) -> Pairs:
+    """Tensors of an average and of its network: floats of both, then counters of both."""
+    old, new = list(average.state_dict().values()), list(network.state_dict().values())
+    floats = [value.is_floating_point() for value in old]
+    return (
+        [value for value, is_float in zip(old, floats, strict=True) if is_float],
+        [value for value, is_float in zip(new, floats, strict=True) if is_float],
+        [value for value, is_float in zip(old, floats, strict=True) if not is_float],
+        [value for value, is_float in zip(new, floats, strict=True) if not is_float],
+    )
+
+
 @torch.no_grad()
-def update_average(average: nn.Module, network: nn.Module, decay: float) -> None:
+def update_average(tensors: Pairs, decay: float) -> None:
     """Move an average of weights and batch statistics towards the network by 1 - decay; counters are copied."""
-    for old, new in zip(average.state_dict().values(), network.state_dict().values(), strict=True):
-        if old.is_floating_point():
-            old.lerp_(new, 1 - decay)
-        else:
-            old.copy_(new)
+    old, new, old_counters, new_counters = tensors
+    torch._foreach_lerp_(old, new, 1 - decay)
+    torch._foreach_copy_(old_counters, new_counters)
 
 
 def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> Detections:
@@ -76,13 +97,31 @@ class DetectTask(lightning.LightningModule):
         self.splits = {"train": train, "val": val}
         self.judged: list[Detections] = []
         self.images_seen = 0
+        self.resumed = (0, 0)
+
+    @property
+    def process(self) -> tuple[int, int]:
+        """This process among all that train together."""
+        return (self._trainer.global_rank, self._trainer.world_size) if self._trainer else (0, 1)
 
     def train_dataloader(self) -> Any:
         frames = TrainingFrames(self.splits["train"], self.config.augment, self.config.seed, self.current_epoch)
-        return loader(frames, self.config)
+        epoch, batches = self.resumed
+        start = batches if epoch == self.current_epoch else 0
+        return loader(frames, self.config, Share(len(frames), self.config.batch_size, *self.process, start))
 
     def val_dataloader(self) -> Any:
-        return loader(EvaluationFrames(self.splits["val"]), self.config)
+        return loader(EvaluationFrames(self.splits["val"], *self.process), self.config)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["epoch_and_batches"] = [
+            self.current_epoch,
+            self.trainer.fit_loop.epoch_loop.batch_progress.current.processed,
+        ]
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        epoch, batches = checkpoint["epoch_and_batches"]
+        self.resumed = (epoch, batches)
 
     def configure_optimizers(self) -> Any:
         decayed = [p for p in self.network.parameters() if p.ndim > 1]
@@ -90,8 +129,10 @@ class DetectTask(lightning.LightningModule):
         optimizer = torch.optim.AdamW(
             [{"params": decayed, "weight_decay": self.config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
             lr=self.config.learning_rate,
+            fused=True,
         )
-        total = int(self.trainer.estimated_stepping_batches)
+        # Lightning's own count would ask for the batches of an epoch before it knows where a resumed run stands.
+        total = self.config.epochs * len(Share(len(self.splits["train"]), self.config.batch_size, *self.process))
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda step: learning_rate_factor(step, self.config.warmup_steps, total)
         )
@@ -122,27 +163,43 @@ class DetectTask(lightning.LightningModule):
             loss = loss + settings.lambda_teacher * (settings.lambda_iou * box + settings.lambda_obj * confidence)
         return loss
 
-    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
-        # Early on the average forgets faster, or it would carry the random start through a short training.
-        decay = min(self.config.ema_decay, (1 + self.global_step) / (10 + self.global_step))
-        update_average(self.evaluated, self.network, decay)
+    def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
+        # Lightning's own refuses fused optimisers, for fear of float16's scaled gradients, which are not in use here.
+        nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip, foreach=True)
+
+    def on_train_start(self) -> None:
+        self.tensors = pairs(self.evaluated, self.network)
+
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        super().optimizer_step(*args, **kwargs)
+        # Here, not after the batch: a checkpoint in between would lack it. Early on the average forgets faster, or
+        # it would carry the random start through a short training.
+        steps = self.global_step + 1
+        update_average(self.tensors, min(self.config.ema_decay, (1 + steps) / (10 + steps)))
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         return batch[0].to(device), batch[1].to(device)
 
     def on_validation_epoch_start(self) -> None:
         self.judged = []
+        if self.process[1] > 1:
+            # Weights are equal in all processes; batch statistics are each one's own, and the first one's count.
+            for value in self.evaluated.buffers():
+                torch.distributed.broadcast(value, 0)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         boxes, scores = self.evaluated.detect(batch[0])
         self.judged += [detections_of(b, s, self.config.evaluation) for b, s in zip(boxes, scores, strict=True)]
 
     def on_validation_epoch_end(self) -> None:
-        split = self.splits["val"]
+        split, judged = self.splits["val"], self.judged
+        processes = self.process[1]
+        if processes > 1:
+            parts: list[Any] = [None] * processes
+            torch.distributed.all_gather_object(parts, judged)
+            judged = [parts[i % processes][i // processes] for i in range(len(split))]
         height, width = split.frames.images.shape[1:]
-        matches = match_split(
-            self.judged, split.labels, (width, height), self.config.evaluation.match_iou, split.radius_px
-        )
+        matches = match_split(judged, split.labels, (width, height), self.config.evaluation.match_iou, split.radius_px)
         points = curve(matches)
         _, recall, f1 = at_threshold(matches, points.best_threshold())
         self.log_dict({"val/ap50": points.average_precision(), "val/f1": f1, "val/recall": recall})

@@ -1,0 +1,34 @@
+"""What each of two processes trained on and ended with; started by torchrun in test_processes.py."""
+
+import sys
+from pathlib import Path
+
+import torch
+
+from perilune_shared.config import resolve
+from perilune_train import runs
+from perilune_train.detect import task
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.run import run_detect
+
+
+def main(dataset: Path, out: Path, *settings: str) -> None:
+    seen: list[tuple[int, int]] = []
+    last: list[task.DetectTask] = []
+
+    class Recorded(task.TrainingFrames):
+        def __getitem__(self, place):
+            seen.append((self.key[1], int(self.order[place])))
+            return super().__getitem__(place)
+
+    task.TrainingFrames = Recorded  # type: ignore[misc]
+    task.DetectTask.on_train_end = lambda self: last.append(self)  # type: ignore[method-assign]
+    config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
+    run_detect(config, dataset, out, "two")
+    state = {"seen": seen, "val_ap50": last[0].trainer.callback_metrics["val/ap50"], **last[0].state_dict()}
+    torch.save(state, out / f"{last[0].process[0]}.pt")
+    assert runs.is_first_process() == (last[0].process[0] == 0)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]), *sys.argv[3:])
