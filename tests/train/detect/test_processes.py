@@ -45,7 +45,7 @@ def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(dataset_detec
         assert process.wait() == -signal.SIGKILL
     epoch, batches = state(checkpoint)["epoch_and_batches"]
     assert epoch == 1 and 3 <= batches < BATCHES
-    done = subprocess.run([*command, "--resume"], env=ALONE, capture_output=True, text=True)
+    done = subprocess.run([*command, "--resume"], env=ALONE, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     resumed, uninterrupted = state(checkpoint), state(whole.last)
     assert resumed["global_step"] == uninterrupted["global_step"] == 2 * BATCHES
@@ -57,9 +57,9 @@ def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(dataset_detec
 
 
 def test_two_processes_share_the_frames_and_end_with_equal_weights(dataset_detect, tmp_path):
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--master-port", "0"]
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     script = [str(Path(__file__).with_name("two_processes.py")), str(dataset_detect), str(tmp_path), *SETTINGS]
-    done = subprocess.run([*torchrun, *script], env=ALONE, capture_output=True, text=True)
+    done = subprocess.run([*torchrun, *script], env=ALONE, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     first, second = (torch.load(tmp_path / f"{process}.pt", weights_only=True) for process in (0, 1))
     seen = [state.pop("seen") for state in (first, second)]
