@@ -26,7 +26,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-infer clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-train bench-infer clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -114,6 +114,9 @@ bench-contrast: setup ## how well contrast tells craters that the detector finds
 
 bench-infer: setup ## time of the detector by engine, one image, two cores; writes runs/bench/infer.json
 	@$(BIN)/python benchmarks/infer.py
+
+bench-train: detect-frames ## training speed beside memory-fed and bare loops; writes runs/bench/train.json
+	@$(BIN)/python benchmarks/train.py --dataset $(DATA)/detect --preset $(PRESET)
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

@@ -17,7 +17,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
 from perilune_shared.progress import progress_bar
 from perilune_train import runs
-from perilune_train.detect.again import threshold_of
+from perilune_train.detect.again import read_metrics, threshold_of
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import FrameLabels
 from perilune_train.detect.evaluation import Evaluation, evaluate_detections
@@ -57,7 +57,7 @@ def evaluate_images(
     if not any(image.wanted(min_size_px).any() for image in given.images):
         raise UserError(place, "boxes", f"none of {min_size_px:g} px or more", "at least one to be found")
     chosen_on = "of best F1 on the run's validation split" if threshold is None else "given by hand"
-    threshold = threshold_of(run) if threshold is None else threshold
+    threshold = threshold_of(read_metrics(run), run / "metrics.json") if threshold is None else threshold
     images = [read_grey(image.path) for image in given.images]
     found = _detect(open_detector(run, config), images, tiling)
     evaluation = judge_images(given, found, threshold, min_size_px, config.evaluation.match_iou)

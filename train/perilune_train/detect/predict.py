@@ -13,7 +13,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import new_folder
 from perilune_shared.progress import console, progress_bar
 from perilune_train import runs
-from perilune_train.detect.again import threshold_of
+from perilune_train.detect.again import read_metrics, threshold_of
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.georeference import Georeference, collection, features, has_rasterio, read_georeference
 from perilune_train.detect.matching import Detections
@@ -56,7 +56,7 @@ def predict_images(
             references.append(_reference(path))
             n_tiles += count_tiles(height, width, tiling)
             progress.advance(check)
-        threshold = threshold_of(run) if threshold is None else threshold
+        threshold = threshold_of(read_metrics(run), run / "metrics.json") if threshold is None else threshold
         detector = open_detector(run, config)
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes = [], []

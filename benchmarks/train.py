@@ -1,0 +1,151 @@
+"""Frames a second of the detector's training, beside the same training fed from memory and a bare loop by hand.
+
+The three take turns in one process, since a machine's speed changes. Each turn trains the preset's network from the
+same weights on the same batches; the first steps of a turn are not counted. Writes runs/bench/train.json.
+
+- ours: `runs.fit` as `detect train` calls it: frames augmented on the fly, moving average, clipping, schedule,
+  TensorBoard, progress bar, checkpoints.
+- memory: the same, with the batches prepared beforehand.
+- bare: a loop of forward, loss, backward and AdamW's step (fused) in the same precision and memory layout, batches
+  prepared beforehand; no schedule, no clipping, no moving average, no logging, no checkpoint.
+"""
+
+import copy
+import json
+import statistics
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+from lightning.pytorch.callbacks import Callback
+
+from perilune_shared.config import resolve
+from perilune_shared.errors import run_command_line
+from perilune_shared.files import write_text
+from perilune_shared.manifest import open_dataset
+from perilune_train import runs
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data import DetectSplit, TrainingFrames, load_split, loader
+from perilune_train.detect.loss import detection_loss
+from perilune_train.detect.run import build_network, label_sizes
+from perilune_train.detect.task import DetectTask
+from perilune_train.models.yolo import YOLOv3
+
+_UNCOUNTED = 3
+
+
+class Clock(Callback):
+    """Seconds of the steps that count."""
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
+        if batch_idx == _UNCOUNTED - 1:
+            self.start = time.perf_counter()
+        self.seconds = time.perf_counter() - getattr(self, "start", 0.0)
+
+
+class Timed(DetectTask):
+    """The detector's training, with batches from memory where some are given."""
+
+    batches: list | None = None
+
+    def configure_callbacks(self) -> list[Callback]:
+        self.clock = Clock()
+        return [self.clock]
+
+    def train_dataloader(self):
+        return self.batches or super().train_dataloader()
+
+
+def few(split: DetectSplit, count: int) -> DetectSplit:
+    """The first frames of a split."""
+    frames = replace(split.frames, table=split.frames.table.iloc[:count], images=split.frames.images[:count])
+    return replace(split, frames=frames, labels=split.labels[:count])
+
+
+def trained(network: YOLOv3, config: DetectConfig, train: DetectSplit, val: DetectSplit, batches: list | None) -> float:
+    """Seconds of an epoch's counted steps by `runs.fit`."""
+    task = Timed(copy.deepcopy(network), config, train, val, 0)
+    task.batches = batches
+    with tempfile.TemporaryDirectory() as folder:
+        run = runs.RunFolder(Path(folder))
+        runs.fit(run, task, label="train", epochs=1, monitor="val/ap50", mode="max", precision=config.precision)
+    return task.clock.seconds
+
+
+def bare(network: YOLOv3, config: DetectConfig, batches: list, device: str, bf16: bool) -> float:
+    """Seconds of the counted steps by hand."""
+    network = copy.deepcopy(network).to(device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, fused=True)
+    start = 0.0
+    for step, (images, targets) in enumerate(batches):
+        if step == _UNCOUNTED:
+            start = time.perf_counter()
+        with torch.autocast(device, torch.bfloat16, enabled=bf16):
+            outputs = network(images.to(device))
+            box, confidence = detection_loss(
+                outputs,
+                targets.to(torch.device(device)),
+                network.anchors,
+                network.strides,
+                config.anchor_ratio,
+                config.loss,
+            )
+            loss = config.loss.lambda_iou * box + config.loss.lambda_obj * confidence
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def main(
+    dataset: Annotated[Path, typer.Option(help="Folder of a detect dataset.")] = Path("data/small/detect"),
+    preset: str = "small",
+    steps: Annotated[int, typer.Option(help="Steps of a turn.")] = 40,
+    turns: int = 5,
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Run the benchmark."""
+    config = resolve(DetectConfig, "detect", "perilune_train", preset, None, ())
+    device = runs.choose_device(config.device)
+    bf16 = runs.choose_bf16(config.precision, device)
+    whole = load_split(open_dataset(dataset), "val", config.labels)
+    train, val = few(whole, steps * config.batch_size), few(whole, config.batch_size)
+    steps = len(train) // config.batch_size
+    train = few(train, steps * config.batch_size)
+    network = build_network(config, label_sizes(train), dataset)
+    batches = list(loader(TrainingFrames(train, config.augment, config.seed, 0), config))
+    seconds: dict[str, list[float]] = {"ours": [], "memory": [], "bare": []}
+    for _ in range(turns):
+        seconds["ours"].append(trained(network, config, train, val, None))
+        seconds["memory"].append(trained(network, config, train, val, batches))
+        seconds["bare"].append(bare(network, config, batches, device, bf16))
+    # Of neighbouring turns, which share the machine's mood.
+    ratios = {
+        name: [other / own for own, other in zip(seconds["ours"], seconds[name], strict=True)]
+        for name in ("memory", "bare")
+    }
+    result = {
+        "images_per_s": (steps - _UNCOUNTED) * config.batch_size / statistics.median(seconds["ours"]),
+        "ratio_to_memory": statistics.median(ratios["memory"]),
+        "ratio_to_bare": statistics.median(ratios["bare"]),
+        "seconds": seconds,
+        "preset": preset,
+        "steps": steps - _UNCOUNTED,
+        "batch_size": config.batch_size,
+        "threads": torch.get_num_threads(),
+        "device": device,
+        "bf16": bf16,
+    }
+    text = json.dumps(result, indent=1)
+    write_text(out / "train.json", text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    run_command_line(lambda: typer.run(main))
