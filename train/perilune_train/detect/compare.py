@@ -42,9 +42,8 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
         cells += [_text(metrics.get("labels/selection")), _text(figures.get("frames")), _text(figures.get("labels"))]
         cells += [with_interval(figures.get(key), _interval(figures, key)) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
-        label, again = name, 2
-        while label in curves:
-            label, again = f"{name} ({again})", again + 1
+        # Of the whole curve, not of the points that are kept of it.
+        label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
     head = ["run", "dataset", "split", "protocol", "wanted", "frames", "labels", *_COLUMNS.values(), *_LOWEST.values()]
     text = "\n".join(table(head, rows)) + "\n"

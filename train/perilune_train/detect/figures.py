@@ -29,12 +29,12 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] | None = None) -> None:
-    """Precision against recall, a line for each curve with its AP (all points)."""
+    """Precision against recall, a line for each curve under its name."""
     figure = Figure(figsize=(7.5, 4.8), layout="constrained")
     axes = figure.subplots()
     for group, style in ((curves, "-"), (dashed or {}, "--")):
         for name, points in group.items():
-            axes.plot(points.recall, points.precision, style, label=f"{name}: AP {points.average_precision():.3f}")
+            axes.plot(points.recall, points.precision, style, label=name)
     axes.set(xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8)

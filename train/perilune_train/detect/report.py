@@ -18,7 +18,6 @@ from perilune_train.detect.matching import COCO_IOUS
 from perilune_train.detect.metrics import Curve, curve
 
 CURVE_FILE = "precision_recall.parquet"
-WRITTEN = "report.md, precision_recall.png, bins.png, detections.png"
 _CURVE_POINTS = 1000
 _ROWS = {
     "ap50": "AP, all points",
@@ -39,10 +38,14 @@ def write_evaluation(
     write_text(folder / "report.md", markdown(evaluation, about))
     curves = {f"IoU {COCO_IOUS[k]:.1f}": curve(evaluation.by_iou[k]) for k in (0, 2, 4, 6, 8)}
     strict = {f"IoU {evaluation.match_iou:g}, strict": curve(evaluation.matches.strict())}
-    draw_curves(curves, folder / "precision_recall.png", dashed=strict)
+    draw_curves(_with_ap(curves), folder / "precision_recall.png", dashed=_with_ap(strict))
     write_curve(folder / CURVE_FILE, curve(evaluation.matches))
     draw_bins(evaluation.bins, folder / "bins.png")
     draw_frames(evaluation, images, folder / "detections.png")
+
+
+def _with_ap(curves: dict[str, Curve]) -> dict[str, Curve]:
+    return {f"{name}: AP {points.average_precision():.3f}": points for name, points in curves.items()}
 
 
 def write_curve(path: Path, points: Curve) -> None:
