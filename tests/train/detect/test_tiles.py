@@ -10,7 +10,7 @@ from perilune_shared.errors import UserError
 from perilune_train.data.frames import FrameStore
 from perilune_train.detect.boxes import iou_matrix, suppress
 from perilune_train.detect.predict import open_detector
-from perilune_train.detect.task import detect_frames
+from perilune_train.detect.task import detect_frames, detections_of
 from perilune_train.detect.tiles import (
     Detector,
     Tiling,
@@ -120,3 +120,12 @@ def test_many_boxes_are_suppressed_as_few_are():
     wanted = suppress(boxes, scores, 0.3, len(boxes))
     assert 1000 < len(wanted) < 5_500
     assert np.array_equal(kept, wanted)
+
+
+def test_long_boxes_go_before_suppression(detector):
+    boxes = torch.tensor([[0.0, 0, 20, 10], [0, 0, 12, 10], [50, 50, 60, 75]])
+    scores = torch.tensor([0.9, 0.8, 0.7])
+    settings = detector.config.evaluation
+    assert detections_of(boxes, scores, settings).scores == pytest.approx([0.9, 0.7])
+    short = detections_of(boxes, scores, settings.model_copy(update={"max_aspect": 1.5}))
+    assert short.scores == pytest.approx([0.8])

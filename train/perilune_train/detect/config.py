@@ -94,6 +94,9 @@ class EvaluationSettings(Section):
     """Of two detections that overlap more than this, the weaker goes."""
     min_score: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Detections below this score are dropped before anything else (the floor of the precision-recall curve)."""
+    max_aspect: Annotated[float, Field(gt=1)] | None = None
+    """Boxes whose longer side is more than this many times the shorter go before suppression: a box about two craters
+    is longer than a crater seen from above. None keeps all."""
     max_detections: Count = 2000
     """Most detections kept in a frame; the usual 100 would truncate crowded frames."""
 

@@ -64,6 +64,9 @@ def update_average(tensors: Pairs, decay: float) -> None:
 def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> Detections:
     """Detections of one frame from all predictors' boxes (K, 4) and scores (K,)."""
     strong = scores >= settings.min_score
+    if settings.max_aspect is not None:
+        sides = boxes[:, 2:] - boxes[:, :2]
+        strong &= sides.amax(1) <= settings.max_aspect * sides.amin(1)
     some_boxes, some_scores = boxes[strong].double().cpu().numpy(), scores[strong].double().cpu().numpy()
     kept = suppress(some_boxes, some_scores, settings.nms_iou, settings.max_detections)
     return Detections(some_boxes[kept], some_scores[kept])
