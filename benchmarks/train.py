@@ -3,7 +3,7 @@
 The three take turns in one process, since a machine's speed changes. Each turn trains the preset's network from the
 same weights on the same batches; the first steps of a turn are not counted. Writes runs/bench/train.json.
 
-- ours: `runs.fit` as `detect train` calls it: frames augmented on the fly, moving average, clipping, schedule,
+- ours: `fit` as `detect train` calls it: frames augmented on the fly, moving average, clipping, schedule,
   TensorBoard, progress bar, checkpoints.
 - memory: the same, with the batches prepared beforehand.
 - bare: a loop of forward, loss, backward and AdamW's step (fused) in the same precision and memory layout, batches
@@ -28,11 +28,13 @@ from perilune_shared.errors import run_command_line
 from perilune_shared.files import write_text
 from perilune_shared.manifest import open_dataset
 from perilune_train import runs
+from perilune_train.detect.batches import TrainingFrames, loader
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import DetectSplit, TrainingFrames, load_split, loader
+from perilune_train.detect.data import DetectSplit, load_split
 from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.run import build_network, label_sizes
 from perilune_train.detect.task import DetectTask
+from perilune_train.fit import fit
 from perilune_train.models.yolo import YOLOv3
 
 _UNCOUNTED = 3
@@ -67,12 +69,12 @@ def few(split: DetectSplit, count: int) -> DetectSplit:
 
 
 def trained(network: YOLOv3, config: DetectConfig, train: DetectSplit, val: DetectSplit, batches: list | None) -> float:
-    """Seconds of an epoch's counted steps by `runs.fit`."""
+    """Seconds of an epoch's counted steps by `fit`."""
     task = Timed(copy.deepcopy(network), config, train, val, 0)
     task.batches = batches
     with tempfile.TemporaryDirectory() as folder:
         run = runs.RunFolder(Path(folder))
-        runs.fit(run, task, label="train", epochs=1, monitor="val/ap50", mode="max", precision=config.precision)
+        fit(run, task, label="train", epochs=1, monitor="val/ap50", mode="max", precision=config.precision)
     return task.clock.seconds
 
 

@@ -9,6 +9,7 @@ from torch import nn
 
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError
+from perilune_train import fit as fitting
 from perilune_train import runs
 
 
@@ -125,7 +126,7 @@ class Line(lightning.LightningModule):
 
 
 def fit(run, task, epochs, resume=False):
-    runs.fit(
+    fitting.fit(
         run,
         task,
         label="line",

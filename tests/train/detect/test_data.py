@@ -13,18 +13,10 @@ from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
 from perilune_shared.frames import quaternion_from_matrix
 from perilune_shared.manifest import open_dataset
+from perilune_train.detect.augment import augment, grey_levels, rescale, turn
+from perilune_train.detect.batches import EvaluationFrames, TrainingFrames, loader
 from perilune_train.detect.config import AugmentSettings, DetectConfig, LabelSettings
-from perilune_train.detect.data import (
-    EvaluationFrames,
-    TrainingFrames,
-    augment,
-    grey_levels,
-    load_split,
-    loader,
-    rescale,
-    turn,
-    unlabelled_craters,
-)
+from perilune_train.detect.data import load_split, unlabelled_craters
 
 PLAIN = AugmentSettings(flips_and_turns=False, gain=0.0, gamma=0.0, blur_px=0.0, noise=0.0)
 

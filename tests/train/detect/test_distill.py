@@ -10,8 +10,9 @@ from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import open_dataset
 from perilune_train import runs
+from perilune_train.detect.batches import EvaluationFrames, loader
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import EvaluationFrames, load_split, loader
+from perilune_train.detect.data import load_split
 from perilune_train.detect.distill import Teacher, distill_loss
 from perilune_train.detect.run import build_network, label_sizes, load_detector, load_teacher, run_detect
 from perilune_train.detect.task import DetectTask

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from perilune_shared.config import resolve
+from perilune_train.detect.batches import Share
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import Share
 from perilune_train.detect.run import run_detect
 
 SETTINGS = ("detect.batch_size=2", "detect.checkpoint_minutes=0", "detect.precision=float32", "detect.device=cpu")

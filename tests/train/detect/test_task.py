@@ -8,8 +8,9 @@ import torch
 from torch import nn
 
 from perilune_shared.manifest import open_dataset
+from perilune_train.detect.batches import EvaluationFrames, loader
 from perilune_train.detect.config import AugmentSettings, DetectConfig, EvaluationSettings, LabelSettings
-from perilune_train.detect.data import EvaluationFrames, load_split, loader
+from perilune_train.detect.data import load_split
 from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.run import build_network, judge, label_sizes

@@ -1,16 +1,11 @@
 """Frames and labels for the detector: what to find, what to ignore, augmentation, batches."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import pandas as pd
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.utils import data as torch_data
 
 from perilune_shared.camera import Camera, camera_from_site
 from perilune_shared.ellipse import project_circles
@@ -18,9 +13,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.manifest import Dataset
 from perilune_shared.selection import read_labels, selected
-from perilune_train.data.frames import FrameStore, load_frames, normalised
-from perilune_train.detect.assign import Targets
-from perilune_train.detect.config import AugmentSettings, DetectConfig, LabelSettings
+from perilune_train.data.frames import FrameStore, load_frames
+from perilune_train.detect.config import LabelSettings
 
 Array = NDArray[np.float64]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
@@ -28,7 +22,7 @@ _CRATER = ["scene_id", "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y",
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 _SHAPE = [*_BOX, "radius_px", *_ELLIPSE]
 
-_MARGIN = np.sqrt(0.5)
+MARGIN = np.sqrt(0.5)
 """Craters below the least radius are ignored down to this share of it: no box in range overlaps lesser ones by half."""
 
 
@@ -107,7 +101,7 @@ def _places(craters: pd.DataFrame) -> tuple[Array, Array]:
 
 
 def _ignored_range(radius_px: tuple[float, float], enlarged: float) -> tuple[float, float]:
-    return radius_px[0] * _MARGIN / enlarged, radius_px[1] / _MARGIN
+    return radius_px[0] * MARGIN / enlarged, radius_px[1] / MARGIN
 
 
 def _right_size(
@@ -157,168 +151,3 @@ def unlabelled_craters(
     box = rows[_BOX].to_numpy(np.float64)
     seen = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
     return rows[seen & rows["radius_px"].between(low, high).to_numpy()]
-
-
-def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
-    """One of the eight symmetries of a frame (height, width) with its boxes (M, 4): bit 0 mirrors left and right,
-    bit 1 top and bottom, bit 2 (applied last) exchanges x and y."""
-    height, width = image.shape
-    x0, y0, x1, y1 = boxes.T
-    if kind & 1:
-        image, x0, x1 = image[:, ::-1], width - x1, width - x0
-    if kind & 2:
-        image, y0, y1 = image[::-1], height - y1, height - y0
-    if kind & 4:
-        image, x0, y0, x1, y1 = image.T, y0, x0, y1, x1
-    return image, np.stack([x0, y0, x1, y1], axis=1)
-
-
-def rescale(image: NDArray, boxes: Array, factor: float, place: tuple[float, float]) -> tuple[NDArray, Array]:
-    """A frame (height, width) and its boxes (M, 4), enlarged or shrunk to an image of the same size.
-
-    `place` in [0, 1] tells, in x and y, which part of an enlarged frame is kept, or where a shrunk one lies; around
-    that is the frame's mean grey.
-    """
-    height, width = image.shape
-    shift = np.array([width, height]) * (1 - 1 / factor) * np.array(place)
-    if factor < 1:
-        image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / factor**2 - 1))
-    # OpenCV counts from the middle of the first pixel, boxes from its edge.
-    origin = shift + 0.5 / factor - 0.5
-    matrix = np.array([[1 / factor, 0, origin[0]], [0, 1 / factor, origin[1]]])
-    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    scaled = cv2.warpAffine(image, matrix, (width, height), flags=how, borderValue=float(image.mean()))
-    return scaled, (boxes - np.tile(shift, 2)) * factor
-
-
-def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.random.Generator) -> NDArray[np.float32]:
-    """What each of the 256 grey levels of a frame becomes: stretched, brightened, bent, clipped at 255."""
-    level = np.arange(256) / 255
-    if settings.stretch:
-        below = np.bincount(image.ravel(), minlength=256).cumsum() / image.size
-        black, white = np.searchsorted(below, [rng.uniform(0, settings.stretch), 1 - rng.uniform(0, settings.stretch)])
-        level = np.clip((np.arange(256) - black) / max(white - black, 1), 0, 1)
-    gain = np.exp(rng.uniform(-1, 1) * np.log1p(settings.gain))
-    gamma = np.exp(rng.uniform(-1, 1) * settings.gamma)
-    return (255 * np.minimum(gain * level**gamma, 1)).astype(np.float32)
-
-
-def augment(
-    image: NDArray[np.uint8],
-    boxes: Array,
-    wanted: NDArray[np.bool_],
-    radius_px: tuple[float, float],
-    settings: AugmentSettings,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
-    """A changed frame (height, width), grey levels as float32, its boxes (M, 4), and which of them are wanted (M,).
-
-    A crater that rescaling moves out of the range `radius_px`, or its centre off the image, is wanted no more; one
-    that becomes much smaller is left out.
-    """
-    turned: NDArray = image
-    if settings.flips_and_turns:
-        square = image.shape[0] == image.shape[1]
-        turned, boxes = turn(image, boxes, int(rng.integers(8 if square else 4)))
-    low, high = settings.scale
-    if high > low:
-        factor = float(np.exp(rng.uniform(np.log(low), np.log(high))))
-        turned, boxes = rescale(np.ascontiguousarray(turned), boxes, factor, (rng.random(), rng.random()))
-        size = np.array(turned.shape[::-1])
-        centre, radius = (boxes[:, :2] + boxes[:, 2:]) / 2, np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(1)) / 2
-        seen = ((boxes[:, 2:] > 0) & (boxes[:, :2] < size)).all(1) & (radius >= radius_px[0] * _MARGIN)
-        boxes, wanted, centre, radius = boxes[seen], wanted[seen], centre[seen], radius[seen]
-        inside = ((centre >= 0) & (centre < size)).all(1)
-        wanted = wanted & inside & (radius >= radius_px[0]) & (radius <= radius_px[1])
-    pixels = grey_levels(turned, settings, rng)[turned]
-    sigma_px = rng.uniform(0, settings.blur_px)
-    if sigma_px > 0.3:
-        pixels = cv2.GaussianBlur(pixels, (0, 0), sigma_px).astype(np.float32, copy=False)
-    noise = rng.uniform(0, settings.noise)
-    if noise > 0:
-        pixels = pixels + np.float32(noise) * rng.standard_normal(pixels.shape, np.float32)
-    return pixels, boxes, wanted
-
-
-Batch = tuple[Tensor, Targets]
-
-
-class TrainingFrames(torch_data.Dataset):
-    """A split in the order and with the augmentation of one epoch, both a function of seed and epoch alone."""
-
-    def __init__(self, split: DetectSplit, settings: AugmentSettings, seed: int, epoch: int):
-        self.split, self.settings, self.key = split, settings, [seed, epoch]
-        self.order = np.random.default_rng(self.key).permutation(len(split))
-
-    def __len__(self) -> int:
-        return len(self.order)
-
-    def __getitem__(self, place: int) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
-        index = int(self.order[place])
-        labels = self.split.labels[index]
-        rng = np.random.default_rng([*self.key, index])
-        image, split = self.split.frames.images[index], self.split
-        pixels, boxes, wanted = augment(image, labels.boxes, labels.wanted, split.radius_px, self.settings, rng)
-        return normalised(pixels), boxes, wanted
-
-
-class EvaluationFrames(torch_data.Dataset):
-    """A split as it is, in order; of several `processes` each sees every n-th frame."""
-
-    def __init__(self, split: DetectSplit, process: int = 0, processes: int = 1):
-        self.split, self.own = split, range(process, len(split), processes)
-
-    def __len__(self) -> int:
-        return len(self.own)
-
-    def __getitem__(self, place: int) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
-        index = self.own[place]
-        labels = self.split.labels[index]
-        return normalised(self.split.frames.images[index]), labels.boxes, labels.wanted
-
-
-def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Tensor:
-    """Normalised frames (N, H, W) as the network takes them: (N, in_channels, H, W), channels last in memory."""
-    stacked = torch.as_tensor(images)[:, None].expand(-1, in_channels, -1, -1)
-    return stacked.contiguous(memory_format=torch.channels_last)
-
-
-class Share(torch_data.Sampler[list[int]]):
-    """The places in an epoch's order that one of `processes` takes, batch by batch.
-
-    In every step the processes together take the next `size * processes` places, each an equal part, so that all
-    have equally many batches and each place is taken once. Only of a last step with fewer places than processes
-    nothing is taken (at most processes - 1 frames of an epoch, other ones in each).
-
-    Iterates from batch `start` on; the length is that of the whole epoch.
-    """
-
-    def __init__(self, count: int, size: int, process: int = 0, processes: int = 1, start: int = 0):
-        self.count, self.size, self.process, self.processes, self.start = count, size, process, processes, start
-
-    def __len__(self) -> int:
-        whole, rest = divmod(self.count, self.size * self.processes)
-        return whole + (rest >= self.processes)
-
-    def __iter__(self) -> Iterator[list[int]]:
-        step = self.size * self.processes
-        for first in range(self.start * step, len(self) * step, step):
-            yield list(range(first, min(first + step, self.count)))[self.process :: self.processes]
-
-
-def loader(
-    frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: Share | None = None
-) -> torch_data.DataLoader:
-    """Batches (images (N, in_channels, H, W), Targets) in the given order; of a share where there is one."""
-
-    def collate(samples: list) -> Batch:
-        images, boxes, wanted = zip(*samples, strict=True)
-        counts = torch.tensor([len(part) for part in boxes])
-        return network_input(np.stack(images), config.in_channels), Targets(
-            torch.as_tensor(np.concatenate(boxes), dtype=torch.float32),
-            torch.repeat_interleave(torch.arange(len(samples)), counts),
-            torch.as_tensor(np.concatenate(wanted)),
-        )
-
-    batches = share or Share(len(frames), config.batch_size)
-    return torch_data.DataLoader(frames, batch_sampler=batches, num_workers=config.workers, collate_fn=collate)

@@ -15,8 +15,9 @@ from perilune_shared.files import new_folder, sha256_of, write_text
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console
 from perilune_train.data.frames import normalised
+from perilune_train.detect.batches import network_input
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import load_split, network_input
+from perilune_train.detect.data import load_split
 from perilune_train.detect.engines import Array, Engine, onnxruntime_engine, openvino_engine
 from perilune_train.detect.flight import FlightDetector
 from perilune_train.detect.flight_notes import readme

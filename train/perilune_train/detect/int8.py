@@ -14,8 +14,9 @@ import numpy as np
 from perilune_shared.manifest import Dataset
 from perilune_shared.progress import progress_bar
 from perilune_train.data.frames import load_frames, normalised
+from perilune_train.detect.batches import network_input
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import DetectSplit, network_input
+from perilune_train.detect.data import DetectSplit
 from perilune_train.detect.engines import Array, Engine, Precision, has_bf16, openvino_engine
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.run import judge

@@ -25,6 +25,7 @@ from perilune_train.detect.metrics import curve, figures
 from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.task import DetectTask, detect_frames
 from perilune_train.detect.transfer import start_from_darknet
+from perilune_train.fit import fit
 from perilune_train.models.darknet_weights import is_darknet
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
@@ -136,7 +137,7 @@ def run_detect(
         console.print("frozen_epochs without init_from: nothing to freeze, the whole network trains from the start")
     task = DetectTask(network, config, splits["train"], splits["val"], frozen_epochs, teacher)
     started = time.perf_counter()
-    runs.fit(
+    fit(
         run,
         task,
         label="train detector",

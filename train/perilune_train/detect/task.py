@@ -9,17 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from perilune_train.data.frames import FrameStore, normalised
+from perilune_train.detect.batches import Batch, EvaluationFrames, Share, TrainingFrames, loader, network_input
 from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig, EvaluationSettings
-from perilune_train.detect.data import (
-    Batch,
-    DetectSplit,
-    EvaluationFrames,
-    Share,
-    TrainingFrames,
-    loader,
-    network_input,
-)
+from perilune_train.detect.data import DetectSplit
 from perilune_train.detect.distill import Teacher, distill_loss
 from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.matching import Detections, match_split

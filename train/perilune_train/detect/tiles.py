@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_train.data.frames import normalised
+from perilune_train.detect.batches import network_input
 from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import network_input
 from perilune_train.detect.matching import Detections
 from perilune_train.detect.task import detections_of
 from perilune_train.models.yolo import YOLOv3

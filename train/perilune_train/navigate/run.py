@@ -11,6 +11,7 @@ from torch import Tensor
 from perilune_shared.files import written_aside
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
+from perilune_train.fit import fit
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data import Descent, load_descents
 from perilune_train.navigate.figures import draw_descent, draw_errors
@@ -21,7 +22,6 @@ from perilune_train.runs import (
     RunFolder,
     check_architecture,
     choose_device,
-    fit,
     load_weights,
     start_run,
     write_metrics,
