@@ -22,6 +22,7 @@ from typing import Annotated
 import torch
 import typer
 from lightning.pytorch.callbacks import Callback
+from torch.utils.data import DataLoader
 
 from perilune_shared.config import resolve
 from perilune_shared.errors import run_command_line
@@ -59,7 +60,10 @@ class Timed(DetectTask):
         return [self.clock]
 
     def train_dataloader(self):
-        return self.batches or super().train_dataloader()
+        if self.batches is None:
+            return super().train_dataloader()
+        # As they are: a bare list would be taken for several loaders.
+        return DataLoader(self.batches, batch_size=None, collate_fn=lambda batch: batch)  # type: ignore[arg-type]
 
 
 def few(split: DetectSplit, count: int) -> DetectSplit:

@@ -17,16 +17,19 @@ class MeanAndMax(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
         largest, where = x.max(dim, keepdim=True)
         ctx.save_for_backward(where)
-        ctx.dim, ctx.shape, ctx.stride = dim, x.shape, x.stride()
+        ctx.dim, ctx.shape = dim, x.shape
+        ctx.order = sorted(range(x.ndim), key=x.stride, reverse=True)
         return x.mean(dim, keepdim=True), largest
 
     @staticmethod
     def backward(ctx: Any, mean_grad: Tensor, max_grad: Tensor) -> tuple[Tensor, None]:
         (where,) = ctx.saved_tensors
         share = mean_grad / ctx.shape[ctx.dim]
-        grad = torch.empty_strided(ctx.shape, ctx.stride, dtype=share.dtype, device=share.device)
-        grad.copy_(share.expand(ctx.shape))
-        return grad.scatter_(ctx.dim, where, share + max_grad), None
+        # In the order in which x lies in memory: scatter_ copies a tensor of any other order twice.
+        order = ctx.order
+        grad = share.expand(ctx.shape).permute(order).contiguous()
+        grad.scatter_(order.index(ctx.dim), where.permute(order), (share + max_grad).permute(order))
+        return grad.permute([order.index(k) for k in range(grad.ndim)]), None
 
 
 class CBAM(nn.Module):
