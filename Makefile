@@ -26,7 +26,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-train bench-infer clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-train bench-infer clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -70,6 +70,14 @@ train-detect: detect-frames ## train and evaluate crater detection
 
 train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
 	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out $(RUNS) --name $(NAME)-none --dataset $(DATA)/detect --resume
+
+# The same seeds, one change each; <name>-<change>. The first is the run of train-detect itself.
+ABLATION := none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
+ablate-detect: train-detect ## train without attention, with plain CBAM, other strides, other widths; one table
+	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
+	  --out $(RUNS) --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset $(DATA)/detect --resume &&) true
+	@$(BIN)/perilune-train detect compare $(RUNS)/detect/$(NAME) $(foreach one,$(ABLATION),$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))) --out $(RUNS)/detect/$(NAME)-ablation
+	@$(BIN)/python benchmarks/size.py $(RUNS)/detect/$(NAME) $(foreach one,$(ABLATION),$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))) --out $(RUNS)/detect/$(NAME)-ablation
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f $(DETECT) || $(MAKE) --no-print-directory train-detect
