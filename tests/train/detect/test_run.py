@@ -10,8 +10,9 @@ from perilune_shared.config import parse_yaml, resolve
 from perilune_shared.errors import UserError
 from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.run import build_network, load_detector, run_detect, start_backbone
+from perilune_train.detect.run import build_network, load_detector, run_detect
 from perilune_train.detect.task import DetectTask
+from perilune_train.detect.transfer import start_from
 
 QUICK = ("detect.epochs=2", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
 
@@ -129,14 +130,30 @@ def test_a_detector_comes_back_as_it_was_saved(finished):
     assert not network.training
 
 
-def test_a_backbone_is_taken_over(finished, tmp_path):
-    config = settings("detect.attention=none")
+@pytest.mark.parametrize(
+    "changes, stays",
+    [
+        ([], ()),
+        (["detect.attention=cbam"], ("backbone.attentions.",)),
+        (["detect.attention=none"], ()),
+        (["detect.strides=[8,16,32]"], ("branches.", "heads.", "laterals.", "anchors")),
+    ],
+)
+def test_a_run_starts_from_what_an_earlier_one_has_for_it(finished, tmp_path, changes, stays):
+    config = settings(*changes)
     network = build_network(config, torch.rand(50, 2).numpy() + 4, tmp_path)
-    start_backbone(network, finished.best, config)
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    start_from(network, finished.best, config)
     saved = runs.load_weights(finished.best)["state_dict"]
-    assert torch.equal(network.backbone.stem.conv.weight, saved["backbone.stem.conv.weight"])
+    for key, value in network.state_dict().items():
+        assert torch.equal(value, before[key] if key.startswith(stays) else saved[key]), key
+
+
+def test_a_run_of_another_width_is_refused(finished, tmp_path):
+    config = settings("detect.width=0.25")
+    network = build_network(config, torch.rand(50, 2).numpy() + 4, tmp_path)
     with pytest.raises(UserError, match=r"best.ckpt: width: found 0.125; wanted 0.25"):
-        start_backbone(network, finished.best, settings("detect.width=0.25"))
+        start_from(network, finished.best, config)
 
 
 def test_another_kind_of_checkpoint(tmp_path):

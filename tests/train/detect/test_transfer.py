@@ -16,9 +16,9 @@ from perilune_train import runs
 from perilune_train.cli import app
 from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data import load_split
-from perilune_train.detect.run import build_network, label_sizes, run_detect, start_backbone
+from perilune_train.detect.run import build_network, label_sizes, run_detect
 from perilune_train.detect.task import DetectTask
-from perilune_train.detect.transfer import darknet_content, rescale_input
+from perilune_train.detect.transfer import darknet_content, rescale_input, start_from
 from perilune_train.models.darknet import AttentionDarknet53
 from perilune_train.models.darknet_weights import read_darknet, write_darknet
 from perilune_train.models.yolo import YOLOv3
@@ -82,7 +82,7 @@ def test_yolov3_fills_backbone_neck_and_heads_but_no_output(coco):
     network = YOLOv3(None, 3, 1.0, FULL.attention).eval()
     outputs = {key: value.clone() for key, value in network.state_dict().items() if ".1.weight" in key}
     assert sum(key.startswith("heads.") for key in outputs) == 3
-    start_backbone(network, path, FULL)
+    start_from(network, path, FULL)
     frames = torch.randn(1, 1, 64, 64, generator=torch.Generator().manual_seed(0)).expand(-1, 3, -1, -1)
     # Exact in the grey scale of the file; in ours the border of the image differs by the padding.
     rescale_input(network.backbone, "grey")
@@ -108,7 +108,7 @@ def test_a_backbone_alone_is_filled_from_conv_74_or_for_finer_strides(coco, tmp_
     torch.manual_seed(0)
     network = YOLOv3(None, 3, 1.0, "none", (4, 8, 16))
     before = network.branches["8"][0].conv.weight.clone()
-    start_backbone(network, path, DetectConfig(attention="none", strides=(4, 8, 16)))
+    start_from(network, path, DetectConfig(attention="none", strides=(4, 8, 16)))
     last = network.backbone.units["B_54"].expand.conv.weight.detach().numpy()
     np.testing.assert_array_equal(last.ravel(), values[N_BACKBONE - last.size : N_BACKBONE])
     assert torch.equal(network.branches["8"][0].conv.weight, before)
@@ -158,7 +158,7 @@ def test_a_run_is_written_as_a_darknet_file_and_comes_back(tmp_path, suffix):
     assert out.stat().st_size == 20 + 4 * (N_BACKBONE if suffix == ".conv.74" else 61_570_957)
     torch.manual_seed(2)
     again = YOLOv3(None, 3, 1.0, "none")
-    start_backbone(again, out, DetectConfig(attention="none"))
+    start_from(again, out, DetectConfig(attention="none"))
     filled = again if suffix == ".weights" else again.backbone
     wanted = (network if suffix == ".weights" else network.backbone).state_dict()
     for key, value in filled.state_dict().items():

@@ -120,8 +120,9 @@ class DetectConfig(Section):
     """First epochs with the backbone frozen, its attention gates excepted. They count only with `init_from`: a
     backbone of random weights, frozen, teaches nothing, so without it training starts unfrozen."""
     init_from: str | None = None
-    """best.ckpt of an earlier detect run whose backbone (and gates, where both have them) to start from, or a Darknet
-    file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads too); these need width 1, in_channels 3."""
+    """best.ckpt of an earlier detect run of equal width and in_channels, to go on from: all of it where the strides
+    are equal, else its backbone. Or a Darknet file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads
+    too); these need width 1 and in_channels 3."""
     teacher: str | None = None
     """best.ckpt of a detect run, usually wider, to learn from beside the labels; its strides, channels and anchors."""
     batch_size: Count = 8

@@ -24,9 +24,8 @@ from perilune_train.detect.matching import Detections, Matches, match_split
 from perilune_train.detect.metrics import curve, figures
 from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.task import DetectTask, detect_frames
-from perilune_train.detect.transfer import start_from_darknet
+from perilune_train.detect.transfer import start_from
 from perilune_train.fit import fit
-from perilune_train.models.darknet_weights import is_darknet
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 
@@ -48,26 +47,6 @@ def build_network(config: DetectConfig, sizes_px: np.ndarray, where: Path) -> YO
     lightning.seed_everything(config.seed, verbose=False)
     shaped = torch.as_tensor(anchors).view(len(config.strides), ANCHORS_PER_SCALE, 2)
     return YOLOv3(shaped, config.in_channels, config.width, config.attention, config.strides)
-
-
-def start_backbone(network: YOLOv3, path: Path, config: DetectConfig) -> None:
-    """Give the network the backbone of an earlier detect run, or what a Darknet file has for it (detect/transfer.py).
-
-    Gates that the other lacks stay as they are.
-    """
-    if is_darknet(path):
-        start_from_darknet(network, path, config)
-        return
-    content = runs.load_weights(path)
-    wanted = {"in_channels": config.in_channels, "width": config.width}
-    runs.check_architecture(path, content["architecture"], wanted)
-    own = network.backbone.state_dict()
-    prefix = "backbone."
-    state = {key.removeprefix(prefix): value for key, value in content["state_dict"].items() if key.startswith(prefix)}
-    if content["architecture"]["attention"] != config.attention:
-        state = {key: value for key, value in state.items() if not key.startswith("attentions.")}
-        state |= {key: value for key, value in own.items() if key.startswith("attentions.")}
-    runs.fill(network.backbone, state, path)
 
 
 def load_detector(path: Path) -> YOLOv3:
@@ -127,7 +106,7 @@ def run_detect(
     sizes = label_sizes(splits["train"])
     network = build_network(config, sizes, dataset.root)
     if config.init_from is not None:
-        start_backbone(network, Path(config.init_from), config)
+        start_from(network, Path(config.init_from), config)
     teacher = None if config.teacher is None else load_teacher(Path(config.teacher), config)
     if teacher is not None:
         network.anchors.copy_(teacher.network.anchors)

@@ -1,4 +1,4 @@
-"""What a detector takes from Darknet's weight files, and gives back as one."""
+"""What a detector takes from an earlier run or from Darknet's weight files, and gives back as one of these."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +16,7 @@ from perilune_train.models.darknet_weights import (
     content_of,
     count_floats,
     fill,
+    is_darknet,
     network_slots,
     read_darknet,
 )
@@ -23,6 +24,7 @@ from perilune_train.models.yolo import YOLOv3
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
 """Of photographs on Darknet's scale of 0 to 1, about. A power of two scales without rounding."""
+_GATES = "backbone.attentions."
 DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}
 
 
@@ -44,6 +46,28 @@ def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"
     else:
         weight /= _GREY_DEVIATION
         mean.copy_(mean.double() + shift / _GREY_DEVIATION)
+
+
+def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
+    """Give the network what an earlier detect run, or a Darknet file, has for it.
+
+    A run of the same strides gives everything, its anchors too; one of other strides gives the backbone. Where their
+    attention differs the gates stay as they are. Raises UserError where width or in_channels are not the same.
+    """
+    if is_darknet(path):
+        start_from_darknet(network, path, config)
+        return
+    content = runs.load_weights(path)
+    architecture = content["architecture"]
+    runs.check_architecture(path, architecture, {"in_channels": config.in_channels, "width": config.width})
+    strides, gates = architecture.get("strides"), architecture.get("attention") == config.attention
+    taken = {
+        key
+        for key in network.state_dict() | content["state_dict"]
+        if (key.startswith("backbone.") or strides == list(config.strides)) and (gates or not key.startswith(_GATES))
+    }
+    left = {key: value for key, value in network.state_dict().items() if key not in taken}
+    runs.fill(network, left | {key: content["state_dict"][key] for key in taken & content["state_dict"].keys()}, path)
 
 
 def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> None:
