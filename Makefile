@@ -72,7 +72,7 @@ train-detect-baseline: detect-frames ## the same network without attention, into
 	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out $(RUNS) --name $(NAME)-none --dataset $(DATA)/detect --resume
 
 # The same seeds, one change each; <name>-<change>. The first is the run of train-detect itself.
-ABLATION := none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
+ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
 ablate-detect: train-detect ## train without attention, with plain CBAM, other strides, other widths; one table
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
 	  --out $(RUNS) --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset $(DATA)/detect --resume &&) true

@@ -66,7 +66,8 @@ def evaluate_images(
     about = [
         f"run `{run.resolve().name}`, best weights; {len(images)} images of `{place.name}`",
         f"wanted: boxes of {min_size_px:g} px or more (sqrt(w h)), centred in the image",
-        f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}",
+        f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
+        + ("" if tiling.box_factor == 1 else f"; boxes drawn {tiling.box_factor:g} times as large"),
         f"threshold {chosen_on}",
         f"oracle, with the threshold ({best:.4f}) of best F1 on these very images, which nobody knows beforehand: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
@@ -78,7 +79,11 @@ def evaluate_images(
     write_crops(out / "crops.png", images, evaluation)
     figures = evaluation.figures() | {f"oracle/{name}": value for name, value in oracle.items()}
     figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}
-    figures |= {"overlap_px": tiling.overlap_px, "scales": " ".join(map(str, tiling.scales))}
+    figures |= {
+        "overlap_px": tiling.overlap_px,
+        "box_factor": tiling.box_factor,
+        "scales": " ".join(map(str, tiling.scales)),
+    }
     runs.write_metrics(runs.RunFolder(out), figures)
     return figures
 

@@ -34,7 +34,7 @@ _TOLERANCE_PX = 2.0
 
 @dataclass(frozen=True)
 class Tiling:
-    """How an image is cut."""
+    """How an image is cut, and how large the boxes are drawn."""
 
     tile_px: int = 256
     """Side of a tile: that of the training frames, pixels."""
@@ -43,6 +43,8 @@ class Tiling:
     scales: tuple[float, ...] = (1.0,)
     """Factors by which the image is enlarged or shrunk before it is cut. Above 1 for smaller craters than those
     trained on, below 1 for larger ones; what several scales find is merged."""
+    box_factor: float = 1.0
+    """Factor on the sides of the boxes found. Ours end at the crest of a rim; people often mark craters wider."""
 
     def check(self) -> None:
         """Raise UserError on what cannot be cut."""
@@ -52,6 +54,8 @@ class Tiling:
             raise UserError("--overlap", "pixels", self.overlap_px, f"0 to {self.tile_px - 1}, less than a tile")
         if not self.scales or not all(0.05 <= scale <= 8 for scale in self.scales):
             raise UserError("--scale", "factor", list(self.scales), "0.05 to 8")
+        if not 0.5 <= self.box_factor <= 2:
+            raise UserError("--box-factor", "factor", self.box_factor, "0.5 to 2")
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,9 @@ def detect_image(
             scores.append(found.scores[own])
     all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
     kept = suppress_in_blocks(all_boxes, all_scores, detector.config.evaluation.nms_iou)
-    return Detections(all_boxes[kept], all_scores[kept])
+    centre, half = (all_boxes[kept, :2] + all_boxes[kept, 2:]) / 2, (all_boxes[kept, 2:] - all_boxes[kept, :2]) / 2
+    half = half * tiling.box_factor
+    return Detections(np.concatenate([centre - half, centre + half], axis=1), all_scores[kept])
 
 
 def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:

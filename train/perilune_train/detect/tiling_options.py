@@ -13,4 +13,11 @@ Scales = Annotated[
     ),
 ]
 TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles: that of the training frames, pixels.")]
+BoxFactor = Annotated[
+    float,
+    typer.Option(
+        help="Factor on the sides of the boxes found, which end at the crest of the rim: above 1 for labels that people"
+        " have drawn wider."
+    ),
+]
 Overlap = Annotated[int, typer.Option(help="Least overlap of two tiles, pixels.")]
