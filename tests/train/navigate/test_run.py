@@ -133,6 +133,13 @@ def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
         load_navigator(run.best, "warp")
 
 
+def test_several_processes_are_refused_before_anything_is_written(dataset_nav, tmp_path, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(UserError, match="torchrun: processes: found 2; wanted 1"):
+        navigate_run(_settings(), dataset_nav, tmp_path / "runs", "a", None, resume=False)
+    assert not (tmp_path / "runs").exists()
+
+
 def test_scales_by_hand(descents):
     training = [d for d in descents if d.split == "train"]
     translation = np.concatenate([d.motion[0] for d in training])

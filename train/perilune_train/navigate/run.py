@@ -1,5 +1,6 @@
 """One navigation run: train the networks asked for, judge them beside the baselines, write tables and pictures."""
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ import lightning
 import pandas as pd
 from torch import Tensor
 
+from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
@@ -36,8 +38,12 @@ def navigate_run(
     """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
 
     `detector` is the default checkpoint for the stack network's backbone, used where it exists and fits;
-    `settings.detector` must fit. Raises UserError on bad data or a checkpoint of another architecture.
+    `settings.detector` must fit. Raises UserError on bad data, a checkpoint of another architecture, or under torchrun
+    with several processes.
     """
+    processes = os.environ.get("WORLD_SIZE", "1")
+    if processes != "1":
+        raise UserError("torchrun", "processes", processes, "1: its descents are not shared out among several")
     wanted: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
     descents = load_descents(open_dataset(dataset))
     backbone, source = _detector_backbone(settings, detector) if "stack" in wanted else (None, "")
