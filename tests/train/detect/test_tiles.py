@@ -75,15 +75,14 @@ def test_each_crater_is_found_once_and_whole(detector, scales, least, size, radi
     assert (np.diff(found.scores) <= 0).all()
 
 
-def test_boxes_can_be_drawn_larger_about_their_centres(detector):
+def test_boxes_can_get_a_margin(detector):
     blobs = Detector(Blobs(), detector.config, "cpu", False)
     image, _ = discs(300, 400, 40, 10)
-    plain, larger = (detect_image(blobs, image, Tiling(box_factor=factor)) for factor in (1.0, 1.5))
-    centre, half = (plain.boxes[:, :2] + plain.boxes[:, 2:]) / 2, (plain.boxes[:, 2:] - plain.boxes[:, :2]) / 2
-    assert len(half) > 20
-    assert larger.boxes == pytest.approx(np.hstack([centre - 1.5 * half, centre + 1.5 * half]))
-    with pytest.raises(UserError, match=r"--box-factor: factor: found 0.1; wanted 0.5 to 2"):
-        Tiling(box_factor=0.1).check()
+    plain, larger = (detect_image(blobs, image, Tiling(box_margin_px=margin)) for margin in (0.0, 1.5))
+    assert len(plain.boxes) > 20
+    assert larger.boxes == pytest.approx(plain.boxes + np.array([-1.5, -1.5, 1.5, 1.5]))
+    with pytest.raises(UserError, match=r"--box-margin: pixels: found -1; wanted 0 to 10"):
+        Tiling(box_margin_px=-1).check()
 
 
 def test_an_image_of_one_tile_gets_what_frames_get(detector):

@@ -10,7 +10,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.progress import console
 from perilune_shared.schema import SPLITS
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.tiling_options import BoxFactor, Overlap, Scales, TileSide
+from perilune_train.detect.tiling_options import BoxMargin, Overlap, Scales, TileSide
 
 _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
@@ -41,7 +41,7 @@ def evaluate(
     scale: Scales = None,
     tile: TileSide = 256,
     overlap: Overlap = 64,
-    box_factor: BoxFactor = 1.0,
+    box_margin: BoxMargin = 0.0,
 ) -> None:
     """Judge a run's best weights: report.md, metrics.json, detections.parquet and pictures.
 
@@ -58,7 +58,7 @@ def evaluate(
         from perilune_train.detect.image_evaluation import evaluate_images
         from perilune_train.detect.tiles import Tiling
 
-        folder, tiling = out or run / "images", Tiling(tile, overlap, tuple(scale or (1.0,)), box_factor)
+        folder, tiling = out or run / "images", Tiling(tile, overlap, tuple(scale or (1.0,)), box_margin)
         evaluate_images(run, config, images, folder, tiling, min_size, threshold)
         console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
         return

@@ -67,7 +67,7 @@ def evaluate_images(
         f"run `{run.resolve().name}`, best weights; {len(images)} images of `{place.name}`",
         f"wanted: boxes of {min_size_px:g} px or more (sqrt(w h)), centred in the image",
         f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
-        + ("" if tiling.box_factor == 1 else f"; boxes drawn {tiling.box_factor:g} times as large"),
+        + ("" if tiling.box_margin_px == 0 else f"; boxes enlarged by {tiling.box_margin_px:g} px at every side"),
         f"threshold {chosen_on}",
         f"oracle, with the threshold ({best:.4f}) of best F1 on these very images, which nobody knows beforehand: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
@@ -81,7 +81,7 @@ def evaluate_images(
     figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}
     figures |= {
         "overlap_px": tiling.overlap_px,
-        "box_factor": tiling.box_factor,
+        "box_margin_px": tiling.box_margin_px,
         "scales": " ".join(map(str, tiling.scales)),
     }
     runs.write_metrics(runs.RunFolder(out), figures)

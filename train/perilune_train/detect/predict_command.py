@@ -8,7 +8,7 @@ import typer
 from perilune_shared.errors import UserError
 from perilune_shared.progress import console
 from perilune_train.detect.evaluate_command import config_of_run
-from perilune_train.detect.tiling_options import BoxFactor, Overlap, Scales, TileSide
+from perilune_train.detect.tiling_options import BoxMargin, Overlap, Scales, TileSide
 
 
 def predict(
@@ -21,7 +21,7 @@ def predict(
     scale: Scales = None,
     tile: TileSide = 256,
     overlap: Overlap = 64,
-    box_factor: BoxFactor = 1.0,
+    box_margin: BoxMargin = 0.0,
 ) -> None:
     """Find craters in images.
 
@@ -36,6 +36,6 @@ def predict(
     from perilune_train.detect.tiles import Tiling
 
     count = predict_images(
-        images, run, config, out, threshold, Tiling(tile, overlap, tuple(scale or (1.0,)), box_factor)
+        images, run, config, out, threshold, Tiling(tile, overlap, tuple(scale or (1.0,)), box_margin)
     )
     console.print(f"{out}: {count} craters in {len(images)} images; detections.parquet, detections.csv, *.overlay.png")

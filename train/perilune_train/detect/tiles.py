@@ -43,8 +43,9 @@ class Tiling:
     scales: tuple[float, ...] = (1.0,)
     """Factors by which the image is enlarged or shrunk before it is cut. Above 1 for smaller craters than those
     trained on, below 1 for larger ones; what several scales find is merged."""
-    box_factor: float = 1.0
-    """Factor on the sides of the boxes found. Ours end at the crest of a rim; people often mark craters wider."""
+    box_margin_px: float = 0.0
+    """Added to the boxes found at every side. Ours end at the crest of the rim, to fractions of a pixel; the smallest
+    box of whole pixels around a crater is half a pixel larger at every side on average."""
 
     def check(self) -> None:
         """Raise UserError on what cannot be cut."""
@@ -54,8 +55,8 @@ class Tiling:
             raise UserError("--overlap", "pixels", self.overlap_px, f"0 to {self.tile_px - 1}, less than a tile")
         if not self.scales or not all(0.05 <= scale <= 8 for scale in self.scales):
             raise UserError("--scale", "factor", list(self.scales), "0.05 to 8")
-        if not 0.5 <= self.box_factor <= 2:
-            raise UserError("--box-factor", "factor", self.box_factor, "0.5 to 2")
+        if not 0 <= self.box_margin_px <= 10:
+            raise UserError("--box-margin", "pixels", self.box_margin_px, "0 to 10")
 
 
 @dataclass(frozen=True)
@@ -119,9 +120,8 @@ def detect_image(
             scores.append(found.scores[own])
     all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
     kept = suppress_in_blocks(all_boxes, all_scores, detector.config.evaluation.nms_iou)
-    centre, half = (all_boxes[kept, :2] + all_boxes[kept, 2:]) / 2, (all_boxes[kept, 2:] - all_boxes[kept, :2]) / 2
-    half = half * tiling.box_factor
-    return Detections(np.concatenate([centre - half, centre + half], axis=1), all_scores[kept])
+    margin = tiling.box_margin_px * np.array([-1, -1, 1, 1])
+    return Detections(all_boxes[kept] + margin, all_scores[kept])
 
 
 def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:

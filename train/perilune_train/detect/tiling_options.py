@@ -13,11 +13,11 @@ Scales = Annotated[
     ),
 ]
 TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles: that of the training frames, pixels.")]
-BoxFactor = Annotated[
+BoxMargin = Annotated[
     float,
     typer.Option(
-        help="Factor on the sides of the boxes found, which end at the crest of the rim: above 1 for labels that people"
-        " have drawn wider."
+        help="Pixels added to the boxes found at every side, which end at the crest of the rim: 0.5 for labels that are"
+        " boxes of whole pixels around a crater."
     ),
 ]
 Overlap = Annotated[int, typer.Option(help="Least overlap of two tiles, pixels.")]
