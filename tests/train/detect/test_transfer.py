@@ -228,11 +228,15 @@ def test_a_run_leaves_the_backbone_alone_in_its_frozen_epochs_only(dataset_detec
     runs.save_weights(tmp_path / "best.ckpt", architecture, start)
     states = []
 
-    def record(self):
-        states.append((parts(self.network), parts(self.evaluated)))
+    def recorded(hook):
+        def record(self):
+            hook(self)
+            states.append((parts(self.network), parts(self.evaluated)))
 
-    monkeypatch.setattr(DetectTask, "on_train_start", record, raising=False)
-    monkeypatch.setattr(DetectTask, "on_train_epoch_end", record, raising=False)
+        return record
+
+    for name in ("on_train_start", "on_train_epoch_end"):
+        monkeypatch.setattr(DetectTask, name, recorded(getattr(DetectTask, name)))
     settings = (*QUICK, f"detect.init_from={tmp_path / 'best.ckpt'}")
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
     run_detect(config, dataset_detect, tmp_path / "runs", "a")
