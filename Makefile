@@ -73,11 +73,12 @@ train-detect-baseline: detect-frames ## the same network without attention, into
 
 # The same seeds, one change each; <name>-<change>. The first is the run of train-detect itself.
 ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
+ABLATED = $(RUNS)/detect/$(NAME) $(foreach one,$(ABLATION),$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one))))
 ablate-detect: train-detect ## train without attention, with plain CBAM, other strides, other widths; one table
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
 	  --out $(RUNS) --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset $(DATA)/detect --resume &&) true
-	@$(BIN)/perilune-train detect compare $(RUNS)/detect/$(NAME) $(foreach one,$(ABLATION),$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))) --out $(RUNS)/detect/$(NAME)-ablation
-	@$(BIN)/python benchmarks/size.py $(RUNS)/detect/$(NAME) $(foreach one,$(ABLATION),$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))) --out $(RUNS)/detect/$(NAME)-ablation
+	@$(BIN)/perilune-train detect compare $(ABLATED) --out $(RUNS)/detect/$(NAME)-ablation
+	@$(BIN)/python benchmarks/size.py $(ABLATED) --out $(RUNS)/detect/$(NAME)-ablation
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f $(DETECT) || $(MAKE) --no-print-directory train-detect

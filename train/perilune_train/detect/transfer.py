@@ -60,14 +60,14 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     content = runs.load_weights(path)
     architecture = content["architecture"]
     runs.check_architecture(path, architecture, {"in_channels": config.in_channels, "width": config.width})
-    strides, gates = architecture.get("strides"), architecture.get("attention") == config.attention
-    taken = {
-        key
-        for key in network.state_dict() | content["state_dict"]
-        if (key.startswith("backbone.") or strides == list(config.strides)) and (gates or not key.startswith(_GATES))
-    }
-    left = {key: value for key, value in network.state_dict().items() if key not in taken}
-    runs.fill(network, left | {key: content["state_dict"][key] for key in taken & content["state_dict"].keys()}, path)
+    whole = architecture.get("strides") == list(config.strides)
+    gates = architecture.get("attention") == config.attention
+
+    def taken(key: str) -> bool:
+        return (whole or key.startswith("backbone.")) and (gates or not key.startswith(_GATES))
+
+    kept = {key: value for key, value in network.state_dict().items() if not taken(key)}
+    runs.fill(network, kept | {key: value for key, value in content["state_dict"].items() if taken(key)}, path)
 
 
 def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> None:
