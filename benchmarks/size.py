@@ -12,7 +12,7 @@ import typer
 from perilune_shared.errors import UserError, run_command_line
 from perilune_shared.files import write_text, written_aside
 from perilune_train.detect.export import load_trained
-from perilune_train.models.size import multiply_adds
+from perilune_train.detect.scales import multiply_adds_of_a_frame
 
 SIZE_PX = 256
 
@@ -32,7 +32,8 @@ def point(root: Path) -> dict[str, Any]:
         "strides": list(trained.config.strides),
         "distilled": trained.config.teacher is not None,
         "parameters": sum(p.numel() for p in trained.network.parameters()),
-        "multiply_adds": multiply_adds(trained.network, (1, trained.config.in_channels, SIZE_PX, SIZE_PX)),
+        "scales": list(trained.config.evaluation.scales),
+        "multiply_adds": multiply_adds_of_a_frame(trained.network, trained.config, SIZE_PX, SIZE_PX),
         **found,
     }
 

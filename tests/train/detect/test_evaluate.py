@@ -68,6 +68,27 @@ def test_other_labels_another_threshold_another_split(run, dataset_detect, tmp_p
     assert "most detections in a frame: 7" in (tmp_path / "report.md").read_text()
 
 
+def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path):
+    judged = ("evaluate", "--run", run, "--dataset", dataset_detect, "--scale", 1, "--scale", 2)
+    call(*judged, "--out", tmp_path / "own")
+    call(*judged, "--choose-threshold", "--out", tmp_path / "chosen")
+    call(*judged, "--split", "val", "--out", tmp_path / "val")
+    own, chosen, val = (figures(tmp_path / name) for name in ("own", "chosen", "val"))
+    assert own["test/threshold"] == figures(run)["test/threshold"] != chosen["test/threshold"]
+    assert own["test/ap50"] == chosen["test/ap50"] != figures(run)["test/ap50"]
+    assert own["evaluation/scales"] == "1 2" and figures(run)["evaluation/scales"] == "1"
+    assert "of best F1 on the dataset's val" in (tmp_path / "chosen/report.md").read_text()
+    assert "looked at at scale 1 and 2" in (tmp_path / "chosen/report.md").read_text()
+    table = call("compare", run, tmp_path / "chosen", "--out", tmp_path / "both")
+    assert "| 1 |" in table and "| 1 2 |" in table
+    # The threshold is the best on val, by the same detections that --split val finds.
+    call(*judged, "--split", "val", "--threshold", chosen["test/threshold"], "--out", tmp_path / "best")
+    assert figures(tmp_path / "best")["val/f1"] >= val["val/f1"]
+    for other in (("--threshold", 0.5), ("--split", "val"), ("--images", tmp_path)):
+        with pytest.raises(UserError, match="--choose-threshold: beside"):
+            call("evaluate", "--run", run, "--choose-threshold", *other)
+
+
 def test_runs_side_by_side(run, dataset_detect, tmp_path):
     call("evaluate", "--run", run, "--dataset", dataset_detect, "--out", tmp_path / "b")
     text = call("compare", run, tmp_path / "b", "--out", tmp_path / "both")

@@ -7,10 +7,10 @@ import torch
 from tests.stored_run import settings_of, store_run
 
 from perilune_shared.errors import UserError
-from perilune_train.data.frames import FrameStore
 from perilune_train.detect.boxes import iou_matrix, suppress
 from perilune_train.detect.predict import open_detector
-from perilune_train.detect.task import detect_frames, detections_of
+from perilune_train.detect.scales import detect_at_scales
+from perilune_train.detect.task import detections_of
 from perilune_train.detect.tiles import (
     Detector,
     Tiling,
@@ -87,7 +87,7 @@ def test_boxes_can_get_a_margin(detector):
 
 def test_an_image_of_one_tile_gets_what_frames_get(detector):
     images = np.random.default_rng(3).integers(0, 256, (2, 128, 128), np.uint8)
-    frames = detect_frames(detector.network, FrameStore(None, images), detector.config, "cpu", False)
+    frames = detect_at_scales(detector.network, images, detector.config, "cpu", False)
     assert min(len(part.scores) for part in frames) > 20
     for image, wanted in zip(images, frames, strict=True):
         found = detect_image(detector, image, Tiling(tile_px=128))

@@ -10,10 +10,12 @@ from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import load_split
 from perilune_train.detect.evaluation import protocol_of
+from perilune_train.detect.metrics import curve
 from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.run import (
     about,
     detect_split,
+    judge,
     judge_in_full,
     load_detector,
     selection_used,
@@ -46,9 +48,18 @@ def threshold_of(metrics: dict[str, float | int | str | None], path: Path) -> fl
 
 
 def evaluate_again(
-    run: Path, config: DetectConfig, dataset_root: Path, split: str, threshold: float | None, out: Path | None
+    run: Path,
+    config: DetectConfig,
+    dataset_root: Path,
+    split: str,
+    threshold: float | None,
+    out: Path | None,
+    choose_threshold: bool = False,
 ) -> Path:
-    """Judge a run's best weights on a split of a dataset; everything it leaves is in the returned folder."""
+    """Judge a run's best weights on a split of a dataset; everything it leaves is in the returned folder.
+
+    The threshold is the one given, else the run's own; with `choose_threshold` that of best F1 on the dataset's val.
+    """
     folder = out or run / "evaluation"
     if folder.resolve() == run.resolve():
         raise UserError(folder, "--out", "the run's own folder", "another: its figures stay as training left them")
@@ -66,12 +77,16 @@ def evaluate_again(
     bf16 = runs.choose_bf16(config.precision, device)
     network = load_detector(runs.RunFolder(run).best)
     frames = load_split(dataset, split, config.labels)
+    if choose_threshold:
+        val = load_split(dataset, "val", config.labels)
+        seen, _ = detect_split(network, val, "val", config, device, bf16)
+        chosen, chosen_on = curve(judge(val, seen, config)).best_threshold(), "of best F1 on the dataset's val"
     found, rate = detect_split(network, frames, split, config, device, bf16)
     evaluation = judge_in_full(frames, found, config, chosen)
     write_detections(folder / "detections.parquet", frames, found)
     told = about(dataset, split, config, protocol, run.resolve().name, chosen_on)
     write_evaluation(folder, evaluation, list(frames.frames.images), told)
-    metrics = selection_used(config, frames) | told_of(dataset, split) | {"dataset/protocol": protocol}
+    metrics = selection_used(config, frames) | told_of(dataset, split, config) | {"dataset/protocol": protocol}
     metrics |= {f"{split}/{key}": value for key, value in evaluation.figures().items()}
     metrics[f"{split}/images_per_s"] = round(rate, 2)
     runs.write_metrics(runs.RunFolder(folder), metrics)

@@ -39,13 +39,15 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
         }
         name = _name(folder)
         cells = [name, _text(metrics.get("dataset/name")), split, _text(metrics.get("dataset/protocol"))]
-        cells += [_text(metrics.get("labels/selection")), _text(figures.get("frames")), _text(figures.get("labels"))]
+        cells += [_text(metrics.get("labels/selection")), _text(metrics.get("evaluation/scales", 1))]
+        cells += [_text(figures.get("frames")), _text(figures.get("labels"))]
         cells += [with_interval(figures.get(key), _interval(figures, key)) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
         # Of the whole curve, not of the points that are kept of it.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
-    head = ["run", "dataset", "split", "protocol", "wanted", "frames", "labels", *_COLUMNS.values(), *_LOWEST.values()]
+    head = ["run", "dataset", "split", "protocol", "wanted", "scales", "frames", "labels"]
+    head += [*_COLUMNS.values(), *_LOWEST.values()]
     text = "\n".join(table(head, rows)) + "\n"
     write_text(out / "compare.md", "# Runs side by side\n\nIn brackets: 95 % intervals.\n\n" + text)
     draw_curves(curves, out / "precision_recall.png")

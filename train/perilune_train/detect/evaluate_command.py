@@ -30,6 +30,13 @@ def evaluate(
     threshold: Annotated[
         float | None, typer.Option(help="Score threshold. [default: the run's, chosen on its validation split]")
     ] = None,
+    choose_threshold: Annotated[
+        bool,
+        typer.Option(
+            "--choose-threshold",
+            help="Choose the threshold anew, on the dataset's val: for other settings than the run was judged with.",
+        ),
+    ] = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation, with --images <run>/images]")
     ] = None,
@@ -45,27 +52,36 @@ def evaluate(
 ) -> None:
     """Judge a run's best weights: report.md, metrics.json, detections.parquet and pictures.
 
-    The threshold is the run's own, chosen on the validation split it was trained beside, unless --threshold gives one.
+    The threshold is the run's own, chosen on the validation split it was trained beside, unless --threshold gives one
+    or --choose-threshold asks for a new one.
     """
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     if threshold is not None and not 0 <= threshold <= 1:
         raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
-    config = config_of_run(run, tuple(set_ or ()))
+    if choose_threshold and (threshold is not None or images is not None or split == "val"):
+        other = "--threshold" if threshold is not None else "--images" if images is not None else "--split val"
+        raise UserError("--choose-threshold", "beside", other, "one of both")
+    settings = tuple(set_ or ())
+    if scale and images is None:
+        settings += (f"detect.evaluation.scales={scale}",)
+    config = config_of_run(run, settings)
     if images is not None:
         if dataset is not None:
             raise UserError("--images", "beside --dataset", images, "one of both")
         from perilune_train.detect.image_evaluation import evaluate_images
         from perilune_train.detect.tiles import Tiling
 
-        folder, tiling = out or run / "images", Tiling(tile, overlap, tuple(scale or (1.0,)), box_margin)
+        folder = out or run / "images"
+        tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
         evaluate_images(run, config, images, folder, tiling, min_size, threshold)
         console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
         return
     # Torch takes seconds to load: not for a wrong key.
     from perilune_train.detect.again import evaluate_again
 
-    folder = evaluate_again(run, config, dataset or Path("data", run.resolve().name, "detect"), split, threshold, out)
+    place = dataset or Path("data", run.resolve().name, "detect")
+    folder = evaluate_again(run, config, place, split, threshold, out, choose_threshold)
     console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")
 
 

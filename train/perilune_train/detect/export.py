@@ -83,6 +83,7 @@ def facts(trained: Trained, size_px: int) -> dict[str, Any]:
         "min_score": settings.min_score,
         "nms_iou": settings.nms_iou,
         "max_detections": settings.max_detections,
+        "scales": list(settings.scales),
         "anchors_px": network.anchors.tolist(),
         "strides": list(network.strides),
         "width": trained.config.width,

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from perilune_train.detect.scales import at_scales
+
 _PROGRAM = '''\
 import json
 
@@ -53,6 +55,13 @@ def readme(told: dict[str, Any]) -> str:
         "too.",
         "",
     ]
+    if told["scales"] != [1.0]:
+        lines += [
+            f"The score of {told['score_threshold']:.4f} is for images looked at {at_scales(tuple(told['scales']))}:",
+            "resized, run through the graph in pieces of its size, boxes divided by the scale, all put through one",
+            "suppression. A look at one scale alone needs a threshold of its own.",
+            "",
+        ]
     if "detector-int8.onnx" in told["files"]:
         int8 = told["int8"]
         lines += [

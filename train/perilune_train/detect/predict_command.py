@@ -36,6 +36,6 @@ def predict(
     from perilune_train.detect.tiles import Tiling
 
     count = predict_images(
-        images, run, config, out, threshold, Tiling(tile, overlap, tuple(scale or (1.0,)), box_margin)
+        images, run, config, out, threshold, Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
     )
     console.print(f"{out}: {count} craters in {len(images)} images; detections.parquet, detections.csv, *.overlay.png")

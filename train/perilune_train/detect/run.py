@@ -23,10 +23,10 @@ from perilune_train.detect.facts import facts_of
 from perilune_train.detect.matching import Detections, Matches, match_split
 from perilune_train.detect.metrics import curve, figures
 from perilune_train.detect.report import write_evaluation
-from perilune_train.detect.task import DetectTask, detect_frames
+from perilune_train.detect.scales import at_scales, detect_at_scales, multiply_adds_of_a_frame
+from perilune_train.detect.task import DetectTask
 from perilune_train.detect.transfer import start_from
 from perilune_train.fit import fit
-from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 
 _ANCHOR_STREAM = 1
@@ -143,21 +143,22 @@ def run_detect(
         "anchors/best_possible_recall": best_possible_recall(sizes, anchors, config.anchor_ratio),
         "anchors/mean_best_iou": mean_best_iou(sizes, anchors),
         "parameters": sum(p.numel() for p in network.parameters()),
-        "multiply_adds": multiply_adds(network, (1, config.in_channels, *splits["test"].frames.images.shape[1:])),
+        "multiply_adds": multiply_adds_of_a_frame(network, config, *splits["test"].frames.images.shape[1:]),
     }
     metrics |= selection_used(config, splits["test"])
-    metrics |= told_of(dataset, "test") | evaluate(run, config, dataset, splits, device, bf16)
+    metrics |= told_of(dataset, "test", config) | evaluate(run, config, dataset, splits, device, bf16)
     runs.write_metrics(run, metrics)
     return run
 
 
-def told_of(dataset: Dataset, split: str) -> dict[str, float | int | str | None]:
-    """Of the judged data, for metrics.json."""
+def told_of(dataset: Dataset, split: str, config: DetectConfig) -> dict[str, float | int | str | None]:
+    """What was judged and how, for metrics.json."""
     return {
         "dataset/name": dataset.info.name,
         "dataset/split_by": dataset.info.split_by,
         "dataset/protocol": protocol_of(dataset.info),
         "evaluation/split": split,
+        "evaluation/scales": " ".join(f"{factor:g}" for factor in config.evaluation.scales),
     }
 
 
@@ -168,7 +169,12 @@ def detect_split(
     with progress_bar() as progress:
         bar = progress.add_task(f"detect {name}", total=len(split), unit="frames", note="")
         started = time.perf_counter()
-        found = detect_frames(network, split.frames, config, device, bf16, lambda n: progress.advance(bar, n))
+        network = network.to(device).eval()
+        found: list[Detections] = []
+        for start in range(0, len(split), config.batch_size):
+            frames = split.frames.images[start : start + config.batch_size]
+            found += detect_at_scales(network, frames, config, device, bf16)
+            progress.advance(bar, len(frames))
         return found, len(split) / (time.perf_counter() - started)
 
 
@@ -194,7 +200,7 @@ def about(dataset: Dataset, split: str, config: DetectConfig, protocol: str, run
         f"wanted: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
         f"threshold {chosen_on}",
         f"detections below a score of {settings.min_score:g} are dropped, suppression at IoU {settings.nms_iou:g}, "
-        f"at most {settings.max_detections} are kept in a frame",
+        f"at most {settings.max_detections} are kept in a frame; frames looked at {at_scales(settings.scales)}",
     ]
 
 

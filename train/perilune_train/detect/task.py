@@ -8,8 +8,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 
-from perilune_train.data.frames import FrameStore, normalised
-from perilune_train.detect.batches import Batch, EvaluationFrames, Share, TrainingFrames, loader, network_input
+from perilune_train.detect.batches import Batch, EvaluationFrames, Share, TrainingFrames, loader
 from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig, EvaluationSettings
 from perilune_train.detect.data import DetectSplit
@@ -208,20 +207,3 @@ class DetectTask(lightning.LightningModule):
         points = curve(matches)
         _, recall, f1 = at_threshold(matches, points.best_threshold())
         self.log_dict({"val/ap50": points.average_precision(), "val/f1": f1, "val/recall": recall})
-
-
-@torch.no_grad()
-def detect_frames(
-    network: YOLOv3, frames: FrameStore, config: DetectConfig, device: str, bf16: bool, advance: Any = None
-) -> list[Detections]:
-    """Detections of all frames, one entry a frame; `advance(n)` is called after n more frames."""
-    network = network.to(device).eval()
-    found: list[Detections] = []
-    for start in range(0, len(frames), config.batch_size):
-        images = network_input(normalised(frames.images[start : start + config.batch_size]), config.in_channels)
-        with torch.autocast(device, torch.bfloat16, enabled=bf16):
-            boxes, scores = network.detect(images.to(device))
-        found += [detections_of(b, s, config.evaluation) for b, s in zip(boxes, scores, strict=True)]
-        if advance is not None:
-            advance(len(images))
-    return found

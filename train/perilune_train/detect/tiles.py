@@ -9,7 +9,6 @@ false ones than the rest of the image does.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from perilune_train.detect.batches import network_input
 from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.matching import Detections
+from perilune_train.detect.scales import resized
 from perilune_train.detect.task import detections_of
 from perilune_train.models.yolo import YOLOv3
 
@@ -101,15 +101,13 @@ def detect_image(
 ) -> Detections:
     """Craters of an image (height, width) of any size, best first; `advance(n)` is called after n more tiles.
 
-    An image of the size of one tile gets what `detect_frames` finds.
+    An image of the size of one tile gets what `detect_at_scales` finds at scale 1.
     """
     height, width = image.shape
     boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
     for scale in tiling.scales:
         size = max(round(width * scale), 1), max(round(height * scale), 1)
-        # Averaging, when shrinking, keeps noise from aliasing into craters.
-        how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-        scaled = image if size == (width, height) else np.asarray(cv2.resize(image, size, interpolation=how), np.uint8)
+        scaled = resized(image, *size)
         whole = padded(scaled, tiling.tile_px)
         for found in _detect_tiles(detector, whole, tiling, advance):
             own = np.ones(len(found.scores), bool)

@@ -9,7 +9,7 @@ Scales = Annotated[
     typer.Option(
         "--scale",
         help="Factor by which images are enlarged or shrunk before the search; repeatable, what several find is merged."
-        " [default: 1]",
+        " [default: those of the run]",
     ),
 ]
 TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles: that of the training frames, pixels.")]
