@@ -13,9 +13,9 @@ from perilune_train.detect.run import build_network
 THRESHOLD = 0.005
 
 
-def store_run(root: Path) -> Path:
-    """A run's folder below `root`; its network finds a little everywhere, at scores around 0.01."""
-    settings = ("width=0.125", "precision=float32", "device=cpu", "evaluation.min_score=0.001")
+def store_run(root: Path, *more: str) -> Path:
+    """A run below `root`, with `more` settings; its network finds a little everywhere, at scores around 0.01."""
+    settings = ("width=0.125", "precision=float32", "device=cpu", "evaluation.min_score=0.001", *more)
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, tuple(f"detect.{s}" for s in settings))
     run = runs.start_run(root, "detect", "stored", config, False)
     network = build_network(config, np.random.default_rng(0).uniform(4, 40, (500, 2)), root)

@@ -105,3 +105,12 @@ def test_the_command(run, folder, tmp_path):
     assert (written["scales"], written["min_size_px"], written["threshold"]) == ("0.5", 20, 0.02)
     refused = CliRunner().invoke(app, [*arguments, "--dataset", "data"])
     assert isinstance(refused.exception, UserError)
+
+
+def test_images_are_looked_at_as_the_run_was_judged(folder, tmp_path):
+    run = store_run(tmp_path / "runs", "evaluation.scales=[1,2]")
+    arguments = ["detect", "evaluate", "--run", str(run), "--images", str(folder), "--out"]
+    for name, given, wanted in (("own", (), "1.0 2.0"), ("other", ("--scale", "0.5"), "0.5")):
+        result = CliRunner().invoke(app, [*arguments, str(tmp_path / name), *given])
+        assert result.exit_code == 0, result.output
+        assert json.loads((tmp_path / name / "metrics.json").read_text())["scales"] == wanted
