@@ -9,13 +9,14 @@ Array = NDArray[np.float64]
 
 def iou_matrix(first: ArrayLike, second: ArrayLike) -> Array:
     """Intersection over union (N, M) of boxes (N, 4) and (M, 4); 0 where both are empty."""
-    a = np.asarray(first, np.float64).reshape(-1, 1, 4)
-    b = np.asarray(second, np.float64).reshape(1, -1, 4)
-    size = np.clip(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), 0, None)
-    overlap = size[..., 0] * size[..., 1]
-    area_a = np.prod(a[..., 2:] - a[..., :2], axis=-1)
-    area_b = np.prod(b[..., 2:] - b[..., :2], axis=-1)
-    union = area_a + area_b - overlap
+    a, b = (np.asarray(boxes, np.float64).reshape(-1, 4).T for boxes in (first, second))
+    # A matrix for each side: a last axis of two takes twice as long.
+    width, height = (
+        np.maximum(np.minimum(a[i + 2, :, None], b[i + 2]) - np.maximum(a[i, :, None], b[i]), 0) for i in (0, 1)
+    )
+    overlap = width * height
+    area_a, area_b = ((c[2] - c[0]) * (c[3] - c[1]) for c in (a, b))
+    union = area_a[:, None] + area_b - overlap
     return np.divide(overlap, union, out=np.zeros_like(overlap), where=union > 0)
 
 
