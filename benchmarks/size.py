@@ -50,7 +50,7 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
         some = sorted((p for p in points if p["distilled"] == distilled), key=lambda p: p["multiply_adds"])
         if not some:
             continue
-        axes.plot([p["multiply_adds"] / 1e9 for p in some], [p["ap50"] for p in some], marker, ls="--", label=words)
+        axes.plot([p["multiply_adds"] / 1e9 for p in some], [p["ap50"] for p in some], marker, label=words)
         for p in some:
             place = (p["multiply_adds"] / 1e9, p["ap50"])
             axes.annotate(p["run"], place, xytext=(4, -11), textcoords="offset points", fontsize=8)
@@ -58,7 +58,7 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     sizes = sorted({round(p["multiply_adds"] / 1e9, 2) for p in points})
     axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
     axes.set_xticks([], minor=True)
-    axes.margins(x=0.2, y=0.15)
+    axes.margins(x=0.3, y=0.15)
     axes.set(
         xlabel=f"multiply-adds of an image of {SIZE_PX} x {SIZE_PX} px, 10$^9$", ylabel="AP at IoU 0.5, test split"
     )
