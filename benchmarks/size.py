@@ -53,7 +53,7 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
         axes.plot([p["multiply_adds"] / 1e9 for p in some], [p["ap50"] for p in some], marker, label=words)
         for p in some:
             place = (p["multiply_adds"] / 1e9, p["ap50"])
-            axes.annotate(p["run"], place, xytext=(4, -11), textcoords="offset points", fontsize=8)
+            axes.annotate(p["run"], place, xytext=(4, 6 if distilled else -11), textcoords="offset points", fontsize=8)
     axes.set_xscale("log")
     sizes = sorted({round(p["multiply_adds"] / 1e9, 2) for p in points})
     axes.set_xticks(sizes, [f"{size:g}" for size in sizes])
