@@ -52,6 +52,8 @@ def test_a_run_judged_again_has_the_same_figures(run, dataset_detect):
     assert again["dataset/protocol"] == "unseen scenes"
     assert (again["test/intervals_over"], again["test/intervals_units"]) == ("frame", 8)
     assert again["test/ap50_low"] <= again["test/ap50"] <= again["test/ap50_high"]
+    assert again["test/strict/ap50"] <= again["test/edge/ap50"] <= again["test/ap50"]
+    assert again["test/edge/recall"] == again["test/recall"]
     for name in ("report.md", "precision_recall.png", "bins.png", "detections.png", "detections.parquet"):
         assert (run / "evaluation" / name).stat().st_size > 0, name
 

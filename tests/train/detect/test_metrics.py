@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from perilune_train.detect.data import FrameLabels
-from perilune_train.detect.matching import FALSE, FOUND, IGNORED, Detections, Matches, find_overlaps, match_split
+from perilune_train.detect.matching import (
+    FALSE,
+    FOUND,
+    IGNORED,
+    Detections,
+    Matches,
+    edge_range,
+    find_overlaps,
+    match_split,
+)
 from perilune_train.detect.metrics import Curve, at_threshold, curve, figures
 
 
@@ -56,6 +65,15 @@ def test_what_no_one_can_judge_is_left_out_unless_strict():
     assert matches.strict().outcome.tolist() == [FOUND, FALSE, FALSE, FALSE, FALSE]
     assert at_threshold(matches, 0.0) == pytest.approx((0.5, 1.0, 2 / 3))
     assert at_threshold(matches.strict(), 0.0) == pytest.approx((0.2, 1.0, 1 / 3))
+
+
+def test_at_the_edge_only_what_lies_on_no_crater_is_false():
+    """Least radius 4 px: a find of 3.5 px in the open is false there, one on a crater and one of 2.9 px are not."""
+    truth = labels([square(10, 10), square(40, 40, 7.0)], [True, False])
+    found = detections([square(10, 10), square(40, 40, 7.0), square(70, 70, 7.0), square(20, 70, 5.8)])
+    overlaps = find_overlaps([found], [truth], [[100, 100]])
+    assert overlaps.match(0.5, (4.0, 50.0)).outcome.tolist() == [FOUND, IGNORED, IGNORED, IGNORED]
+    assert overlaps.match(0.5, edge_range((4.0, 50.0))).outcome.tolist() == [FOUND, IGNORED, FALSE, IGNORED]
 
 
 def outcomes(*kinds, wanted):

@@ -10,6 +10,7 @@ from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import load_split
 from perilune_train.detect.evaluation import protocol_of
+from perilune_train.detect.matching import EDGE
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.run import (
@@ -76,7 +77,7 @@ def evaluate_again(
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
     network = load_detector(runs.RunFolder(run).best)
-    frames = load_split(dataset, split, config.labels)
+    frames = load_split(dataset, split, config.labels, 1 / EDGE)
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
         seen, _ = detect_split(network, val, "val", config, device, bf16)

@@ -16,6 +16,7 @@ from perilune_train.detect.report import CURVE_FILE, number, table, with_interva
 
 _COLUMNS = {
     "ap50": "AP",
+    "edge/ap50": "edge AP",
     "strict/ap50": "strict AP",
     "ap50_95": "AP 0.50:0.95",
     "precision": "precision",

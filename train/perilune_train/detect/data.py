@@ -62,7 +62,8 @@ class DetectSplit:
 def load_split(dataset: Dataset, split: str, settings: LabelSettings, enlarged: float = 1.0) -> DetectSplit:
     """Frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take.
 
-    `enlarged` is the largest factor by which frames will be enlarged: what is ignored reaches down accordingly.
+    `enlarged` is the largest factor by which frames will be enlarged: what is ignored reaches down accordingly. For
+    the account of the edge it is 1 / EDGE.
     """
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):

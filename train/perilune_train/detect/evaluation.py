@@ -28,8 +28,17 @@ from perilune_train.detect.bootstrap import (
 )
 from perilune_train.detect.data import FrameLabels
 from perilune_train.detect.facts import FrameFacts
-from perilune_train.detect.matching import COCO_IOUS, FALSE, FOUND, Detections, Matches, Overlaps, find_overlaps
-from perilune_train.detect.metrics import figures, figures_over_ious
+from perilune_train.detect.matching import (
+    COCO_IOUS,
+    FALSE,
+    FOUND,
+    Detections,
+    Matches,
+    Overlaps,
+    edge_range,
+    find_overlaps,
+)
+from perilune_train.detect.metrics import figures, figures_of_account, figures_over_ious
 
 Array = NDArray[np.float64]
 
@@ -52,12 +61,15 @@ class Evaluation:
     """Which detection may be which label."""
     matches: Matches
     """At match_iou."""
+    at_edge: Matches
+    """The same in the account of the edge (matching.py)."""
     by_iou: list[Matches]
     """At COCO_IOUS."""
     bins: list[BinFigures]
     """By radius, altitude, Sun, freshness; only bins that hold labels."""
     intervals: dict[str, Interval]
-    """95 % of ap50, ap50_95, precision, recall and f1, and of the strict ap50, by bootstrap over `resamples.unit`."""
+    """95 % of ap50, ap50_95, precision, recall, f1, and of ap50 at the edge and strict, by bootstrap over
+    `resamples.unit`."""
     resamples: Resamples
     """What the intervals are drawn from."""
 
@@ -71,6 +83,7 @@ class Evaluation:
         <bin>/ap50 and others, recall_radius_..., errors. What is not defined is NaN."""
         result: dict[str, float | int | str | None] = {
             **figures(self.matches, self.threshold),
+            **figures_of_account(self.at_edge, self.threshold, "edge/"),
             **figures_over_ious(self.by_iou),
             "threshold": self.threshold,
             "match_iou": self.match_iou,
@@ -120,14 +133,17 @@ def evaluate_detections(
 ) -> Evaluation:
     """Judge the detections of all frames; `radius_px` is the range of radii that is labelled.
 
+    The account of the edge is fair only where `labels` hold craters, ignored ones, well below that range.
     `threshold` must come from other frames (validation). `seed` is of the bootstrap alone.
     """
     overlaps = find_overlaps(found, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
     matches = overlaps.match(match_iou, radius_px)
+    at_edge = overlaps.match(match_iou, edge_range(radius_px))
     by_iou = [overlaps.match(iou, radius_px) for iou in COCO_IOUS]
     resamples = draw_resamples(facts, np.random.default_rng(seed))
     drawn = {
         "ap50": average_precisions(matches, resamples),
+        "edge/ap50": average_precisions(at_edge, resamples),
         "strict/ap50": average_precisions(matches.strict(), resamples),
         "ap50_95": np.mean([average_precisions(part, resamples) for part in by_iou], axis=0),
         **at_threshold_resampled(matches, threshold, resamples),
@@ -140,6 +156,7 @@ def evaluate_detections(
         match_iou,
         overlaps,
         matches,
+        at_edge,
         by_iou,
         figures_by_bin(overlaps, matches, facts, match_iou, radius_px, threshold, resamples),
         {name: interval(values) for name, values in drawn.items()},

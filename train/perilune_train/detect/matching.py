@@ -10,7 +10,10 @@ A detection is taken in order of score and finds the free wanted label of highes
 IoU asked for. Two accounts are kept. The usual one leaves out what no one can judge: a detection that finds no wanted
 label is not counted where it lies on an ignored crater (hardly visible, or just outside the labelled range), where
 its radius sqrt(w h) / 2 is outside the labelled range, or where its centre is off the image. The strict one leaves
-out nothing: all these are false. In both only wanted labels are to be found.
+out nothing: all these are false. Between the two lies the account of the edge (`edge_range`). In the usual one nobody
+pays for calling everything just under the least radius a crater, yet some of such boxes meet a label and count; in
+this one a detection somewhat below the least radius is false too, unless it lies on a crater, wanted or not. In all of
+them only wanted labels are to be found.
 
 COCO (COCOeval without crowds) is the same but for two things. There an ignored label absorbs one detection, here any
 number, since several detections on a crater that nobody can judge cannot be judged either; COCO comes to the same
@@ -31,8 +34,15 @@ Flags = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 FOUND, FALSE, IGNORED = 1, 0, -1
 NO_LABEL, ON_IGNORED = -1, -2
+EDGE = 0.75
+"""The account of the edge judges radii down to this share of the least."""
 COCO_IOUS = tuple(np.linspace(0.5, 0.95, 10).tolist())
 """The IoUs over which COCO averages, to the last bit."""
+
+
+def edge_range(radius_px: tuple[float, float]) -> tuple[float, float]:
+    """Range of radii, pixels, in which the account of the edge calls unmatched detections false."""
+    return radius_px[0] * EDGE, radius_px[1]
 
 
 @dataclass(frozen=True)

@@ -68,18 +68,20 @@ def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, floa
 
 def figures(matches: Matches, threshold: float) -> dict[str, float]:
     """ap50 (all points), ap50_101 (COCO's), precision, recall and f1, each also strict, under their keys."""
-    result: dict[str, float] = {}
-    for prefix, account in (("", matches), ("strict/", matches.strict())):
-        points = curve(account)
-        precision, recall, f1 = at_threshold(account, threshold)
-        result |= {
-            f"{prefix}ap50": points.average_precision(),
-            f"{prefix}ap50_101": points.average_precision_101(),
-            f"{prefix}precision": precision,
-            f"{prefix}recall": recall,
-            f"{prefix}f1": f1,
-        }
-    return result
+    return figures_of_account(matches, threshold, "") | figures_of_account(matches.strict(), threshold, "strict/")
+
+
+def figures_of_account(matches: Matches, threshold: float, prefix: str) -> dict[str, float]:
+    """The five figures of one account under their keys with a prefix."""
+    points = curve(matches)
+    precision, recall, f1 = at_threshold(matches, threshold)
+    return {
+        f"{prefix}ap50": points.average_precision(),
+        f"{prefix}ap50_101": points.average_precision_101(),
+        f"{prefix}precision": precision,
+        f"{prefix}recall": recall,
+        f"{prefix}f1": f1,
+    }
 
 
 def figures_over_ious(by_iou: Sequence[Matches]) -> dict[str, float]:

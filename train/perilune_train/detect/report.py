@@ -14,7 +14,7 @@ from perilune_train.detect.bins import BinFigures
 from perilune_train.detect.bootstrap import RESAMPLES, Interval
 from perilune_train.detect.evaluation import Evaluation
 from perilune_train.detect.figures import draw_bins, draw_curves, draw_frames
-from perilune_train.detect.matching import COCO_IOUS
+from perilune_train.detect.matching import COCO_IOUS, EDGE
 from perilune_train.detect.metrics import Curve, curve
 
 CURVE_FILE = "precision_recall.parquet"
@@ -37,8 +37,9 @@ def write_evaluation(
     """
     write_text(folder / "report.md", markdown(evaluation, about))
     curves = {f"IoU {COCO_IOUS[k]:.1f}": curve(evaluation.by_iou[k]) for k in (0, 2, 4, 6, 8)}
-    strict = {f"IoU {evaluation.match_iou:g}, strict": curve(evaluation.matches.strict())}
-    draw_curves(_with_ap(curves), folder / "precision_recall.png", dashed=_with_ap(strict))
+    others = {"edge": evaluation.at_edge, "strict": evaluation.matches.strict()}
+    dashed = {f"IoU {evaluation.match_iou:g}, {name}": curve(matches) for name, matches in others.items()}
+    draw_curves(_with_ap(curves), folder / "precision_recall.png", dashed=_with_ap(dashed))
     write_curve(folder / CURVE_FILE, curve(evaluation.matches))
     draw_bins(evaluation.bins, folder / "bins.png")
     draw_frames(evaluation, images, folder / "detections.png")
@@ -90,21 +91,21 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         f"- in brackets: 95 % intervals, {RESAMPLES} resamples of {unit.count} {unit.unit}s"
         + (f" (few {unit.unit}s: rough)" if unit.count < 5 else ""),
         "- usual account: finds on ignored craters, outside the range of radii or centred off the image do not count; "
-        "strict account: they are false",
+        f"edge: from {EDGE:g} of the least radius on, those on no crater at all are false; strict: all are false",
         "",
         "## All frames",
         "",
     ]
     rows = [
-        [title, with_interval(figures[key], intervals.get(key)), _strict(figures, intervals, key)]
+        [title, *(with_interval(figures[f"{a}{key}"], intervals.get(f"{a}{key}")) for a in ("", "edge/", "strict/"))]
         for key, title in _ROWS.items()
     ]
     rows += [
-        ["AP over IoU 0.50:0.95, all points", with_interval(figures["ap50_95"], intervals["ap50_95"]), ""],
-        ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_101"]), ""],
-        ["AP at IoU 0.75, all points", number(figures["ap75"]), ""],
+        ["AP over IoU 0.50:0.95, all points", with_interval(figures["ap50_95"], intervals["ap50_95"]), "", ""],
+        ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_101"]), "", ""],
+        ["AP at IoU 0.75, all points", number(figures["ap75"]), "", ""],
     ]
-    lines += [*table(["", "usual", "strict"], rows), ""]
+    lines += [*table(["", "usual", "edge", "strict"], rows), ""]
     for by, title in (("radius", "Radius"), ("altitude", "Altitude"), ("sun", "Sun elevation")):
         lines += _bins(title, [part for part in evaluation.bins if part.by == by])
     lines += _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
@@ -122,10 +123,6 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     ]
     lines += [*table(["", "px", "over the radius"], rows), ""]
     return "\n".join(lines)
-
-
-def _strict(figures: dict, intervals: dict[str, Interval], key: str) -> str:
-    return with_interval(figures[f"strict/{key}"], intervals.get(f"strict/{key}"))
 
 
 def _range(part: BinFigures) -> str:

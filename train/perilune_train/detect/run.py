@@ -20,7 +20,7 @@ from perilune_train.detect.data import DetectSplit, load_split
 from perilune_train.detect.distill import Teacher
 from perilune_train.detect.evaluation import Evaluation, evaluate_detections, protocol_of
 from perilune_train.detect.facts import facts_of
-from perilune_train.detect.matching import Detections, Matches, match_split
+from perilune_train.detect.matching import EDGE, Detections, Matches, match_split
 from perilune_train.detect.metrics import curve, figures
 from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.scales import at_scales, detect_at_scales, multiply_adds_of_a_frame
@@ -99,7 +99,7 @@ def run_detect(
     dataset = open_dataset(dataset_root)
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
-    enlarged = {"train": max(config.augment.scale[1], 1.0)}
+    enlarged = {"train": max(config.augment.scale[1], 1.0), "test": 1 / EDGE}
     splits = {
         split: load_split(dataset, split, config.labels, enlarged.get(split, 1.0)) for split in ("train", "val", "test")
     }
