@@ -1,8 +1,12 @@
 """Run folders, weights, resuming."""
 
 import json
+import os
+import subprocess
+import sys
 
 import lightning
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -13,8 +17,18 @@ from perilune_train import fit as fitting
 from perilune_train import runs
 
 
+class Part(Section):
+    size: int
+    limits: tuple[float, float] = (1e-5, 2.0)
+
+
 class Settings(Section):
     rate: float = 0.1
+
+
+class Larger(Settings):
+    workers: int = 0
+    part: Part = Part(size=3)
 
 
 def test_an_older_run_is_replaced_and_nothing_else(tmp_path):
@@ -36,9 +50,60 @@ def test_resuming_keeps_the_run_and_needs_its_settings(tmp_path):
     (run.root / "checkpoints").mkdir()
     run.last.write_text("state")
     assert runs.start_run(tmp_path, "detect", "a", Settings(), resume=True).last.exists()
-    with pytest.raises(UserError, match="--resume: found another configuration"):
+    with pytest.raises(UserError, match=r"config.yaml: detect.rate: found 0.1; wanted 0.2, as now asked for"):
         runs.start_run(tmp_path, "detect", "a", Settings(rate=0.2), resume=True)
-    assert run.last.exists()
+    assert run.last.exists() and run.config.read_text() == "detect:\n  rate: 0.1\n"
+
+
+@pytest.mark.parametrize(
+    ("config", "told"),
+    [
+        (Larger(), None),
+        (Larger(workers=3), None),
+        (Larger(part=Part(size=4)), r"detect.part: found nothing; wanted {'size': 4"),
+    ],
+)
+def test_a_run_older_than_a_setting_has_its_default(tmp_path, config, told):
+    run = runs.start_run(tmp_path, "detect", "a", Settings(), resume=False)
+    if told is None:
+        return runs.check_settings(run, "detect", config)
+    with pytest.raises(UserError, match=told):
+        runs.check_settings(run, "detect", config)
+
+
+def test_the_first_other_setting_is_named(tmp_path):
+    run = runs.start_run(tmp_path, "detect", "a", Larger(part=Part(size=5)), resume=False)
+    runs.check_settings(run, "detect", Larger(workers=2, part=Part(size=5)))
+    with pytest.raises(UserError, match=r"detect.part.size: found 5; wanted 3"):
+        runs.check_settings(run, "detect", Larger(rate=0.1))
+    with pytest.raises(UserError, match=r"detect.part: found .* wanted no such setting"):
+        runs.check_settings(run, "detect", Settings())
+    run.config.write_text("detect:\n  part: {limits: [1.0e-05, 2]}\n")
+    with pytest.raises(UserError, match=r"detect.part.size: found nothing; wanted 3"):
+        runs.check_settings(run, "detect", Larger())
+    runs.check_settings(runs.RunFolder(tmp_path / "absent"), "detect", Larger())
+
+
+def test_only_the_first_process_touches_the_folder(tmp_path, monkeypatch):
+    older = runs.start_run(tmp_path, "detect", "a", Settings(), resume=False)
+    monkeypatch.setattr(runs, "is_first_process", lambda: False)
+    again = runs.start_run(tmp_path, "detect", "a", Settings(rate=0.2), resume=False)
+    assert again == older and older.config.read_text() == "detect:\n  rate: 0.1\n"
+    # The first one makes it at this very moment: an unfinished file, no config.yaml yet.
+    (tmp_path / "detect" / "b").mkdir()
+    (tmp_path / "detect" / "b" / ".config.1.part.yaml").touch()
+    for resume in (False, True):
+        runs.start_run(tmp_path, "detect", "b", Settings(), resume)
+        runs.start_run(tmp_path, "detect", "c", Settings(), resume)
+    assert [path.name for path in (tmp_path / "detect" / "b").iterdir()] == [".config.1.part.yaml"]
+    assert not (tmp_path / "detect" / "c").exists()
+
+
+def test_a_process_that_lightning_starts_knows_at_once_that_it_is_not_the_first():
+    ask = "from perilune_train.runs import is_first_process; print(is_first_process())"
+    own = {**os.environ, "LOCAL_RANK": "1"}
+    done = subprocess.run([sys.executable, "-c", ask], env=own, capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr
 
 
 def test_metrics_are_plain_json(tmp_path):
@@ -94,6 +159,24 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(tmp_path, content):
         runs.load_weights(tmp_path / "absent.ckpt")
 
 
+def test_damaged_weights_are_refused_in_one_line(tmp_path, recwarn):
+    """Single bytes, as a failing disk changes them: torch answers with a dozen kinds of error."""
+    path = tmp_path / "best.ckpt"
+    runs.save_weights(path, {"width": 0.5}, nn.Linear(3, 2))
+    whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for place in rng.integers(len(whole), size=5):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            runs.load_weights(path)
+        except UserError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused > 50 and not recwarn.list
+
+
 class Line(lightning.LightningModule):
     """Fits y = 2 x; data follow from the epoch. Stops dead in `dies_in`, as a killed process would."""
 
@@ -126,7 +209,7 @@ class Line(lightning.LightningModule):
 
 
 def fit(run, task, epochs, resume=False):
-    fitting.fit(
+    return fitting.fit(
         run,
         task,
         label="line",
@@ -153,6 +236,37 @@ def test_a_resumed_run_repeats_the_uninterrupted_one(tmp_path):
     best = runs.load_weights(killed.best)
     assert best["architecture"] == {"kind": "line"}
     assert (best["state_dict"]["weight"] - 2).abs() < 2
+
+
+def test_a_resumed_run_took_the_time_of_all_its_sittings(tmp_path):
+    run = runs.start_run(tmp_path, "detect", "a", Settings(), False)
+    with pytest.raises(KeyError):
+        fit(run, Line(dies_in=2), 3)
+    state = torch.load(run.last, weights_only=True)
+    assert 0 < state["callbacks"]["KeepLast"]["seconds"] < 60
+    state["callbacks"]["KeepLast"]["seconds"] = 1000.0
+    torch.save(state, run.last)
+    assert 1000 < fit(run, Line(), 3, resume=True) < 1060
+    assert 1000 < fit(run, Line(), 3, resume=True) < 1060
+    assert fit(run, Line(), 3) < 60
+
+
+@pytest.mark.parametrize("fault", ["cut", "empty", "best", "other", "text"])
+def test_a_last_state_that_cannot_be_gone_on_with(tmp_path, fault):
+    run = runs.start_run(tmp_path, "detect", "a", Settings(), False)
+    task = Line()
+    fit(run, task, 1)
+    if fault == "other":
+        task.network = nn.Linear(2, 1)
+    else:
+        state = run.last.read_bytes()
+        contents = {"cut": state[: len(state) // 2], "empty": b"", "best": run.best.read_bytes(), "text": b"state"}
+        run.last.write_bytes(contents[fault])
+    with pytest.raises(UserError) as caught:
+        fit(run, task, 2, resume=True)
+    told = str(caught.value)
+    assert told.startswith(f"{run.last}: ") and "\n" not in told
+    assert ("weight: found (1, 1); wanted (1, 2)" if fault == "other" else "start anew without --resume") in told
 
 
 def test_best_keeps_the_best_not_the_last(tmp_path):

@@ -14,9 +14,18 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from perilune_shared.progress import progress_bar
 from perilune_train.config import Precision
-from perilune_train.runs import RunFolder, choose_bf16, choose_device, is_first_process, save_weights
+from perilune_train.runs import (
+    RunFolder,
+    check_tensors,
+    choose_bf16,
+    choose_device,
+    is_first_process,
+    read_saved,
+    save_weights,
+)
 
 _STEPS_BETWEEN_LOOKS = 20
+_STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
 
 
 class KeepBest(Callback):
@@ -52,6 +61,18 @@ class KeepLast(Callback):
 
     def __init__(self, run: RunFolder, minutes: float | None):
         self.run, self.minutes = run, minutes
+        self.earlier_s, self.began = 0.0, time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """What the training took until now, with the earlier sittings up to the state from which it was resumed."""
+        return self.earlier_s + time.monotonic() - self.began
+
+    def state_dict(self) -> dict[str, float]:
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        self.earlier_s = state_dict["seconds"]
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         self.saved = time.monotonic()
@@ -130,15 +151,23 @@ def fit(
     num_nodes: int = 1,
     strategy: str = "auto",
     checkpoint_minutes: float | None = None,
-) -> None:
+) -> float:
     """Train `task` for a fixed number of epochs, keeping the best weights and the last state in the run's folder.
+
+    Returns the seconds that it took; of a resumed run those of all its sittings.
 
     The task gives its own loaders, asked for anew before every epoch (so that order and augmentation can follow
     from seed and epoch alone; with several processes each gives its share), logs `monitor` in validation, and has
     `architecture` and `evaluated` (see KeepBest). With `resume` training goes on from last.ckpt, if the run has one,
     and repeats exactly what an uninterrupted run does. That is kept after every epoch, and with `checkpoint_minutes`
-    within epochs too; then the task's training batches must go on where the checkpoint was made.
+    within epochs too; then the task's training batches must go on where the checkpoint was made. Raises UserError
+    where last.ckpt is damaged or of another network.
     """
+    resume_from = run.last if resume and run.last.is_file() else None
+    if resume_from is not None:
+        anew = "the last state of a run; start anew without --resume"
+        check_tensors(resume_from, read_saved(resume_from, "--resume", _STATE, anew)["state_dict"], task)
+    keep_last = KeepLast(run, checkpoint_minutes)
     device = choose_device(device)
     devices, num_nodes = machines(devices, num_nodes)
     for name in ("lightning.pytorch", "lightning.fabric"):
@@ -167,12 +196,12 @@ def fit(
                 *([Bar(label)] if is_first_process() else []),
                 LearningRateMonitor("step"),
                 KeepBest(run, monitor, mode),
-                KeepLast(run, checkpoint_minutes),
+                keep_last,
             ],
         )
-        resume_from = str(run.last) if resume and run.last.is_file() else None
         try:
             trainer.fit(task, ckpt_path=resume_from, weights_only=True)
         except SystemExit:
             # Lightning answers Ctrl-C with a bare exit; the command line has words for it.
             raise KeyboardInterrupt from None
+    return keep_last.seconds

@@ -3,9 +3,9 @@
 import io
 import json
 import math
-import pickle
 import shutil
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,13 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
-from perilune_shared.config import Section, to_yaml
+from perilune_shared.config import Section, read_config_file, to_yaml
 from perilune_shared.errors import UserError
 from perilune_shared.files import write_bytes, write_text
 from perilune_train.config import Precision
+
+_NO_RESULT = {"detect.workers", "detect.checkpoint_minutes"}
+"""Settings that say how a run goes on, and change nothing that comes of it."""
 
 
 @dataclass(frozen=True)
@@ -54,28 +57,60 @@ class RunFolder:
 
 
 def is_first_process() -> bool:
-    """Whether this process writes files and says things: the only one, or of several that train together the first."""
+    """Whether this process writes files and says things: the only one, or of several that train together the first.
+
+    It is known from the start: Lightning reads it from what torchrun, or it itself, gives the processes they start.
+    """
     return int(rank_zero_only.rank) == 0
 
 
 def start_run(runs: Path, task: str, name: str, config: Section, resume: bool) -> RunFolder:
     """The folder of a run about to start, with its config.yaml; an older run of that name is replaced.
 
-    With `resume` an older run is kept, if there is one. Raises UserError where it had another configuration, and
-    where the folder holds something that is no run.
+    With `resume` an older run is kept, if there is one. Raises UserError where it had other settings, and where the
+    folder holds something that is no run. Of several processes only the first touches the folder.
     """
     run = RunFolder(runs / task / name)
-    text = to_yaml(task, config)
+    if resume:
+        check_settings(run, task, config)
+    # Another process would take away what the first has just made.
+    if not is_first_process():
+        return run
     if run.root.is_dir() and any(run.root.iterdir()):
         if not run.config.is_file():
             raise UserError(run.root, "--name", "a folder that is no run (no config.yaml)", "another name")
         if resume:
-            if run.config.read_text(encoding="utf-8") != text:
-                raise UserError(run.config, "--resume", "another configuration", "the settings the run began with")
             return run
         shutil.rmtree(run.root)
-    write_text(run.config, text)
+    write_text(run.config, to_yaml(task, config))
     return run
+
+
+def check_settings(run: RunFolder, task: str, config: Section) -> None:
+    """Raise UserError naming the first setting in which an older run, if there is one, differs from `config`.
+
+    A setting that config.yaml lacks, since it is newer than the run, stands for its default.
+    """
+    if not run.config.is_file():
+        return
+    for key, old, new in _differences(task, read_config_file(run.config).get(task, {}), config):
+        if key not in _NO_RESULT:
+            raise UserError(run.config, key, old, f"{new}, as now asked for; --resume keeps what the run began with")
+
+
+def _differences(where: str, old: Mapping[str, Any], config: Section) -> Iterator[tuple[str, object, object]]:
+    """Key, old and new value of what differs between plain settings and a section."""
+    plain = config.model_dump(mode="json")
+    for name, field in type(config).model_fields.items():
+        key, value = f"{where}.{name}", getattr(config, name)
+        if isinstance(value, Section) and isinstance(old.get(name), dict):
+            yield from _differences(key, old[name], value)
+        elif name in old and old[name] != plain[name]:
+            yield key, old[name], plain[name]
+        elif name not in old and value != field.get_default(call_default_factory=True):
+            yield key, "nothing", plain[name]
+    for name in sorted(old.keys() - plain.keys()):
+        yield f"{where}.{name}", old[name], "no such setting"
 
 
 def write_metrics(run: RunFolder, metrics: Mapping[str, float | int | str | None]) -> None:
@@ -101,13 +136,21 @@ def load_weights(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise UserError(path, "checkpoint", "no such file", "checkpoints/best.ckpt of a finished run")
+    return read_saved(path, "checkpoint", {"architecture", "state_dict"}, "checkpoints/best.ckpt of a run")
+
+
+def read_saved(path: Path, field: str, keys: set[str], wanted: str) -> dict[str, Any]:
+    """The dictionary that torch saved in a file, on the CPU. Raises UserError where it is damaged or lacks `keys`."""
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, OSError, ValueError, KeyError) as error:
-        said = str(error) or type(error).__name__
-        raise UserError(path, "checkpoint", said, "checkpoints/best.ckpt of a run") from None
-    if not isinstance(content, dict) or not {"architecture", "state_dict"} <= content.keys():
-        raise UserError(path, "checkpoint", "no architecture and state_dict", "checkpoints/best.ckpt of a run")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    # Torch names no kinds of error; damaged bytes raise a dozen.
+    except Exception as error:
+        raise UserError(path, field, str(error) or type(error).__name__, wanted) from None
+    missing = keys - content.keys() if isinstance(content, dict) else keys
+    if missing:
+        raise UserError(path, field, f"no {', '.join(sorted(missing))}", wanted)
     return content
 
 
@@ -119,14 +162,19 @@ def check_architecture(path: Path, found: Mapping[str, Any], wanted: Mapping[str
 
 
 def fill(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
-    """Load all weights into a network. Raises UserError naming the first tensor that is missing, extra or misshapen."""
+    """Load all weights into a network. Raises UserError as `check_tensors`."""
+    check_tensors(path, state, network)
+    network.load_state_dict(dict(state))
+
+
+def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Module) -> None:
+    """Raise UserError naming the first tensor of a checkpoint that is missing, extra or misshapen for a network."""
     own = network.state_dict()
     for key in sorted(own.keys() | state.keys()):
         found = tuple(state[key].shape) if key in state else "nothing"
         wanted = str(tuple(own[key].shape)) if key in own else "no such tensor"
         if str(found) != wanted:
             raise UserError(path, key, found, f"{wanted}; the checkpoint is of another architecture")
-    network.load_state_dict(dict(state))
 
 
 def choose_device(device: str) -> str:

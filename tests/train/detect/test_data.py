@@ -83,6 +83,22 @@ def test_craters_just_outside_the_labelled_range_are_ignored():
     assert not rows["wanted"].any() and not rows["labelled"].any()
 
 
+def test_what_is_ignored_reaches_as_far_as_frames_are_resized():
+    camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
+    frame = {"position_m": [0.0, 0.0, 100.0], "rotation_wxyz": quaternion_from_matrix(np.diag([1.0, -1.0, -1.0]))}
+    row = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "normal_x": 0.0, "normal_y": 0.0, "normal_z": 1.0}
+    craters = pd.DataFrame([{**row, "diameter_m": 2 * radius} for radius in (0.6, 1.1, 1.8, 65.0, 110.0, 150.0)])
+
+    def ignored(*scale):
+        return unlabelled_craters(craters, camera, frame, (2.0, 50.0), scale)["radius_px"].round(6).tolist()
+
+    # Of the radii times the factors, those from 2 sqrt(1/2) to 50 sqrt(2) pixels.
+    assert ignored(1.0, 1.0) == [1.8, 65.0]
+    assert ignored(1.0, 2.0) == [1.1, 1.8, 65.0]
+    assert ignored(0.5, 1.0) == [1.8, 65.0, 110.0]
+    assert ignored(1.5, 2.0) == ignored(1.0, 2.0)
+
+
 def test_a_distorted_camera_ignores_craters_where_it_sees_them():
     """Barrel distortion draws a crater off the image into it; one beyond the fold of the distortion is nowhere."""
     plain = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
@@ -181,6 +197,13 @@ def test_stretching_clips_the_given_share_at_most(split):
     assert 0.1 < shares[:, 0].max() <= 0.2
     assert 0.1 < shares[:, 1].max() < 0.25
     assert np.ptp(shares, axis=0).min() > 0.05
+
+
+def test_one_scale_for_all_frames(split):
+    before, labels, pixels, boxes, _ = changed(split, PLAIN.model_copy(update={"scale": (2.0, 2.0)}))
+    assert not np.array_equal(pixels, before)
+    sizes = {tuple((box[2:] - box[:2]).round(6)) for box in boxes}
+    assert sizes <= {tuple((2 * (box[2:] - box[:2])).round(6)) for box in labels.boxes}
 
 
 def test_scales_are_least_and_largest():

@@ -110,6 +110,12 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
         (["--set", "detect.width=1"], "--set: detect.width: found not a setting of judging"),
         (["--set", "detect.evaluation.match_iuo=0.4"], "found unknown key; wanted match_iou"),
         (["--out", "."], "the run's own folder"),
+        (["--scale", "9"], "--scale: detect.evaluation.scales.0: found 9.0; wanted"),
+        (["--scale", "nan"], "--scale: detect.evaluation.scales.0"),
+        (["--tile", "256"], "--tile: beside: found no --images; wanted --images, or no --tile"),
+        (["--overlap", "32"], "--overlap: beside: found no --images"),
+        (["--box-margin", "0.5"], "--box-margin: beside: found no --images"),
+        (["--min-size", "8"], "--min-size: beside: found no --images"),
     ],
 )
 def test_wrong_options_in_one_line(run, dataset_detect, options, told, monkeypatch):

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from perilune_shared.errors import UserError
 from perilune_train.cli import app
+from perilune_train.detect.compare import compare_folders
 from perilune_train.detect.image_evaluation import evaluate_images, judge_images
 from perilune_train.detect.images import ImageSet, LabelledImage, read_images
 from perilune_train.detect.matching import Detections
@@ -103,8 +104,33 @@ def test_the_command(run, folder, tmp_path):
     assert result.exit_code == 0, result.output
     written = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert (written["scales"], written["min_size_px"], written["threshold"]) == ("0.5", 20, 0.02)
-    refused = CliRunner().invoke(app, [*arguments, "--dataset", "data"])
-    assert isinstance(refused.exception, UserError)
+    for option, value, told in (
+        ("--dataset", "data", "--dataset: beside: found --images; wanted one of both"),
+        ("--split", "test", "--split: beside: found --images; wanted one of both"),
+        ("--set", "detect.labels.selection=all", "--set: detect.labels.selection: found beside --images"),
+        ("--scale", "9", "--scale: factor: found [9.0]"),
+    ):
+        refused = CliRunner().invoke(app, [*arguments, option, value])
+        assert isinstance(refused.exception, UserError) and told in str(refused.exception)
+
+
+def test_the_runs_own_folder_keeps_its_figures(run, folder):
+    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
+    for out in (run, run / "checkpoints" / ".."):
+        result = CliRunner().invoke(
+            app, ["detect", "evaluate", "--run", str(run), "--images", str(folder), "--out", str(out)]
+        )
+        assert isinstance(result.exception, UserError) and "the run's own folder" in str(result.exception)
+    assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_compare_shows_images(run, folder, tmp_path):
+    figures = evaluate_images(run, settings_of(run), folder, tmp_path / "a", Tiling(96, 32, (0.5, 1.0)), 12.0)
+    text = compare_folders([tmp_path / "a"], tmp_path / "both")
+    cells = [cell.strip() for cell in text.splitlines()[-1].strip("| ").split("|")]
+    assert cells[1:8] == ["images", "images", "-", "from 12.0 px", "0.5 1.0", "2", str(figures["labels"])]
+    assert cells[8].startswith(f"{figures['ap50']:.3f} (") and "-" not in cells[9:15]
+    assert f"{figures['lowest_ap50_by_radius']:.3f}" == cells[15]
 
 
 def test_images_are_looked_at_as_the_run_was_judged(folder, tmp_path):

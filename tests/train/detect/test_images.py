@@ -120,7 +120,7 @@ def test_coco(tmp_path):
         ({"categories": [{"id": 1, "name": "cat"}, {"id": 2, "name": "dog"}]}, "categories: found cat, dog"),
         ({"annotations": [{"image_id": 8, "category_id": 1, "bbox": [1, 2, 3, 4]}]}, r"annotations\[0\].image_id"),
         ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, 3]}]}, r"annotations\[0\].bbox"),
-        ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, 0, 4]}]}, "above 0"),
+        ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, -1, 4]}]}, "above 0"),
         ({"annotations": [{"image_id": 7, "category_id": 1}]}, r"annotations\[0\].bbox: found None"),
     ],
 )
@@ -137,6 +137,36 @@ def test_coco_does_not_follow_a_link_out_of_its_folder(tmp_path):
     (inner / "link.png").symlink_to(tmp_path / "outside.png")
     with pytest.raises(UserError, match=r"file_name: found link.png"):
         read_images(path)
+
+
+@pytest.mark.parametrize("folder", ["annotations", "images", "images/train2017", "train2017"])
+def test_coco_beside_a_folder_of_images(tmp_path, folder):
+    root = tmp_path / "given"
+    path = coco(root / "annotations", images=[{"id": 7, "file_name": "a.png"}])
+    path = path.rename(path.with_name("instances_train2017.json"))
+    wanted = picture(root / folder / "a.png")
+    assert read_images(path).images[0].path == wanted.resolve()
+    # Names that lead out of these folders, and links, stay refused, whatever is there.
+    picture(tmp_path / "outside.png")
+    wanted.unlink()
+    wanted.symlink_to(tmp_path / "outside.png")
+    with pytest.raises(UserError, match=r"file_name: found a.png"):
+        read_images(path)
+    wanted.unlink()
+    with pytest.raises(UserError, match=r"annotations/a.png: image: found no such file"):
+        read_images(path)
+    coco(root / "annotations", images=[{"id": 7, "file_name": "../images/b.png"}]).replace(path)
+    picture(root / "images" / "b.png")
+    with pytest.raises(UserError, match=r"file_name: found ../images/b.png"):
+        read_images(path)
+
+
+def test_coco_boxes_without_an_area_are_left_out_and_told(tmp_path, capsys):
+    sizes = [(0, 9), (9, 0.0), (0, 0), (9, 10)]
+    path = coco(tmp_path, annotations=[{"image_id": 7, "category_id": 1, "bbox": [2, 3, *size]} for size in sizes])
+    (image,) = read_images(path).images
+    assert image.boxes.tolist() == [[2, 3, 11, 13]] and image.marked.tolist() == [True]
+    assert "annotations.json: 3 boxes without width or height are left out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("text", ["[", "[]", "[" * 100_000, '"x"'])

@@ -113,6 +113,30 @@ def test_an_image_of_the_earth_is_refused(tmp_path):
         read_georeference(geotiff(tmp_path / "g.tif", EARTH, from_origin(10, 50, 0.1, 0.1)))
 
 
+ORTHOGRAPHIC = CRS.from_proj4(f"+proj=ortho +lat_0=0 +lon_0=0 +R={MOON_RADIUS_M:.0f} +units=m +no_defs")
+WHOLE_DISC = from_origin(-2e6, 2e6, 4e6 / 128, 4e6 / 128)
+
+
+def test_what_lies_off_the_map_is_left_out_and_told(run, tmp_path, capsys):
+    path = geotiff(tmp_path / "disc[b].tif", ORTHOGRAPHIC, WHOLE_DISC, 128, 128)
+    middles = np.array([[2.0, 2], [64, 64], [64, 126], [119, 64], [100, 64]])
+    boxes = np.concatenate([middles - 2, middles + 2], axis=1)
+    kept = features("disc[b].tif", Detections(boxes, np.linspace(0.9, 0.5, 5)), read_georeference(path))
+    # The middle of the image and one well inside the disc; at 119 the ellipse reaches over the limb.
+    assert [feature["properties"]["score"] for feature in kept] == [0.8, 0.5]
+    assert kept[0]["properties"]["longitude_deg"] == pytest.approx(0, abs=1e-6)
+    count = predict_images([path], run, settings_of(run), tmp_path / "out", None, Tiling(tile_px=128))
+    shapes = json.loads((tmp_path / "out" / "detections.geojson").read_text())["features"]
+    assert 0 < len(shapes) < count == len(pd.read_parquet(tmp_path / "out" / "detections.parquet"))
+    assert f"disc[b].tif: {count - len(shapes)} craters lie off its map" in " ".join(capsys.readouterr().err.split())
+
+
+def test_an_image_wholly_off_its_map_is_refused(tmp_path):
+    path = geotiff(tmp_path / "sky.tif", ORTHOGRAPHIC, from_origin(5e6, 5e6, 1000, 1000))
+    with pytest.raises(UserError, match=r"sky\.tif: projection: found none of its pixels on the map"):
+        read_georeference(path)
+
+
 def test_one_faulty_image_among_several_leaves_nothing(run, tmp_path):
     good, bad = tmp_path / "good.png", tmp_path / "bad.png"
     assert cv2.imwrite(str(good), noise(64, 64))
@@ -141,6 +165,12 @@ def test_the_command(run, tmp_path):
     arguments = ["detect", "predict", str(tmp_path / "a.png"), "--run", str(run), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, [*arguments, "--scale", "1", "--scale", "2", "--threshold", "0.9"])
     assert result.exit_code == 0, result.output
+    assert "geojson" not in result.output
+    placed = geotiff(tmp_path / "g.tif", POLAR, from_origin(1000, 3000, 2, 2))
+    result = CliRunner().invoke(
+        app, ["detect", "predict", str(placed), "--run", str(run), "--out", str(tmp_path / "placed")]
+    )
+    assert "detections.csv, detections.geojson, *.overlay.png" in " ".join(result.output.split())
     table = pd.read_parquet(tmp_path / "out" / "detections.parquet")
     assert len(table) == 0 and list(table.columns) == COLUMNS
     for options in (["--threshold", "2"], ["--scale", "0"], ["--tile", "100"], ["--overlap", "-1"], []):

@@ -57,6 +57,10 @@ def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(dataset_detec
 
 
 def test_two_processes_share_the_frames_and_end_with_equal_weights(dataset_detect, tmp_path):
+    run = tmp_path / "detect" / "two"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "config.yaml").write_text("detect: {}\n")
+    (run / "checkpoints" / "last.ckpt").write_text("of an older run, to be replaced")
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     script = [str(Path(__file__).with_name("two_processes.py")), str(dataset_detect), str(tmp_path), *SETTINGS]
     done = subprocess.run([*torchrun, *script], env=ALONE, capture_output=True, text=True, timeout=120)
@@ -69,7 +73,6 @@ def test_two_processes_share_the_frames_and_end_with_equal_weights(dataset_detec
         {key: value for key, value in first.items() if not key.startswith("network.") or is_weight(key)},
         {key: value for key, value in second.items() if not key.startswith("network.") or is_weight(key)},
     )
-    run = tmp_path / "detect" / "two"
     saved = state(run.joinpath("checkpoints", "last.ckpt"))["state_dict"]
     assert_equal_tensors(saved, {key: first[key] for key in saved})
     assert (run / "metrics.json").is_file() and len(list(run.glob("events*"))) == 1

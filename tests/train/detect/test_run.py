@@ -1,6 +1,7 @@
 """A whole detection run, and what wrong input gets."""
 
 import json
+import shutil
 
 import pyarrow.parquet as pq
 import pytest
@@ -8,8 +9,11 @@ import torch
 
 from perilune_shared.config import parse_yaml, resolve
 from perilune_shared.errors import UserError
+from perilune_shared.manifest import open_dataset
+from perilune_shared.pack import pack
 from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.run import build_network, load_detector, run_detect
 from perilune_train.detect.task import DetectTask
 from perilune_train.detect.transfer import start_from
@@ -117,9 +121,97 @@ def test_the_same_seed_gives_the_same_weights_also_when_resumed(finished, datase
     first, again = (torch.load(r.last, weights_only=True)["state_dict"] for r in (finished, run))
     assert first.keys() == again.keys()
     assert all(torch.equal(first[key], again[key]) for key in first)
+    assert [torch.load(r.last, weights_only=True)["images_seen"] for r in (finished, run)] == [48, 48]
     timed = ("train/seconds", "train/images_per_s", "test/images_per_s")
     metrics = [{k: v for k, v in json.loads(r.metrics.read_text()).items() if k not in timed} for r in (finished, run)]
     assert metrics[0] == metrics[1]
+
+
+def test_a_finished_run_is_left_as_it_is(finished, tmp_path, capsys):
+    def files():
+        return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in finished.root.rglob("*")}
+
+    before = files()
+    run_detect(settings("detect.workers=1"), tmp_path / "absent", finished.root.parents[1], "a", resume=True)
+    assert "finished, and left as it is" in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(UserError, match=r"config.yaml: detect.learning_rate: found 0.005; wanted 0.01"):
+        other = settings("detect.learning_rate=0.01")
+        run_detect(other, tmp_path / "absent", finished.root.parents[1], "a", resume=True)
+    assert files() == before
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory, make_dataset):
+    """Six frames to train on, two of val and of test."""
+    return make_dataset(tmp_path_factory.mktemp("few") / "few", "detect", n_frames=2)
+
+
+@pytest.fixture
+def unjudged(monkeypatch):
+    """Runs are trained alone: judging takes most of the time of a small one."""
+    monkeypatch.setattr("perilune_train.detect.run.evaluate", lambda *_: {})
+
+
+def test_weights_to_start_from_are_not_needed_to_go_on(finished, few, tmp_path, unjudged):
+    """The last state of a run that was stopped while it was judged: all trained, no figures yet."""
+    first = tmp_path / "first.ckpt"
+    shutil.copy(finished.best, first)
+    config = settings("detect.epochs=1", f"detect.init_from={first}")
+    run = run_detect(config, few, tmp_path, "a")
+    last, seconds = run.last.read_bytes(), json.loads(run.metrics.read_text())["train/seconds"]
+    first.unlink()
+    run.metrics.unlink()
+    run_detect(config, few, tmp_path, "a", resume=True)
+    assert run.last.read_bytes() == last
+    metrics = json.loads(run.metrics.read_text())
+    assert metrics["train/seconds"] >= seconds
+    assert metrics["train/images_per_s"] > 0
+
+
+def test_the_anchors_are_told_before_training(few, tmp_path, monkeypatch, capsys):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("perilune_train.detect.run.fit", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        run_detect(settings(), few, tmp_path, "a")
+    assert "anchors: best possible recall" in capsys.readouterr().err
+
+
+def test_the_report_tells_of_the_anchors(finished):
+    best = json.loads(finished.metrics.read_text())["anchors/best_possible_recall"]
+    assert f"- anchors: best possible recall {best:.4f}," in (finished.root / "report.md").read_text()
+
+
+def test_a_run_in_bfloat16(few, tmp_path, monkeypatch):
+    coarse = []
+
+    def recorded(outputs, *more):
+        coarse.extend(torch.equal(part, part.bfloat16().float()) for part in outputs)
+        return detection_loss(outputs, *more)
+
+    monkeypatch.setattr("perilune_train.detect.task.detection_loss", recorded)
+    run = run_detect(settings("detect.epochs=1", "detect.precision=bf16"), few, tmp_path, "a")
+    assert coarse and all(coarse)
+    weights = runs.load_weights(run.best)["state_dict"].values()
+    assert {value.dtype for value in weights if value.is_floating_point()} == {torch.float32}
+    assert all(value.isfinite().all() for value in weights)
+    metrics = json.loads(run.metrics.read_text())
+    for account in ("test/", "test/strict/", "test/edge/", "val/"):
+        assert 0 <= metrics[account + "ap50"] <= 1
+
+
+def test_a_packed_dataset_gives_the_same_weights(few, tmp_path, unjudged):
+    pack(open_dataset(few), tmp_path / "packed")
+    made = [run_detect(settings(), root, tmp_path, root.name) for root in (few, tmp_path / "packed")]
+    first, again = (runs.load_weights(run.best)["state_dict"] for run in made)
+    assert first.keys() == again.keys() and all(torch.equal(first[key], again[key]) for key in first)
+
+
+def test_fewer_frames_than_processes(few, tmp_path):
+    with pytest.raises(UserError, match=r"/few: val frames: found 2; wanted at least 3, one for each process"):
+        run_detect(settings("detect.devices=3"), few, tmp_path / "runs", "a")
+    assert not (tmp_path / "runs").exists()
 
 
 def test_a_detector_comes_back_as_it_was_saved(finished):

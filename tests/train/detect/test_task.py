@@ -63,6 +63,24 @@ def test_while_frozen_only_gates_and_head_may_learn(split, tmp_path):
     assert task.network.backbone.units["B_11"].reduce.norm.training
 
 
+def test_long_gradients_are_shortened_and_short_ones_left_alone(split, tmp_path):
+    config = DetectConfig(width=0.125, in_channels=1, gradient_clip=2.0)
+    task = DetectTask(build_network(config, label_sizes(split), tmp_path), config, split, split, 0)
+    parameters = list(task.network.parameters())
+    random = torch.Generator().manual_seed(0)
+    # A frozen weight has none.
+    drawn = [torch.randn(p.shape, generator=random) for p in parameters[1:]]
+    length = torch.cat([gradient.flatten() for gradient in drawn]).norm()
+    for wanted, factor in ((50.0, 2.0 / 50), (2.5, 2.0 / 2.5), (1.9, 1.0)):
+        for p, gradient in zip(parameters[1:], drawn, strict=True):
+            p.grad = gradient * (wanted / length)
+        given = [p.grad.clone() for p in parameters[1:]]
+        task.configure_gradient_clipping(None)
+        assert parameters[0].grad is None
+        for p, gradient in zip(parameters[1:], given, strict=True):
+            torch.testing.assert_close(p.grad, factor * gradient, rtol=0 if factor == 1 else 1e-4, atol=0)
+
+
 def test_a_few_frames_can_be_learned_by_heart(split, tmp_path):
     """The whole chain (assignment, loss, decoding, suppression, matching) agrees: else this cannot work."""
     config = DetectConfig(width=0.125, in_channels=1, strides=(4, 8, 16), attention="cbam_identity", batch_size=4)

@@ -48,6 +48,12 @@ def threshold_of(metrics: dict[str, float | int | str | None], path: Path) -> fl
     return float(found)
 
 
+def check_folder(folder: Path, run: Path) -> None:
+    """Refuse to write an evaluation over the run's own report and figures."""
+    if folder.resolve() == run.resolve():
+        raise UserError(folder, "--out", "the run's own folder", "another: its figures stay as training left them")
+
+
 def evaluate_again(
     run: Path,
     config: DetectConfig,
@@ -62,8 +68,7 @@ def evaluate_again(
     The threshold is the one given, else the run's own; with `choose_threshold` that of best F1 on the dataset's val.
     """
     folder = out or run / "evaluation"
-    if folder.resolve() == run.resolve():
-        raise UserError(folder, "--out", "the run's own folder", "another: its figures stay as training left them")
+    check_folder(folder, run)
     earlier = read_metrics(run)
     chosen = threshold_of(earlier, run / "metrics.json") if threshold is None else threshold
     chosen_on = "of best F1 on the run's own val" if threshold is None else "given by hand"
@@ -77,7 +82,7 @@ def evaluate_again(
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
     network = load_detector(runs.RunFolder(run).best)
-    frames = load_split(dataset, split, config.labels, 1 / EDGE)
+    frames = load_split(dataset, split, config.labels, (1.0, 1 / EDGE))
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
         seen, _ = detect_split(network, val, "val", config, device, bf16)

@@ -72,7 +72,7 @@ def augment(
         square = image.shape[0] == image.shape[1]
         turned, boxes = turn(image, boxes, int(rng.integers(8 if square else 4)))
     low, high = settings.scale
-    if high > low:
+    if (low, high) != (1, 1):
         factor = float(np.exp(rng.uniform(np.log(low), np.log(high))))
         turned, boxes = rescale(np.ascontiguousarray(turned), boxes, factor, (rng.random(), rng.random()))
         size = np.array(turned.shape[::-1])

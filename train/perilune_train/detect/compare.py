@@ -34,14 +34,17 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
     rows, curves = [], {}
     for folder in folders:
         metrics = read_metrics(folder)
-        split = str(metrics.get("evaluation/split", "test"))
-        figures = {
-            key.removeprefix(f"{split}/"): value for key, value in metrics.items() if key.startswith(f"{split}/")
-        }
         name = _name(folder)
-        cells = [name, _text(metrics.get("dataset/name")), split, _text(metrics.get("dataset/protocol"))]
-        cells += [_text(metrics.get("labels/selection")), _text(metrics.get("evaluation/scales", 1))]
-        cells += [_text(figures.get("frames")), _text(figures.get("labels"))]
+        if "ap50" in metrics:
+            # An evaluation on real images, whose figures have no split before them.
+            split, figures, wanted = "images", metrics, f"from {metrics.get('min_size_px')} px"
+            told: list[object] = [metrics.get("images/name"), split, None, wanted, metrics.get("scales")]
+        else:
+            split = str(metrics.get("evaluation/split", "test"))
+            figures = {key.removeprefix(f"{split}/"): metrics[key] for key in metrics if key.startswith(f"{split}/")}
+            told = [metrics.get("dataset/name"), split, metrics.get("dataset/protocol")]
+            told += [metrics.get("labels/selection"), metrics.get("evaluation/scales", 1)]
+        cells = [name, *map(_text, (*told, figures.get("frames"), figures.get("labels")))]
         cells += [with_interval(figures.get(key), _interval(figures, key)) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
         # Of the whole curve, not of the points that are kept of it.

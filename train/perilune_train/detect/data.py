@@ -59,11 +59,13 @@ class DetectSplit:
         return len(self.labels)
 
 
-def load_split(dataset: Dataset, split: str, settings: LabelSettings, enlarged: float = 1.0) -> DetectSplit:
+def load_split(
+    dataset: Dataset, split: str, settings: LabelSettings, scale: tuple[float, float] = (1.0, 1.0)
+) -> DetectSplit:
     """Frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take.
 
-    `enlarged` is the largest factor by which frames will be enlarged: what is ignored reaches down accordingly. For
-    the account of the edge it is 1 / EDGE.
+    `scale` holds the least and the largest factor by which frames will be shrunk and enlarged: what is ignored reaches
+    up and down accordingly. For the account of the edge the largest is 1 / EDGE.
     """
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
@@ -83,10 +85,10 @@ def load_split(dataset: Dataset, split: str, settings: LabelSettings, enlarged: 
         rows = rows_of.get(frame["frame_id"], np.empty(0, np.intp))
         # Of the hundred thousand craters of a scene, those of the right size first: the rest is then cheap.
         scene, points, radius_m = by_scene.get(frame["scene_id"], nowhere)
-        near = _right_size(points, radius_m, camera.intrinsics(), frame, _ignored_range(radius_px, enlarged))
+        near = _right_size(points, radius_m, camera.intrinsics(), frame, _ignored_range(radius_px, scale))
         others = scene[near]
         others = others[~others["crater_id"].isin(ids[rows])]
-        ignored = unlabelled_craters(others, camera.intrinsics(), frame, radius_px, enlarged)
+        ignored = unlabelled_craters(others, camera.intrinsics(), frame, radius_px, scale)
         shape = np.concatenate([shapes[rows], ignored[_SHAPE].to_numpy(np.float64)])
         labelled = np.arange(len(shape)) < len(rows)
         chosen = np.zeros(len(shape), np.bool_)
@@ -101,8 +103,8 @@ def _places(craters: pd.DataFrame) -> tuple[Array, Array]:
     return craters[["x_m", "y_m", "z_m"]].to_numpy(np.float64), craters["diameter_m"].to_numpy(np.float64) / 2
 
 
-def _ignored_range(radius_px: tuple[float, float], enlarged: float) -> tuple[float, float]:
-    return radius_px[0] * MARGIN / enlarged, radius_px[1] / MARGIN
+def _ignored_range(radius_px: tuple[float, float], scale: tuple[float, float]) -> tuple[float, float]:
+    return radius_px[0] * MARGIN / max(scale[1], 1.0), radius_px[1] / MARGIN / min(scale[0], 1.0)
 
 
 def _right_size(
@@ -125,17 +127,21 @@ def _labelled_range(dataset: Dataset) -> tuple[float, float]:
 
 
 def unlabelled_craters(
-    craters: pd.DataFrame, camera: Camera, frame: dict[Any, Any], radius_px: tuple[float, float], enlarged: float = 1.0
+    craters: pd.DataFrame,
+    camera: Camera,
+    frame: dict[Any, Any],
+    radius_px: tuple[float, float],
+    scale: tuple[float, float] = (1.0, 1.0),
 ) -> pd.DataFrame:
     """Craters of the scene that a frame shows just outside what is labelled, as rows to be ignored.
 
     A crater of 1.9 px looks like one of 2.1 px: with only the second in the table, half of what is labelled near the
     limit would be trained away as background, and finding the first would count as false. So, as COCO does with
     objects outside its area range, craters within a factor of sqrt(2) of the range (beyond that no box within the
-    range overlaps them by half) and those whose centre is off the image are ignored; smaller ones too where frames
-    will be `enlarged` by up to a factor. `frame` is a row of the table.
+    range overlaps them by half) and those whose centre is off the image are ignored; smaller and larger ones too where
+    frames will be enlarged and shrunk (`scale`, see load_split). `frame` is a row of the table.
     """
-    low, high = _ignored_range(radius_px, enlarged)
+    low, high = _ignored_range(radius_px, scale)
     points, radius_m = _places(craters)
     sized = _right_size(points, radius_m, camera, frame, (low, high))
     craters, points, radius_m = craters[sized], points[sized], radius_m[sized]

@@ -1,6 +1,7 @@
 """One detector, several engines: each becomes a function from images to boxes and scores."""
 
 import contextlib
+import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -18,9 +19,10 @@ Engine = Callable[[Array], tuple[Array, Array]]
 Precision = Literal["f32", "bf16"]
 
 
-def _package(name: str) -> Any:
+def package(name: str) -> Any:
+    """A module of the extra `export`. Raises UserError where it is not installed."""
     try:
-        return __import__(name)
+        return importlib.import_module(name)
     except ImportError:
         raise UserError("perilune-train", name, "not installed", "pip install 'perilune-train[export]'") from None
 
@@ -41,7 +43,7 @@ def torch_engine(network: nn.Module, precision: Precision = "f32") -> Engine:
 
 def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
     """A written .onnx file by ONNX Runtime; 0 threads are as many as there are cores."""
-    onnxruntime = _package("onnxruntime")
+    onnxruntime = package("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     with _readable(path):
@@ -54,7 +56,7 @@ def openvino_engine(path: Path, precision: Precision = "f32", threads: int = 0, 
 
     Left alone OpenVINO takes bfloat16 where the processor has it; here `precision` says so.
     """
-    openvino = _package("openvino")
+    openvino = package("openvino")
     core = openvino.Core()
     with _readable(path):
         model = core.read_model(str(path))
@@ -74,7 +76,7 @@ def openvino_engine(path: Path, precision: Precision = "f32", threads: int = 0, 
 
 def has_bf16() -> bool:
     """Whether OpenVINO computes in bfloat16 on this processor."""
-    return "BF16" in _package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    return "BF16" in package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
 @contextlib.contextmanager

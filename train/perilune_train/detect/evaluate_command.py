@@ -12,10 +12,13 @@ from perilune_shared.schema import SPLITS
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.tiling_options import BoxMargin, Overlap, Scales, TileSide
 
+_FOR_DATASETS = ("dataset", "split")
+_FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin")
 _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
 
 def evaluate(
+    context: typer.Context,
     run: Annotated[Path, typer.Option(help="Folder of a finished detect run, for example runs/detect/small.")],
     dataset: Annotated[
         Path | None, typer.Option(help="Folder of the dataset. [default: data/<name of the run>/detect]")
@@ -62,13 +65,19 @@ def evaluate(
     if choose_threshold and (threshold is not None or images is not None or split == "val"):
         other = "--threshold" if threshold is not None else "--images" if images is not None else "--split val"
         raise UserError("--choose-threshold", "beside", other, "one of both")
-    settings = tuple(set_ or ())
-    if scale and images is None:
-        settings += (f"detect.evaluation.scales={scale}",)
-    config = config_of_run(run, settings)
+    for name in _FOR_IMAGES if images is None else _FOR_DATASETS:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = "--" + name.replace("_", "-")
+            if images is None:
+                raise UserError(option, "beside", "no --images", f"--images, or no {option}")
+            raise UserError(option, "beside", "--images", "one of both")
+    config = config_of_run(run, tuple(set_ or ()))
     if images is not None:
-        if dataset is not None:
-            raise UserError("--images", "beside --dataset", images, "one of both")
+        for text in set_ or ():
+            keys, _ = parse_setting(text)
+            if keys[1] == "labels":
+                raise UserError("--set", ".".join(keys), "beside --images", "--min-size: images have no such labels")
         from perilune_train.detect.image_evaluation import evaluate_images
         from perilune_train.detect.tiles import Tiling
 
@@ -77,6 +86,10 @@ def evaluate(
         evaluate_images(run, config, images, folder, tiling, min_size, threshold)
         console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
         return
+    if scale:
+        own = config.model_dump(mode="json")
+        own["evaluation"]["scales"] = scale
+        config = resolve_over(DetectConfig, "detect", "--scale", own)
     # Torch takes seconds to load: not for a wrong key.
     from perilune_train.detect.again import evaluate_again
 

@@ -18,7 +18,7 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.batches import network_input
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import load_split
-from perilune_train.detect.engines import Array, Engine, onnxruntime_engine, openvino_engine
+from perilune_train.detect.engines import Array, Engine, onnxruntime_engine, openvino_engine, package
 from perilune_train.detect.flight import FlightDetector
 from perilune_train.detect.flight_notes import readme
 from perilune_train.detect.int8 import Int8Verdict, try_int8
@@ -96,8 +96,7 @@ def facts(trained: Trained, size_px: int) -> dict[str, Any]:
 
 def write_onnx(detector: FlightDetector, path: Path, told: dict[str, Any], in_channels: int, size_px: int) -> None:
     """The graph with any number of images; `told` goes into its metadata, each entry as JSON."""
-    import onnx
-
+    onnx = package("onnx")
     names = {"images": {0: "n"}, "boxes": {0: "n"}, "scores": {0: "n"}}
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
@@ -120,8 +119,7 @@ def write_onnx(detector: FlightDetector, path: Path, told: dict[str, Any], in_ch
 
 def write_openvino(onnx_path: Path, path: Path) -> None:
     """OpenVINO's own form of an ONNX file: `path` (.xml) and, beside it, the weights (.bin) in float32."""
-    import openvino
-
+    openvino = package("openvino")
     # Read by the runtime, not by the converter, which reports its use over the network.
     openvino.save_model(openvino.Core().read_model(str(onnx_path)), str(path), compress_to_fp16=False)
 

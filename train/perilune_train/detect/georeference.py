@@ -23,6 +23,8 @@ _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
 MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 """Longitude and latitude, degrees, on the sphere of the Moon's mean radius."""
 _CORNERS = 32
+_GRID = 17
+"""Pixels a side that tell whether an image lies on its map at all: a disc may leave its corners empty."""
 _DECIMALS = 8
 """Of degrees: 0.3 mm on the ground."""
 
@@ -39,8 +41,11 @@ class Georeference:
     """The image, for faults to name."""
 
     def lon_lat_deg(self, pixels: Array) -> Array:
-        """East longitude and latitude (N, 2), degrees, of pixel coordinates (N, 2). Raises UserError off the Moon."""
-        from rasterio._err import CPLE_BaseError
+        """East longitude and latitude (N, 2), degrees, of pixel coordinates (N, 2); infinite off the map.
+
+        Raises UserError where the projection is not one of the Moon.
+        """
+        from rasterio._err import CPLE_AppDefinedError, CPLE_BaseError
         from rasterio.errors import RasterioError
         from rasterio.warp import transform
 
@@ -48,6 +53,12 @@ class Georeference:
         x, y = a * pixels[:, 0] + b * pixels[:, 1] + c, d * pixels[:, 0] + e * pixels[:, 1] + f
         try:
             return np.stack(transform(self.projection, _MOON, x, y)[:2], axis=1)
+        except CPLE_AppDefinedError:
+            # One point off the projection's domain fails them all: halved until it is alone.
+            half = len(pixels) // 2
+            if half == 0:
+                return np.full((1, 2), np.inf)
+            return np.concatenate([self.lon_lat_deg(part) for part in (pixels[:half], pixels[half:])])
         except (RasterioError, CPLE_BaseError, ValueError) as error:
             raise UserError(self.path, "projection", error, "a coordinate reference system of the Moon") from None
 
@@ -65,7 +76,7 @@ def read_georeference(path: Path) -> Georeference | None:
         warnings.simplefilter("ignore")
         try:
             with rasterio.open(path.resolve(), driver=driver) as image:
-                transform, projection = image.transform, image.crs
+                transform, projection, size = image.transform, image.crs, (image.width, image.height)
             if projection is None and beside.is_file():
                 projection = CRS.from_wkt(beside.read_text(encoding="utf-8"), morph_from_esri_dialect=True)
         except (RasterioError, ValueError) as error:
@@ -74,7 +85,9 @@ def read_georeference(path: Path) -> Georeference | None:
     if transform.is_identity or transform.determinant == 0 or projection is None:
         return None
     found = Georeference(tuple(transform)[:6], projection.to_wkt(), path)
-    found.lon_lat_deg(np.zeros((1, 2)))
+    grid = np.stack(np.meshgrid(*(np.linspace(0, side, _GRID) for side in size)), axis=-1).reshape(-1, 2)
+    if not np.isfinite(found.lon_lat_deg(grid)).all(axis=1).any():
+        raise UserError(path, "projection", "none of its pixels on the map", "an image of a place on the Moon")
     return found
 
 
@@ -87,7 +100,7 @@ def features(name: str, found: Detections, reference: Georeference) -> list[dict
     """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with diameter_m.
 
     Longitudes go on past 180 degrees where a polygon crosses it. A polygon around a pole is not one in longitude and
-    latitude: such a crater's corners are right, its filling is not.
+    latitude: such a crater's corners are right, its filling is not. Detections that reach off the map are left out.
     """
     if not len(found.boxes):
         return []
@@ -96,10 +109,12 @@ def features(name: str, found: Detections, reference: Georeference) -> list[dict
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     pixels = np.concatenate([centre[:, None], centre[:, None] + half[:, None] * ring], axis=1)
     places = reference.lon_lat_deg(pixels.reshape(-1, 2)).reshape(pixels.shape)
+    on_map = np.isfinite(places).all(axis=(1, 2))
+    places, centre, half, scores = places[on_map], centre[on_map], half[on_map], found.scores[on_map]
     places[:, 1:, 0] -= 360 * np.round((places[:, 1:, 0] - places[:, :1, 0]) / 360)
     quarter = _CORNERS // 4
     along, across = (great_circle_m(places[:, 1 + k], places[:, 1 + k + 2 * quarter]) for k in (0, quarter))
-    rows = zip(places, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), found.scores, centre, strict=True)
+    rows = zip(places, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), scores, centre, strict=True)
     return [
         {
             "type": "Feature",

@@ -17,7 +17,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
 from perilune_shared.progress import progress_bar
 from perilune_train import runs
-from perilune_train.detect.again import read_metrics, threshold_of
+from perilune_train.detect.again import check_folder, read_metrics, threshold_of
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import FrameLabels
 from perilune_train.detect.evaluation import Evaluation, evaluate_detections
@@ -50,6 +50,7 @@ def evaluate_images(
     Leaves report.md, detections.parquet, precision_recall.png, bins.png, detections.png and crops.png in `out` too.
     Raises UserError where anything of it cannot be read; then nothing is written.
     """
+    check_folder(out, run)
     tiling.check()
     if not 0 < min_size_px < np.inf:
         raise UserError("--min-size", "pixels", min_size_px, "above 0")
@@ -77,7 +78,8 @@ def evaluate_images(
     with written_aside(out / "detections.parquet") as aside:
         table.to_parquet(aside, index=False)
     write_crops(out / "crops.png", images, evaluation)
-    figures = evaluation.figures() | {f"oracle/{name}": value for name, value in oracle.items()}
+    figures = {"images/name": place.resolve().name} | evaluation.figures()
+    figures |= {f"oracle/{name}": value for name, value in oracle.items()}
     figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}
     figures |= {
         "overlap_px": tiling.overlap_px,

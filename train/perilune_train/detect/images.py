@@ -1,8 +1,10 @@
 """Labelled images that are no dataset of ours: a folder of pictures with tables of boxes beside them, or COCO.
 
 A table (`<name>.txt` beside `<name>.png`) has a header with X, Y, W and H: left, top, width and height of a box in
-pixels, separated by commas or tabs. COCO is read from annotations.json in the folder, or from a file given by name,
-with the images beside it. Coordinates are taken to begin at the outer corner of the top-left pixel.
+pixels, separated by commas or tabs. COCO is read from annotations.json in the folder, or from a file given by name;
+its images are beside it, or where COCO has them: in the folder images next to the file's own, or in one that the file's
+name ends with (train2017 for instances_train2017.json), there or in images. Coordinates are taken to begin at the outer
+corner of the top-left pixel.
 """
 
 import json
@@ -16,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
+from perilune_shared.progress import console
 from perilune_train.detect.pictures import SUFFIXES, picture_size
 
 Array = NDArray[np.float64]
@@ -110,13 +113,16 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     return ((n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip())
 
 
-def _box(values: Any, path: Path, field: str) -> tuple[float, float, float, float]:
+def _box(values: Any, path: Path, field: str, may_be_empty: bool = False) -> tuple[float, float, float, float]:
     """A box from left, top, width and height."""
     try:
         x, y, w, h = (float(value) for value in values)
     except (TypeError, ValueError, OverflowError):
         raise UserError(path, field, values, "four numbers: left, top, width, height") from None
-    if not all(math.isfinite(v) and abs(v) <= _LARGEST_PX for v in (x, y, w, h)) or w <= 0 or h <= 0:
+    least = min(w, h)
+    if not all(math.isfinite(v) and abs(v) <= _LARGEST_PX for v in (x, y, w, h)) or not (
+        least > 0 or (may_be_empty and least == 0)
+    ):
         raise UserError(path, field, values, f"a width and height above 0, and nothing beyond {_LARGEST_PX:.0f} px")
     return x, y, x + w, y + h
 
@@ -135,6 +141,7 @@ def _read_coco(path: Path) -> ImageSet:
         raise UserError(path, "images", "none" if not images else "two of one id", "images with an id each")
     boxes: list[list] = [[] for _ in images]
     marked: list[list[bool]] = [[] for _ in images]
+    n_empty = 0
     for n, annotation in enumerate(_records(content, "annotations", path)):
         field = f"annotations[{n}]"
         if category is not None and annotation.get("category_id") != category:
@@ -142,17 +149,23 @@ def _read_coco(path: Path) -> ImageSet:
         row = place.get(_identity(annotation, "image_id", field, path))
         if row is None:
             raise UserError(path, f"{field}.image_id", annotation["image_id"], "the id of one of the images")
-        boxes[row].append(_box(annotation.get("bbox"), path, f"{field}.bbox"))
+        box = _box(annotation.get("bbox"), path, f"{field}.bbox", may_be_empty=True)
+        if box[0] == box[2] or box[1] == box[3]:
+            n_empty += 1
+            continue
+        boxes[row].append(box)
         marked[row].append(not annotation.get("iscrowd") and not annotation.get("ignore"))
     result = []
     for k, image in enumerate(images):
-        picture = _beside(path, image.get("file_name"), f"images[{k}].file_name")
+        picture = _picture(path, image.get("file_name"), f"images[{k}].file_name")
         size = picture_size(picture)
         told = image.get("width", size[0]), image.get("height", size[1])
         if told != size:
             raise UserError(picture, "size", f"{size[0]} x {size[1]}", f"{told[0]} x {told[1]}, as {path.name} says")
         own = np.array(boxes[k], np.float64).reshape(-1, 4)
         result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(marked[k], bool)))
+    if n_empty:
+        console.print(f"{path.name}: {n_empty} boxes without width or height are left out", markup=False)
     return ImageSet(result, ends_at_edges=True)
 
 
@@ -182,14 +195,25 @@ def _crater_category(categories: list[dict[str, Any]], path: Path) -> int | str 
     raise UserError(path, "categories", names, "one category, or one named crater")
 
 
-def _beside(path: Path, name: Any, field: str) -> Path:
-    """The picture that a COCO file names, in its folder or below."""
+def _picture(path: Path, name: Any, field: str) -> Path:
+    """The picture that a COCO file names: of the folders where it may be, in the first that has it."""
     root = path.resolve().parent
+    ending = path.stem.rpartition("_")[2]
+    images = root.parent / "images"
+    for folder in (root, images, images / ending, root.parent / ending):
+        picture = _below(folder, name, path, field)
+        if picture.is_file():
+            return picture
+    return _below(root, name, path, field)
+
+
+def _below(folder: Path, name: Any, path: Path, field: str) -> Path:
+    """A path in a folder or below it. Raises UserError on one that leads out."""
     if isinstance(name, str) and name and "\0" not in name:
         try:
-            picture = root.joinpath(name).resolve()
+            picture = folder.joinpath(name).resolve()
         except (OSError, RuntimeError):  # links that lead to themselves
-            picture = root
-        if picture != root and picture.is_relative_to(root):
+            picture = folder
+        if picture != folder and picture.is_relative_to(folder):
             return picture
-    raise UserError(path, field, name, "a path of an image in the folder of the COCO file")
+    raise UserError(path, field, name, "a path of an image below the COCO file's folder, or below images next to it")

@@ -17,7 +17,7 @@ from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.batches import network_input
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import DetectSplit
-from perilune_train.detect.engines import Array, Engine, Precision, has_bf16, openvino_engine
+from perilune_train.detect.engines import Array, Engine, Precision, has_bf16, openvino_engine, package
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.run import judge
 from perilune_train.detect.task import detections_of
@@ -35,7 +35,7 @@ class Int8Verdict:
     """What quantisation cost and gave, by OpenVINO on this machine."""
 
     ap50_float: float
-    """AP on the validation split in float32."""
+    """AP on the validation split in float32, frames as they are, whatever the run's scales."""
     ap50_int8: float
     """... in int8, the rest in `precision`."""
     float_s: float
@@ -90,10 +90,9 @@ def quantise(source: Path, out: Path, images: Array) -> None:
 
     `images` (N, C, H, W) are run through the network to see how large each activation gets.
     """
-    import onnx
-    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+    onnx, quantization = package("onnx"), package("onnxruntime.quantization")
 
-    class Frames(CalibrationDataReader):
+    class Frames(quantization.CalibrationDataReader):  # type: ignore[name-defined]
         def __init__(self) -> None:
             self.left: Iterator[Array] = iter(images)
 
@@ -105,15 +104,15 @@ def quantise(source: Path, out: Path, images: Array) -> None:
     level = logging.root.level
     logging.root.setLevel(logging.ERROR)
     try:
-        quantize_static(
+        quantization.quantize_static(
             str(source),
             str(out),
             Frames(),
-            quant_format=QuantFormat.QDQ,
+            quant_format=quantization.QuantFormat.QDQ,
             op_types_to_quantize=["Conv"],
             per_channel=True,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
+            activation_type=quantization.QuantType.QUInt8,
+            weight_type=quantization.QuantType.QInt8,
             nodes_to_exclude=[node.name for node in graph.node if any(part in node.name for part in _KEPT_FLOAT)],
             # So that engines can join a convolution with what follows it before they round.
             extra_options={"OpTypesToExcludeOutputQuantization": ["Conv"]},
@@ -123,7 +122,7 @@ def quantise(source: Path, out: Path, images: Array) -> None:
 
 
 def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, label: str) -> float:
-    """AP at the run's IoU of what an engine finds on a split, image by image."""
+    """AP at the run's IoU of what an engine finds on a split, image by image, at scale 1 alone as in flight."""
     import torch
 
     found = []

@@ -68,7 +68,12 @@ def predict_images(
             tables.append(table_of(path.name, found))
             write_overlay(folder / f"{path.name}.overlay.png", image, found)
             if reference is not None:
-                shapes += features(path.name, found, reference)
+                own = features(path.name, found, reference)
+                shapes += own
+                if len(own) < len(found.boxes):
+                    left_out = len(found.boxes) - len(own)
+                    told = f"{path.name}: {left_out} craters lie off its map: not in detections.geojson"
+                    console.print(told, markup=False)
         table = pd.concat(tables, ignore_index=True)
         table.to_parquet(folder / "detections.parquet", index=False)
         table.round(4).to_csv(folder / "detections.csv", index=False)

@@ -38,4 +38,6 @@ def predict(
     count = predict_images(
         images, run, config, out, threshold, Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
     )
-    console.print(f"{out}: {count} craters in {len(images)} images; detections.parquet, detections.csv, *.overlay.png")
+    places = ", detections.geojson" if (out / "detections.geojson").is_file() else ""
+    written = f"detections.parquet, detections.csv{places}, *.overlay.png"
+    console.print(f"{out}: {count} craters in {len(images)} images; {written}")

@@ -1,5 +1,6 @@
 """One detection run: load, train, evaluate, write."""
 
+import math
 import time
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.scales import at_scales, detect_at_scales, multiply_adds_of_a_frame
 from perilune_train.detect.task import DetectTask
 from perilune_train.detect.transfer import start_from
-from perilune_train.fit import fit
+from perilune_train.fit import fit, machines
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 
 _ANCHOR_STREAM = 1
@@ -94,18 +95,32 @@ def write_detections(path: Path, split: DetectSplit, found: list[Detections]) ->
 def run_detect(
     config: DetectConfig, dataset_root: Path, runs_root: Path, name: str, resume: bool = False
 ) -> runs.RunFolder:
-    """Train and evaluate a detector; everything it leaves is in the returned folder."""
+    """Train and evaluate a detector; everything it leaves is in the returned folder.
+
+    With `resume` a stopped run goes on, and a finished one stays as it is. Raises UserError where its settings were
+    others, where its last state is damaged, and on a dataset, weights or settings that cannot be trained with.
+    """
     console.quiet = not runs.is_first_process()
+    run = runs.RunFolder(runs_root / "detect" / name)
+    if resume:
+        runs.check_settings(run, "detect", config)
+        if run.finished:
+            console.print(f"{run.root}: finished, and left as it is")
+            return run
     dataset = open_dataset(dataset_root)
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
-    enlarged = {"train": max(config.augment.scale[1], 1.0), "test": 1 / EDGE}
-    splits = {
-        split: load_split(dataset, split, config.labels, enlarged.get(split, 1.0)) for split in ("train", "val", "test")
-    }
+    scale = {"train": config.augment.scale, "val": (1.0, 1.0), "test": (1.0, 1 / EDGE)}
+    splits = {split: load_split(dataset, split, config.labels, scale[split]) for split in ("train", "val", "test")}
+    processes = math.prod(machines(config.devices, config.num_nodes))
+    for split in ("train", "val"):
+        if len(splits[split]) < processes:
+            wanted = f"at least {processes}, one for each process"
+            raise UserError(dataset.root, f"{split} frames", len(splits[split]), wanted)
     sizes = label_sizes(splits["train"])
     network = build_network(config, sizes, dataset.root)
-    if config.init_from is not None:
+    resuming = resume and run.last.is_file()
+    if config.init_from is not None and not resuming:
         start_from(network, Path(config.init_from), config)
     teacher = None if config.teacher is None else load_teacher(Path(config.teacher), config)
     if teacher is not None:
@@ -114,9 +129,11 @@ def run_detect(
     frozen_epochs = config.frozen_epochs if config.init_from is not None else 0
     if config.frozen_epochs and not frozen_epochs:
         console.print("frozen_epochs without init_from: nothing to freeze, the whole network trains from the start")
+    # The anchors of a run that goes on may be others, and are in its state.
+    if not resuming:
+        console.print(told_of_anchors(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, splits["train"], splits["val"], frozen_epochs, teacher)
-    started = time.perf_counter()
-    fit(
+    seconds = fit(
         run,
         task,
         label="train detector",
@@ -134,12 +151,11 @@ def run_detect(
     )
     if not runs.is_first_process():
         return run
-    seconds = time.perf_counter() - started
-    anchors = network.anchors.flatten(0, 1).double().cpu().numpy()
+    anchors = anchor_sizes(network)
     metrics: dict[str, float | int | str | None] = {
         "train/seconds": round(seconds, 1),
         "train/epochs": config.epochs,
-        "train/images_per_s": round(task.images_seen * task.process[1] / seconds, 2),
+        "train/images_per_s": round(task.images_seen / seconds, 2),
         "anchors/best_possible_recall": best_possible_recall(sizes, anchors, config.anchor_ratio),
         "anchors/mean_best_iou": mean_best_iou(sizes, anchors),
         "parameters": sum(p.numel() for p in network.parameters()),
@@ -148,7 +164,22 @@ def run_detect(
     metrics |= selection_used(config, splits["test"])
     metrics |= told_of(dataset, "test", config) | evaluate(run, config, dataset, splits, device, bf16)
     runs.write_metrics(run, metrics)
+    console.print(f"{run.root}: metrics.json, report.md, detections.png, precision_recall.png, bins.png")
     return run
+
+
+def anchor_sizes(network: YOLOv3) -> np.ndarray:
+    """Widths and heights (N, 2) in pixels of a network's anchors."""
+    return network.anchors.flatten(0, 1).double().cpu().numpy()
+
+
+def told_of_anchors(network: YOLOv3, sizes_px: np.ndarray, ratio: float) -> str:
+    """How well a network's anchors suit labels of these sizes (N, 2): recall that training can reach at best."""
+    recall = best_possible_recall(sizes_px, anchor_sizes(network), ratio)
+    return (
+        f"anchors: best possible recall {recall:.4f}, the share of the training labels that have one within a factor "
+        f"of {ratio:g} in width and height"
+    )
 
 
 def told_of(dataset: Dataset, split: str, config: DetectConfig) -> dict[str, float | int | str | None]:
@@ -221,6 +252,7 @@ def evaluate(
     evaluation = judge_in_full(splits["test"], found, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found)
     told = about(dataset, "test", config, protocol_of(dataset.info), run.root.name, "of best F1 on val")
+    told.append(told_of_anchors(network, label_sizes(splits["train"]), config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), told)
     metrics: dict[str, float | int | str | None] = {
         f"val/{key}": value for key, value in figures(matches, threshold).items()

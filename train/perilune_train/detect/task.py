@@ -116,10 +116,12 @@ class DetectTask(lightning.LightningModule):
             self.current_epoch,
             self.trainer.fit_loop.epoch_loop.batch_progress.current.processed,
         ]
+        checkpoint["images_seen"] = self.images_seen
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         epoch, batches = checkpoint["epoch_and_batches"]
         self.resumed = (epoch, batches)
+        self.images_seen = checkpoint.get("images_seen", 0)
 
     def configure_optimizers(self) -> Any:
         decayed = [p for p in self.network.parameters() if p.ndim > 1]
@@ -146,7 +148,7 @@ class DetectTask(lightning.LightningModule):
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         images, targets = batch
-        self.images_seen += len(images)
+        self.images_seen += len(images) * self.process[1]
         outputs = self.network(images)
         settings = self.config.loss
         box, confidence = detection_loss(

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from perilune_shared.config import resolve
-from perilune_shared.progress import console
 from perilune_train.detect.config import DetectConfig
 
 
@@ -28,7 +27,7 @@ def train(
 
     Leaves runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, report.md,
     detections.parquet, detections.png, precision_recall.png and .parquet, bins.png and TensorBoard events. A run of the
-    same name is replaced, unless --resume.
+    same name is replaced, unless --resume: then a stopped one goes on, and a finished one stays as it is.
 
     The baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
     """
@@ -36,5 +35,4 @@ def train(
     # Torch and Lightning take seconds to load: not for a wrong key.
     from perilune_train.detect.run import run_detect
 
-    run = run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, resume)
-    console.print(f"{run.root}: metrics.json, report.md, detections.png, precision_recall.png, bins.png")
+    run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, resume)

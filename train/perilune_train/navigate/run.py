@@ -53,9 +53,7 @@ def navigate_run(
     # stack comes first, so that the run of warp, finished last, holds the table of both.
     for fusion in wanted:
         run = start_run(runs, "navigate", name if fusion == "warp" else f"{name}-stack", settings, resume)
-        started = time.monotonic()
-        _train(run, settings, fusion, descents, backbone if fusion == "stack" else None, resume)
-        seconds = time.monotonic() - started
+        seconds = _train(run, settings, fusion, descents, backbone if fusion == "stack" else None, resume)
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
         motions = {fusion: [predict(network, architecture, descent) for descent in test], **motions}
@@ -79,11 +77,12 @@ def _train(
     descents: list[Descent],
     backbone: dict[str, Tensor] | None,
     resume: bool,
-) -> None:
+) -> float:
+    """The seconds that it took."""
     lightning.seed_everything(settings.seed, verbose=False)
     task = NavigationTask(settings, fusion, descents, backbone)
     own = task.own
-    fit(
+    return fit(
         run,
         task,
         label=f"train {fusion}",
