@@ -140,7 +140,8 @@ class DetectConfig(Section):
     gradient_clip: Positive = 10.0
     """Largest norm of all gradients together; longer ones are shortened to it."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
-    """Moving average of the weights, per step; the average is what is judged and kept."""
+    """Moving average of the weights, per step; the average is what is judged and kept. At step s it is at most
+    (1 + s) / (10 + s), so that 0.998 holds from step 4490 on."""
     anchor_ratio: Annotated[float, Field(gt=1)] = 2.0
     """An anchor takes part in a label whose width and height are within this factor of its own."""
     labels: LabelSettings = LabelSettings()
