@@ -21,7 +21,7 @@ from perilune_train.detect.matching import COCO_IOUS, Detections, find_overlaps
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.run import run_detect
 
-QUICK = ("detect.epochs=3", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
+QUICK = ("detect.epochs=4", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +86,14 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
     # The threshold is the best on val, by the same detections that --split val finds.
     call(*judged, "--split", "val", "--threshold", chosen["test/threshold"], "--out", tmp_path / "best")
     assert figures(tmp_path / "best")["val/f1"] >= val["val/f1"]
+    # Another operating point on the same val: the words, and a precision there that no lower score would keep.
+    wished = ("--set", f"detect.evaluation.min_precision={val['val/precision'] / 2}")
+    call(*judged, "--choose-threshold", *wished, "--out", tmp_path / "recall")
+    assert "of most recall at a precision of" in (tmp_path / "recall/report.md").read_text()
+    more = figures(tmp_path / "recall")
+    call(*judged, "--split", "val", "--threshold", more["test/threshold"], "--out", tmp_path / "val-recall")
+    assert figures(tmp_path / "val-recall")["val/precision"] >= val["val/precision"] / 2
+    assert figures(tmp_path / "val-recall")["val/recall"] >= val["val/recall"]
     for other in (("--threshold", 0.5), ("--split", "val"), ("--images", tmp_path)):
         with pytest.raises(UserError, match="--choose-threshold: beside"):
             call("evaluate", "--run", run, "--choose-threshold", *other)

@@ -65,13 +65,13 @@ def evaluate_again(
 ) -> Path:
     """Judge a run's best weights on a split of a dataset; everything it leaves is in the returned folder.
 
-    The threshold is the one given, else the run's own; with `choose_threshold` that of best F1 on the dataset's val.
+    The threshold is the one given, else the run's own; with `choose_threshold` one chosen on the dataset's val.
     """
     folder = out or run / "evaluation"
     check_folder(folder, run)
     earlier = read_metrics(run)
     chosen = threshold_of(earlier, run / "metrics.json") if threshold is None else threshold
-    chosen_on = "of best F1 on the run's own val" if threshold is None else "given by hand"
+    chosen_on = "chosen on the run's own val" if threshold is None else "given by hand"
     known = earlier.get("dataset/name")
     dataset = open_dataset(dataset_root)
     protocol = protocol_of(dataset.info)
@@ -86,7 +86,9 @@ def evaluate_again(
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
         seen, _ = detect_split(network, val, "val", config, device, bf16)
-        chosen, chosen_on = curve(judge(val, seen, config)).best_threshold(), "of best F1 on the dataset's val"
+        points = curve(judge(val, seen, config))
+        chosen, chosen_as = points.operating_threshold(config.evaluation.min_precision)
+        chosen_on = f"{chosen_as} on the dataset's val"
     found, rate = detect_split(network, frames, split, config, device, bf16)
     evaluation = judge_in_full(frames, found, config, chosen)
     write_detections(folder / "detections.parquet", frames, found)

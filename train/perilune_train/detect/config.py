@@ -56,10 +56,11 @@ class AugmentSettings(Section):
     stretch: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
     """Largest share of a frame's darkest, and of its brightest, pixels that become black and white: published images
     are often stretched so."""
-    blur_px: Annotated[float, Field(ge=0, le=5)] = 0.8
-    """Largest standard deviation of a Gaussian blur, pixels."""
-    noise: Annotated[float, Field(ge=0, le=100)] = 4.0
-    """Largest standard deviation of Gaussian noise, grey levels of 255."""
+    blur_px: Annotated[float, Field(ge=0, le=5)] = 0.2
+    """Largest standard deviation of a Gaussian blur, pixels. Rendered frames have the sensor's own: more than a little
+    hides the smallest craters."""
+    noise: Annotated[float, Field(ge=0, le=100)] = 1.0
+    """Largest standard deviation of Gaussian noise, grey levels of 255, beside the sensor's own."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "AugmentSettings":
@@ -103,6 +104,8 @@ class EvaluationSettings(Section):
     is longer than a crater seen from above. None keeps all."""
     max_detections: Count = 2000
     """Most detections kept in a frame; the usual 100 would truncate crowded frames."""
+    min_precision: Annotated[float, Field(gt=0, lt=1)] | None = None
+    """The score threshold is that of most recall at this precision on the validation split. None: of best F1."""
 
 
 class DetectConfig(Section):

@@ -57,7 +57,7 @@ def evaluate_images(
     given = read_images(place)
     if not any(image.wanted(min_size_px).any() for image in given.images):
         raise UserError(place, "boxes", f"none of {min_size_px:g} px or more", "at least one to be found")
-    chosen_on = "of best F1 on the run's validation split" if threshold is None else "given by hand"
+    chosen_on = "chosen on the run's validation split" if threshold is None else "given by hand"
     threshold = threshold_of(read_metrics(run), run / "metrics.json") if threshold is None else threshold
     images = [read_grey(image.path) for image in given.images]
     found = _detect(open_detector(run, config), images, tiling)

@@ -41,6 +41,20 @@ class Curve:
             return 1.0
         return float(self.scores[int(f1_score(self.precision, self.recall).argmax())])
 
+    def operating_threshold(self, min_precision: float | None) -> tuple[float, str]:
+        """A threshold and what it is in words: that of best F1, or of most recall at a precision of min_precision.
+
+        Where no threshold has that precision, best F1 decides again, and the words say so.
+        """
+        if min_precision is None:
+            return self.best_threshold(), "of best F1"
+        # Of equal scores a threshold keeps all: only the last of them is a point where one can stand.
+        ends = np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
+        precise = np.flatnonzero(ends & (self.precision >= min_precision))
+        if not len(precise):
+            return self.best_threshold(), f"of best F1, since none has a precision of {min_precision:g},"
+        return float(self.scores[precise[-1]]), f"of most recall at a precision of {min_precision:g}"
+
 
 def f1_score(precision: Array, recall: Array) -> Array:
     """2 P R / (P + R), 0 where both are 0."""

@@ -248,10 +248,10 @@ def evaluate(
     found_val, _ = detect_split(network, splits["val"], "val", config, device, bf16)
     found, rate = detect_split(network, splits["test"], "test", config, device, bf16)
     matches = judge(splits["val"], found_val, config)
-    threshold = curve(matches).best_threshold()
+    threshold, chosen_as = curve(matches).operating_threshold(config.evaluation.min_precision)
     evaluation = judge_in_full(splits["test"], found, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found)
-    told = about(dataset, "test", config, protocol_of(dataset.info), run.root.name, "of best F1 on val")
+    told = about(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{chosen_as} on val")
     told.append(told_of_anchors(network, label_sizes(splits["train"]), config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), told)
     metrics: dict[str, float | int | str | None] = {
