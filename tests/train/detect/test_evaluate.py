@@ -86,7 +86,7 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
     # The threshold is the best on val, by the same detections that --split val finds.
     call(*judged, "--split", "val", "--threshold", chosen["test/threshold"], "--out", tmp_path / "best")
     assert figures(tmp_path / "best")["val/f1"] >= val["val/f1"]
-    # Another operating point on the same val: the words, and a precision there that no lower score would keep.
+    # Another operating point on the same val: the words, the precision wished, and no less recall.
     wished = ("--set", f"detect.evaluation.min_precision={val['val/precision'] / 2}")
     call(*judged, "--choose-threshold", *wished, "--out", tmp_path / "recall")
     assert "of most recall at a precision of" in (tmp_path / "recall/report.md").read_text()

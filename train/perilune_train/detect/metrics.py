@@ -42,7 +42,7 @@ class Curve:
         return float(self.scores[int(f1_score(self.precision, self.recall).argmax())])
 
     def operating_threshold(self, min_precision: float | None) -> tuple[float, str]:
-        """A threshold and what it is in words: that of best F1, or of most recall at a precision of min_precision.
+        """A score (0 to 1) as threshold and its name: of best F1, or of most recall at a precision of min_precision.
 
         Where no threshold has that precision, best F1 decides again, and the words say so.
         """
