@@ -14,7 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from perilune_render.blender.renderer import Renderer
-from perilune_render.config import CratersConfig, DatasetConfig, FlightConfig, Span
+from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config_terrain import CratersConfig
+from perilune_render.config_values import Span
 from perilune_render.plan import camera_of, make_plan
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.cache import cached_scene

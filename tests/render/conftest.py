@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from perilune_render.config import BouldersConfig, DatasetConfig, KindConfig, TerrainConfig
+from perilune_render.config import DatasetConfig, KindConfig
+from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.terrain.boulders import Boulders
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid

@@ -6,7 +6,8 @@ import pytest
 from rich.progress import Progress
 
 from perilune_render import tables
-from perilune_render.config import KindConfig, TerrainConfig
+from perilune_render.config import KindConfig
+from perilune_render.config_terrain import TerrainConfig
 from perilune_render.develop import develop_dataset
 from perilune_render.output import begin_or_go_on, check_begun, info_of, open_finished
 from perilune_render.plan import make_plan

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from perilune_render.config import BouldersConfig
+from perilune_render.config_terrain import BouldersConfig
 from perilune_render.streams import stream
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid

@@ -40,7 +40,8 @@ def cache_folder() -> Path:
 def generator() -> str:
     """Hash of the code that grows scenes: whatever changes it makes other files."""
     package = Path(__file__).parent
-    sources = [*sorted(package.glob("*.py")), package.parent / "streams.py", package.parent / "config.py"]
+    settings = sorted(package.parent.glob("config*.py"))
+    sources = [*sorted(package.glob("*.py")), package.parent / "streams.py", *settings]
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
 
 

@@ -7,7 +7,7 @@ octaves whose amplitudes fall as L^H, from the longest wave down to the shortest
 
 import numpy as np
 
-from perilune_render.config import ReliefConfig
+from perilune_render.config_terrain import ReliefConfig
 from perilune_render.streams import stream
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.noise import RMS_SLOPE, add_waves

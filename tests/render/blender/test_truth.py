@@ -12,7 +12,8 @@ import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from perilune_render.blender.renderer import Renderer
-from perilune_render.config import BouldersConfig, RenderConfig, TerrainConfig
+from perilune_render.config import RenderConfig
+from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.exr import read_radiance, write_exr
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.export import vertices

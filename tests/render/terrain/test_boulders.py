@@ -3,7 +3,7 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 
-from perilune_render.config import BouldersConfig, CratersConfig
+from perilune_render.config_terrain import BouldersConfig, CratersConfig
 from perilune_render.terrain.boulders import boulder_mesh, draw_boulders, rock
 from perilune_render.terrain.craters import draw_craters
 from perilune_render.terrain.grid import Grid

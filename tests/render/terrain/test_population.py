@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from perilune_render.config import CratersConfig, DatasetConfig, FlightConfig, Span
+from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config_terrain import CratersConfig
+from perilune_render.config_values import Span
 from perilune_render.terrain.craters import ORIGINS, draw_craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import value_at
