@@ -34,7 +34,8 @@ def validate(
     if not faults:
         console.print(Text(f"{one_line(dataset)}: no fault"))
         return
-    table = Table("file", "row", "column", "found", "wanted", title=Text(f"{one_line(dataset)}: {len(faults)} faults"))
+    count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
+    table = Table("file", "row", "column", "got", "expected", title=Text(f"{one_line(dataset)}: {count}"))
     for fault in faults[:most]:
         row = "" if fault.row is None else str(fault.row)
         # As Text, since brackets would be read as markup; so with all that a stranger may have named.

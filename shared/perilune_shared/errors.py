@@ -31,7 +31,7 @@ class UserError(Exception):
         # Any of them may come out of a stranger's file, in any length.
         self.field, self.found, self.wanted = shortened(field), shortened(found), shortened(wanted, 500)
         super().__init__(
-            one_line(f"{shortened(where, 4200)}: {self.field}: found {self.found}; wanted {self.wanted}"),
+            one_line(f"{shortened(where, 4200)}: {self.field}: got {self.found}, expected {self.wanted}"),
         )
 
 

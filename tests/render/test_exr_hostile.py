@@ -51,7 +51,7 @@ DAMAGES = {
     "a size below nothing": (lambda path: resized(path, -5, -5), "exr|size"),
     "sampled": (sampled, "exr|channels"),
     "a channel less": (lambda path: exr(path, names=CHANNELS[:-1]), "no crater"),
-    "300 channels": (lambda path: exr(path, names=[f"c{k}" for k in range(300)]), "found 300"),
+    "300 channels": (lambda path: exr(path, names=[f"c{k}" for k in range(300)]), "got 300"),
     "its half": (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "whole EXR"),
     "its header alone": (lambda path: path.write_bytes(path.read_bytes()[:300]), "whole EXR"),
     "nothing": (lambda path: path.write_bytes(b""), "whole EXR"),

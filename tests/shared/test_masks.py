@@ -149,9 +149,9 @@ def test_masks_under_distortion_are_in_the_camera_that_is_asked_for(tiny_detect)
 def test_what_is_not_there_is_refused(tiny):
     dataset = open_dataset(tiny / "detect")
     frame_id = dataset.table("frames", ["frame_id"])["frame_id"][0].as_py()
-    with pytest.raises(UserError, match="frame_id: found nowhere"):
+    with pytest.raises(UserError, match="frame_id: got nowhere"):
         frame_masks(dataset, "nowhere")
-    with pytest.raises(UserError, match="crater_id: found -4"):
+    with pytest.raises(UserError, match="crater_id: got -4"):
         frame_masks(dataset, frame_id, [-4])
     with pytest.raises(UserError, match=r"depth_m.*128 x 128"):
         frame_masks(dataset, frame_id, depth_m=np.ones((4, 4)))

@@ -50,7 +50,7 @@ def test_resuming_keeps_the_run_and_needs_its_settings(tmp_path):
     (run.root / "checkpoints").mkdir()
     run.last.write_text("state")
     assert runs.start_run(tmp_path, "detect", "a", Settings(), resume=True).last.exists()
-    with pytest.raises(UserError, match=r"config.yaml: detect.rate: found 0.1; wanted 0.2, as now asked for"):
+    with pytest.raises(UserError, match=r"config.yaml: detect.rate: got 0.1, expected 0.2, as now asked for"):
         runs.start_run(tmp_path, "detect", "a", Settings(rate=0.2), resume=True)
     assert run.last.exists() and run.config.read_text() == "detect:\n  rate: 0.1\n"
 
@@ -60,7 +60,7 @@ def test_resuming_keeps_the_run_and_needs_its_settings(tmp_path):
     [
         (Larger(), None),
         (Larger(workers=3), None),
-        (Larger(part=Part(size=4)), r"detect.part: found nothing; wanted {'size': 4"),
+        (Larger(part=Part(size=4)), r"detect.part: got nothing, expected {'size': 4"),
     ],
 )
 def test_a_run_older_than_a_setting_has_its_default(tmp_path, config, told):
@@ -74,12 +74,12 @@ def test_a_run_older_than_a_setting_has_its_default(tmp_path, config, told):
 def test_the_first_other_setting_is_named(tmp_path):
     run = runs.start_run(tmp_path, "detect", "a", Larger(part=Part(size=5)), resume=False)
     runs.check_settings(run, "detect", Larger(workers=2, part=Part(size=5)))
-    with pytest.raises(UserError, match=r"detect.part.size: found 5; wanted 3"):
+    with pytest.raises(UserError, match=r"detect.part.size: got 5, expected 3"):
         runs.check_settings(run, "detect", Larger(rate=0.1))
-    with pytest.raises(UserError, match=r"detect.part: found .* wanted no such setting"):
+    with pytest.raises(UserError, match=r"detect.part: got .* expected no such setting"):
         runs.check_settings(run, "detect", Settings())
     run.config.write_text("detect:\n  part: {limits: [1.0e-05, 2]}\n")
-    with pytest.raises(UserError, match=r"detect.part.size: found nothing; wanted 3"):
+    with pytest.raises(UserError, match=r"detect.part.size: got nothing, expected 3"):
         runs.check_settings(run, "detect", Larger())
     runs.check_settings(runs.RunFolder(tmp_path / "absent"), "detect", Larger())
 
@@ -125,13 +125,13 @@ def test_weights_come_back(tmp_path):
 
 def test_another_architecture_is_named(tmp_path):
     path = tmp_path / "best.ckpt"
-    with pytest.raises(UserError, match=r"weight: found \(2, 3\); wanted \(2, 4\)"):
+    with pytest.raises(UserError, match=r"weight: got \(2, 3\), expected \(2, 4\)"):
         runs.fill(nn.Linear(4, 2), nn.Linear(3, 2).state_dict(), path)
-    with pytest.raises(UserError, match="bias: found nothing; wanted"):
+    with pytest.raises(UserError, match="bias: got nothing, expected"):
         runs.fill(nn.Linear(3, 2), nn.Linear(3, 2, bias=False).state_dict(), path)
-    with pytest.raises(UserError, match=r"bias: .* wanted no such tensor"):
+    with pytest.raises(UserError, match=r"bias: .* expected no such tensor"):
         runs.fill(nn.Linear(3, 2, bias=False), nn.Linear(3, 2).state_dict(), path)
-    with pytest.raises(UserError, match=r"width: found 0.5; wanted 1.0"):
+    with pytest.raises(UserError, match=r"width: got 0.5, expected 1.0"):
         runs.check_architecture(path, {"width": 0.5, "attention": "none"}, {"attention": "none", "width": 1.0})
 
 
@@ -266,7 +266,7 @@ def test_a_last_state_that_cannot_be_gone_on_with(tmp_path, fault):
         fit(run, task, 2, resume=True)
     told = str(caught.value)
     assert told.startswith(f"{run.last}: ") and "\n" not in told
-    assert ("weight: found (1, 1); wanted (1, 2)" if fault == "other" else "start anew without --resume") in told
+    assert ("weight: got (1, 1), expected (1, 2)" if fault == "other" else "start anew without --resume") in told
 
 
 def test_best_keeps_the_best_not_the_last(tmp_path):

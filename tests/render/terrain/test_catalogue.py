@@ -97,11 +97,11 @@ def test_real_craters_are_measured_on_the_model_and_kept_beside_ours(tmp_path, m
     [
         (None, "no such file"),
         ("", "longitude_deg"),
-        ("lon,lat,d\n1,2,3\n", "longitude_deg: found columns lon, lat, d"),
-        ("longitude_deg,latitude_deg,diameter_m\n1,2,3\n1,95,3\n", "c.csv:3: latitude_deg: found 95"),
-        ("longitude_deg,latitude_deg,diameter_m\n1,2,nan\n", "c.csv:2: diameter_m: found nan"),
-        ("longitude_deg,latitude_deg,diameter_m\n1,2\n", "c.csv:2: diameter_m: found nothing"),
-        ("longitude_deg,latitude_deg,diameter_m\n1,2,-5\n", "c.csv:2: diameter_m: found -5"),
+        ("lon,lat,d\n1,2,3\n", "longitude_deg: got columns lon, lat, d"),
+        ("longitude_deg,latitude_deg,diameter_m\n1,2,3\n1,95,3\n", "c.csv:3: latitude_deg: got 95"),
+        ("longitude_deg,latitude_deg,diameter_m\n1,2,nan\n", "c.csv:2: diameter_m: got nan"),
+        ("longitude_deg,latitude_deg,diameter_m\n1,2\n", "c.csv:2: diameter_m: got nothing"),
+        ("longitude_deg,latitude_deg,diameter_m\n1,2,-5\n", "c.csv:2: diameter_m: got -5"),
     ],
 )
 def test_faults_are_told_with_their_line(tmp_path, model, text, part):

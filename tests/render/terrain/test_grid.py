@@ -84,7 +84,7 @@ def test_half_width_for_is_where_the_spacing_is_reached():
 
 def test_too_many_vertices_are_refused_and_a_spacing_is_named():
     with pytest.raises(
-        UserError, match=r"dataset.terrain.spacing_px: found 0.5 needs 5,.* vertices; wanted at least 2.39"
+        UserError, match=r"dataset.terrain.spacing_px: got 0.5 needs 5,.* vertices, expected at least 2.39"
     ):
         graded_grid(config_with(terrain={"max_vertices": 250_000}), CAMERA, FLIGHT)
     wider = config_with(terrain={"max_vertices": 300_000, "spacing_px": 2.5})

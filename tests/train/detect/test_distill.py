@@ -137,7 +137,7 @@ def test_the_teacher_adds_to_the_loss(teacher_path, dataset_detect):
 
 
 def test_a_teacher_of_other_strides_is_refused(teacher_path):
-    with pytest.raises(UserError, match=r"best.ckpt: strides: found \[4, 8, 16\]; wanted \[8, 16, 32\]"):
+    with pytest.raises(UserError, match=r"best.ckpt: strides: got \[4, 8, 16\], expected \[8, 16, 32\]"):
         load_teacher(teacher_path, settings("detect.strides=[8, 16, 32]"))
-    with pytest.raises(UserError, match=r"best.ckpt: in_channels: found 1; wanted 3"):
+    with pytest.raises(UserError, match=r"best.ckpt: in_channels: got 1, expected 3"):
         load_teacher(teacher_path, settings("detect.in_channels=3"))

@@ -113,17 +113,17 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--split", "tset"], "--split: split: found tset; wanted one of train, val, test"),
-        (["--threshold", "2"], "--threshold: score: found 2.0; wanted a number from 0 to 1"),
-        (["--set", "detect.width=1"], "--set: detect.width: found not a setting of judging"),
-        (["--set", "detect.evaluation.match_iuo=0.4"], "found unknown key; wanted match_iou"),
+        (["--split", "tset"], "--split: split: got tset, expected one of train, val, test"),
+        (["--threshold", "2"], "--threshold: score: got 2.0, expected a number from 0 to 1"),
+        (["--set", "detect.width=1"], "--set: detect.width: got not a setting of judging"),
+        (["--set", "detect.evaluation.match_iuo=0.4"], "got unknown key, expected match_iou"),
         (["--out", "."], "the run's own folder"),
-        (["--scale", "9"], "--scale: detect.evaluation.scales.0: found 9.0; wanted"),
+        (["--scale", "9"], "--scale: detect.evaluation.scales.0: got 9.0, expected"),
         (["--scale", "nan"], "--scale: detect.evaluation.scales.0"),
-        (["--tile", "256"], "--tile: beside: found no --images; wanted --images, or no --tile"),
-        (["--overlap", "32"], "--overlap: beside: found no --images"),
-        (["--box-margin", "0.5"], "--box-margin: beside: found no --images"),
-        (["--min-size", "8"], "--min-size: beside: found no --images"),
+        (["--tile", "256"], "--tile: beside: got no --images, expected --images, or no --tile"),
+        (["--overlap", "32"], "--overlap: beside: got no --images"),
+        (["--box-margin", "0.5"], "--box-margin: beside: got no --images"),
+        (["--min-size", "8"], "--min-size: beside: got no --images"),
     ],
 )
 def test_wrong_options_in_one_line(run, dataset_detect, options, told, monkeypatch):
@@ -134,18 +134,18 @@ def test_wrong_options_in_one_line(run, dataset_detect, options, told, monkeypat
 
 
 def test_folders_that_are_no_finished_runs(run, dataset_detect, tmp_path):
-    with pytest.raises(UserError, match=r"config.yaml: configuration: found no such file"):
+    with pytest.raises(UserError, match=r"config.yaml: configuration: got no such file"):
         call("evaluate", "--run", tmp_path, "--dataset", dataset_detect)
-    with pytest.raises(UserError, match=r"metrics.json: metrics: found no such file"):
+    with pytest.raises(UserError, match=r"metrics.json: metrics: got no such file"):
         call("compare", run, tmp_path, "--out", tmp_path / "out")
     (tmp_path / "metrics.json").write_text("[1, 2]")
-    with pytest.raises(UserError, match="wanted flat keys"):
+    with pytest.raises(UserError, match="expected flat keys"):
         call("compare", tmp_path, "--out", tmp_path / "out")
     (tmp_path / "metrics.json").write_text("{}")
-    with pytest.raises(UserError, match=r"precision_recall.parquet: curve: found no such file"):
+    with pytest.raises(UserError, match=r"precision_recall.parquet: curve: got no such file"):
         call("compare", tmp_path, "--out", tmp_path / "out")
     (tmp_path / "precision_recall.parquet").write_bytes(b"PAR1 and no more")
-    with pytest.raises(UserError, match="wanted columns score, precision and recall"):
+    with pytest.raises(UserError, match="expected columns score, precision and recall"):
         call("compare", tmp_path, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -153,7 +153,7 @@ def test_a_file_that_differs_is_not_left(run_folder, tmp_path, monkeypatch):
         return made
 
     monkeypatch.setattr(export, "FlightDetector", wrong)
-    with pytest.raises(UserError, match=r"detector.onnx: onnxruntime: found boxes 0.*px.*wanted 0.001 px"):
+    with pytest.raises(UserError, match=r"detector.onnx: onnxruntime: got boxes 0.*px.*expected 0.001 px"):
         export.export_run(run_folder, tmp_path / "flight", ("onnx",), SIZE)
     assert list(tmp_path.iterdir()) == []
 
@@ -177,7 +177,7 @@ def test_int8_is_judged_and_kept_only_if_worth_it(run_folder, dataset_detect, tm
 @pytest.mark.parametrize("missing", ["onnx", "onnxruntime", "openvino", "onnxruntime.quantization"])
 def test_without_the_extra_one_line_says_what_to_install(run_folder, dataset_detect, tmp_path, monkeypatch, missing):
     monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(UserError, match=rf"{missing}: found not installed; wanted pip install"):
+    with pytest.raises(UserError, match=rf"{missing}: got not installed, expected pip install"):
         export.export_run(run_folder, tmp_path / "a", export.FORMATS, SIZE, dataset_detect, int8=True)
     assert list(tmp_path.iterdir()) == []
 
@@ -209,10 +209,10 @@ def test_when_int8_is_worth_it(loss, seconds, kept):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--formats", "onnx,tflite"], "--formats: found onnx,tflite"),
-        (["--int8"], "--int8: found no --dataset"),
-        (["--size-px", "100"], "--size-px: found 100; wanted a multiple of 32"),
-        (["--run", "nowhere"], "nowhere: --run: found no metrics.json"),
+        (["--formats", "onnx,tflite"], "--formats: got onnx,tflite"),
+        (["--int8"], "--int8: got no --dataset"),
+        (["--size-px", "100"], "--size-px: got 100, expected a multiple of 32"),
+        (["--run", "nowhere"], "nowhere: --run: got no metrics.json"),
     ],
 )
 def test_wrong_options_leave_nothing(run_folder, tmp_path, options, words):
@@ -223,7 +223,7 @@ def test_wrong_options_leave_nothing(run_folder, tmp_path, options, words):
 
 
 def test_frames_of_another_size(run_folder, dataset_detect, tmp_path):
-    with pytest.raises(UserError, match="frames: found 96 x 96; wanted 256 x 256"):
+    with pytest.raises(UserError, match="frames: got 96 x 96, expected 256 x 256"):
         export.export_run(run_folder, tmp_path / "x", ("onnx",), 256, dataset_detect)
 
 
@@ -231,7 +231,7 @@ def test_engines_refuse_what_is_no_network(tmp_path):
     path = Path(tmp_path, "detector.onnx")
     path.write_bytes(b"nothing of the kind")
     for engine in (onnxruntime_engine, openvino_engine):
-        with pytest.raises(UserError, match=r"detector.onnx: network: found "):
+        with pytest.raises(UserError, match=r"detector.onnx: network: got "):
             engine(path)
         with pytest.raises(UserError, match="no such file"):
             engine(tmp_path / "absent.onnx")

@@ -105,10 +105,10 @@ def test_the_command(run, folder, tmp_path):
     written = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert (written["scales"], written["min_size_px"], written["threshold"]) == ("0.5", 20, 0.02)
     for option, value, told in (
-        ("--dataset", "data", "--dataset: beside: found --images; wanted one of both"),
-        ("--split", "test", "--split: beside: found --images; wanted one of both"),
-        ("--set", "detect.labels.selection=all", "--set: detect.labels.selection: found beside --images"),
-        ("--scale", "9", "--scale: factor: found [9.0]"),
+        ("--dataset", "data", "--dataset: beside: got --images, expected one of both"),
+        ("--split", "test", "--split: beside: got --images, expected one of both"),
+        ("--set", "detect.labels.selection=all", "--set: detect.labels.selection: got beside --images"),
+        ("--scale", "9", "--scale: factor: got [9.0]"),
     ):
         refused = CliRunner().invoke(app, [*arguments, option, value])
         assert isinstance(refused.exception, UserError) and told in str(refused.exception)

@@ -44,13 +44,13 @@ def test_tables_with_commas_and_tabs(tmp_path, separator):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "line 1: found no header; wanted a column X"),
-        ("ID,X,Y,W\n0,1,2,3", "line 1: found ID,X,Y,W; wanted a column H"),
-        ("X,Y,W,H\n1,2,3,4\n1,2,3", "line 3: found 3 values; wanted 4"),
-        ("X,Y,W,H\n1,2,three,4", "line 2: found ['1', '2', 'three', '4']; wanted four numbers"),
-        ("X,Y,W,H\n1,2,nan,4", "line 2: found ['1', '2', 'nan', '4']; wanted a width and height above 0"),
-        ("X,Y,W,H\n1,2,3,-4", "line 2: found"),
-        ("X,Y,W,H\n1e9,2,3,4", "line 2: found"),
+        ("", "line 1: got no header, expected a column X"),
+        ("ID,X,Y,W\n0,1,2,3", "line 1: got ID,X,Y,W, expected a column H"),
+        ("X,Y,W,H\n1,2,3,4\n1,2,3", "line 3: got 3 values, expected 4"),
+        ("X,Y,W,H\n1,2,three,4", "line 2: got ['1', '2', 'three', '4'], expected four numbers"),
+        ("X,Y,W,H\n1,2,nan,4", "line 2: got ['1', '2', 'nan', '4'], expected a width and height above 0"),
+        ("X,Y,W,H\n1,2,3,-4", "line 2: got"),
+        ("X,Y,W,H\n1e9,2,3,4", "line 2: got"),
     ],
 )
 def test_broken_tables_are_named_with_their_line(tmp_path, text, told):
@@ -63,10 +63,10 @@ def test_broken_tables_are_named_with_their_line(tmp_path, text, told):
 
 def test_tables_that_are_missing_or_no_text(tmp_path):
     picture(tmp_path / "a.png")
-    with pytest.raises(UserError, match=r"a\.txt: boxes: found no such file"):
+    with pytest.raises(UserError, match=r"a\.txt: boxes: got no such file"):
         read_images(tmp_path)
     (tmp_path / "a.txt").write_bytes(b"X,Y,W,H\n\xff\xfe")
-    with pytest.raises(UserError, match=r"a\.txt: boxes: found bytes that are no text"):
+    with pytest.raises(UserError, match=r"a\.txt: boxes: got bytes that are no text"):
         read_images(tmp_path)
 
 
@@ -109,19 +109,19 @@ def test_coco(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"images": [{"id": 7, "file_name": "../x.png"}]}, r"images\[0\].file_name: found ../x.png"),
-        ({"images": [{"id": 7, "file_name": "/etc/passwd"}]}, r"images\[0\].file_name: found /etc/passwd"),
-        ({"images": [{"id": 7, "file_name": 3}]}, r"images\[0\].file_name: found 3"),
-        ({"images": [{"id": 7, "file_name": "absent.png"}]}, r"absent.png: image: found no such file"),
-        ({"images": [{"id": 7, "file_name": "pictures/a b.png", "width": 41}]}, "size: found 40 x 30; wanted 41 x 30"),
-        ({"images": [{"file_name": "pictures/a b.png"}]}, r"images\[0\].id: found None"),
-        ({"images": []}, "images: found none"),
-        ({"images": 3}, "images: found int; wanted a list of objects"),
-        ({"categories": [{"id": 1, "name": "cat"}, {"id": 2, "name": "dog"}]}, "categories: found cat, dog"),
+        ({"images": [{"id": 7, "file_name": "../x.png"}]}, r"images\[0\].file_name: got ../x.png"),
+        ({"images": [{"id": 7, "file_name": "/etc/passwd"}]}, r"images\[0\].file_name: got /etc/passwd"),
+        ({"images": [{"id": 7, "file_name": 3}]}, r"images\[0\].file_name: got 3"),
+        ({"images": [{"id": 7, "file_name": "absent.png"}]}, r"absent.png: image: got no such file"),
+        ({"images": [{"id": 7, "file_name": "pictures/a b.png", "width": 41}]}, "size: got 40 x 30, expected 41 x 30"),
+        ({"images": [{"file_name": "pictures/a b.png"}]}, r"images\[0\].id: got None"),
+        ({"images": []}, "images: got none"),
+        ({"images": 3}, "images: got int, expected a list of objects"),
+        ({"categories": [{"id": 1, "name": "cat"}, {"id": 2, "name": "dog"}]}, "categories: got cat, dog"),
         ({"annotations": [{"image_id": 8, "category_id": 1, "bbox": [1, 2, 3, 4]}]}, r"annotations\[0\].image_id"),
         ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, 3]}]}, r"annotations\[0\].bbox"),
         ({"annotations": [{"image_id": 7, "category_id": 1, "bbox": [1, 2, -1, 4]}]}, "above 0"),
-        ({"annotations": [{"image_id": 7, "category_id": 1}]}, r"annotations\[0\].bbox: found None"),
+        ({"annotations": [{"image_id": 7, "category_id": 1}]}, r"annotations\[0\].bbox: got None"),
     ],
 )
 def test_odd_coco_files_are_refused_in_one_line(tmp_path, changes, told):
@@ -135,7 +135,7 @@ def test_coco_does_not_follow_a_link_out_of_its_folder(tmp_path):
     inner = tmp_path / "inner"
     path = coco(inner, images=[{"id": 7, "file_name": "link.png"}])
     (inner / "link.png").symlink_to(tmp_path / "outside.png")
-    with pytest.raises(UserError, match=r"file_name: found link.png"):
+    with pytest.raises(UserError, match=r"file_name: got link.png"):
         read_images(path)
 
 
@@ -150,14 +150,14 @@ def test_coco_beside_a_folder_of_images(tmp_path, folder):
     picture(tmp_path / "outside.png")
     wanted.unlink()
     wanted.symlink_to(tmp_path / "outside.png")
-    with pytest.raises(UserError, match=r"file_name: found a.png"):
+    with pytest.raises(UserError, match=r"file_name: got a.png"):
         read_images(path)
     wanted.unlink()
-    with pytest.raises(UserError, match=r"annotations/a.png: image: found no such file"):
+    with pytest.raises(UserError, match=r"annotations/a.png: image: got no such file"):
         read_images(path)
     coco(root / "annotations", images=[{"id": 7, "file_name": "../images/b.png"}]).replace(path)
     picture(root / "images" / "b.png")
-    with pytest.raises(UserError, match=r"file_name: found ../images/b.png"):
+    with pytest.raises(UserError, match=r"file_name: got ../images/b.png"):
         read_images(path)
 
 
@@ -173,7 +173,7 @@ def test_coco_boxes_without_an_area_are_left_out_and_told(tmp_path, capsys):
 def test_files_that_are_no_coco(tmp_path, text):
     path = tmp_path / "a.json"
     path.write_text(text)
-    with pytest.raises(UserError, match="JSON: found"):
+    with pytest.raises(UserError, match="JSON: got"):
         read_images(path)
 
 
@@ -214,7 +214,7 @@ def test_pictures_that_are_damaged_or_none(tmp_path):
         read_grey(tmp_path / "absent.png")
     header = b"IHDR" + (2**17).to_bytes(4, "big") * 2 + whole[24:29]
     (tmp_path / "bomb.png").write_bytes(whole[:12] + header + zlib.crc32(header).to_bytes(4, "big") + whole[33:])
-    with pytest.raises(UserError, match=r"bomb\.png: size: found 131072 x 131072"):
+    with pytest.raises(UserError, match=r"bomb\.png: size: got 131072 x 131072"):
         read_grey(tmp_path / "bomb.png")
 
 

@@ -112,11 +112,11 @@ def test_what_stays_unread_is_told_in_one_line(tmp_path, monkeypatch, capfd):
     cut.write_bytes(whole.read_bytes()[:9000])
     with pytest.raises(UserError, match=r"cut\.tif: image"):
         read_grey(cut)
-    with pytest.raises(UserError, match=r"z\.tif: image: found complex numbers"):
+    with pytest.raises(UserError, match=r"z\.tif: image: got complex numbers"):
         read_grey(tiff(tmp_path / "z.tif", ramp(), "complex64"))
-    with pytest.raises(UserError, match="image: found a folder; wanted a PNG"):
+    with pytest.raises(UserError, match="image: got a folder, expected a PNG"):
         read_grey(tmp_path)
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(UserError, match=r"found a file that does not decode; wanted .* need rasterio \(pip install"):
+    with pytest.raises(UserError, match=r"got a file that does not decode, expected .* need rasterio \(pip install"):
         picture_size(whole)
     assert capfd.readouterr() == ("", "")

@@ -133,7 +133,7 @@ def test_what_lies_off_the_map_is_left_out_and_told(run, tmp_path, capsys):
 
 def test_an_image_wholly_off_its_map_is_refused(tmp_path):
     path = geotiff(tmp_path / "sky.tif", ORTHOGRAPHIC, from_origin(5e6, 5e6, 1000, 1000))
-    with pytest.raises(UserError, match=r"sky\.tif: projection: found none of its pixels on the map"):
+    with pytest.raises(UserError, match=r"sky\.tif: projection: got none of its pixels on the map"):
         read_georeference(path)
 
 
@@ -146,16 +146,16 @@ def test_one_faulty_image_among_several_leaves_nothing(run, tmp_path):
     (tmp_path / "more").mkdir()
     twin = tmp_path / "more" / "good.png"
     twin.write_bytes(good.read_bytes())
-    with pytest.raises(UserError, match=r"more/good\.png: name: found a second image"):
+    with pytest.raises(UserError, match=r"more/good\.png: name: got a second image"):
         predict_images([good, twin], run, settings_of(run), tmp_path / "out", None, Tiling())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.png", "good.png", "more"]
 
 
 def test_a_run_that_is_not_finished(run, tmp_path):
     assert cv2.imwrite(str(tmp_path / "a.png"), noise(64, 64))
-    with pytest.raises(UserError, match=r"metrics\.json: metrics: found no such file"):
+    with pytest.raises(UserError, match=r"metrics\.json: metrics: got no such file"):
         predict_images([tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", None, Tiling())
-    with pytest.raises(UserError, match=r"best\.ckpt: checkpoint: found no such file"):
+    with pytest.raises(UserError, match=r"best\.ckpt: checkpoint: got no such file"):
         predict_images([tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", 0.5, Tiling())
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 

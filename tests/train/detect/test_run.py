@@ -84,11 +84,11 @@ def test_a_selection_is_named_and_its_thresholds_replaced():
 @pytest.mark.parametrize(
     ("setting", "told"),
     [
-        ("selection=visibel", "detect.labels.selection: found 'visibel'; wanted visible (nearest known)"),
-        ("selection=3", "detect.labels.selection: found 3; wanted "),
-        ("min_contrst=3", "min_contrst: found unknown key; wanted min_contrast (nearest known)"),
-        ("radius_px=[3, 20, 30]", "detect.labels.radius_px: found"),
-        ("min_depth_ratio=deep", "detect.labels.min_depth_ratio: found 'deep'; wanted "),
+        ("selection=visibel", "detect.labels.selection: got 'visibel', expected visible (nearest known)"),
+        ("selection=3", "detect.labels.selection: got 3, expected "),
+        ("min_contrst=3", "min_contrst: got unknown key, expected min_contrast (nearest known)"),
+        ("radius_px=[3, 20, 30]", "detect.labels.radius_px: got"),
+        ("min_depth_ratio=deep", "detect.labels.min_depth_ratio: got 'deep', expected "),
     ],
 )
 def test_an_unknown_selection_is_refused_in_one_line(setting, told):
@@ -134,7 +134,7 @@ def test_a_finished_run_is_left_as_it_is(finished, tmp_path, capsys):
     before = files()
     run_detect(settings("detect.workers=1"), tmp_path / "absent", finished.root.parents[1], "a", resume=True)
     assert "finished, and left as it is" in " ".join(capsys.readouterr().err.split())
-    with pytest.raises(UserError, match=r"config.yaml: detect.learning_rate: found 0.005; wanted 0.01"):
+    with pytest.raises(UserError, match=r"config.yaml: detect.learning_rate: got 0.005, expected 0.01"):
         other = settings("detect.learning_rate=0.01")
         run_detect(other, tmp_path / "absent", finished.root.parents[1], "a", resume=True)
     assert files() == before
@@ -209,7 +209,7 @@ def test_a_packed_dataset_gives_the_same_weights(few, tmp_path, unjudged):
 
 
 def test_fewer_frames_than_processes(few, tmp_path):
-    with pytest.raises(UserError, match=r"/few: val frames: found 2; wanted at least 3, one for each process"):
+    with pytest.raises(UserError, match=r"/few: val frames: got 2, expected at least 3, one for each process"):
         run_detect(settings("detect.devices=3"), few, tmp_path / "runs", "a")
     assert not (tmp_path / "runs").exists()
 
@@ -244,7 +244,7 @@ def test_a_run_starts_from_what_an_earlier_one_has_for_it(finished, tmp_path, ch
 def test_a_run_of_another_width_is_refused(finished, tmp_path):
     config = settings("detect.width=0.25")
     network = build_network(config, torch.rand(50, 2).numpy() + 4, tmp_path)
-    with pytest.raises(UserError, match=r"best.ckpt: width: found 0.125; wanted 0.25"):
+    with pytest.raises(UserError, match=r"best.ckpt: width: got 0.125, expected 0.25"):
         start_from(network, finished.best, config)
 
 
@@ -256,7 +256,7 @@ def test_another_kind_of_checkpoint(tmp_path):
 
 
 def test_nothing_is_written_for_a_missing_dataset_or_checkpoint(dataset_detect, tmp_path):
-    with pytest.raises(UserError, match=r"dataset.json: found no such file"):
+    with pytest.raises(UserError, match=r"dataset.json: got no such file"):
         run_detect(settings(), tmp_path / "absent", tmp_path / "runs", "a")
     with pytest.raises(UserError, match="no such file"):
         run_detect(settings("detect.init_from=absent.ckpt"), dataset_detect, tmp_path / "runs", "a")

@@ -119,9 +119,9 @@ def test_a_backbone_alone_is_filled_from_conv_74_or_for_finer_strides(coco, tmp_
 @pytest.mark.parametrize(
     ("setting", "told"),
     [
-        ("detect.width=0.5", "yolov3.weights: detect.width: found 0.5; wanted 1, as Darknet's files have it"),
-        ("detect.in_channels=1", "yolov3.weights: detect.in_channels: found 1; wanted 3, as Darknet's files have it"),
-        ("detect.width=1", "yolov3.weights: size: found 24 bytes: a header and 1 floats; wanted 40620640 or "),
+        ("detect.width=0.5", "yolov3.weights: detect.width: got 0.5, expected 1, as Darknet's files have it"),
+        ("detect.in_channels=1", "yolov3.weights: detect.in_channels: got 1, expected 3, as Darknet's files have it"),
+        ("detect.width=1", "yolov3.weights: size: got 24 bytes: a header and 1 floats, expected 40620640 or "),
     ],
 )
 def test_a_network_or_file_of_another_shape_is_refused_before_anything_is_written(
@@ -175,10 +175,10 @@ def test_a_run_is_written_as_a_darknet_file_and_comes_back(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("name", "shape", "told"),
     [
-        ("a.bin", {}, "a.bin: --out: found the name a.bin; wanted a name that ends in .conv.74 or .weights"),
-        ("a.conv.74", {"width": 0.125}, "best.ckpt: width: found 0.125; wanted 1.0"),
-        ("a.weights", {"width": 0.125}, "best.ckpt: width: found 0.125; wanted 1.0"),
-        ("absent.weights", None, "best.ckpt: checkpoint: found no such file"),
+        ("a.bin", {}, "a.bin: --out: got the name a.bin, expected a name that ends in .conv.74 or .weights"),
+        ("a.conv.74", {"width": 0.125}, "best.ckpt: width: got 0.125, expected 1.0"),
+        ("a.weights", {"width": 0.125}, "best.ckpt: width: got 0.125, expected 1.0"),
+        ("absent.weights", None, "best.ckpt: checkpoint: got no such file"),
     ],
 )
 def test_what_has_no_darknet_file_is_refused(tmp_path, name, shape, told):
@@ -193,9 +193,9 @@ def test_a_whole_file_holds_no_gates_and_no_finer_strides(tmp_path):
     with torch.device("meta"):
         network = YOLOv3()
     shape = {"in_channels": 3, "width": 1.0, "attention": "cbam", "strides": [8, 16, 32]}
-    with pytest.raises(UserError, match=r"best.ckpt: attention: found cbam; wanted none"):
+    with pytest.raises(UserError, match=r"best.ckpt: attention: got cbam, expected none"):
         darknet_content(network, shape, Path("best.ckpt"), whole=True)
-    with pytest.raises(UserError, match=r"strides: found \[4, 8, 16\]; wanted \[8, 16, 32\]"):
+    with pytest.raises(UserError, match=r"strides: got \[4, 8, 16\], expected \[8, 16, 32\]"):
         darknet_content(network, {**shape, "strides": [4, 8, 16]}, Path("best.ckpt"), whole=True)
 
 

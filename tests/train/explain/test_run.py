@@ -96,11 +96,11 @@ def test_what_cannot_be_explained(checkpoints, dataset_detect, dataset_nav, tmp_
     detector, stack = checkpoints
     plain = _DETECTOR | {"attention": "none"}
     save_weights(tmp_path / "plain.ckpt", plain, YOLOv3(None, **plain))
-    with pytest.raises(UserError, match="attention: found none"):
+    with pytest.raises(UserError, match="attention: got none"):
         _explain((tmp_path / "plain.ckpt", stack), dataset_detect, dataset_nav, tmp_path)
     with pytest.raises(UserError, match="no such file"):
         _explain((tmp_path / "missing.ckpt", stack), dataset_detect, dataset_nav, tmp_path)
     with pytest.raises(UserError, match="fusion"):
         _explain((detector, detector), dataset_detect, dataset_nav, tmp_path)
-    with pytest.raises(UserError, match="kind: found nav"):
+    with pytest.raises(UserError, match="kind: got nav"):
         _explain((detector, stack), dataset_nav, dataset_nav, tmp_path)

@@ -117,8 +117,8 @@ def test_a_file_of_another_size_is_refused_by_name(tmp_path, size, found, n_floa
     with pytest.raises(UserError) as caught:
         read_darknet(path, (40_620_640, 62_001_757))
     told = str(caught.value)
-    assert told.startswith(f"{path}: size: found ") and found in told and "\n" not in told
-    assert told.endswith("wanted 40620640 or 62001757 floats")
+    assert told.startswith(f"{path}: size: got ") and found in told and "\n" not in told
+    assert told.endswith("expected 40620640 or 62001757 floats")
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -127,7 +127,7 @@ def test_what_is_not_finite_is_refused(tmp_path, values, bad):
     spoilt = values.copy()
     spoilt[1234] = bad
     path.write_bytes(by_hand.HEADER + spoilt.tobytes())
-    with pytest.raises(UserError, match=f"x.weights: float 1234: found {bad}; wanted finite numbers"):
+    with pytest.raises(UserError, match=f"x.weights: float 1234: got {bad}, expected finite numbers"):
         read_darknet(path, (len(values),))
 
 
@@ -139,7 +139,7 @@ def test_a_negative_variance_is_refused_and_nothing_is_loaded(tmp_path, backbone
     spoilt[count_floats(slots[:at])] = -0.5
     path = tmp_path / "x.weights"
     path.write_bytes(by_hand.HEADER + spoilt.tobytes())
-    with pytest.raises(UserError, match=r"x.weights: convolution 51 variance: found -0.5"):
+    with pytest.raises(UserError, match=r"x.weights: convolution 51 variance: got -0.5"):
         fill(slots, read_darknet(path, (len(values),)), path)
     assert all(torch.equal(value, before[key]) for key, value in backbone.state_dict().items())
 
@@ -147,9 +147,9 @@ def test_a_negative_variance_is_refused_and_nothing_is_loaded(tmp_path, backbone
 def test_a_negative_version_and_a_missing_file_are_refused(tmp_path):
     path = tmp_path / "x.weights"
     path.write_bytes(struct.pack("<3iQ", 0, -2, 0, 0))
-    with pytest.raises(UserError, match=r"version: found 0.-2.0"):
+    with pytest.raises(UserError, match=r"version: got 0.-2.0"):
         read_darknet(path, (1,))
-    with pytest.raises(UserError, match=r"absent.weights: weights: found no such file"):
+    with pytest.raises(UserError, match=r"absent.weights: weights: got no such file"):
         read_darknet(tmp_path / "absent.weights", (1,))
 
 

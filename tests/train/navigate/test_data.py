@@ -45,7 +45,7 @@ def test_distorted_images_are_refused(dataset_nav, tmp_path):
     info = json.loads((root / "dataset.json").read_text())
     info["camera"]["distortion"][0] = -0.1
     (root / "dataset.json").write_text(json.dumps(info))
-    with pytest.raises(UserError, match=r"camera\.distortion.*wanted zeros"):
+    with pytest.raises(UserError, match=r"camera\.distortion.*expected zeros"):
         load_descents(open_dataset(root))
 
 

@@ -127,7 +127,7 @@ def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
     settings = _settings(fusion="stack", stack=_NETWORK | {"width": 0.25})
     (run,) = navigate_run(settings, dataset_nav, tmp_path, "t", detector, False)
     assert "width" in json.loads(run.metrics.read_text())["network/backbone"]
-    with pytest.raises(UserError, match=r"width: found 0\.125"):
+    with pytest.raises(UserError, match=r"width: got 0\.125"):
         navigate_run(settings.model_copy(update={"detector": detector}), dataset_nav, tmp_path, "t", None, False)
     with pytest.raises(UserError, match="fusion"):
         load_navigator(run.best, "warp")
@@ -135,7 +135,7 @@ def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
 
 def test_several_processes_are_refused_before_anything_is_written(dataset_nav, tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(UserError, match="torchrun: processes: found 2; wanted 1"):
+    with pytest.raises(UserError, match="torchrun: processes: got 2, expected 1"):
         navigate_run(_settings(), dataset_nav, tmp_path / "runs", "a", None, resume=False)
     assert not (tmp_path / "runs").exists()
 
