@@ -22,9 +22,10 @@ def point(root: Path) -> dict[str, Any]:
     trained = load_trained(root)
     metrics = json.loads((root / "metrics.json").read_text(encoding="utf-8"))
     try:
-        found = {key: float(metrics[f"test/{key}"]) for key in ("ap50", "f1")}
+        found = {key: float(metrics[f"test/{key}"]) for key in ("ap50_paper", "f1")}
     except (KeyError, TypeError, ValueError):
-        raise UserError(root / "metrics.json", "test/ap50", "no number", "the metrics of a finished run") from None
+        file = root / "metrics.json"
+        raise UserError(file, "test/ap50_paper", "no number", "the metrics of a finished run") from None
     return {
         "run": root.name,
         "width": trained.config.width,
@@ -39,7 +40,7 @@ def point(root: Path) -> dict[str, Any]:
 
 
 def draw(points: list[dict[str, Any]], path: Path) -> None:
-    """AP against multiply-adds, alone and distilled runs apart."""
+    """AP (the paper's sum) against multiply-adds, alone and distilled runs apart."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -50,9 +51,9 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
         some = sorted((p for p in points if p["distilled"] == distilled), key=lambda p: p["multiply_adds"])
         if not some:
             continue
-        axes.plot([p["multiply_adds"] / 1e9 for p in some], [p["ap50"] for p in some], marker, label=words)
+        axes.plot([p["multiply_adds"] / 1e9 for p in some], [p["ap50_paper"] for p in some], marker, label=words)
         for p in some:
-            place = (p["multiply_adds"] / 1e9, p["ap50"])
+            place = (p["multiply_adds"] / 1e9, p["ap50_paper"])
             axes.annotate(p["run"], place, xytext=(4, 6 if distilled else -11), textcoords="offset points", fontsize=8)
     axes.set_xscale("log")
     sizes = sorted({round(p["multiply_adds"] / 1e9, 2) for p in points})

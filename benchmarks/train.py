@@ -78,7 +78,7 @@ def trained(network: YOLOv3, config: DetectConfig, train: DetectSplit, val: Dete
     task.batches = batches
     with tempfile.TemporaryDirectory() as folder:
         run = runs.RunFolder(Path(folder))
-        fit(run, task, label="train", epochs=1, monitor="val/ap50", mode="max", precision=config.precision)
+        fit(run, task, label="train", epochs=1, monitor="val/ap50_paper", mode="max", precision=config.precision)
     return task.clock.seconds
 
 

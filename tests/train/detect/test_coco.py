@@ -20,8 +20,8 @@ def our_average_precisions(found, labels):
     overlaps = find_overlaps(found, labels, np.full((len(found), 2), SIZE_PX))
     by_iou = [overlaps.match(iou, EVERY_RADIUS) for iou in COCO_IOUS]
     curves = [curve(part) for part in by_iou]
-    both = [c.average_precision_101() for c in curves], [c.average_precision() for c in curves]
-    assert figures_over_ious(by_iou)["ap50_95_101"] == pytest.approx(np.mean(both[0]))
+    both = [c.ap_coco101() for c in curves], [c.ap_envelope() for c in curves]
+    assert figures_over_ious(by_iou)["ap50_95_coco101"] == pytest.approx(np.mean(both[0]))
     return both
 
 

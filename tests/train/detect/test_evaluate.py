@@ -51,8 +51,8 @@ def test_a_run_judged_again_has_the_same_figures(run, dataset_detect):
             assert value == first[key], key
     assert again["dataset/protocol"] == "unseen scenes"
     assert (again["test/intervals_over"], again["test/intervals_units"]) == ("frame", 8)
-    assert again["test/ap50_low"] <= again["test/ap50"] <= again["test/ap50_high"]
-    assert again["test/strict/ap50"] <= again["test/edge/ap50"] <= again["test/ap50"]
+    assert again["test/ap50_paper_low"] <= again["test/ap50_paper"] <= again["test/ap50_paper_high"]
+    assert again["test/strict/ap50_paper"] <= again["test/edge/ap50_paper"] <= again["test/ap50_paper"]
     assert again["test/edge/recall"] == again["test/recall"]
     for name in ("report.md", "precision_recall.png", "bins.png", "detections.png", "detections.parquet"):
         assert (run / "evaluation" / name).stat().st_size > 0, name
@@ -77,7 +77,7 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
     call(*judged, "--split", "val", "--out", tmp_path / "val")
     own, chosen, val = (figures(tmp_path / name) for name in ("own", "chosen", "val"))
     assert own["test/threshold"] == figures(run)["test/threshold"] != chosen["test/threshold"]
-    assert own["test/ap50"] == chosen["test/ap50"] != figures(run)["test/ap50"]
+    assert own["test/ap50_paper"] == chosen["test/ap50_paper"] != figures(run)["test/ap50_paper"]
     assert own["evaluation/scales"] == "1 2" and figures(run)["evaluation/scales"] == "1"
     assert "of best F1 on the dataset's val" in (tmp_path / "chosen/report.md").read_text()
     assert "looked at at scale 1 and 2" in (tmp_path / "chosen/report.md").read_text()
@@ -106,7 +106,7 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
     rows = [line for line in written.splitlines() if line.startswith("| ")][2:]
     assert len(rows) == 2 and all(row in text for row in rows)
     assert rows[0].split("|")[2:] == rows[1].split("|")[2:]
-    assert "unseen scenes" in rows[0] and f"{figures(run)['test/ap50']:.3f}" in rows[0]
+    assert "unseen scenes" in rows[0] and f"{figures(run)['test/ap50_paper']:.3f}" in rows[0]
     assert (tmp_path / "both/precision_recall.png").stat().st_size > 5000
 
 
@@ -165,5 +165,5 @@ def test_a_networks_detections_by_pycocotools(run, dataset_detect):
     curves = [curve(overlaps.match(iou, (0.0, 1e9))) for iou in COCO_IOUS]
     by_101, by_all = coco_evaluation(found, labels)
     assert len(table) > 100 and by_all[0] > 0
-    np.testing.assert_allclose([points.average_precision_101() for points in curves], by_101, atol=1e-6)
-    np.testing.assert_allclose([points.average_precision() for points in curves], by_all, atol=1e-6)
+    np.testing.assert_allclose([points.ap_coco101() for points in curves], by_101, atol=1e-6)
+    np.testing.assert_allclose([points.ap_envelope() for points in curves], by_all, atol=1e-6)

@@ -166,7 +166,7 @@ def test_int8_is_judged_and_kept_only_if_worth_it(run_folder, dataset_detect, tm
     monkeypatch.setattr(int8, "interleaved", lambda *given: timed(*given) | {"int8": [0.0]})
     verdict = export.export_run(run_folder, tmp_path / "a", ("onnx",), SIZE, dataset_detect, int8=True)
     assert verdict.kept == (most_loss > 0)
-    assert 0 <= verdict.ap50_int8 <= 1 and verdict.float_s > 0
+    assert 0 <= verdict.ap50_paper_int8 <= 1 and verdict.float_s > 0
     assert (tmp_path / "a" / "detector-int8.onnx").exists() == verdict.kept
     told = json.loads((tmp_path / "a" / "detector.json").read_text())
     assert told["int8"]["kept"] == verdict.kept

@@ -76,8 +76,8 @@ def test_a_folder_is_judged(run, folder, tmp_path):
     assert written["threshold"] == THRESHOLD and written["frames"] == 2
     wanted = [image.wanted(8.0).sum() for image in read_images(folder).images]
     assert written["labels"] == sum(wanted) > 40
-    assert 0 < written["ap50"] < 1 and written["oracle/f1"] >= written["f1"] > 0
-    assert written["ap50"] == pytest.approx(figures["ap50"])
+    assert 0 < written["ap50_paper"] < 1 and written["oracle/f1"] >= written["f1"] > 0
+    assert written["ap50_paper"] == pytest.approx(figures["ap50_paper"])
     for name in ("report.md", "precision_recall.png", "detections.png", "detections.parquet", "crops.png"):
         assert (out / name).stat().st_size > 0, name
     assert "oracle" in (out / "report.md").read_text()
@@ -129,8 +129,8 @@ def test_compare_shows_images(run, folder, tmp_path):
     text = compare_folders([tmp_path / "a"], tmp_path / "both")
     cells = [cell.strip() for cell in text.splitlines()[-1].strip("| ").split("|")]
     assert cells[1:8] == ["images", "images", "-", "from 12.0 px", "0.5 1.0", "2", str(figures["labels"])]
-    assert cells[8].startswith(f"{figures['ap50']:.3f} (") and "-" not in cells[9:15]
-    assert f"{figures['lowest_ap50_by_radius']:.3f}" == cells[15]
+    assert cells[8].startswith(f"{figures['ap50_paper']:.3f} (") and "-" not in cells[9:15]
+    assert f"{figures['lowest_ap50_paper_by_radius']:.3f}" == cells[15]
 
 
 def test_images_are_looked_at_as_the_run_was_judged(folder, tmp_path):

@@ -86,20 +86,34 @@ def test_average_precision_by_hand():
     points = curve(outcomes(FOUND, FALSE, FOUND, FALSE, wanted=4))
     assert points.precision.tolist() == pytest.approx([1, 1 / 2, 2 / 3, 1 / 2])
     assert points.recall.tolist() == [0.25, 0.25, 0.5, 0.5]
-    assert points.average_precision() == pytest.approx(0.25 * 1 + 0.25 * 2 / 3)
+    assert points.ap_paper() == pytest.approx(0.25 * 1 + 0.25 * 2 / 3)
     # Recalls 0 .. 0.25 are 26 of the 101 points, 0.26 .. 0.50 another 25.
-    assert points.average_precision_101() == pytest.approx((26 * 1 + 25 * 2 / 3) / 101)
+    assert points.ap_envelope() == pytest.approx(points.ap_paper())
+    assert points.ap_coco101() == pytest.approx((26 * 1 + 25 * 2 / 3) / 101)
 
 
-def test_interpolation_takes_the_best_later_precision():
+def test_only_the_envelope_takes_the_best_later_precision():
     points = curve(outcomes(FALSE, FOUND, FOUND, wanted=2))
-    assert points.average_precision() == pytest.approx(2 / 3)
+    assert points.ap_envelope() == pytest.approx(2 / 3)
+    # Precisions 0, 1/2, 2/3 at recalls 0, 1/2, 1.
+    assert points.ap_paper() == pytest.approx(0.5 * 1 / 2 + 0.5 * 2 / 3)
+
+
+def test_the_papers_sum_takes_equal_scores_together():
+    """The worked example of scikit-learn's average_precision_score (0.8333), and one with a tie, whatever its order."""
+    scores, hits = np.array([0.8, 0.4, 0.35, 0.1]), [FOUND, FALSE, FOUND, FALSE]
+    none = np.zeros(4, np.intp)
+    assert curve(Matches(scores, np.array(hits, np.int8), none, none, none[:2])).ap_paper() == pytest.approx(5 / 6)
+    for order in ([FOUND, FOUND, FALSE, FOUND], [FOUND, FALSE, FOUND, FOUND]):
+        tied = Matches(np.array([0.9, 0.5, 0.5, 0.2]), np.array(order, np.int8), none, none, np.zeros(4, np.intp))
+        # Thresholds 0.9, 0.5, 0.2: recalls 1/4, 2/4, 3/4, precisions 1, 2/3, 3/4.
+        assert curve(tied).ap_paper() == pytest.approx((1 + 2 / 3 + 3 / 4) / 4)
 
 
 def test_ignored_detections_do_not_move_the_curve():
     with_ignored = curve(outcomes(FOUND, IGNORED, FALSE, FOUND, IGNORED, wanted=2))
     without = curve(outcomes(FOUND, FALSE, FOUND, wanted=2))
-    assert with_ignored.average_precision() == pytest.approx(without.average_precision())
+    assert with_ignored.ap_paper() == pytest.approx(without.ap_paper())
 
 
 def test_threshold_of_best_f1():
@@ -122,17 +136,18 @@ def test_threshold_of_most_recall_at_a_precision():
 
 def test_nothing_found_and_nothing_wanted():
     none = judge(detections([]), labels([square(0, 0)]))
-    assert curve(none).average_precision() == 0
-    assert curve(none).average_precision_101() == 0
+    assert curve(none).ap_paper() == 0
+    assert curve(none).ap_coco101() == 0
     assert curve(none).best_threshold() == 1.0
     assert at_threshold(none, 0.5) == (0, 0, 0)
     nothing_wanted = judge(detections([square(20, 20)]), labels([]))
-    assert curve(nothing_wanted).average_precision() == 0
+    assert curve(nothing_wanted).ap_paper() == 0
 
 
 def test_figures_of_both_accounts():
     truth = labels([square(0, 0, 8), square(20, 0, 8), square(40, 40, 30)], [True, True, False])
     result = figures(judge(detections([square(0, 0, 8), square(40, 40, 30)], [0.9, 0.8]), truth), threshold=0.5)
-    assert result["recall"] == result["strict/recall"] == result["ap50"] == 0.5
+    assert result["recall"] == result["strict/recall"] == result["ap50_paper"] == result["ap50_envelope"] == 0.5
+    assert "ap50" not in result
     assert (result["precision"], result["strict/precision"]) == (1, 0.5)
     assert result["f1"] == pytest.approx(2 / 3)

@@ -50,9 +50,9 @@ class BinFigures:
     """Frames with a wanted label in the bin."""
     labels: int
     """Wanted labels."""
-    ap50: float
-    """All points."""
-    ap50_interval: Interval
+    ap50_paper: float
+    """AP as in the paper (metrics.py)."""
+    ap50_paper_interval: Interval
     """95 %, by bootstrap."""
     precision: float
     """In the usual account."""
@@ -119,7 +119,7 @@ def _of_matches(
         high,
         len(np.unique(matches.wanted_frame)),
         len(matches.wanted_frame),
-        curve(matches).average_precision(),
+        curve(matches).ap_paper(),
         interval(average_precisions(matches, resamples)),
         precision,
         recall,

@@ -50,24 +50,26 @@ def draw_resamples(facts: FrameFacts, rng: np.random.Generator, count: int = RES
 
 
 def average_precisions(matches: Matches, resamples: Resamples) -> Array:
-    """All-point average precision of every resample (R,); NaN without wanted labels, see `resampled_wanted`.
+    """The paper's AP (`Curve.ap_paper`) of every resample (R,); NaN without wanted labels, see `resampled_wanted`.
 
     The sorted detections are counted by unit in at most 2000 groups of neighbouring scores, and a curve has one point
-    a group: exact for that many detections, else within a few ten-thousandths.
+    per group: exact for that many distinct scores, else within a few ten-thousandths.
     """
     counted = np.flatnonzero(matches.outcome != IGNORED)
     order = counted[np.argsort(-matches.scores[counted], kind="stable")]
-    group = np.arange(len(order)) * min(_GROUPS, len(order)) // max(len(order), 1)
+    rank = np.cumsum(np.diff(matches.scores[order], prepend=np.inf) != 0) - 1
+    n_scores = int(rank[-1]) + 1 if len(rank) else 0
+    n_groups = min(_GROUPS, n_scores)
+    group = rank * n_groups // max(n_scores, 1)
     place = resamples.of_frame[matches.frame[order]], group
-    shape = (resamples.count, min(_GROUPS, len(order)))
+    shape = (resamples.count, n_groups)
     hits, every = np.zeros(shape), np.zeros(shape)
     np.add.at(hits, place, matches.outcome[order] == FOUND)
     np.add.at(every, place, 1.0)
     hits, every = (np.cumsum(resamples.weights @ part, axis=1) for part in (hits, every))
     wanted = resampled_wanted(matches.wanted_frame, resamples)
     precision = hits / np.maximum(every, 1)
-    envelope = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
-    area = (np.diff(hits, axis=1, prepend=0.0) * envelope).sum(axis=1)
+    area = (np.diff(hits, axis=1, prepend=0.0) * precision).sum(axis=1)
     return np.divide(area, wanted, out=np.full(len(wanted), np.nan), where=wanted > 0)
 
 

@@ -15,15 +15,15 @@ from perilune_train.detect.metrics import Curve
 from perilune_train.detect.report import CURVE_FILE, number, table, with_interval
 
 _COLUMNS = {
-    "ap50": "AP",
-    "edge/ap50": "edge AP",
-    "strict/ap50": "strict AP",
-    "ap50_95": "AP 0.50:0.95",
+    "ap50_paper": "AP",
+    "edge/ap50_paper": "edge AP",
+    "strict/ap50_paper": "strict AP",
+    "ap50_95_paper": "AP 0.50:0.95",
     "precision": "precision",
     "recall": "recall",
     "f1": "F1",
 }
-_LOWEST = {f"lowest_ap50_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
+_LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
 
 
 def compare_folders(folders: Sequence[Path], out: Path) -> str:
@@ -35,7 +35,14 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
     for folder in folders:
         metrics = read_metrics(folder)
         name = _name(folder)
-        if "ap50" in metrics:
+        if any(key.removeprefix("test/") == "ap50" for key in metrics):
+            raise UserError(
+                folder / "metrics.json",
+                "ap50",
+                "the interpolated AP of an earlier release",
+                "ap50_paper: run `perilune-train detect evaluate` again",
+            )
+        if "images/name" in metrics:
             # An evaluation on real images, whose figures have no split before them.
             split, figures, wanted = "images", metrics, f"from {metrics.get('min_size_px')} px"
             told: list[object] = [metrics.get("images/name"), split, None, wanted, metrics.get("scales")]
@@ -48,7 +55,7 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
         cells += [with_interval(figures.get(key), _interval(figures, key)) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
         # Of the whole curve, not of the points that are kept of it.
-        label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50'))}"
+        label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
     head = ["run", "dataset", "split", "protocol", "wanted", "scales", "frames", "labels"]
     head += [*_COLUMNS.values(), *_LOWEST.values()]

@@ -68,8 +68,8 @@ class Evaluation:
     bins: list[BinFigures]
     """By radius, altitude, Sun, freshness; only bins that hold labels."""
     intervals: dict[str, Interval]
-    """95 % of ap50, ap50_95, precision, recall, f1, and of ap50 at the edge and strict, by bootstrap over
-    `resamples.unit`."""
+    """95 % of ap50_paper, ap50_95_paper, precision, recall, f1, and of ap50_paper at the edge and strict, by bootstrap
+    over `resamples.unit`."""
     resamples: Resamples
     """What the intervals are drawn from."""
 
@@ -80,7 +80,7 @@ class Evaluation:
 
     def figures(self) -> dict[str, float | int | str | None]:
         """Flat keys: those of `metrics.figures` and `figures_over_ious`, <name>_low and _high of the intervals,
-        <bin>/ap50 and others, recall_radius_..., errors. What is not defined is NaN."""
+        <bin>/ap50_paper and others, recall_radius_..., errors. What is not defined is NaN."""
         result: dict[str, float | int | str | None] = {
             **figures(self.matches, self.threshold),
             **figures_of_account(self.at_edge, self.threshold, "edge/"),
@@ -98,15 +98,16 @@ class Evaluation:
         for part in self.bins:
             result |= {f"{part.key}/recall": part.recall, f"{part.key}/labels": part.labels}
             if part.by != "depth_ratio":
-                result |= {f"{part.key}/{name}": getattr(part, name) for name in ("ap50", "precision", "f1")}
+                result |= {f"{part.key}/{name}": getattr(part, name) for name in ("ap50_paper", "precision", "f1")}
                 result |= {
-                    f"{part.key}/ap50_low": part.ap50_interval[0],
-                    f"{part.key}/ap50_high": part.ap50_interval[1],
+                    f"{part.key}/ap50_paper_low": part.ap50_paper_interval[0],
+                    f"{part.key}/ap50_paper_high": part.ap50_paper_interval[1],
                 }
             if part.by == "radius":
                 result[f"recall_{part.key}"] = part.recall
         for by in ("radius", "altitude", "sun"):
-            result[f"lowest_ap50_by_{by}"] = min((part.ap50 for part in self.bins if part.by == by), default=None)
+            aps = [part.ap50_paper for part in self.bins if part.by == by]
+            result[f"lowest_ap50_paper_by_{by}"] = min(aps, default=None)
         return result
 
     def frame_f1(self) -> Array:
@@ -142,10 +143,10 @@ def evaluate_detections(
     by_iou = [overlaps.match(iou, radius_px) for iou in COCO_IOUS]
     resamples = draw_resamples(facts, np.random.default_rng(seed))
     drawn = {
-        "ap50": average_precisions(matches, resamples),
-        "edge/ap50": average_precisions(at_edge, resamples),
-        "strict/ap50": average_precisions(matches.strict(), resamples),
-        "ap50_95": np.mean([average_precisions(part, resamples) for part in by_iou], axis=0),
+        "ap50_paper": average_precisions(matches, resamples),
+        "edge/ap50_paper": average_precisions(at_edge, resamples),
+        "strict/ap50_paper": average_precisions(matches.strict(), resamples),
+        "ap50_95_paper": np.mean([average_precisions(part, resamples) for part in by_iou], axis=0),
         **at_threshold_resampled(matches, threshold, resamples),
     }
     return Evaluation(

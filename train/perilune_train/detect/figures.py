@@ -48,10 +48,10 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
     for place, (by, title) in enumerate(drawn):
         parts = [part for part in bins if part.by == by]
         axes = figure.add_subplot(1, len(drawn), place + 1)
-        heights = np.array([part.ap50 for part in parts])
-        ends = np.array([part.ap50_interval for part in parts])
+        heights = np.array([part.ap50_paper for part in parts])
+        ends = np.array([part.ap50_paper_interval for part in parts])
         reach = np.abs(ends.T - heights)
-        colours = ["#3b7dd8" if part.ap50 >= _GOAL else "#d8873b" for part in parts]
+        colours = ["#3b7dd8" if part.ap50_paper >= _GOAL else "#d8873b" for part in parts]
         axes.bar(range(len(parts)), heights, color=colours, yerr=reach, capsize=3, ecolor="#404040")
         axes.axhline(_GOAL, linestyle="--", color="black", linewidth=0.8)
         for x, height in enumerate(heights):

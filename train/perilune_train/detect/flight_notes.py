@@ -66,8 +66,8 @@ def readme(told: dict[str, Any]) -> str:
         int8 = told["int8"]
         lines += [
             "`detector-int8.onnx` has its convolutions, but for gates and heads, in 8-bit integers. On the validation",
-            f"frames it has an AP of {int8['ap50_int8']:.4f}; in float32 {int8['ap50_float']:.4f}. Made for",
-            "OpenVINO; ONNX Runtime runs it more slowly than `detector.onnx`.",
+            f"frames it has an AP of {int8['ap50_paper_int8']:.4f}; in float32 {int8['ap50_paper_float']:.4f}.",
+            "Made for OpenVINO; ONNX Runtime runs it more slowly than `detector.onnx`.",
             "",
         ]
     if "detector.onnx" in told["files"]:

@@ -34,9 +34,9 @@ _KEPT_FLOAT = ("/squeeze", "/excite", "/spatial", "/heads.")
 class Int8Verdict:
     """What quantisation cost and gave, by OpenVINO on this machine."""
 
-    ap50_float: float
+    ap50_paper_float: float
     """AP on the validation split in float32, frames as they are, whatever the run's scales."""
-    ap50_int8: float
+    ap50_paper_int8: float
     """... in int8, the rest in `precision`."""
     float_s: float
     """Median time of one image before quantisation, in `precision`."""
@@ -48,7 +48,7 @@ class Int8Verdict:
     @property
     def kept(self) -> bool:
         """At most half a point of AP lost, and faster."""
-        return self.ap50_float - self.ap50_int8 <= MOST_LOSS and self.int8_s < self.float_s
+        return self.ap50_paper_float - self.ap50_paper_int8 <= MOST_LOSS and self.int8_s < self.float_s
 
     def as_facts(self) -> dict[str, Any]:
         """As plain data."""
@@ -57,7 +57,7 @@ class Int8Verdict:
     def words(self) -> str:
         """In one line."""
         told = (
-            f"AP {self.ap50_int8:.4f} (float32 {self.ap50_float:.4f}) on the validation split, "
+            f"AP {self.ap50_paper_int8:.4f} (float32 {self.ap50_paper_float:.4f}) on the validation split, "
             f"{1000 * self.int8_s:.1f} ms an image ({self.precision} {1000 * self.float_s:.1f} ms)"
         )
         return f"int8 {'kept' if self.kept else 'not kept'}: {told}"
@@ -122,7 +122,7 @@ def quantise(source: Path, out: Path, images: Array) -> None:
 
 
 def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, label: str) -> float:
-    """AP at the run's IoU of what an engine finds on a split, image by image, at scale 1 alone as in flight."""
+    """The paper's AP, at the run's IoU, of an engine on a split: image by image, at scale 1 alone as in flight."""
     import torch
 
     found = []
@@ -133,7 +133,7 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
             boxes, scores = (torch.as_tensor(part[0]) for part in engine(image))
             found.append(detections_of(boxes, scores, config.evaluation))
             bar.advance(task)
-    return curve(judge(split, found, config)).average_precision()
+    return curve(judge(split, found, config)).ap_paper()
 
 
 def interleaved(engines: dict[str, Engine], images: Array, rounds: int, warm_up: int = 5) -> dict[str, list[float]]:

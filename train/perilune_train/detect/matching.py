@@ -4,7 +4,7 @@ Whoever has detections and labels of some images, rendered or real, judges them 
 
     overlaps = find_overlaps(found, labels, sizes_px)          # list[Detections], list[FrameLabels], (N, 2)
     matches = overlaps.match(0.5, (2.0, 50.0))                 # at one IoU
-    curve(matches).average_precision()                         # metrics.py
+    curve(matches).ap_paper()                                  # metrics.py
 
 A detection is taken in order of score and finds the free wanted label of highest IoU, if that is at least the
 IoU asked for. Two accounts are kept. The usual one leaves out what no one can judge: a detection that finds no wanted

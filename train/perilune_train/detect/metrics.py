@@ -22,18 +22,31 @@ class Curve:
     recall: Array
     """(K,)."""
 
-    def average_precision(self) -> float:
-        """Area under the curve, sum of (R_n - R_(n-1)) P_n over all points (the paper's AP).
+    def ap_paper(self) -> float:
+        """The paper's AP and the headline: sum of (R_n - R_(n-1)) P_n over all thresholds, precision as it is.
 
-        P_n is the best precision at that recall or a higher one, as usual (all-point interpolation).
+        One threshold per distinct score, as in scikit-learn's average_precision_score: equal scores count together.
+        Never above `ap_envelope`.
+        """
+        ends = self._thresholds()
+        return float(np.sum(np.diff(self.recall[ends], prepend=0.0) * self.precision[ends]))
+
+    def ap_envelope(self) -> float:
+        """All-point interpolated AP: P_n is replaced by the best precision at that recall or a higher one.
+
+        Equal scores count one by one, in the order of the detections, as in COCO's tools.
         """
         envelope = np.maximum.accumulate(self.precision[::-1])[::-1]
         return float(np.sum(np.diff(self.recall, prepend=0.0) * envelope))
 
-    def average_precision_101(self) -> float:
-        """Mean of the interpolated precision at recalls 0, 0.01 .. 1 (COCO)."""
+    def ap_coco101(self) -> float:
+        """COCO's AP: mean of the interpolated precision at recalls 0, 0.01 .. 1."""
         envelope = np.append(np.maximum.accumulate(self.precision[::-1])[::-1], 0.0)
         return float(envelope[np.searchsorted(self.recall, np.linspace(0, 1, 101), side="left")].mean())
+
+    def _thresholds(self) -> NDArray[np.bool_]:
+        """The points at which a threshold can stand (K,): of equal scores only the last, since it keeps all."""
+        return np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
 
     def best_threshold(self) -> float:
         """The score at which F1 is highest, 1 without detections."""
@@ -48,9 +61,7 @@ class Curve:
         """
         if min_precision is None:
             return self.best_threshold(), "of best F1"
-        # Of equal scores a threshold keeps all: only the last of them is a point where one can stand.
-        ends = np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
-        precise = np.flatnonzero(ends & (self.precision >= min_precision))
+        precise = np.flatnonzero(self._thresholds() & (self.precision >= min_precision))
         if not len(precise):
             return self.best_threshold(), f"of best F1, since none has a precision of {min_precision:g},"
         return float(self.scores[precise[-1]]), f"of most recall at a precision of {min_precision:g}"
@@ -81,17 +92,18 @@ def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, floa
 
 
 def figures(matches: Matches, threshold: float) -> dict[str, float]:
-    """ap50 (all points), ap50_101 (COCO's), precision, recall and f1, each also strict, under their keys."""
+    """ap50_paper, ap50_envelope, ap50_coco101, precision, recall and f1 by key, and the same under "strict/"."""
     return figures_of_account(matches, threshold, "") | figures_of_account(matches.strict(), threshold, "strict/")
 
 
 def figures_of_account(matches: Matches, threshold: float, prefix: str) -> dict[str, float]:
-    """The five figures of one account under their keys with a prefix."""
+    """The six figures of one account by key, with a prefix."""
     points = curve(matches)
     precision, recall, f1 = at_threshold(matches, threshold)
     return {
-        f"{prefix}ap50": points.average_precision(),
-        f"{prefix}ap50_101": points.average_precision_101(),
+        f"{prefix}ap50_paper": points.ap_paper(),
+        f"{prefix}ap50_envelope": points.ap_envelope(),
+        f"{prefix}ap50_coco101": points.ap_coco101(),
         f"{prefix}precision": precision,
         f"{prefix}recall": recall,
         f"{prefix}f1": f1,
@@ -99,12 +111,14 @@ def figures_of_account(matches: Matches, threshold: float, prefix: str) -> dict[
 
 
 def figures_over_ious(by_iou: Sequence[Matches]) -> dict[str, float]:
-    """ap50_95, ap50_95_101 and ap75, ap75_101 of matches at COCO_IOUS."""
+    """ap50_95_... (mean over COCO_IOUS) and ap75_..., each as paper, envelope and coco101."""
     curves = [curve(matches) for matches in by_iou]
     at_75 = curves[COCO_IOUS.index(0.75)]
     return {
-        "ap50_95": float(np.mean([points.average_precision() for points in curves])),
-        "ap50_95_101": float(np.mean([points.average_precision_101() for points in curves])),
-        "ap75": at_75.average_precision(),
-        "ap75_101": at_75.average_precision_101(),
+        "ap50_95_paper": float(np.mean([points.ap_paper() for points in curves])),
+        "ap50_95_envelope": float(np.mean([points.ap_envelope() for points in curves])),
+        "ap50_95_coco101": float(np.mean([points.ap_coco101() for points in curves])),
+        "ap75_paper": at_75.ap_paper(),
+        "ap75_envelope": at_75.ap_envelope(),
+        "ap75_coco101": at_75.ap_coco101(),
     }

@@ -20,8 +20,9 @@ from perilune_train.detect.metrics import Curve, curve
 CURVE_FILE = "precision_recall.parquet"
 _CURVE_POINTS = 1000
 _ROWS = {
-    "ap50": "AP, all points",
-    "ap50_101": "AP, COCO's 101 points",
+    "ap50_paper": "AP (the paper's sum)",
+    "ap50_envelope": "AP, interpolated at all points",
+    "ap50_coco101": "AP, COCO's 101 points",
     "precision": "precision",
     "recall": "recall",
     "f1": "F1",
@@ -46,7 +47,7 @@ def write_evaluation(
 
 
 def _with_ap(curves: dict[str, Curve]) -> dict[str, Curve]:
-    return {f"{name}: AP {points.average_precision():.3f}": points for name, points in curves.items()}
+    return {f"{name}: AP {points.ap_paper():.3f}": points for name, points in curves.items()}
 
 
 def write_curve(path: Path, points: Curve) -> None:
@@ -101,11 +102,12 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         for key, title in _ROWS.items()
     ]
     rows += [
-        ["AP over IoU 0.50:0.95, all points", with_interval(figures["ap50_95"], intervals["ap50_95"]), "", ""],
-        ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_101"]), "", ""],
-        ["AP at IoU 0.75, all points", number(figures["ap75"]), "", ""],
+        ["AP over IoU 0.50:0.95", with_interval(figures["ap50_95_paper"], intervals["ap50_95_paper"]), "", ""],
+        ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_coco101"]), "", ""],
+        ["AP at IoU 0.75", number(figures["ap75_paper"]), "", ""],
     ]
     lines += [*table(["", "usual", "edge", "strict"], rows), ""]
+    lines += ["AP without another word is the paper's: the sum of (R_n - R_(n-1)) P_n over all thresholds.", ""]
     for by, title in (("radius", "Radius"), ("altitude", "Altitude"), ("sun", "Sun elevation")):
         lines += _bins(title, [part for part in evaluation.bins if part.by == by])
     lines += _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
@@ -137,18 +139,18 @@ def _bins(title: str, parts: list[BinFigures]) -> list[str]:
             _range(part),
             str(part.frames),
             str(part.labels),
-            with_interval(part.ap50, part.ap50_interval),
+            with_interval(part.ap50_paper, part.ap50_paper_interval),
             number(part.precision),
             with_interval(part.recall, part.recall_interval),
             number(part.f1),
         ]
         for part in parts
     ]
-    least = min(parts, key=lambda part: part.ap50)
+    least = min(parts, key=lambda part: part.ap50_paper)
     return [
         f"## {title}",
         "",
-        f"Lowest AP: {number(least.ap50)} at {_range(least)}.",
+        f"Lowest AP: {number(least.ap50_paper)} at {_range(least)}.",
         "",
         *table([title.lower(), "frames", "labels", "AP", "precision", "recall", "F1"], rows),
         "",

@@ -138,7 +138,7 @@ def run_detect(
         task,
         label="train detector",
         epochs=config.epochs,
-        monitor="val/ap50",
+        monitor="val/ap50_paper",
         mode="max",
         resume=resume,
         gradient_clip=config.gradient_clip,

@@ -208,4 +208,4 @@ class DetectTask(lightning.LightningModule):
         matches = match_split(judged, split.labels, (width, height), self.config.evaluation.match_iou, split.radius_px)
         points = curve(matches)
         _, recall, f1 = at_threshold(matches, points.best_threshold())
-        self.log_dict({"val/ap50": points.average_precision(), "val/f1": f1, "val/recall": recall})
+        self.log_dict({"val/ap50_paper": points.ap_paper(), "val/f1": f1, "val/recall": recall})
