@@ -7,8 +7,8 @@ import numpy as np
 from perilune_shared.config import resolve
 from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.evaluate_command import config_of_run
 from perilune_train.detect.run import build_network
+from perilune_train.detect.run_config import config_of_run
 
 THRESHOLD = 0.005
 

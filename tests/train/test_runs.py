@@ -290,3 +290,14 @@ def test_device_and_precision():
         assert runs.choose_device("auto") == "cpu"
         with pytest.raises(UserError, match="torch finds no GPU"):
             runs.choose_device("cuda")
+
+
+@pytest.mark.parametrize("hardware", [True, False])
+def test_emulated_bfloat16_does_not_count(monkeypatch, hardware):
+    """A GPU without bfloat16: torch reports it as supported unless asked to leave out emulation."""
+
+    def supported(including_emulation: bool = True) -> bool:
+        return including_emulation or hardware
+
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", supported)
+    assert runs.choose_bf16("auto", "cuda") is hardware

@@ -19,6 +19,7 @@ from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect import export, int8
 from perilune_train.detect.engines import onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.flight import FlightDetector
+from perilune_train.detect.run_config import config_of_run
 from perilune_train.models.yolo import YOLOv3
 
 onnx = pytest.importorskip("onnx", reason="the extra `export` is not installed")
@@ -81,6 +82,13 @@ def run_folder(tmp_path_factory):
     run.config.write_text(text, encoding="utf-8")
     runs.write_metrics(run, {"test/threshold": 0.4})
     return run.root
+
+
+def test_settings_come_from_the_run_alone(run_folder):
+    """config.yaml of this run lacks most settings: they have their defaults, not those of a preset."""
+    config = export.load_trained(run_folder).config
+    assert config == config_of_run(run_folder)
+    assert (config.warmup_steps, config.workers, config.strides) == (100, 0, (4, 8, 16))
 
 
 @pytest.fixture(scope="module")

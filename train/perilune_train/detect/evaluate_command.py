@@ -5,16 +5,16 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.config import parse_setting, read_config_file, resolve_over
+from perilune_shared.config import parse_setting, resolve_over
 from perilune_shared.errors import UserError
 from perilune_shared.progress import console
 from perilune_shared.schema import SPLITS
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.run_config import config_of_run
 from perilune_train.detect.tiling_options import BoxMargin, Overlap, Scales, TileSide
 
 _FOR_DATASETS = ("dataset", "split")
 _FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin")
-_MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
 
 def evaluate(
@@ -96,23 +96,3 @@ def evaluate(
     place = dataset or Path("data", run.resolve().name, "detect")
     folder = evaluate_again(run, config, place, split, threshold, out, choose_threshold)
     console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")
-
-
-def config_of_run(run: Path, settings: tuple[str, ...]) -> DetectConfig:
-    """The settings of a run, with single ones of judging replaced. Raises UserError on any that would change the
-    network: that would be another run."""
-    path = run / "config.yaml"
-    section = read_config_file(path).get("detect")
-    if section is None:
-        raise UserError(path, "detect", "no such section", "config.yaml of a detect run")
-    for text in settings:
-        keys, _ = parse_setting(text)
-        if keys[0] != "detect" or keys[1] not in _MAY_CHANGE:
-            raise UserError(
-                "--set", ".".join(keys), "not a setting of judging", "detect.evaluation... or detect.labels..."
-            )
-    named = any(text.startswith("detect.labels.selection=") for text in settings)
-    if named:
-        # The run stores every threshold of its own selection; another name brings its own.
-        section = {key: value for key, value in section.items() if key != "labels"}
-    return resolve_over(DetectConfig, "detect", str(path), section, None, settings)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
 from perilune_shared.files import new_folder, sha256_of, write_text
 from perilune_shared.manifest import open_dataset
@@ -23,6 +22,7 @@ from perilune_train.detect.flight import FlightDetector
 from perilune_train.detect.flight_notes import readme
 from perilune_train.detect.int8 import Int8Verdict, try_int8
 from perilune_train.detect.run import load_detector
+from perilune_train.detect.run_config import config_of_run
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.runs import RunFolder
@@ -56,7 +56,7 @@ def load_trained(root: Path) -> Trained:
     run = RunFolder(root)
     if not run.finished:
         raise UserError(root, "--run", "no metrics.json", "the folder of a finished run, as runs/detect/small")
-    config = resolve(DetectConfig, "detect", "perilune_train", "paper", run.config)
+    config = config_of_run(root)
     try:
         threshold = float(json.loads(run.metrics.read_text(encoding="utf-8"))["test/threshold"])
     except (ValueError, KeyError, TypeError):

@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.errors import UserError
 from perilune_shared.progress import console
-from perilune_train.detect.evaluate_command import config_of_run
+from perilune_train.detect.run_config import config_of_run
 from perilune_train.detect.tiling_options import BoxMargin, Overlap, Scales, TileSide
 
 

@@ -1,0 +1,31 @@
+"""The settings that a detect run was trained with, read back from its config.yaml."""
+
+from pathlib import Path
+
+from perilune_shared.config import parse_setting, read_config_file, resolve_over
+from perilune_shared.errors import UserError
+from perilune_train.detect.config import DetectConfig
+
+_MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
+
+
+def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
+    """Settings of a run, from its own config.yaml alone; a setting that the file lacks has its default.
+
+    `settings` replaces single settings of the evaluation. Raises UserError on a setting that would change the network.
+    """
+    path = run / "config.yaml"
+    section = read_config_file(path).get("detect")
+    if section is None:
+        raise UserError(path, "detect", "no such section", "config.yaml of a detect run")
+    for text in settings:
+        keys, _ = parse_setting(text)
+        if keys[0] != "detect" or keys[1] not in _MAY_CHANGE:
+            raise UserError(
+                "--set", ".".join(keys), "not a setting of the evaluation", "detect.evaluation... or detect.labels..."
+            )
+    named = any(text.startswith("detect.labels.selection=") for text in settings)
+    if named:
+        # The run stores every threshold of its own selection; another name brings its own.
+        section = {key: value for key, value in section.items() if key != "labels"}
+    return resolve_over(DetectConfig, "detect", str(path), section, None, settings)
