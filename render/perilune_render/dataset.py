@@ -16,7 +16,15 @@ from perilune_render.config import DatasetConfig
 from perilune_render.frame import Shot, Studio
 from perilune_render.interrupts import interrupts_held
 from perilune_render.labels import RimCircles
-from perilune_render.output import begin_or_go_on, check_begun, info_of, open_finished, write_overview
+from perilune_render.output import (
+    begin_or_go_on,
+    check_begun,
+    info_of,
+    open_finished,
+    sync_frames,
+    write_overview,
+    writing,
+)
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
 from perilune_render.recipe import recipe_of
 from perilune_render.sensor import FixedPattern
@@ -41,9 +49,17 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
 
 
 def render_plan(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, progress: Progress) -> Dataset:
-    """Render a plan into `out`, going on where an earlier call stopped; `info` is the dataset.json to begin with."""
+    """Render a plan into `out`, or resume it; `info` is the dataset.json to begin with.
+
+    Raises UserError where `out` holds something else or another process is writing it.
+    """
+    check_ground(config, plan.exr_camera, config.kind(info.recipe().kind).flight)
+    with writing(out):
+        return _render(plan, config, info, out, progress)
+
+
+def _render(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, progress: Progress) -> Dataset:
     kind = info.recipe().kind
-    check_ground(config, plan.exr_camera, config.kind(kind).flight)
     info = begin_or_go_on(out, info)
     check_begun(out, plan)
     if info.complete:
@@ -55,7 +71,7 @@ def render_plan(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path,
     for scene_plan in plan.scenes:
         trajectories = plan.of_scene(scene_plan.scene_id)
         waiting = [t for t in trajectories if not _frames_part(out, t).exists()]
-        progress.advance(task, sum(len(t.splits) for t in trajectories if t not in waiting))
+        progress.advance(task, sum(len(t.splits) for t in trajectories) - sum(len(t.splits) for t in waiting))
         if not waiting:
             continue
         progress.update(task, note=f"{scene_plan.scene_id}: growing")
@@ -112,4 +128,5 @@ def _render_trajectory(
     # A labels part without its frames part is left from a stop between the two.
     (out / "manifest" / "labels" / f"{name}.parquet").unlink(missing_ok=True)
     write_part(out, "labels", name, pa.concat_tables(labels))
+    sync_frames(out, rows)
     write_part(out, "frames", name, tables.frame_table(trajectory, studio.camera, studio.sun, rows))

@@ -17,7 +17,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.exr import read_radiance
 from perilune_render.frame import Shot, Studio
 from perilune_render.labels import Labels, RimCircles
-from perilune_render.output import begin_or_go_on, first_difference, open_finished, write_overview
+from perilune_render.output import begin_or_go_on, first_difference, open_finished, sync_frames, write_overview, writing
 from perilune_render.plan import camera_of
 from perilune_render.recipe import versions
 from perilune_render.sensor import FixedPattern
@@ -26,7 +26,7 @@ from perilune_shared.camera import Camera
 from perilune_shared.checksums import seal
 from perilune_shared.config import resolve_over
 from perilune_shared.errors import UserError
-from perilune_shared.info import Counts, Origin, Recipe, recipes_of, write_info
+from perilune_shared.info import Counts, DatasetInfo, Origin, Recipe, recipes_of, write_info
 from perilune_shared.manifest import Dataset, count_rows, open_dataset
 from perilune_shared.parts import write_part
 from perilune_shared.writer import with_column
@@ -75,6 +75,20 @@ def develop_dataset(
         raise UserError(source.root, "exr_path", "null", "a dataset rendered with dataset.render.exr=true")
     if source.info.images != "files":
         raise UserError(source.root, "images", source.info.images, "a dataset with its EXRs")
+    with writing(out):
+        return _develop(source, config, info, (camera, exr_camera), out, progress)
+
+
+def _develop(
+    source: Dataset,
+    config: DatasetConfig,
+    info: DatasetInfo,
+    cameras: tuple[Camera, Camera],
+    out: Path,
+    progress: Progress,
+) -> Dataset:
+    """The dataset in `out`, begun or resumed; `cameras` are those of its PNGs and of the source's EXRs."""
+    camera, exr_camera = cameras
     info = begin_or_go_on(out, info)
     if info.complete:
         return open_finished(out)
@@ -158,6 +172,7 @@ def _develop_descent(
     # A labels part without its frames part is left from a stop between the two.
     (out / "manifest" / "labels" / f"{name}.parquet").unlink(missing_ok=True)
     write_part(out, "labels", name, pa.concat_tables(labels))
+    sync_frames(out, written)
     write_part(out, "frames", name, tables.developed_frame_table(frames, studio.camera, written))
 
 

@@ -32,11 +32,14 @@ class Radiance:
 
 
 def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:
-    """Write a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), losslessly compressed."""
+    """Write a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), losslessly compressed.
+
+    Returns before the file is on the disk.
+    """
     values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), radiance.sunlit, crater)
     channels = {name: np.ascontiguousarray(value, np.float32) for name, value in zip(CHANNELS, values, strict=True)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with written_aside(path) as aside:
+    with written_aside(path, durable=False) as aside:
         try:
             OpenEXR.File(header, channels).write(str(aside))
         except RuntimeError as error:

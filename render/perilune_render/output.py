@@ -1,6 +1,8 @@
 """What every command that makes a dataset does alike: begin or go on, write a PNG, draw the overview."""
 
+import contextlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ from perilune_shared import files
 from perilune_shared.checksums import SUMS_NAME, seal
 from perilune_shared.errors import UserError
 from perilune_shared.info import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
+from perilune_shared.locks import LOCK_NAME, locked
 from perilune_shared.manifest import Dataset, open_dataset
 from perilune_shared.parts import read_part
 from perilune_shared.schema import SCHEMA_VERSION
@@ -45,13 +48,27 @@ def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
     )
 
 
+def writing(out: Path) -> contextlib.AbstractContextManager[None]:
+    """The lock of a dataset's folder, but none where the dataset is finished: it is only read, perhaps from a disk that
+    cannot be written."""
+    return contextlib.nullcontext() if (out / SUMS_NAME).exists() else locked(out)
+
+
+def sync_frames(root: Path, rows: list[dict[str, Any]]) -> None:
+    """Wait until the files of frames, given by their columns png_path and exr_path, are on the disk.
+
+    Frames are written without waiting. Once they stand in the manifest they count as finished.
+    """
+    files.sync_all(root / row[name] for row in rows for name in ("png_path", "exr_path") if row.get(name) is not None)
+
+
 def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
     """Write the dataset.json of a new dataset, or read that of one that was begun with the same settings.
 
     Raises UserError where `out` holds something else.
     """
     if not (out / "dataset.json").exists():
-        if out.exists() and any(out.iterdir()):
+        if out.exists() and any(not path.name.startswith(LOCK_NAME) for path in out.iterdir()):
             raise UserError(
                 out,
                 "--out",
@@ -131,7 +148,7 @@ def write_png(root: Path, frame_id: str, image: np.ndarray, bits: int) -> dict[s
     """
     path = f"frames/{frame_id}.png"
     stored = image if bits == 8 else image << (16 - bits)
-    files.write_bytes(files.inside(root, path), cv2.imencode(".png", stored)[1].tobytes())
+    files.write_bytes(files.inside(root, path), cv2.imencode(".png", stored)[1].tobytes(), durable=False)
     return file_columns(root, "png", path)
 
 

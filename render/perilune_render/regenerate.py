@@ -31,6 +31,7 @@ from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.files import sha256_of
 from perilune_shared.info import Recipe
+from perilune_shared.locks import locked
 from perilune_shared.manifest import Dataset
 from perilune_shared.png import png_header
 
@@ -89,11 +90,12 @@ def regenerate(
     frames = frames.filter(pc.is_in(frames["frame_id"], pa.array(list(frame_ids), pa.string())))
     task = progress.add_task("regenerate", total=len(frames), unit="frames", note="")
     outcomes = []
-    for scene in dataset.table("scenes").sort_by("scene_id").to_pylist():
-        own = frames.filter(pc.equal(frames["scene_id"], scene["scene_id"])).sort_by("frame_id")
-        if len(own):
-            progress.update(task, note=f"{scene['scene_id']}: growing")
-            outcomes += _of_scene(dataset, scene, own.to_pylist(), out, dem, catalogue, lambda: progress.advance(task))
+    with locked(out):
+        for scene in dataset.table("scenes").sort_by("scene_id").to_pylist():
+            own = frames.filter(pc.equal(frames["scene_id"], scene["scene_id"])).sort_by("frame_id").to_pylist()
+            if own:
+                progress.update(task, note=f"{scene['scene_id']}: growing")
+                outcomes += _of_scene(dataset, scene, own, out, dem, catalogue, lambda: progress.advance(task))
     return outcomes
 
 

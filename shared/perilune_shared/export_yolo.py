@@ -44,7 +44,9 @@ def export_yolo(
                 lines[frame_id].append(f"{CRATER_CLASS} {x:.8f} {y:.8f} {w:.8f} {h:.8f}\n")
             n_boxes += int(seen.sum())
             for frame_id, own_split in zip(scene.frames["frame_id"], scene.frames["split"], strict=True):
-                files.write_text(files.inside(folder, f"labels/{frame_id}.txt"), "".join(lines[frame_id]))
+                files.write_text(
+                    files.inside(folder, f"labels/{frame_id}.txt"), "".join(lines[frame_id]), durable=False
+                )
                 lists[own_split].append(f"./images/{frame_id}.png\n")
             _bring_images(dataset, scene.frames, folder)
             progress.advance(task)
@@ -65,4 +67,4 @@ def _bring_images(dataset: Dataset, frames: pd.DataFrame, folder: Path) -> None:
             files.bring(dataset.file(row["png_path"]), to, link=True)
         return
     for frame_id, png in dataset.pngs(pa.Table.from_pandas(rows, preserve_index=False)):
-        files.write_bytes(files.inside(folder, f"images/{frame_id}.png"), png)
+        files.write_bytes(files.inside(folder, f"images/{frame_id}.png"), png, durable=False)

@@ -1,44 +1,80 @@
-"""Files written aside and renamed, and relative paths that cannot leave their folder."""
+"""Files and folders written to a temporary name and renamed, and relative paths that cannot leave their folder."""
 
 import contextlib
+import errno
 import hashlib
 import os
 import re
+import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 from perilune_shared.errors import UserError
+from perilune_shared.locks import lock
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _LONGEST_PATH = 500
 
 
+def temporary_name(path: Path) -> Path:
+    """A name beside `path` that no other process uses, with the suffix of `path`."""
+    # PIDs repeat: in a container they begin with 1.
+    return path.with_name(f".{path.stem}.{secrets.token_hex(8)}.part{path.suffix}")
+
+
 @contextlib.contextmanager
-def written_aside(path: Path) -> Iterator[Path]:
+def written_aside(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
 
-    The temporary name keeps the suffix of `path`, since image writers choose their format by it.
+    The temporary name keeps the suffix of `path`, since image writers choose their format by it. A durable file is on
+    the disk before it has its name, so that a power cut leaves no empty one; whoever writes many files synchronises
+    them together in the end (`sync_all`).
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    aside = temporary_name(path)
     try:
         yield aside
+        if durable:
+            sync(aside)
         aside.replace(path)
+        if durable:
+            sync(path.parent)
     finally:
         aside.unlink(missing_ok=True)
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def sync(path: Path) -> None:
+    """Wait until a file's content, or the names in a folder, are on the disk."""
+    if os.name == "nt":  # folders cannot be opened there, nor files for reading alone be synchronised
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a file system without it
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def sync_all(paths: Iterable[Path]) -> None:
+    """Wait until files and the names in their folders are on the disk."""
+    paths = list(paths)
+    for path in [*paths, *sorted({path.parent for path in paths})]:
+        sync(path)
+
+
+def write_bytes(path: Path, content: bytes, *, durable: bool = True) -> None:
     """Write a whole file, or nothing."""
-    with written_aside(path) as aside:
+    with written_aside(path, durable=durable) as aside:
         aside.write_bytes(content)
 
 
-def write_text(path: Path, content: str) -> None:
+def write_text(path: Path, content: str, *, durable: bool = True) -> None:
     """Write a whole UTF-8 file, or nothing."""
-    write_bytes(path, content.encode())
+    write_bytes(path, content.encode(), durable=durable)
 
 
 def sha256_of(path: Path) -> str:
@@ -87,24 +123,33 @@ def check_plain_file(path: Path) -> int:
 def new_folder(out: Path) -> Iterator[Path]:
     """A hidden folder beside `out`, renamed to `out` on success and removed on any failure.
 
-    Raises UserError where `out` holds something.
+    Its files are on the disk before it is renamed. What killed writers of the same `out` left is removed. Raises
+    UserError where `out` is not empty or another process is writing it.
     """
     check_free(out)
     out = out.absolute()  # "." has no name to put another beside
-    aside = out.with_name(f".{out.name}.{os.getpid()}.part")
-    shutil.rmtree(aside, ignore_errors=True)
-    aside.mkdir(parents=True)
-    try:
-        yield aside
-        if out.is_dir():
-            out.rmdir()
-        aside.replace(out)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with lock(out.with_name(f".{out.name}.lock"), out):
+        left = re.compile(rf"\.{re.escape(out.name)}\.[0-9a-f]+\.part")
+        for path in out.parent.iterdir():
+            if left.fullmatch(path.name):
+                shutil.rmtree(path, ignore_errors=True)
+        aside = out.with_name(f".{out.name}.{secrets.token_hex(8)}.part")
+        try:
+            aside.mkdir()
+            yield aside
+            sync_all(path for path in aside.rglob("*") if not path.is_symlink())
+            check_free(out)
+            if out.is_dir():
+                out.rmdir()
+            aside.replace(out)
+            sync(out.parent)
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
 
 
 def check_free(out: Path) -> None:
-    """Raises UserError where a folder for a new dataset holds something."""
+    """Raises UserError where a folder for a new dataset is not empty."""
     if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
         raise UserError(out, "--out", "something that is there", "a new or empty folder")
 

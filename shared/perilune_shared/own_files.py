@@ -1,10 +1,12 @@
 """Files that are added to a finished dataset: a card, metadata for search engines. Its checksums stay right."""
 
+import contextlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from perilune_shared import checksums, files
 from perilune_shared.errors import UserError
+from perilune_shared.locks import locked
 from perilune_shared.manifest import Dataset
 
 
@@ -28,7 +30,8 @@ def check_sums(dataset: Dataset, paths: Iterable[Path]) -> bool:
 
 def add_files(dataset: Dataset, contents: Mapping[Path, bytes], *, seal: bool) -> None:
     """Write files, each whole or not at all, and then SHA256SUMS where `check_sums` said so."""
-    for path, content in contents.items():
-        files.write_bytes(path, content)
-    if seal:
-        checksums.seal(dataset.root)
+    with locked(dataset.root) if seal else contextlib.nullcontext():
+        for path, content in contents.items():
+            files.write_bytes(path, content)
+        if seal:
+            checksums.seal(dataset.root)

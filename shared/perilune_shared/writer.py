@@ -81,7 +81,7 @@ class DatasetWriter:
         by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path"]).to_pylist()}
         if source.info.images == "packed":
             for frame_id, png in source.pngs(frames):
-                files.write_bytes(files.inside(self.root, frame_path(names[frame_id], "png")), png)
+                files.write_bytes(files.inside(self.root, frame_path(names[frame_id], "png")), png, durable=False)
         else:
             for row in frames.select(["frame_id", "png_path"]).to_pylist():
                 by_id[row["frame_id"]]["png_path"] = row["png_path"]

@@ -1,5 +1,6 @@
 """What a rendering may go on with, and what it must not touch. Nothing is rendered here."""
 
+import os
 from dataclasses import replace
 
 import pytest
@@ -8,6 +9,7 @@ from rich.progress import Progress
 from perilune_render import tables
 from perilune_render.config import KindConfig
 from perilune_render.config_terrain import TerrainConfig
+from perilune_render.dataset import render_plan
 from perilune_render.develop import develop_dataset
 from perilune_render.output import begin_or_go_on, check_begun, info_of, open_finished
 from perilune_render.plan import make_plan
@@ -17,6 +19,7 @@ from perilune_shared.checksums import SUMS_NAME
 from perilune_shared.errors import UserError
 from perilune_shared.frames import sun_direction
 from perilune_shared.info import write_info
+from perilune_shared.locks import locked
 from perilune_shared.manifest import open_dataset
 from perilune_shared.parts import write_part
 from perilune_shared.subset import subset
@@ -69,6 +72,16 @@ def test_a_manifest_is_not_rendered_into_itself(tmp_path):
 def test_checksums_that_a_stop_left_out_are_written(drawn):
     (drawn / SUMS_NAME).unlink()
     assert validate(open_finished(drawn)) == []
+
+
+def test_a_folder_that_another_process_writes_is_left_alone(begun):
+    plan, out = begun
+    config = config_with()
+    info = info_of(config, plan, recipe_of(config, "detect", "tiny"))
+    before = sorted(out.rglob("*"))
+    with locked(out), pytest.raises(UserError, match=f"locked by PID {os.getpid()} "):
+        render_plan(plan, config, info, out, Progress())
+    assert sorted(out.rglob("*")) == before
 
 
 def test_frames_are_not_made_again_over_a_dataset(drawn):

@@ -1,3 +1,6 @@
+import os
+from pathlib import Path
+
 import pytest
 
 from perilune_shared import files
@@ -37,3 +40,18 @@ def test_a_plain_path_is_given_back(tmp_path):
 def test_sha256_of_abc(tmp_path):
     (tmp_path / "a").write_bytes(b"abc")
     assert files.sha256_of(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    """A power cut after the rename would otherwise leave an empty file that counts as finished."""
+    synchronised = []
+
+    def fsync(descriptor):
+        synchronised.append(Path(f"/proc/self/fd/{descriptor}").resolve())
+        assert (tmp_path / "a.txt").exists() == (len(synchronised) > 1)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    files.write_text(tmp_path / "a.txt", "whole")
+    assert len(synchronised) == 2 and ".part" in synchronised[0].name and synchronised[1] == tmp_path
+    files.write_bytes(tmp_path / "b.png", b"frame", durable=False)
+    assert len(synchronised) == 2

@@ -1,0 +1,131 @@
+"""One writer at a time on an output folder.
+
+The operating system holds the lock and releases it when the process ends, however it ends. A record beside the lock
+says who holds it. The record alone decides where two machines write to one network drive that does not pass locks on:
+its holder renews it, and it expires when it has not been renewed for ten minutes.
+"""
+
+import contextlib
+import json
+import os
+import platform
+import re
+import threading
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from perilune_shared.errors import UserError
+
+LOCK_NAME = ".perilune.lock"
+"""The lock in a folder that is written in place."""
+_RENEWED_S = 30.0
+_EXPIRED_S = 600.0
+_LARGEST_RECORD_BYTES = 10_000
+_LEFT_FILE = re.compile(r"\..+\.[0-9a-f]+\.part(\.[A-Za-z0-9]+)?")
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder that is written in place; remove temporary files that killed writers left in it.
+
+    The folder is created where it does not exist, and removed again where it stays empty. Raises UserError where
+    another process holds the lock.
+    """
+    created = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with lock(folder / LOCK_NAME, folder):
+            for root, _, names in os.walk(folder):
+                for name in filter(_LEFT_FILE.fullmatch, names):
+                    Path(root, name).unlink(missing_ok=True)
+            yield
+    finally:
+        if created:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+@contextlib.contextmanager
+def lock(path: Path, folder: Path) -> Iterator[None]:
+    """Hold the lock file `path`, which protects `folder`. Raises UserError where another process holds it."""
+    held, record = FileLock(path), path.with_name(f"{path.name}.json")
+    try:
+        held.acquire(timeout=0)
+    except Timeout:
+        raise _refusal(folder, _read(record), "a free folder: wait until that process ends") from None
+    try:
+        _check_expired(folder, record)
+        try:
+            with _recorded(record):
+                yield
+        finally:
+            # Before the release: afterwards the file may be another process's lock.
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+    finally:
+        held.release()
+
+
+def _check_expired(folder: Path, record: Path) -> None:
+    """Raises UserError where a process on another machine may still be writing.
+
+    On this machine the lock is free only where the process that wrote the record has ended.
+    """
+    holder = _read(record)
+    if holder is None or holder.get("boot_id") == _boot_id():
+        return
+    left_s = _EXPIRED_S - (time.time() - record.stat().st_mtime)
+    if left_s > 0:
+        wanted = f"a free folder: if that process was killed, remove {record} or wait {left_s:.0f} s"
+        raise _refusal(folder, holder, wanted)
+
+
+@contextlib.contextmanager
+def _recorded(record: Path) -> Iterator[None]:
+    """Keep the record of this process as the holder, and renew it."""
+    since = datetime.now(UTC).isoformat(timespec="seconds")
+    holder = {"pid": os.getpid(), "host": platform.node(), "since": since, "boot_id": _boot_id()}
+    ended = threading.Event()
+
+    def renew() -> None:
+        while not ended.wait(_RENEWED_S):
+            with contextlib.suppress(OSError):
+                os.utime(record)
+
+    try:
+        record.write_text(json.dumps(holder) + "\n", encoding="utf-8")
+        threading.Thread(target=renew, daemon=True, name=f"lock {record}").start()
+        yield
+    finally:
+        ended.set()
+        record.unlink(missing_ok=True)
+
+
+def _read(record: Path) -> dict[str, Any] | None:
+    """The record of a holder, or None where there is none."""
+    try:
+        if not record.is_file() or record.stat().st_size > _LARGEST_RECORD_BYTES:
+            return None
+        content = json.loads(record.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def _refusal(folder: Path, holder: dict[str, Any] | None, wanted: str) -> UserError:
+    known = holder or {}
+    words = {"pid": "PID", "host": "on host", "since": "since"}
+    told = " ".join(f"{word} {known[name]}" for name, word in words.items() if name in known)
+    return UserError(folder, "folder", f"one locked by {told or 'another process'}", wanted)
+
+
+def _boot_id() -> str:
+    """Names the running kernel: the same in all containers of a machine, another one after every boot."""
+    with contextlib.suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    return platform.node()
