@@ -12,14 +12,14 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.camera import Camera
 from perilune_shared.content import content_sha256
 from perilune_shared.frames import Array, selenographic_from_site
-from perilune_shared.schema import TABLES
+from perilune_shared.schema import TABLES, complete
 
 _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
 _FILES = ("png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
 
 
 def _table(name: str, columns: dict) -> pa.Table:
-    return pa.table(columns, schema=TABLES[name])
+    return complete(name, pa.table(columns, schema=pa.schema([TABLES[name].field(column) for column in columns])))
 
 
 def _vectors(values: ArrayLike) -> pa.Array:

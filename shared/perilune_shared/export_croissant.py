@@ -19,7 +19,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.info import INFO_NAME
 from perilune_shared.manifest import Dataset
 from perilune_shared.own_files import add_files, check_sums
-from perilune_shared.schema import KEYS, TABLES
+from perilune_shared.parts import Part
+from perilune_shared.schema import KEYS, OPTIONAL, TABLES
 
 CROISSANT_NAME = "croissant.json"
 # The registered name, application/vnd.apache.parquet, is one that mlcroissant does not read.
@@ -105,13 +106,20 @@ def metadata_of(dataset: Dataset) -> dict[str, Any]:
     record_sets = []
     for table, schema in TABLES.items():
         distribution.append(_distribution(dataset, table))
+        # A file may lack optional columns, which mlcroissant would then not find.
+        missing = {
+            name
+            for name in OPTIONAL.get(table, ())
+            for part in dataset.parts(table)
+            if name not in Part(part, table).found.names
+        }
         record_sets.append(
             {
                 "@type": "cr:RecordSet",
                 "@id": table,
                 "name": table,
                 "key": [{"@id": f"{table}/{column}"} for column in KEYS[table]],
-                "field": [_field(table, column, distribution[-1]) for column in schema],
+                "field": [_field(table, column, distribution[-1]) for column in schema if column.name not in missing],
             }
         )
     if info.images in ("files", "packed"):

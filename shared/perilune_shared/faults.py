@@ -11,11 +11,12 @@ import pyarrow.compute as pc
 
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.manifest import Dataset
-from perilune_shared.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, WHOLE_TABLE, Part
-from perilune_shared.schema import SPLITS, TABLES
+from perilune_shared.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, Part, is_whole
+from perilune_shared.schema import OPTIONAL, SPLITS, TABLES
 
 _PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
 _PLAIN = r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$"
+_COLUMN = r"^[A-Za-z][A-Za-z0-9_]{0,63}$"
 _SHA256 = r"^[0-9a-f]{64}$"
 _TEXTS = {
     "scene_id": ID_PATTERN,
@@ -44,7 +45,7 @@ _POSITIVE = (
     "png_bytes",
     "exr_bytes",
 )
-_NOT_NEGATIVE = ("crater_id", "boulder_id", "shape_id", "frame_index", "seed", "time_s")
+_NOT_NEGATIVE = ("crater_id", "boulder_id", "shape_id", "frame_index", "seed", "time_s", "n_craters_above_max_radius")
 _RANGES = {
     "latitude_deg": (-90, 90),
     "longitude_deg": (-180, 180),
@@ -52,6 +53,7 @@ _RANGES = {
     "sun_elevation_deg": (-90, 90),
     "visible_fraction": (0, 1),
     "sunlit_fraction": (0, 1),
+    "real_ground_share": (0, 1),
     "age_myr": (0, 4600),
     "ellipse_theta_rad": (0, np.pi),
 }
@@ -103,12 +105,15 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
         return
     try:
         part = Part(path, table)
-        names = part.found.names
-        if names != TABLES[table].names:
-            odd = sorted(set(names) ^ set(TABLES[table].names)) or "another order"
-            yield Fault.of(where, None, "schema", odd, f"the columns of {table}")
+        names, known = part.found.names, TABLES[table].names
+        missing = set(known) - set(names) - set(OPTIONAL.get(table, ()))
+        odd = sorted({name for name in names if name not in known and not matches(_COLUMN, name)} | missing)
+        # Others are ignored: a later version may have added them.
+        present = [name for name in names if name in known]
+        if odd or present != [name for name in known if name in names]:
+            yield Fault.of(where, None, "schema", odd or "another order", f"the columns of {table}")
             return
-        for found, wanted in zip(part.found, TABLES[table], strict=True):
+        for found, wanted in ((part.found.field(name), TABLES[table].field(name)) for name in present):
             if (found.type, found.nullable) != (wanted.type, wanted.nullable) or found.metadata != wanted.metadata:
                 yield Fault.of(where, None, found.name, found.metadata, f"{wanted.type} with {wanted.metadata}")
         first_row = 0
@@ -125,7 +130,7 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
 def _of_the_name(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
     """A reader looks for a scene's rows by the parts' names, so that these must hold no others."""
     scene, _, trajectory = stem.partition(".")
-    if stem == WHOLE_TABLE:
+    if is_whole(stem):
         return
     if "scene_id" in rows.column_names:
         own = pc.equal(rows["scene_id"], scene)

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from perilune_shared import files
 from perilune_shared.errors import UserError
 from perilune_shared.info import Counts, DatasetInfo, read_info
-from perilune_shared.parts import WHOLE_TABLE, Part
+from perilune_shared.parts import Part, is_whole
 from perilune_shared.schema import IMAGES, SPLITS, TABLES
 
 LARGEST_FRAME_BYTES = 2**30
@@ -31,7 +31,8 @@ class Dataset:
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[Path]:
         """The table's part files, sorted by name; only those that may hold rows of a scene or a descent."""
-        found = sorted(self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet"))
+        found = self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet")
+        found = sorted(found, key=lambda part: part.stem)
         return [part for part in found if _may_hold(part.stem, scene_id, trajectory_id)]
 
     def table(
@@ -148,7 +149,7 @@ def _check_names(table: str, columns: Sequence[str] | None) -> None:
 def _may_hold(stem: str, scene_id: str | None, trajectory_id: str | None) -> bool:
     """Whether a part of this name may hold rows of a scene, and of a descent in it."""
     scene, _, trajectory = stem.partition(".")
-    if stem == WHOLE_TABLE or scene_id is None:
+    if is_whole(stem) or scene_id is None:
         return True
     return scene == scene_id and (trajectory_id is None or trajectory in ("", trajectory_id))
 
@@ -163,7 +164,7 @@ def _chosen(
     by_frame = scene_id is not None and "scene_id" not in columns
     prefix = f"{scene_id}/{trajectory_id}/" if trajectory_id is not None else f"{scene_id}/"
     groups = None
-    if part.path.stem == WHOLE_TABLE and scene_id is not None:
+    if is_whole(part.path.stem) and scene_id is not None:
         # Among frame ids all with a prefix come from it on and before the same with "0", which follows "/", at its end.
         if "frame_id" in columns:
             groups = part.groups_within("frame_id", prefix, prefix[:-1] + "0")
@@ -172,6 +173,6 @@ def _chosen(
     rows = part.read(list(dict.fromkeys([*names, *equal, *(["frame_id"] if by_frame else [])])), groups)
     for name, value in equal.items():
         rows = rows.filter(pc.equal(rows[name], value))
-    if by_frame and part.path.stem in (WHOLE_TABLE, scene_id):
+    if by_frame and (is_whole(part.path.stem) or part.path.stem == scene_id):
         rows = rows.filter(pc.starts_with(rows["frame_id"], prefix))
     return rows.select(list(names))

@@ -16,7 +16,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.info import INFO_NAME, DatasetInfo, Recipe, checked_info, read_object
 from perilune_shared.manifest import Dataset
 from perilune_shared.parts import Part
-from perilune_shared.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.writer import written
 
 _ADDED_IN_3 = {"scenes": ("recipe", "content_sha256"), "labels": ("contrast",)}
@@ -30,7 +30,7 @@ def _without(tables: dict[str, pa.Schema], added: Mapping[str, tuple[str, ...]])
     return kept
 
 
-_TABLES_2 = _without(TABLES, _ADDED_IN_3)
+_TABLES_2 = _without(_without(TABLES, OPTIONAL), _ADDED_IN_3)
 OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
 """Columns of the tables in older versions."""
 
@@ -108,8 +108,9 @@ class _Old(Dataset):
         columns = {
             name: rows[name] if name in schema.names else self._added(table, name, rows, scene_id)
             for name in TABLES[table].names
+            if name not in OPTIONAL.get(table, ())
         }
-        return pa.table(columns, schema=TABLES[table])
+        return complete(table, pa.table(columns, schema=pa.schema(map(TABLES[table].field, columns))))
 
     def _of_scene(self, table: str, rows: pa.Table, scene_id: str) -> pa.Table:
         key = "scene_id" if "scene_id" in rows.column_names else "frame_id"

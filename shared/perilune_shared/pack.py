@@ -9,8 +9,9 @@ from rich.progress import Progress
 from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo
 from perilune_shared.manifest import Dataset
+from perilune_shared.parts import MOST_ROWS_WRITTEN
 from perilune_shared.rewrite import check_source, rewrite
-from perilune_shared.writer import frame_path, with_column, written
+from perilune_shared.writer import MOST_IMAGES_WRITTEN, frame_path, with_column, written
 
 _EXR = ("exr_path", "exr_sha256", "exr_bytes")
 _LARGEST_SHARD_MB = 8000
@@ -18,9 +19,19 @@ _LARGEST_SHARD_MB = 8000
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
 
 
-def pack(source: Dataset, out: Path, shard_mb: float = 1000, progress: Progress | None = None) -> None:
+def pack(
+    source: Dataset,
+    out: Path,
+    shard_mb: float = 1000,
+    progress: Progress | None = None,
+    *,
+    most_rows: int = MOST_ROWS_WRITTEN,
+    most_images: int = MOST_IMAGES_WRITTEN,
+) -> None:
     """Write a packed dataset: frames in shards of about `shard_mb` megabytes, which Hugging Face `datasets` opens too.
 
+    A table of more than `most_rows` rows becomes several parts, and a shard holds at most `most_images` frames, so that
+    no file exceeds what a reader accepts (perilune_shared.parts).
     A dataset without frames is packed as its tables alone. EXRs stay behind: their columns become null.
     """
     check_source(source, out)
@@ -32,12 +43,12 @@ def pack(source: Dataset, out: Path, shard_mb: float = 1000, progress: Progress 
         info = info.changed("packed", images="packed", exr_camera=None)
     frames = source.table("frames").sort_by(_ORDER)
     task = progress.add_task("packing", total=len(frames), unit="frames", note="") if progress and packed else None
-    with written(out, info, whole_tables=True) as writer:
+    with written(out, info, whole_tables=True, most_rows=most_rows) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
             writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
         if packed:
-            writer.pack_images(_images(source, frames, progress, task), round(shard_mb * 1e6))
+            writer.pack_images(_images(source, frames, progress, task), round(shard_mb * 1e6), most_images)
 
 
 def _images(source: Dataset, frames: pa.Table, progress: Progress | None, task) -> Iterator[tuple[str, str, bytes]]:

@@ -1,7 +1,7 @@
 """One Parquet part of a table: written once, aside and renamed; read with limits, since it may come from anybody.
 
-A part's name says whose rows it holds: `<scene_id>` or `<scene_id>.<trajectory_id>`, or `all` for a whole table, whose
-row groups then hold a scene or a few descents each.
+A part's name says whose rows it holds: `<scene_id>` or `<scene_id>.<trajectory_id>`. A whole table is the part `all`,
+whose row groups hold a scene or a few descents each; a table above the limits continues in `all.0001` and so on.
 """
 
 import re
@@ -15,10 +15,12 @@ import pyarrow.parquet as pq
 from perilune_shared import files
 from perilune_shared.errors import UserError
 from perilune_shared.pages import pages_of
-from perilune_shared.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
 
 WHOLE_TABLE = "all"
-"""Name of the part that holds all rows of its table."""
+"""Name of the part that holds all rows of its table, or the first of them."""
+MOST_ROWS_WRITTEN = 10_000_000
+"""Rows of one part that is written: of no table do so many reach a limit of the reader."""
 _MOST_ROWS = 50_000_000
 _MOST_GROUP_ROWS = 2**21
 _LONGEST_TEXT = 1000
@@ -37,6 +39,11 @@ PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
 _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
 
 
+def is_whole(stem: str) -> bool:
+    """Whether a part of this name may hold rows of any scene."""
+    return stem.partition(".")[0] == WHOLE_TABLE
+
+
 class Part:
     """An opened part, whose footer has been checked."""
 
@@ -44,8 +51,11 @@ class Part:
         """Raises UserError where it is no Parquet file, of another table or schema version, or too large.
 
         `schema` is that of the table's columns where it is not that of TABLES, as in older versions.
+
+        Columns that the table does not know are ignored. Columns of `OPTIONAL` that the file lacks are read as null.
         """
         self.path, self.schema = path, schema or TABLES[table]
+        self._optional = OPTIONAL.get(table, ()) if schema is None else ()
         self._n_bytes = files.check_plain_file(path)
         limits = {
             "thrift_string_size_limit": _LONGEST_FOOTER_TEXT,
@@ -89,6 +99,8 @@ class Part:
                 raise UserError(self.path, "rows", f"{rows.num_rows} in a row group", wanted)
             for place in range(rows.num_columns):
                 column = rows.column(place)
+                if column.path_in_schema.split(".")[0] not in self.schema.names:
+                    continue  # never read
                 n_bytes += max(column.total_uncompressed_size, 0)
                 # The longest list is a quaternion.
                 if column.num_values > 4 * rows.num_rows:
@@ -108,23 +120,28 @@ class Part:
         Raises UserError where that cannot be read, or names of scenes, descents and frames could not be names of files
         (unless `any_ids`).
         """
+        chosen = list(range(self.n_groups) if groups is None else groups)
         names = list(columns) if columns is not None else self.schema.names
         wanted = pa.schema([self.schema.field(name) for name in names], metadata=self.schema.metadata)
-        for field in wanted:
+        missing = [name for name in names if name in self._optional and name not in self.found.names]
+        present = [name for name in names if name not in missing]
+        for field in map(wanted.field, present):
             place = self.found.get_field_index(field.name)
             if place < 0:
                 raise UserError(self.path, "columns", f"no {field.name}", f"every column of version {SCHEMA_VERSION}")
             if self.found.field(place).type != field.type:
                 raise UserError(self.path, field.name, self.found.field(place).type, f"{field.type}")
         try:
-            chosen = list(range(self.n_groups) if groups is None else groups)
             for group in chosen:
-                self._check_pages(group, names)
-            rows = self.file.read_row_groups(chosen, columns=names)
-            for field in wanted:
+                self._check_pages(group, present)
+            rows = self.file.read_row_groups(chosen, columns=present)
+            for field in map(wanted.field, present):
                 if pa.types.is_string(field.type):
                     self._check_text(field.name, rows[field.name], None if any_ids else _IDS.get(field.name))
-            rows = rows.cast(wanted)
+            for name in missing:
+                n_rows = sum(self.file.metadata.row_group(group).num_rows for group in chosen)
+                rows = rows.append_column(name, pa.nulls(n_rows, wanted.field(name).type))
+            rows = rows.select(names).cast(wanted)
             rows.validate(full=True)
             return rows
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
@@ -191,5 +208,5 @@ def write_part(root: Path, table: str, name: str, rows: pa.Table, rows_a_group: 
     if part.exists():
         raise FileExistsError(part)
     with files.written_aside(part) as aside:
-        pq.write_table(rows.cast(TABLES[table]), aside, compression="zstd", row_group_size=rows_a_group)
+        pq.write_table(complete(table, rows), aside, compression="zstd", row_group_size=rows_a_group)
     return part

@@ -11,6 +11,17 @@ SCHEMA_VERSION = "3"
 _TEXT, _REAL, _INTEGER = pa.string(), pa.float64(), pa.int64()
 
 
+def complete(table: str, rows: pa.Table) -> pa.Table:
+    """Rows with exactly the table's columns, in order and of their types: optional ones that are missing become null.
+
+    Raises pyarrow's error where another column is missing or of another type.
+    """
+    for name in OPTIONAL.get(table, ()):
+        if name not in rows.column_names:
+            rows = rows.append_column(name, pa.nulls(len(rows), TABLES[table].field(name).type))
+    return rows.select(TABLES[table].names).cast(TABLES[table])
+
+
 def _vector(length: int) -> pa.DataType:
     return pa.list_(_REAL, length)
 
@@ -136,6 +147,9 @@ TABLES: dict[str, pa.Schema] = {
         ),
     ),
 }
+OPTIONAL: dict[str, tuple[str, ...]] = {}
+"""Columns that a file may lack, by table: they came after the schema version. A reader fills them with nulls, a writer
+writes them. To add one: a column with `optional=True` at the end of its table, and its name here."""
 KEYS: dict[str, list[str]] = {
     "scenes": ["scene_id"],
     "craters": ["scene_id", "crater_id"],

@@ -18,7 +18,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.faults import Fault, part_faults
 from perilune_shared.frames import selenographic_from_site
 from perilune_shared.manifest import Dataset, count_rows
-from perilune_shared.parts import WHOLE_TABLE, Part
+from perilune_shared.parts import Part, is_whole
 from perilune_shared.schema import KEYS, TABLES
 from perilune_shared.validate_descent import descent_faults
 from perilune_shared.validate_images import image_faults
@@ -153,7 +153,7 @@ def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, told: set[tupl
         if (fault.file, fault.column) in told:
             continue
         told.add((fault.file, fault.column))
-        if fault.row is not None and path.stem == WHOLE_TABLE:
+        if fault.row is not None and is_whole(path.stem):
             part = Part(path, path.parent.name)
             key = "frame_id" if "frame_id" in part.schema.names else "scene_id"
             keys = part.read([key])[key]

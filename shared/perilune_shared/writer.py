@@ -20,21 +20,26 @@ from perilune_shared.content import terrain_of
 from perilune_shared.errors import UserError
 from perilune_shared.info import Counts, DatasetInfo, checked_info, write_info
 from perilune_shared.manifest import Dataset
-from perilune_shared.parts import WHOLE_TABLE, write_part
-from perilune_shared.schema import IMAGES, TABLES, SplitUnit
+from perilune_shared.parts import MOST_ROWS_WRITTEN, WHOLE_TABLE, write_part
+from perilune_shared.schema import IMAGES, TABLES, SplitUnit, complete
 
 SceneTables = dict[str, pa.Table]
 """Every table of one scene, by name."""
 _PER_DESCENT = ("frames", "labels")
 _IMAGES_A_GROUP, _BYTES_A_GROUP = 128, 2**28
+MOST_IMAGES_WRITTEN = 1_000_000
+"""Frames of one shard: 7,813 row groups, of which a reader accepts 10,000."""
 
 
 class DatasetWriter:
     """Collects a dataset in a folder; see `written`."""
 
-    def __init__(self, root: Path, info: DatasetInfo, *, whole_tables: bool = False):
+    def __init__(
+        self, root: Path, info: DatasetInfo, *, whole_tables: bool = False, most_rows: int = MOST_ROWS_WRITTEN
+    ):
         self.root, self.info = root, info
-        self.whole_tables = whole_tables
+        self.whole_tables, self._most_rows = whole_tables, most_rows
+        self._n_whole = dict.fromkeys(TABLES, 0)
         self._rows = dict.fromkeys(TABLES, 0)
         self._kept: dict[str, list[pa.Table]] = defaultdict(list)
         self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
@@ -63,15 +68,31 @@ class DatasetWriter:
         scene_id = scene["scene_id"]
         for name, rows in tables.items():
             self._rows[name] += len(rows)
-            rows = rows.cast(TABLES[name])
+            rows = complete(name, rows)
             if self.whole_tables:
-                self._kept[name].append(rows)
+                self._keep(name, _sorted_by(rows, "frame_id") if name in _PER_DESCENT else rows)
             elif name in _PER_DESCENT:
                 for trajectory_id in pc.unique(frames["trajectory_id"]).to_pylist():
                     own = pc.starts_with(rows["frame_id"], f"{scene_id}/{trajectory_id}/")
                     write_part(self.root, name, f"{scene_id}.{trajectory_id}", rows.filter(own))
             else:
                 write_part(self.root, name, scene_id, rows)
+
+    def _keep(self, name: str, rows: pa.Table) -> None:
+        """Collect rows of a whole table; write a part whenever another row would exceed its limit."""
+        while len(rows):
+            free = self._most_rows - sum(map(len, self._kept[name]))
+            if not free:
+                self._write_whole(name)
+                continue
+            self._kept[name].append(rows[:free])
+            rows = rows[free:]
+
+    def _write_whole(self, name: str) -> None:
+        rows = pa.concat_tables([TABLES[name].empty_table(), *self._kept.pop(name, [])])
+        stem = f"{WHOLE_TABLE}.{self._n_whole[name]:04d}" if self._n_whole[name] else WHOLE_TABLE
+        write_part(self.root, name, stem, rows, max(1000, len(rows) // 200))
+        self._n_whole[name] += 1
 
     def add_images(self, source: Dataset, frames: pa.Table, names: dict[str, str], *, link: bool) -> None:
         """Bring frames of another dataset as files: `frames` are its rows, `names` give the new frame_id of each.
@@ -91,9 +112,11 @@ class DatasetWriter:
                     to = files.inside(self.root, frame_path(names[frame_id], kind))
                     files.bring(source.file(row[f"{kind}_path"]), to, link=link)
 
-    def pack_images(self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int) -> None:
-        """Write frames (frame_id, png_path, PNG bytes) into shards images/*.parquet of about `shard_bytes`."""
-        shard, size, held, writer = 0, 0, 0, None
+    def pack_images(
+        self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int, most_images: int = MOST_IMAGES_WRITTEN
+    ) -> None:
+        """Write frames (frame_id, png_path, PNG bytes) into shards images/*.parquet of about `shard_bytes` at most."""
+        shard, size, held, n_images, writer = 0, 0, 0, 0, None
         waiting: list[tuple[str, str, bytes]] = []
         self.root.joinpath("images").mkdir(parents=True, exist_ok=True)
 
@@ -110,12 +133,13 @@ class DatasetWriter:
             waiting, held = [], 0
 
         for name, path, png in images:
-            if size and size + len(png) > shard_bytes:
+            if size and (size + len(png) > shard_bytes or n_images == most_images):
                 flush()
                 if writer is not None:
                     writer.close()
-                shard, size, writer = shard + 1, 0, None
+                shard, size, n_images, writer = shard + 1, 0, 0, None
             waiting.append((name, path, png))
+            n_images += 1
             size += len(png)
             held += len(png)
             if len(waiting) == _IMAGES_A_GROUP or held > _BYTES_A_GROUP:
@@ -128,11 +152,9 @@ class DatasetWriter:
         """Write what remains, dataset.json and the checksums. Raises UserError about `out` where no frame came."""
         if not self._rows["frames"]:
             raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
-        for name, pieces in self._kept.items():
-            if name in _PER_DESCENT:
-                pieces = [_sorted_by(piece, "frame_id") for piece in pieces]
-            rows = pa.concat_tables(pieces)
-            write_part(self.root, name, WHOLE_TABLE, rows, max(1000, len(rows) // 200))
+        for name in TABLES if self.whole_tables else ():
+            if self._kept[name] or not self._n_whole[name]:
+                self._write_whole(name)
         # A descent may come twice: rendered, and developed again with another sensor.
         torn = any(len(splits) > 1 for splits in self._splits_of_descent.values())
         shared = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
@@ -147,16 +169,18 @@ class DatasetWriter:
 
 
 @contextlib.contextmanager
-def written(out: Path, info: DatasetInfo, *, whole_tables: bool = False) -> Iterator[DatasetWriter]:
+def written(
+    out: Path, info: DatasetInfo, *, whole_tables: bool = False, most_rows: int = MOST_ROWS_WRITTEN
+) -> Iterator[DatasetWriter]:
     """A writer for a new dataset in `out`, which appears whole or not at all.
 
-    `info` gives all that does not follow from the rows; a dataset of no frames is refused. Raises UserError where `out`
-    holds something.
+    With `whole_tables` each table is one part, or several of at most `most_rows` rows. `info` gives all that does not
+    follow from the rows. Raises UserError where there are no frames or `out` holds something.
     """
     with files.new_folder(out) as aside:
         # A copy of an info with fields replaced was never checked.
         checked_info(json.loads(info.model_dump_json()), out)
-        writer = DatasetWriter(aside, info, whole_tables=whole_tables)
+        writer = DatasetWriter(aside, info, whole_tables=whole_tables, most_rows=most_rows)
         yield writer
         writer.finish(out)
 

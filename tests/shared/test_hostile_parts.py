@@ -8,6 +8,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from perilune_shared.checksums import seal
+from perilune_shared.errors import UserError
+from perilune_shared.manifest import open_dataset
+from perilune_shared.validate import validate
 from tests import hostile_parquet as forged
 from tests.hostile import assert_refused, part_of, sealed
 
@@ -131,7 +135,7 @@ CASES = {
     "a vector of four": (column("frames", "position_m", pa.list_(pa.float64(), 4), [0.0] * 4), "position_m"),
     "a vector as text": (column("frames", "rotation_wxyz", pa.string(), "[1,0,0,0]"), "rotation_wxyz"),
     "a missing column": (table("frames", lambda rows: rows.drop_columns("png_path")), "schema"),
-    "another column": (table("frames", extended("extra")), "schema"),
+    "a column of an odd name": (table("frames", extended("extra column")), "schema"),
     "a column named like a method": (table("frames", extended("__class__")), "schema"),
     "a column named by HTML": (table("frames", extended("<script>")), "schema"),
     "a column named by a command": (table("labels", renamed("crater_id", "$(touch canary)")), "schema"),
@@ -201,6 +205,37 @@ def test_parts_of_ill_will(name, victim, capsys, monkeypatch):
     damage, told = CASES[name]
     damage(victim)
     assert_refused(victim, "", told, capsys, monkeypatch)
+
+
+def test_unknown_columns_are_ignored_and_never_read(victim):
+    """Whatever they hold: lists of any length, text without end, pickles."""
+    part = part_of(victim, "frames")
+    rows = pq.read_table(part)
+    n = len(rows)
+    for name, cells in (
+        ("later_list", pa.array([[1.0] * 1000] * n)),
+        ("later_text", pa.array(["x" * 100_000] * n)),
+        ("later_pickle", pa.array([pickle.dumps(Pickled(victim.parent / "canary" / "made"))] * n)),
+    ):
+        rows = rows.add_column(1, name, cells)
+    before = open_dataset(victim).table("frames")
+    pq.write_table(rows, part)
+    seal(victim)
+    assert validate(open_dataset(victim)) == []
+    assert open_dataset(victim).table("frames").equals(before)
+
+
+def test_a_known_column_between_unknown_ones_keeps_its_checks(victim):
+    """A known column of another type stays an error, and so does a name that differs in case alone."""
+    part = part_of(victim, "craters")
+    rows = pq.read_table(part)
+    wrong = rows.set_column(2, "x_m", rows["x_m"].cast(pa.float32())).append_column("later", pa.nulls(len(rows)))
+    pq.write_table(wrong, part)
+    with pytest.raises(UserError, match="x_m: got float"):
+        open_dataset(victim).table("craters")
+    pq.write_table(renamed("x_m", "X_M")(rows), part)
+    with pytest.raises(UserError, match="no x_m"):
+        open_dataset(victim).table("craters", ["x_m"])
 
 
 def test_what_is_pickled_stays_so(victim, capsys, monkeypatch):

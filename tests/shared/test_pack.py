@@ -4,15 +4,19 @@ import json
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from perilune_shared import parts
 from perilune_shared.attach import attach
 from perilune_shared.diff import differences
 from perilune_shared.errors import UserError
+from perilune_shared.export_croissant import metadata_of
 from perilune_shared.manifest import open_dataset
 from perilune_shared.migrate import migrate
 from perilune_shared.pack import pack, unpack
+from perilune_shared.schema import OPTIONAL, TABLES
 from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset
 from perilune_shared.validate import validate
@@ -37,6 +41,45 @@ def test_packed_and_unpacked_it_is_the_same(drawn, packed, tmp_path):
     assert [each.column for each in differences(source, again)] == ["history"]
     for path in source.table("frames", ["png_path"])["png_path"].to_pylist():
         assert again.file(path).read_bytes() == source.file(path).read_bytes()
+
+
+def test_large_tables_become_several_parts_that_the_reader_accepts(little, tmp_path, monkeypatch):
+    source = open_dataset(little)
+    assert source.info.counts.craters == 600
+    pack(source, tmp_path / "p", most_rows=100, most_images=2)
+    original = parts._MOST_ROWS
+    monkeypatch.setattr(parts, "_MOST_ROWS", 100)
+    with pytest.raises(UserError, match="rows"):
+        source.table("craters")
+    made = open_dataset(tmp_path / "p")
+    assert validate(made) == []
+    assert len(made.parts("craters")) == 6 and len(made.parts("labels")) == 1 and len(made.shards()) == 3
+    assert [part.stem for part in made.parts("craters")][:2] == ["all", "all.0001"]
+    monkeypatch.setattr(parts, "_MOST_ROWS", original)
+    assert made.table("craters").equals(source.table("craters"))
+    for scene_id in source.scene_ids():
+        assert made.table("craters", scene_id=scene_id).equals(source.table("craters", scene_id=scene_id))
+    assert [each.column for each in differences(source, made)] == ["history"]
+
+
+def test_files_without_optional_columns_read_as_null(little, tmp_path, monkeypatch):
+    """A column that came later is null in older files, and is written by every tool; see the list in schema.py."""
+    later = pa.field("later_share", pa.float64(), metadata={"unit": "", "meaning": "a later column"})
+    schema = TABLES["frames"].append(later)
+    monkeypatch.setitem(TABLES, "frames", schema)
+    with pytest.raises(UserError, match="no later_share"):
+        open_dataset(little).table("frames")
+    monkeypatch.setitem(OPTIONAL, "frames", (*OPTIONAL.get("frames", ()), "later_share"))
+    source = open_dataset(little)
+    assert validate(source) == []
+    frames = source.table("frames", ["later_share", "frame_id"], split="val")
+    assert frames["later_share"].null_count == len(frames) == 3
+    assert source.table("frames", ["later_share"]).num_rows == 6
+    subset(source, tmp_path / "s", images="none")
+    part = open_dataset(tmp_path / "s").parts("frames")[0]
+    assert "later_share" in pq.read_schema(part).names
+    assert metadata_of(open_dataset(tmp_path / "s"))["recordSet"][4]["field"][-1]["name"] == "later_share"
+    assert metadata_of(source)["recordSet"][4]["field"][-1]["name"] != "later_share"
 
 
 def test_packed_frames_are_found_by_their_ids(drawn, packed):
