@@ -159,7 +159,7 @@ class SensorConfig(Section):
     hot_pixel_e: NotNegative = 6_000.0
     """Mean of the hot pixels' exponentially distributed extra signal, electrons."""
     psf_sigma_px: NotNegative = 0.45
-    """Standard deviation of the Gaussian point spread, pixels."""
+    """Standard deviation of the point spread, a discrete Gaussian over the pixels; 0 for none."""
     motion_blur: bool = True
     """Whether the camera's velocity during the exposure blurs the frame."""
 

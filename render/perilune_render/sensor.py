@@ -15,6 +15,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from scipy.special import ive
 
 from perilune_render.config import SensorConfig
 from perilune_render.exr import Radiance
@@ -87,13 +88,27 @@ def expose(
     """
     light = np.maximum(resample(radiance.radiance_factor.astype(np.float32, copy=False), camera, exr_camera), 0)
     if config.psf_sigma_px > 0:
-        light = cv2.GaussianBlur(light, (0, 0), config.psf_sigma_px, borderType=cv2.BORDER_REFLECT)
+        kernel = psf_kernel(config.psf_sigma_px)
+        light = cv2.sepFilter2D(light, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
     exposure_s = exposure_time_s(light, config)
     way_m = np.asarray(velocity_camera_mps) * exposure_s
     if config.motion_blur and _fastest_px(radiance.depth_m, camera, exr_camera, way_m) >= _LEAST_MOTION_PX:
         depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
         light = _blurred(light, motion_px(depth_m, camera, way_m))
     return Exposure(light, exposure_s)
+
+
+@lru_cache(maxsize=4)
+def psf_kernel(sigma_px: float) -> np.ndarray:
+    """Weights (2 n + 1,) of the point spread along one axis: the discrete Gaussian of variance sigma_px^2.
+
+    The weight at k pixels is exp(-t) I_k(t) with t = sigma_px^2 (Lindeberg 1990, doi 10.1109/34.49051). Its variance
+    over the pixels is t for every t, while a Gaussian sampled at the pixel centres loses variance below about 0.7 px
+    (sigma 0.45 becomes 0.38). The mean over the pixel's own area is the renderer's and is not part of sigma_px.
+    """
+    half = int(np.ceil(6 * sigma_px + 4))
+    weights = ive(np.abs(np.arange(-half, half + 1)), sigma_px**2)
+    return weights / weights.sum()
 
 
 def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rng: np.random.Generator) -> np.ndarray:

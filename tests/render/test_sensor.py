@@ -6,7 +6,7 @@ import pytest
 
 from perilune_render.config import SensorConfig
 from perilune_render.exr import Radiance
-from perilune_render.sensor import FixedPattern, develop, expected, expose, motion_px
+from perilune_render.sensor import FixedPattern, develop, expected, expose, motion_px, psf_kernel
 from perilune_shared.camera import Camera
 
 CAMERA = Camera(200, 160, 220.0, 220.0, 100.0, 80.0)
@@ -130,16 +130,17 @@ def test_shadow_stays_black():
     assert photograph(0.0, sensor(exposure="automatic")).max() == 0
 
 
-@pytest.mark.parametrize("sigma", [0.6, 1.5])
-def test_the_point_spread_has_its_width_and_keeps_the_light(sigma):
+@pytest.mark.parametrize("sigma", [0.2, 0.3, 0.45, 0.7, 1.0, 2.0])
+def test_the_point_spread_has_its_variance_and_keeps_the_light(sigma):
     light = np.zeros((160, 200))
     light[80, 100] = 20.0
-    image = photograph(light, sensor(psf_sigma_px=sigma, full_well_e=3e6)) / 65535 * 3e6
-    assert image.sum() == pytest.approx(2e6, rel=0.02)
+    spread = expose(scene(light), sensor(psf_sigma_px=sigma), CAMERA, CAMERA, np.zeros(3)).light.astype(float)
+    assert spread.sum() == pytest.approx(20, rel=1e-5)
     v, u = np.mgrid[:160, :200]
-    # The Gaussian is sampled at pixel centres.
-    assert np.sqrt((image * (u - 100) ** 2).sum() / image.sum()) == pytest.approx(sigma, rel=0.05)
-    assert np.sqrt((image * (v - 80) ** 2).sum() / image.sum()) == pytest.approx(sigma, rel=0.05)
+    assert (spread * (u - 100) ** 2).sum() / spread.sum() == pytest.approx(sigma**2, rel=0.01)
+    assert (spread * (v - 80) ** 2).sum() / spread.sum() == pytest.approx(sigma**2, rel=0.01)
+    kernel = psf_kernel(sigma)
+    assert kernel @ np.square(np.arange(len(kernel)) - len(kernel) // 2) == pytest.approx(sigma**2, rel=1e-6)
 
 
 @pytest.mark.parametrize(("velocity", "blur_px"), [((100.0, 0, 0), 4.4), ((-20.0, 0, 0), 0.88)])
