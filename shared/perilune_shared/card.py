@@ -12,7 +12,6 @@ from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
-import yaml
 from rich.progress import Progress
 
 from perilune_shared.card_pictures import TITLES, Gathered, draw, gather
@@ -23,6 +22,7 @@ from perilune_shared.info import INFO_NAME, Recipe
 from perilune_shared.manifest import Dataset
 from perilune_shared.own_files import add_files, check_sums
 from perilune_shared.stats import summary
+from perilune_shared.yaml_text import to_yaml_text
 
 CARD_NAME = "README.md"
 _PICTURE_NAME = "card.png"
@@ -113,7 +113,7 @@ def _head(dataset: Dataset) -> str:
         "tags": ["moon", "craters", "lunar-landing", "synthetic", "perilune"],
         "size_categories": [next((name for most, name in _SIZES if info.counts.frames < most), "n>1M")],
     }
-    return "---\n" + yaml.safe_dump(head, sort_keys=False) + "---"
+    return "---\n" + to_yaml_text(head) + "---"
 
 
 def _counts(dataset: Dataset) -> str:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from perilune_shared.cli_change import DatasetArgument
-from perilune_shared.config import nearest
+from perilune_shared.config_errors import nearest
 from perilune_shared.errors import UserError
 from perilune_shared.files import check_free
 from perilune_shared.manifest import open_dataset

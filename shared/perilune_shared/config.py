@@ -5,22 +5,20 @@ A configuration file has up to four sections, one for each command that reads it
 so that one file can describe a whole experiment.
 """
 
-import difflib
 import json
-import re
-import typing
 from importlib import resources
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from perilune_shared.config_errors import explained, nearest
 from perilune_shared.errors import UserError
+from perilune_shared.yaml_text import parse_yaml, to_yaml_text
 
 SECTIONS = ("dataset", "detect", "navigate", "explain")
 PRESETS = ("tiny", "small", "paper", "large")
-_LARGEST_FILE_BYTES = 1_000_000
+_LARGEST_FILE_BYTES = 100_000
 
 
 class Section(BaseModel):
@@ -32,28 +30,6 @@ class Section(BaseModel):
 
 
 SectionType = TypeVar("SectionType", bound=Section)
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML 1.1 reads 1e-4 as text; a number without a dot is a number here. Aliases are refused (they can explode)."""
-
-    def compose_node(self, parent, index):
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("aliases (*name) are not allowed")
-        return super().compose_node(parent, index)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+0123456789.")
-)
-
-
-def parse_yaml(text: str, where: object) -> Any:
-    """Plain data from YAML text; raises UserError where it is not YAML."""
-    try:
-        return yaml.load(text, Loader=_Loader)  # noqa: S506 - a SafeLoader with stricter rules
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise UserError(where, "syntax", str(error).replace("\n", " "), "YAML with plain values") from None
 
 
 def read_config_file(path: Path) -> dict[str, dict]:
@@ -71,7 +47,7 @@ def read_config_file(path: Path) -> dict[str, dict]:
         raise UserError(path, "configuration", type(content).__name__, "a mapping of sections")
     for name, section in content.items():
         if name not in SECTIONS:
-            raise UserError(path, str(name), "unknown section", nearest(str(name), SECTIONS))
+            raise UserError(path, str(name), "an unknown section", nearest(str(name), SECTIONS))
         if not isinstance(section, dict):
             raise UserError(path, name, repr(section), "a mapping of settings")
     return content
@@ -82,9 +58,9 @@ def parse_setting(text: str) -> tuple[list[str], Any]:
     key, separator, value = text.partition("=")
     path = key.strip().split(".")
     if not separator or len(path) < 2 or not all(path):
-        raise UserError("--set", text, "not section.key=value", "for example dataset.seed=3")
+        raise UserError("--set", "setting", text, "section.key=value, for example dataset.seed=3")
     if path[0] not in SECTIONS:
-        raise UserError("--set", key, "unknown section", nearest(path[0], SECTIONS))
+        raise UserError("--set", key, "an unknown section", nearest(path[0], SECTIONS))
     return path, parse_yaml(value, f"--set {key}")
 
 
@@ -129,14 +105,14 @@ def resolve_over(
     try:
         return model.model_validate_json(json.dumps(merged))
     except ValidationError as error:
-        raise _explain(error, model, section, sources) from None
+        raise explained(error, model, section, sources) from None
     except (TypeError, ValueError) as error:
         raise UserError(sources[-1][0], section, error, "numbers, text, lists and mappings") from None
 
 
 def to_yaml(section: str, config: Section) -> str:
     """A resolved section as YAML that `resolve` reads again."""
-    return yaml.safe_dump({section: config.model_dump(mode="json")}, sort_keys=False)
+    return to_yaml_text({section: config.model_dump(mode="json")})
 
 
 def _nested(path: list[str], value: Any) -> Any:
@@ -151,49 +127,3 @@ def _merge(base: dict, over: dict) -> dict:
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
         merged[key] = _merge(merged[key], value) if both else value
     return merged
-
-
-def nearest(name: str, known: typing.Iterable[str]) -> str:
-    """What a user may have meant by an unknown name: the known one most like it, or all of them."""
-    known = list(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)
-
-
-def _explain(error: ValidationError, model: type[Section], section: str, sources: list[tuple[str, dict]]) -> UserError:
-    fault = error.errors(include_url=False)[0]
-    location = [str(part) for part in fault["loc"]]
-    where = next((name for name, content in reversed(sources) if _holds(content, location)), sources[-1][0])
-    field = ".".join([section, *location])
-    if fault["type"] == "extra_forbidden":
-        return UserError(where, field, "unknown key", nearest(location[-1], _fields_at(model, location[:-1])))
-    if fault["type"] == "missing":
-        return UserError(where, field, "nothing", "a value")
-    wanted = fault["msg"][0].lower() + fault["msg"][1:]
-    return UserError(where, field, repr(fault["input"]), wanted.removeprefix("value error, "))
-
-
-def _holds(content: Any, location: list[str]) -> bool:
-    for key in location:
-        if isinstance(content, list):
-            return True
-        if not isinstance(content, dict) or key not in content:
-            return False
-        content = content[key]
-    return True
-
-
-def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
-    for key in location:
-        field = model.model_fields.get(key)
-        found = [] if field is None else _models_in(field.annotation)
-        if not found:
-            return []
-        model = found[0]
-    return list(model.model_fields)
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [found for part in typing.get_args(annotation) for found in _models_in(part)]

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from perilune_shared import files
 from perilune_shared.camera import Camera
+from perilune_shared.config_errors import expected_of, shown
 from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.errors import UserError, shortened
 from perilune_shared.schema import SCHEMA_VERSION, TABLES, ImageState, Kind, SplitUnit
@@ -240,7 +241,7 @@ def checked_info(content: dict[str, Any], path: Path) -> DatasetInfo:
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in fault["loc"])
-        raise UserError(path, field or "content", repr(fault["input"]), fault["msg"]) from None
+        raise UserError(path, field or "content", shown(fault["input"]), expected_of(fault)) from None
     except RecursionError as error:
         raise UserError(path, "content", error, "JSON that is not nested so deep") from None
     _check_texts(info, path)

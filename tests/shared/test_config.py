@@ -1,9 +1,16 @@
+import copy
+import functools
+import re
+
 import pytest
 from pydantic import ValidationError
 
 from perilune_render.config import DatasetConfig
-from perilune_shared.config import SECTIONS, parse_setting, parse_yaml, resolve, to_yaml
+from perilune_shared.config import SECTIONS, parse_setting, resolve, resolve_over, to_yaml
 from perilune_shared.errors import UserError
+from perilune_train.detect.config import DetectConfig
+from perilune_train.explain.config import ExplainConfig
+from perilune_train.navigate.config import NavigateConfig
 
 
 def dataset(**kwargs):
@@ -36,17 +43,24 @@ def test_an_unknown_key_is_named_with_the_nearest(tmp_path):
 @pytest.mark.parametrize(
     ("setting", "parts"),
     [
-        ("dataset.camera.width_px=-4", ["--set", "dataset.camera.width_px", "-4", "greater than or equal to 16"]),
+        ("dataset.camera.width_px=-4", ["--set", "dataset.camera.width_px", "-4", "at least 16"]),
         ("dataset.camera.width_px=wide", ["dataset.camera.width_px", "'wide'", "integer"]),
         ("dataset.seed=1.5", ["dataset.seed", "1.5"]),
         ("dataset.detect.split_by=crater", ["dataset.detect.split_by", "'scene'"]),
         ("dataset.detect.flight.end_altitude_m=2000", ["below start_altitude_m"]),
-        ("dataset.seeed=1", ["unknown key", "seed (nearest known)"]),
-        ("datset.seed=1", ["unknown section", "dataset (nearest known)"]),
+        ("dataset.seeed=1", ["an unknown key", "seed (nearest known)"]),
+        ("datset.seed=1", ["an unknown section", "dataset (nearest known)"]),
         ("seed=1", ["section.key=value"]),
         ("dataset.seed", ["section.key=value"]),
         ("dataset.terrain.relief.rms_slope_deg=.inf", ["rms_slope_deg"]),
-        ("dataset.terrain=flat", ["dataset.terrain", "'flat'"]),
+        ("dataset.terrain=flat", ["dataset.terrain", "got 'flat', expected a mapping"]),
+        ("dataset.detect.sun.elevation_deg={low:5,high:9}", ["'low:5' without a value", "a space after the colon"]),
+        ("dataset.detect.sun.elevation_deg=low:5", ["got 'low:5', expected a mapping, with a space after each colon"]),
+        ("dataset.detect.flight.duration_s=1:30", ["got '1:30', expected a number"]),
+        ("dataset.light.bounce=off", ["got 'off', expected true or false"]),
+        ("dataset.camera={width_px: 64, width_px: 32}", ["'width_px' twice", "each key once"]),
+        ("dataset.seed=true", ["got true, expected an integer"]),
+        ("dataset.camera.weight_on_moon=1", ["got an unknown key, expected one of width_px, height_px, "]),
     ],
 )
 def test_a_wrong_setting_is_told_in_one_line(setting, parts):
@@ -79,8 +93,37 @@ def test_other_sections_may_stand_in_the_same_file(tmp_path):
     assert dataset(config_file=file).seed == 9
 
 
-def test_numbers_with_an_exponent_are_numbers():
-    assert parse_yaml("{a: 1e-4, b: 2E5, c: 1.5e3, d: text}", "") == {"a": 1e-4, "b": 2e5, "c": 1500.0, "d": "text"}
+WRONG = ["'text'", -1e9, 1e9, 1.5, 0, 1, True, None, [], [1] * 99, ["a"], [[1]], {}, {"zzz": 1}, float("inf"), "a:b"]
+
+
+@pytest.mark.parametrize(
+    ("section", "model"),
+    [("dataset", DatasetConfig), ("detect", DetectConfig), ("navigate", NavigateConfig), ("explain", ExplainConfig)],
+)
+def test_every_wrong_value_of_every_setting_is_told_as_got_and_expected(section, model):
+    """No message has the wording of the validation library."""
+    package = "perilune_render" if section == "dataset" else "perilune_train"
+    preset = resolve(model, section, package, "tiny").model_dump(mode="json")
+    messages = []
+
+    def visit(content, path):
+        for key, value in content.items():
+            for wrong in WRONG:
+                setting = copy.deepcopy(preset)
+                functools.reduce(dict.__getitem__, path, setting)[key] = wrong
+                try:
+                    resolve_over(model, section, "file.yaml", setting)
+                except UserError as error:
+                    messages.append(str(error))
+            if isinstance(value, dict):
+                visit(value, [*path, key])
+
+    visit(preset, [])
+    assert len(messages) > 50
+    form = re.compile(rf"file\.yaml: {section}[\w.]*: got .+, expected \S.*")
+    odd = re.compile(r"input|should|valid |value error|dictionary|expected [A-Z]|List |Tuple ", re.DOTALL)
+    for message in messages:
+        assert form.fullmatch(message) and not odd.search(message.rpartition("expected ")[2]), message
 
 
 def test_a_setting_is_a_path_and_a_value():

@@ -116,7 +116,7 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
         (["--split", "tset"], "--split: split: got tset, expected one of train, val, test"),
         (["--threshold", "2"], "--threshold: score: got 2.0, expected a number from 0 to 1"),
         (["--set", "detect.width=1"], "--set: detect.width: got not a setting of the evaluation"),
-        (["--set", "detect.evaluation.match_iuo=0.4"], "got unknown key, expected match_iou"),
+        (["--set", "detect.evaluation.match_iuo=0.4"], "got an unknown key, expected match_iou"),
         (["--out", "."], "the run's own folder"),
         (["--scale", "9"], "--scale: detect.evaluation.scales.0: got 9.0, expected"),
         (["--scale", "nan"], "--scale: detect.evaluation.scales.0"),

@@ -7,10 +7,11 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from perilune_shared.config import parse_yaml, resolve
+from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import open_dataset
 from perilune_shared.pack import pack
+from perilune_shared.yaml_text import parse_yaml
 from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.loss import detection_loss
@@ -87,7 +88,7 @@ def test_a_selection_is_named_and_its_thresholds_replaced():
     [
         ("selection=visibel", "detect.labels.selection: got 'visibel', expected visible (nearest known)"),
         ("selection=3", "detect.labels.selection: got 3, expected "),
-        ("min_contrst=3", "min_contrst: got unknown key, expected min_contrast (nearest known)"),
+        ("min_contrst=3", "min_contrst: got an unknown key, expected min_contrast (nearest known)"),
         ("radius_px=[3, 20, 30]", "detect.labels.radius_px: got"),
         ("min_depth_ratio=deep", "detect.labels.min_depth_ratio: got 'deep', expected "),
     ],

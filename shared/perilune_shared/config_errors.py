@@ -1,0 +1,117 @@
+"""Validation errors of settings in plain words: source, key, what was given and what is expected."""
+
+import difflib
+import json
+import re
+import typing
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from perilune_shared.errors import UserError
+
+_LEAST_LIKENESS = 0.75
+"""Least similarity (difflib's ratio) of a known name that is worth a hint."""
+
+# By pydantic's type of error; in braces its context.
+_EXPECTED = {
+    "missing": "a value",
+    "none_required": "null",
+    "bool_type": "true or false",
+    "int_type": "an integer",
+    "int_from_float": "an integer",
+    "int_parsing_size": "a smaller integer",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "string_type": "text",
+    "string_too_short": "text of at least {min_length} characters",
+    "string_too_long": "text of at most {max_length} characters",
+    "string_pattern_mismatch": "text of the form {pattern}",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "dict_type": "a mapping",
+    "model_type": "a mapping",
+    "model_attributes_type": "a mapping",
+    "greater_than": "above {gt}",
+    "greater_than_equal": "at least {ge}",
+    "less_than": "below {lt}",
+    "less_than_equal": "at most {le}",
+    "multiple_of": "a multiple of {multiple_of}",
+    "literal_error": "{expected}",
+    "enum": "{expected}",
+    "value_error": "{error}",
+    "extra_forbidden": "no such key",
+}
+_COUNTED = {"too_short": ("at least", "min_length"), "too_long": ("at most", "max_length")}
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """What is expected in place of an unknown name: the known one much like it, or else all of them."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=_LEAST_LIKENESS)
+    return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)
+
+
+def expected_of(fault: ErrorDetails) -> str:
+    """What pydantic expected, as a noun phrase or a bound that completes "expected ..."."""
+    kind, context = fault["type"], fault.get("ctx", {})
+    if kind in _COUNTED:
+        bound, key = _COUNTED[kind]
+        return f"{bound} {context[key]} item{'s' if context[key] != 1 else ''}"
+    if kind in _EXPECTED:
+        short = {key: f"{value:g}" if isinstance(value, float) else value for key, value in context.items()}
+        expected = _EXPECTED[kind].format_map(short)
+        # `{low:5}` and `low:5` are text in YAML, since a colon needs a space after it.
+        spaced = expected == "a mapping" and isinstance(fault["input"], str) and re.search(r":\S", fault["input"])
+        return f"{expected}, with a space after each colon" if spaced else expected
+    text = re.sub(r"^(\w+ )?[Ii]nput should (be|have) (a valid )?", "", fault["msg"])
+    return text[0].lower() + text[1:]
+
+
+def shown(value: Any) -> str:
+    """A given value in YAML's words where they differ from Python's."""
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    return repr(value)
+
+
+def explained(
+    error: ValidationError, model: type[BaseModel], section: str, sources: list[tuple[str, dict[str, Any]]]
+) -> UserError:
+    """The first fault of a section that was merged from `sources` (name, content), later ones winning."""
+    fault = error.errors(include_url=False)[0]
+    location = [str(part) for part in fault["loc"]]
+    where = next((name for name, content in reversed(sources) if _holds(content, location)), sources[-1][0])
+    field = ".".join([section, *location])
+    if fault["type"] == "extra_forbidden":
+        return UserError(where, field, "an unknown key", nearest(location[-1], _fields_at(model, location[:-1])))
+    got = "nothing" if fault["type"] == "missing" else shown(fault["input"])
+    return UserError(where, field, got, expected_of(fault))
+
+
+def _holds(content: Any, location: list[str]) -> bool:
+    for key in location:
+        if isinstance(content, list):
+            return True
+        if not isinstance(content, Mapping) or key not in content:
+            return False
+        content = content[key]
+    return True
+
+
+def _fields_at(model: type[BaseModel], location: list[str]) -> list[str]:
+    for key in location:
+        field = model.model_fields.get(key)
+        found = [] if field is None else _models_in(field.annotation)
+        if not found:
+            return []
+        model = found[0]
+    return list(model.model_fields)
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [found for part in typing.get_args(annotation) for found in _models_in(part)]
