@@ -261,7 +261,7 @@ def export(
         raise UserError(out, "format", out.suffix or "none", "one of " + ", ".join(MESH_SUFFIXES + RASTER_SUFFIXES))
     name = _first(kind)
     plan = make_plan(resolved, name)
-    scene = cached_scene(resolved, plan.exr_camera, resolved.kind(name).flight, plan.scenes[0].seed)
+    scene = cached_scene(resolved, plan.exr_camera, resolved.ground_flight(name), plan.scenes[0].seed)
     if out.suffix in RASTER_SUFFIXES:
         export_raster(scene, out, pixel_m)
     else:

@@ -192,11 +192,20 @@ class LabelsConfig(Section):
     """Largest sqrt(a b), pixels."""
 
 
+_GROUND_FIELDS = ("start_altitude_m", "end_altitude_m", "downrange_m")
+"""Of the flight: what the extent and spacing of the ground follow from, beside the sizes of the perturbations."""
+_SPREAD_FIELDS = ("position_sigma_m", "attitude_sigma_deg")
+
+
 class DatasetConfig(Section):
     """One preset's two datasets."""
 
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,59}$")] = "unnamed"
+    """Name of the dataset; terrain, Sun and splits follow from it and the seed. Every preset has its own."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
-    """From which every random stream is derived."""
+    """From which, with the name, every random stream is derived."""
+    shared_terrain: bool = False
+    """Whether both kinds fly over the same scenes, as in the paper; else each kind has its own."""
     camera: CameraConfig = CameraConfig()
     """Camera."""
     terrain: TerrainConfig = TerrainConfig()
@@ -214,6 +223,23 @@ class DatasetConfig(Section):
     nav: KindConfig
     """Dataset for navigation."""
 
+    @model_validator(mode="after")
+    def _one_ground(self) -> "DatasetConfig":
+        if self.shared_terrain and self.detect.sun != self.nav.sun:
+            raise ValueError("detect.sun equal to nav.sun, since shared_terrain is true")
+        for field in _GROUND_FIELDS if self.shared_terrain else ():
+            if getattr(self.detect.flight, field) != getattr(self.nav.flight, field):
+                raise ValueError(f"detect.flight.{field} equal to nav.flight.{field}, since shared_terrain is true")
+        return self
+
     def kind(self, name: str) -> KindConfig:
         """The settings of the dataset `detect` or `nav`."""
         return self.detect if name == "detect" else self.nav
+
+    def ground_flight(self, kind: str) -> FlightConfig:
+        """The flight for which the ground of `detect` or `nav` is made: with `shared_terrain` it covers both."""
+        if not self.shared_terrain:
+            return self.kind(kind).flight
+        first, second = self.detect.flight, self.nav.flight
+        widest = {name: max(getattr(first, name), getattr(second, name)) for name in _SPREAD_FIELDS}
+        return first.model_copy(update=widest)

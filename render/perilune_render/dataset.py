@@ -53,7 +53,7 @@ def render_plan(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path,
 
     Raises UserError where `out` holds something else or another process is writing it.
     """
-    check_ground(config, plan.exr_camera, config.kind(info.recipe().kind).flight)
+    check_ground(config, plan.exr_camera, config.ground_flight(info.recipe().kind))
     with writing(out):
         return _render(plan, config, info, out, progress)
 
@@ -76,7 +76,7 @@ def _render(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, pro
             continue
         progress.update(task, note=f"{scene_plan.scene_id}: growing")
         with interrupts_held():
-            scene = cached_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
+            scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
         _write_scene(out, scene_plan, scene, config, info.recipe().key, trajectories)
         progress.update(task, note=scene_plan.scene_id)
         sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)

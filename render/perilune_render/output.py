@@ -34,7 +34,7 @@ def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
     if split_by == "scene" and config.terrain.dem is not None and settings.n_scenes > 1:
         split_by = "trajectory"  # all scenes are of the elevation model's one ground
     return DatasetInfo(
-        name=f"perilune-{recipe.preset}-{recipe.kind}",
+        name=f"perilune-{config.name}-{recipe.kind}",
         kind=recipe.kind,
         schema_version=SCHEMA_VERSION,
         complete=False,

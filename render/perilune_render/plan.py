@@ -109,19 +109,24 @@ def camera_of(config: CameraConfig) -> Camera:
 
 
 def make_plan(config: DatasetConfig, kind: str) -> Plan:
-    """The plan of the dataset `detect` or `nav`. Raises UserError on a camera that cannot be."""
+    """The plan of the dataset `detect` or `nav`. Raises UserError on an impossible camera.
+
+    Seeds follow from the configuration's seed and name and from the kind, so that no two presets share terrain, nor do
+    the two kinds of one preset, unless `shared_terrain` says so.
+    """
     settings = config.kind(kind)
     camera = camera_of(config.camera)
-    splits = _splits(settings, stream(config.seed, kind, "splits"))
+    splits = _splits(settings, stream(config.seed, config.name, kind, "splits"))
+    ground = "shared" if config.shared_terrain else kind
     scenes, trajectories = [], []
     for s in range(settings.n_scenes):
-        seed = derived_seed(config.seed, kind, "scene", s)
+        seed = derived_seed(config.seed, config.name, ground, "scene", s)
         sun = stream(seed, "sun")
         azimuth = sun.uniform(settings.sun.azimuth_deg.low, settings.sun.azimuth_deg.high)
         elevation = sun.uniform(settings.sun.elevation_deg.low, settings.sun.elevation_deg.high)
         scenes.append(ScenePlan(f"scene-{s:04d}", seed, float(azimuth), float(elevation)))
         for t in range(settings.trajectories_per_scene):
-            own = derived_seed(seed, "trajectory", t)
+            own = derived_seed(seed, kind, "trajectory", t)
             flight = fly(settings.flight, settings.n_frames, own)
             name, places = f"trajectory-{t:04d}", tuple(range(settings.n_frames))
             trajectories.append(TrajectoryPlan(scenes[-1].scene_id, name, own, places, tuple(splits[s, t]), flight))

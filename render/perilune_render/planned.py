@@ -24,14 +24,14 @@ def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progre
     settings, or where `out` holds something.
     """
     plan = make_plan(config, kind)
-    check_ground(config, plan.exr_camera, config.kind(kind).flight)
+    check_ground(config, plan.exr_camera, config.ground_flight(kind))
     recipe = recipe_of(config, kind, preset)
     info = info_of(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes", note="")
     with written(out, info, whole_tables=True) as writer:
         for scene_plan in plan.scenes:
             with interrupts_held():
-                scene = grow_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
+                scene = grow_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
             sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
             trajectories = plan.of_scene(scene_plan.scene_id)
             paths = ("png", "exr") if config.render.exr else ("png",)

@@ -21,7 +21,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     """The first scene from the first descent, evenly spaced in time: frames above, the same with labels below."""
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
-    scene = cached_scene(config, plan.exr_camera, config.kind(kind).flight, scene_plan.seed)
+    scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
     sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
     studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)

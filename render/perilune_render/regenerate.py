@@ -119,7 +119,7 @@ def _of_scene(
             raise UserError(dataset.root, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
     config = config_of(recipe, where, dem, catalogue)
     ground_config = _ground_config(recipe, config, where)
-    camera, flight = camera_of(config.camera), ground_config.kind(recipe.kind).flight
+    camera, flight = camera_of(config.camera), ground_config.ground_flight(recipe.kind)
     exr_camera = camera_of(ground_config.camera).covering_pinhole()
     if camera != dataset.info.camera.intrinsics():
         raise UserError(where, "camera", dataset.info.camera.intrinsics(), f"that of its recipe, {camera}")
