@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perilune_train.detect.bootstrap import average_precisions, draw_resamples, interval
+from perilune_train.detect.bootstrap import average_precisions
 from perilune_train.detect.data import FrameLabels
 from perilune_train.detect.evaluation import evaluate_detections
 from perilune_train.detect.facts import FrameFacts, unknown_facts
@@ -15,6 +15,7 @@ from perilune_train.detect.figures import choose_frames
 from perilune_train.detect.matching import FALSE, FOUND, Detections, Matches
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.report import write_evaluation
+from perilune_train.spread import Spread, draw_resamples, read_spread
 
 
 def circles(*rows):
@@ -115,6 +116,10 @@ def test_errors_of_found_craters():
     assert all(np.isnan(value) for value in nothing.values())
 
 
+def resamples_of(known):
+    return draw_resamples(known.scene, known.descent, known.name, np.random.default_rng(1))
+
+
 def random_matches(seed, n_frames, n_detections, n_wanted):
     rng = np.random.default_rng(seed)
     hit = rng.random(n_detections) < 0.7
@@ -131,10 +136,11 @@ def test_resampled_average_precision_is_that_of_the_frames_repeated(n_detections
     matches = random_matches(0, 12, n_detections, n_detections)
     matches = replace(matches, scores=matches.scores.round(decimals))
     known = facts("aaabbbcccddd")
-    resamples = draw_resamples(known, np.random.default_rng(1), count=5)
+    resamples = resamples_of(known)
+    resamples = replace(resamples, weights=resamples.weights[:5])
     drawn = average_precisions(matches, resamples)
     for weights, value in zip(resamples.weights, drawn, strict=True):
-        times = weights[resamples.of_frame].astype(int)
+        times = weights[resamples.of_row].astype(int)
         rows, wanted = (np.repeat(np.arange(len(f)), times[f]) for f in (matches.frame, matches.wanted_frame))
         repeated = Matches(
             matches.scores[rows],
@@ -147,23 +153,48 @@ def test_resampled_average_precision_is_that_of_the_frames_repeated(n_detections
 
 
 def test_the_unit_of_resampling():
-    rng = np.random.default_rng(0)
-    assert draw_resamples(facts("aab"), rng).unit == "scene"
+    assert resamples_of(facts("aab")).unit == "scene"
     one_scene = FrameFacts(["x", "y"], np.ones((2, 2)), ["a", "a"], ["a/0", "a/1"], np.zeros(2), np.zeros(2))
-    assert draw_resamples(one_scene, rng).unit == "descent"
-    assert draw_resamples(facts("aaa"), rng).unit == "frame"
-    nothing_known = draw_resamples(unknown_facts(["x.png", "y.png"], np.ones((2, 2))), rng)
-    assert (nothing_known.unit, nothing_known.count) == ("frame", 2)
+    assert resamples_of(one_scene).unit == "trajectory"
+    # Frames of one trajectory are not independent of each other.
+    assert (resamples_of(facts("aaa")).unit, resamples_of(facts("aaa")).count) == ("trajectory", 1)
+    nothing_known = resamples_of(unknown_facts(["x.png", "y.png"], np.ones((2, 2))))
+    assert (nothing_known.unit, nothing_known.count) == ("image", 2)
     assert (nothing_known.weights.sum(axis=1) == 2).all()
 
 
-def test_one_unit_with_labels_gives_no_interval():
-    matches = random_matches(0, 2, 100, 100)
-    alone = matches.of_frames(np.array([True, False]))
-    resamples = draw_resamples(facts("ab"), np.random.default_rng(0))
-    assert np.isnan(interval(average_precisions(alone, resamples))).all()
-    low, high = interval(average_precisions(matches, resamples))
-    assert low <= curve(matches).ap_paper() <= high
+def scenes_found(scenes):
+    """One label a frame, of which the second scene finds none; a find in each frame of the others."""
+    ours = [found((20, 20, 5, 0.9)) if scene != "b" else found() for scene in scenes]
+    known = facts(scenes, altitude_m=[300 if scene in "ab" else 700 for scene in scenes])
+    return evaluate_detections(ours, [labels((20, 20, 5))] * len(scenes), known, 0.5, radius_px=(2.0, 50.0))
+
+
+def test_fewer_than_five_units_give_their_values_and_no_interval(tmp_path):
+    figures = scenes_found("aabbcd").figures()
+    assert figures["recall"] == pytest.approx(4 / 6)
+    assert figures["recall_interval"] is None and "recall_low" not in figures and "recall_high" not in figures
+    assert [figures[f"recall/by_scene/{name}"] for name in "abcd"] == [1, 0, 1, 1]
+    assert [figures[f"ap50_paper/by_scene/{name}"] for name in "abcd"] == [1, 0, 1, 1]
+    evaluation = scenes_found("aabbcd")
+    write_evaluation(tmp_path, evaluation, [np.zeros((200, 200), np.uint8)] * 6, [])
+    report = (tmp_path / "report.md").read_text()
+    assert "4 of them are too few for an interval" in report and " to 1.000)" not in report
+    assert "| recall | 0.667 (a 1.000, b 0.000, c 1.000, d 1.000)" in report
+
+
+def test_five_units_give_an_interval_but_not_in_bins_that_hold_fewer():
+    figures = scenes_found("abcde").figures()
+    assert figures["recall_low"] < figures["recall"] == 0.8 < figures["recall_high"]
+    assert not any(name.startswith("recall/by_") for name in figures)
+    assert figures["altitude_200_500_m/ap50_paper_interval"] is None
+    assert figures["altitude_200_500_m/ap50_paper/by_scene/b"] == 0
+    assert figures["radius_5_10_px/ap50_paper_low"] < 0.8
+
+
+def test_spreads_are_read_from_flat_figures_as_they_were_written():
+    for given in (Spread("", (0.1, 0.2)), Spread("scene", None, {"s/0": 0.5, "t": 0.25})):
+        assert read_spread(given.keys("strict/f1") | {"f1_low": 0.0, "f1_high": 1.0}, "strict/f1") == given
 
 
 def test_best_typical_and_worst_frames():
@@ -184,7 +215,11 @@ def test_the_report_of_images_of_which_nothing_is_known(tmp_path: Path):
     images = [np.full((height, width), 90, np.uint8) for width, height in sizes]
     write_evaluation(tmp_path, evaluation, images, ["made by hand"])
     report = (tmp_path / "report.md").read_text()
-    assert "made by hand" in report and "3 frames, 3 wanted labels" in report and "of 3 frames" in report
+    assert (
+        "made by hand" in report
+        and "3 frames, 3 wanted labels" in report
+        and "the value of each image; 3 of them" in report
+    )
     assert "| precision | 0.333" in report
     assert "## Radius" in report and "## Sun" not in report and "## Freshness" not in report
     assert "nan" not in report

@@ -129,7 +129,7 @@ def test_compare_shows_images(run, folder, tmp_path):
     text = compare_folders([tmp_path / "a"], tmp_path / "both")
     cells = [cell.strip() for cell in text.splitlines()[-1].strip("| ").split("|")]
     assert cells[1:8] == ["images", "images", "-", "from 12.0 px", "0.5 1.0", "2", str(figures["labels"])]
-    assert cells[8].startswith(f"{figures['ap50_paper']:.3f} (") and "-" not in cells[9:15]
+    assert cells[8].startswith(f"{figures['ap50_paper']:.3f} (a.png ") and "-" not in cells[9:15]
     assert f"{figures['lowest_ap50_paper_by_radius']:.3f}" == cells[15]
 
 

@@ -29,8 +29,8 @@ def descents(make_dataset, tmp_path_factory):
 def test_tracks_find_the_motion_far_better_than_the_nominal_curve(descents):
     found = summary(motion_errors(descents, [klt_descent(d) for d in descents]))
     nominal = summary(motion_errors(descents, [d.nominal_motion for d in descents]))
-    assert found["position_rmse_m"] < 0.5 * nominal["position_rmse_m"]
-    assert found["orientation_rmse_deg"] < 0.3
+    assert found["position_rmse_vector_m"] < 0.5 * nominal["position_rmse_vector_m"]
+    assert found["orientation_rmse_angle_deg"] < 0.3
     assert found["orientation_rmse_z_deg"] < 0.05
 
 

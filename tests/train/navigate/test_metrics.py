@@ -5,7 +5,7 @@ from perilune_shared.camera import Camera
 from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.frames import matrix_from_rotation_vector
 from perilune_train.navigate.data import Descent
-from perilune_train.navigate.metrics import mean_motion, mean_motion_at_step, motion_errors, summary
+from perilune_train.navigate.metrics import mean_motion, mean_motion_at_step, motion_errors, summary, summary_spreads
 
 
 def _descent(steps_m, name="t0"):
@@ -46,11 +46,31 @@ def test_errors_and_drift_by_hand():
     # The offsets add up in O_L, whose z is against z_C: (3, 0, -4), then (6, 0, -4).
     np.testing.assert_allclose(errors["drift_m"], [5, np.sqrt(52)])
     figures = summary(errors)
-    assert figures["position_rmse_m"] == pytest.approx(np.sqrt((25 + 9) / 2))
+    # Errors (3, 0, 4) and (3, 0, 0): two lengths, six components.
+    assert figures["position_rmse_vector_m"] == pytest.approx(np.sqrt((25 + 9) / 2))
+    assert figures["position_rmse_per_component_m"] == pytest.approx(np.sqrt((9 + 0 + 16 + 9 + 0 + 0) / 6))
     assert figures["position_rmse_x_m"] == pytest.approx(3)
-    assert figures["orientation_rmse_deg"] == pytest.approx(0.5 / np.sqrt(2))
+    assert figures["orientation_rmse_angle_deg"] == pytest.approx(0.5 / np.sqrt(2))
+    assert figures["orientation_rmse_per_component_deg"] == pytest.approx(np.sqrt((0.3**2 + 0.4**2) / 6))
+    assert not {"position_rmse_m", "orientation_rmse_deg"} & set(figures)
     assert figures["drift_final_m"] == pytest.approx(np.sqrt(52))
     assert figures["drift_rms_m"] == pytest.approx(np.sqrt((25 + 52) / 2))
+
+
+def errors_of(n_trajectories):
+    """Descents of two steps, the k-th off by k metres in x in every step."""
+    descents = [_descent([[0, 0, -10]] * 2, f"t{k}") for k in range(n_trajectories)]
+    motions = [(d.motion[0] + [k, 0, 0], d.motion[1]) for k, d in enumerate(descents)]
+    return motion_errors(descents, motions)
+
+
+def test_an_interval_needs_five_trajectories():
+    few = summary_spreads(errors_of(4))["position_rmse_vector_m"]
+    assert few.interval is None and few.unit == "trajectory"
+    assert few.by_unit == pytest.approx({"s/t0": 0, "s/t1": 1, "s/t2": 2, "s/t3": 3})
+    enough = summary_spreads(errors_of(5))["position_rmse_vector_m"]
+    low, high = enough.interval
+    assert 0 < low < summary(errors_of(5))["position_rmse_vector_m"] < high < 4 and enough.by_unit == {}
 
 
 def test_a_rotation_error_bends_the_dead_reckoned_path():

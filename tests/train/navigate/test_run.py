@@ -58,10 +58,14 @@ def test_a_run_leaves_one_table_of_all_methods(runs):
     table = pd.read_parquet(runs / "tiny" / "navigation.parquet").set_index("method")
     assert list(table.index) == ["warp", "stack", "klt", "nominal", "mean_at_step", "mean"]
     metrics = json.loads((runs / "tiny" / "metrics.json").read_text())
-    assert metrics["test/position_rmse_m"] == pytest.approx(table.loc["warp", "position_rmse_m"])
+    assert metrics["test/position_rmse_vector_m"] == pytest.approx(table.loc["warp", "position_rmse_vector_m"])
     for method in ("klt", "nominal", "mean_at_step", "mean"):
-        for key in ("position_rmse_m", "orientation_rmse_deg", "drift_rms_m"):
+        for key in ("position_rmse_vector_m", "orientation_rmse_angle_deg", "drift_rms_m"):
             assert metrics[f"baseline/{method}/{key}"] == pytest.approx(table.loc[method, key])
+    # One test trajectory: its own value, and no interval.
+    assert metrics["test/position_rmse_vector_m_interval"] is None
+    own = [value for key, value in metrics.items() if key.startswith("test/position_rmse_vector_m/by_trajectory/")]
+    assert own == pytest.approx([metrics["test/position_rmse_vector_m"]])
     stack = json.loads((runs / "tiny-stack" / "metrics.json").read_text())
     assert stack["test/drift_rms_m"] == pytest.approx(table.loc["stack", "drift_rms_m"])
     for name in ("tiny", "tiny-stack"):
@@ -74,7 +78,9 @@ def test_the_table_of_pairs_agrees_with_the_summary(runs):
     table = pd.read_parquet(runs / "tiny" / "navigation.parquet").set_index("method")
     for method, own in pairs.groupby("method"):
         assert len(own) == 7
-        assert np.sqrt((own["position_error_m"] ** 2).mean()) == pytest.approx(table.loc[method, "position_rmse_m"])
+        assert np.sqrt((own["position_error_m"] ** 2).mean()) == pytest.approx(
+            table.loc[method, "position_rmse_vector_m"]
+        )
 
 
 def test_the_saved_network_gives_the_figures_again(runs, descents):

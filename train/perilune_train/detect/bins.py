@@ -12,17 +12,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_train.detect.bootstrap import (
-    Interval,
-    Resamples,
-    at_threshold_resampled,
-    average_precisions,
-    interval,
-    resampled_wanted,
-)
+from perilune_train.detect.bootstrap import at_threshold_resampled, average_precisions
 from perilune_train.detect.facts import FrameFacts
 from perilune_train.detect.matching import Matches, Overlaps
 from perilune_train.detect.metrics import at_threshold, curve
+from perilune_train.spread import Resamples, Spread, spreads
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -31,7 +25,6 @@ ALTITUDE_BINS_M = (200.0, 500.0, 1000.0, 1500.0)
 SUN_BINS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 DEPTH_RATIO_BINS = (0.0, 0.04, 0.06, 0.08, 0.1, 0.15, 1.0)
 _ALTITUDE_MARGIN = 0.1
-_UNDEFINED = (float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
@@ -52,14 +45,14 @@ class BinFigures:
     """Wanted labels."""
     ap50_paper: float
     """AP as in the paper (metrics.py)."""
-    ap50_paper_interval: Interval
-    """95 %, by bootstrap."""
+    ap50_paper_spread: Spread
+    """Over the units that have wanted labels in the bin."""
     precision: float
     """In the usual account."""
     recall: float
     """Share of the wanted labels found."""
-    recall_interval: Interval
-    """95 %, by bootstrap."""
+    recall_spread: Spread
+    """Over the same units."""
     f1: float
     """Of precision and recall."""
 
@@ -111,7 +104,14 @@ def _of_matches(
     by: str, unit: str, low: float, high: float, matches: Matches, threshold: float, resamples: Resamples
 ) -> BinFigures:
     precision, recall, f1 = at_threshold(matches, threshold)
-    drawn = at_threshold_resampled(matches, threshold, resamples)
+    spread = spreads(
+        lambda drawn: {
+            "ap50_paper": average_precisions(matches, drawn),
+            "recall": at_threshold_resampled(matches, threshold, drawn)["recall"],
+        },
+        matches.wanted_frame,
+        resamples,
+    )
     return BinFigures(
         by,
         unit,
@@ -120,10 +120,10 @@ def _of_matches(
         len(np.unique(matches.wanted_frame)),
         len(matches.wanted_frame),
         curve(matches).ap_paper(),
-        interval(average_precisions(matches, resamples)),
+        spread["ap50_paper"],
         precision,
         recall,
-        interval(drawn["recall"]),
+        spread["recall"],
         f1,
     )
 
@@ -141,11 +141,11 @@ def _of_labels(
     hit = np.zeros(len(own), np.bool_)
     hit[matches.label[(matches.label >= 0) & (matches.scores >= threshold)]] = True
     frames = overlaps.label_frame[own]
-    found = resamples.weights @ np.bincount(
-        resamples.of_frame[overlaps.label_frame[own & hit]], minlength=resamples.count
-    )
-    wanted = resampled_wanted(frames, resamples)
-    drawn = np.divide(found, wanted, out=np.full(len(wanted), np.nan), where=wanted > 0)
+
+    def recalls(drawn: Resamples) -> dict[str, Array]:
+        found, wanted = drawn.totals(overlaps.label_frame[own & hit]), drawn.totals(frames)
+        return {"recall": np.divide(found, wanted, out=np.full(len(wanted), np.nan), where=wanted > 0)}
+
     nan = float("nan")
     recall = float(hit[own].mean()) if own.any() else nan
     return BinFigures(
@@ -156,9 +156,9 @@ def _of_labels(
         len(np.unique(frames)),
         len(frames),
         nan,
-        _UNDEFINED,
+        Spread(resamples.unit, None),
         nan,
         recall,
-        interval(drawn),
+        spreads(recalls, frames, resamples)["recall"],
         nan,
     )

@@ -12,7 +12,8 @@ from perilune_shared.files import write_text
 from perilune_train.detect.again import read_metrics
 from perilune_train.detect.figures import draw_curves
 from perilune_train.detect.metrics import Curve
-from perilune_train.detect.report import CURVE_FILE, number, table, with_interval
+from perilune_train.detect.report import CURVE_FILE, number, table
+from perilune_train.spread import read_spread
 
 _COLUMNS = {
     "ap50_paper": "AP",
@@ -52,7 +53,7 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
             told = [metrics.get("dataset/name"), split, metrics.get("dataset/protocol")]
             told += [metrics.get("labels/selection"), metrics.get("evaluation/scales", 1)]
         cells = [name, *map(_text, (*told, figures.get("frames"), figures.get("labels")))]
-        cells += [with_interval(figures.get(key), _interval(figures, key)) for key in _COLUMNS]
+        cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
         # Of the whole curve, not of the points that are kept of it.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
@@ -60,7 +61,10 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
     head = ["run", "dataset", "split", "protocol", "wanted", "scales", "frames", "labels"]
     head += [*_COLUMNS.values(), *_LOWEST.values()]
     text = "\n".join(table(head, rows)) + "\n"
-    write_text(out / "compare.md", "# Runs side by side\n\nIn brackets: 95 % intervals.\n\n" + text)
+    write_text(
+        out / "compare.md",
+        "# Runs side by side\n\nIn brackets: 95 % intervals, or single units where they are too few.\n\n" + text,
+    )
     draw_curves(curves, out / "precision_recall.png")
     return text
 
@@ -88,7 +92,6 @@ def _text(value: object) -> str:
     return "-" if value is None else " ".join(str(value).split())
 
 
-def _interval(figures: dict, key: str) -> tuple[float, float] | None:
-    ends = figures.get(f"{key}_low"), figures.get(f"{key}_high")
-    low, high = ends
-    return (float(low), float(high)) if isinstance(low, float) and isinstance(high, float) else None
+def _cell(figures: dict, key: str) -> str:
+    value = figures.get(key)
+    return read_spread(figures, key).text(value) if isinstance(value, int | float) else number(value)

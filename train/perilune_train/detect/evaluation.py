@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.info import DatasetInfo
 from perilune_train.detect.bins import BinFigures, figures_by_bin
-from perilune_train.detect.bootstrap import (
-    Interval,
-    Resamples,
-    at_threshold_resampled,
-    average_precisions,
-    draw_resamples,
-    interval,
-)
+from perilune_train.detect.bootstrap import at_threshold_resampled, average_precisions
 from perilune_train.detect.data import FrameLabels
 from perilune_train.detect.facts import FrameFacts
 from perilune_train.detect.matching import (
@@ -39,6 +32,7 @@ from perilune_train.detect.matching import (
     find_overlaps,
 )
 from perilune_train.detect.metrics import figures, figures_of_account, figures_over_ious
+from perilune_train.spread import Resamples, Spread, draw_resamples, spreads
 
 Array = NDArray[np.float64]
 
@@ -67,9 +61,8 @@ class Evaluation:
     """At COCO_IOUS."""
     bins: list[BinFigures]
     """By radius, altitude, Sun, freshness; only bins that hold labels."""
-    intervals: dict[str, Interval]
-    """95 % of ap50_paper, ap50_95_paper, precision, recall, f1, and of ap50_paper at the edge and strict, by bootstrap
-    over `resamples.unit`."""
+    spreads: dict[str, Spread]
+    """Of ap50_paper, ap50_95_paper, precision, recall, f1, and of ap50_paper at the edge and strict."""
     resamples: Resamples
     """What the intervals are drawn from."""
 
@@ -79,7 +72,7 @@ class Evaluation:
         return errors_of_found(self.overlaps, self.matches, self.threshold)
 
     def figures(self) -> dict[str, float | int | str | None]:
-        """Flat keys: those of `metrics.figures` and `figures_over_ious`, <name>_low and _high of the intervals,
+        """Flat keys: those of `metrics.figures` and `figures_over_ious`, `Spread.keys` of the spreads,
         <bin>/ap50_paper and others, recall_radius_..., errors. What is not defined is NaN."""
         result: dict[str, float | int | str | None] = {
             **figures(self.matches, self.threshold),
@@ -93,16 +86,13 @@ class Evaluation:
             "intervals_units": self.resamples.count,
             **self.errors,
         }
-        for name, (low, high) in self.intervals.items():
-            result |= {f"{name}_low": low, f"{name}_high": high}
+        for name, spread in self.spreads.items():
+            result |= spread.keys(name)
         for part in self.bins:
             result |= {f"{part.key}/recall": part.recall, f"{part.key}/labels": part.labels}
             if part.by != "depth_ratio":
                 result |= {f"{part.key}/{name}": getattr(part, name) for name in ("ap50_paper", "precision", "f1")}
-                result |= {
-                    f"{part.key}/ap50_paper_low": part.ap50_paper_interval[0],
-                    f"{part.key}/ap50_paper_high": part.ap50_paper_interval[1],
-                }
+                result |= part.ap50_paper_spread.keys(f"{part.key}/ap50_paper")
             if part.by == "radius":
                 result[f"recall_{part.key}"] = part.recall
         for by in ("radius", "altitude", "sun"):
@@ -141,14 +131,17 @@ def evaluate_detections(
     matches = overlaps.match(match_iou, radius_px)
     at_edge = overlaps.match(match_iou, edge_range(radius_px))
     by_iou = [overlaps.match(iou, radius_px) for iou in COCO_IOUS]
-    resamples = draw_resamples(facts, np.random.default_rng(seed))
-    drawn = {
-        "ap50_paper": average_precisions(matches, resamples),
-        "edge/ap50_paper": average_precisions(at_edge, resamples),
-        "strict/ap50_paper": average_precisions(matches.strict(), resamples),
-        "ap50_95_paper": np.mean([average_precisions(part, resamples) for part in by_iou], axis=0),
-        **at_threshold_resampled(matches, threshold, resamples),
-    }
+    resamples = draw_resamples(facts.scene, facts.descent, facts.name, np.random.default_rng(seed))
+
+    def statistics(drawn: Resamples) -> dict[str, Array]:
+        return {
+            "ap50_paper": average_precisions(matches, drawn),
+            "edge/ap50_paper": average_precisions(at_edge, drawn),
+            "strict/ap50_paper": average_precisions(matches.strict(), drawn),
+            "ap50_95_paper": np.mean([average_precisions(part, drawn) for part in by_iou], axis=0),
+            **at_threshold_resampled(matches, threshold, drawn),
+        }
+
     return Evaluation(
         found,
         labels,
@@ -160,7 +153,7 @@ def evaluate_detections(
         at_edge,
         by_iou,
         figures_by_bin(overlaps, matches, facts, match_iou, radius_px, threshold, resamples),
-        {name: interval(values) for name, values in drawn.items()},
+        spreads(statistics, matches.wanted_frame, resamples),
         resamples,
     )
 

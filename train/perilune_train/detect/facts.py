@@ -19,7 +19,7 @@ class FrameFacts:
     sizes_px: NDArray[np.int64]
     """Width and height (N, 2)."""
     scene: list[str]
-    """Terrain, the unit by which intervals are drawn; "" where not known (N)."""
+    """Terrain, the unit over which intervals are drawn (spread.py); "" where not known (N)."""
     descent: list[str]
     """Descent over it, of a name of its own; "" where not known (N)."""
     altitude_m: Array

@@ -15,6 +15,7 @@ from perilune_train.detect.bins import BinFigures
 from perilune_train.detect.evaluation import Evaluation
 from perilune_train.detect.matching import FALSE, FOUND
 from perilune_train.detect.metrics import Curve
+from perilune_train.spread import LEAST_UNITS
 
 matplotlib.use("Agg")
 _LABEL, _IGNORED, _FOUND, _FALSE = "#ff4040", "#e0c030", "#19d3e0", "#ff40ff"
@@ -42,24 +43,32 @@ def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] |
 
 
 def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
-    """AP by radius, altitude and Sun as bars with their 95 % intervals, labels counted, the goal of 0.85 dashed."""
+    """AP by radius, altitude and Sun as bars with 95 % intervals or single units, labels counted, goal 0.85 dashed."""
+    unit = bins[0].ap50_paper_spread.unit if bins else "unit"
     drawn = [(by, title) for by, title in _PANELS.items() if any(part.by == by for part in bins)]
     figure = Figure(figsize=(4.4 * max(len(drawn), 1), 3.8), layout="constrained")
     for place, (by, title) in enumerate(drawn):
         parts = [part for part in bins if part.by == by]
         axes = figure.add_subplot(1, len(drawn), place + 1)
         heights = np.array([part.ap50_paper for part in parts])
-        ends = np.array([part.ap50_paper_interval for part in parts])
-        reach = np.abs(ends.T - heights)
         colours = ["#3b7dd8" if part.ap50_paper >= _GOAL else "#d8873b" for part in parts]
-        axes.bar(range(len(parts)), heights, color=colours, yerr=reach, capsize=3, ecolor="#404040")
+        axes.bar(range(len(parts)), heights, color=colours)
+        for x, part in enumerate(parts):
+            spread = part.ap50_paper_spread
+            if spread.interval is None:
+                values = list(spread.by_unit.values())
+                axes.plot([x] * len(values), values, "o", color="#404040", markersize=3)
+            else:
+                axes.vlines(x, *spread.interval, color="#404040")
         axes.axhline(_GOAL, linestyle="--", color="black", linewidth=0.8)
         for x, height in enumerate(heights):
             axes.text(x - 0.36, 0.02, f"{height:.2f}", fontsize=8, color="white")
         axes.set(xlabel=title, ylim=(0, 1), ylabel="AP" if place == 0 else "")
         axes.set_xticks(range(len(parts)), [f"{part.low:g}-{part.high:g}\n{part.labels}" for part in parts], fontsize=8)
     figure.suptitle(
-        "AP with 95 % intervals; below each bin its number of labels; dashed and blue: the goal of 0.85", fontsize=9
+        f"AP (the paper's sum) with 95 % intervals; dots: single {unit}s where they are fewer than {LEAST_UNITS}; "
+        "below each bin its number of labels; dashed and blue: the goal of 0.85",
+        fontsize=9,
     )
     save_figure(figure, path)
 

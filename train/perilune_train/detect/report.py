@@ -1,7 +1,7 @@
 """What an evaluation leaves in a folder: report.md, pictures, and the curve as a table. Needs no dataset."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from perilune_shared.files import write_text, written_aside
 from perilune_train.detect.bins import BinFigures
-from perilune_train.detect.bootstrap import RESAMPLES, Interval
 from perilune_train.detect.evaluation import Evaluation
 from perilune_train.detect.figures import draw_bins, draw_curves, draw_frames
 from perilune_train.detect.matching import COCO_IOUS, EDGE
 from perilune_train.detect.metrics import Curve, curve
+from perilune_train.spread import LEAST_UNITS, RESAMPLES, Resamples, Spread
 
 CURVE_FILE = "precision_recall.parquet"
 _CURVE_POINTS = 1000
@@ -67,13 +67,6 @@ def number(value: object) -> str:
     return f"{value:.3f}" if isinstance(value, int | float) and math.isfinite(value) else "-"
 
 
-def with_interval(value: object, interval: Interval | None) -> str:
-    """A figure with its interval, where both are defined."""
-    if interval is None or not all(math.isfinite(end) for end in interval):
-        return number(value)
-    return f"{number(value)} ({interval[0]:.3f} to {interval[1]:.3f})"
-
-
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a Markdown table; an upright bar within a cell is escaped."""
     lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
@@ -83,14 +76,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     """The whole report."""
-    figures, intervals, unit = evaluation.figures(), evaluation.intervals, evaluation.resamples
+    figures, spreads = evaluation.figures(), evaluation.spreads
     fullest = max((len(part.scores) for part in evaluation.found), default=0)
     lines = ["# Crater detection, judged", "", *[f"- {line}" for line in about]]
     lines += [
         f"- {figures['frames']} frames, {figures['labels']} wanted labels; most detections in a frame: {fullest}",
         f"- match at IoU {evaluation.match_iou:g}; precision, recall and F1 at a score of {evaluation.threshold:.4f}",
-        f"- in brackets: 95 % intervals, {RESAMPLES} resamples of {unit.count} {unit.unit}s"
-        + (f" (few {unit.unit}s: rough)" if unit.count < 5 else ""),
+        f"- {_of_brackets(evaluation.resamples)}",
         "- usual account: finds on ignored craters, outside the range of radii or centred off the image do not count; "
         f"edge: from {EDGE:g} of the least radius on, those on no crater at all are false; strict: all are false",
         "",
@@ -98,11 +90,11 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         "",
     ]
     rows = [
-        [title, *(with_interval(figures[f"{a}{key}"], intervals.get(f"{a}{key}")) for a in ("", "edge/", "strict/"))]
+        [title, *(_cell(figures, spreads, f"{account}{key}") for account in ("", "edge/", "strict/"))]
         for key, title in _ROWS.items()
     ]
     rows += [
-        ["AP over IoU 0.50:0.95", with_interval(figures["ap50_95_paper"], intervals["ap50_95_paper"]), "", ""],
+        ["AP over IoU 0.50:0.95", _cell(figures, spreads, "ap50_95_paper"), "", ""],
         ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_coco101"]), "", ""],
         ["AP at IoU 0.75", number(figures["ap75_paper"]), "", ""],
     ]
@@ -127,6 +119,23 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
+def _cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], key: str) -> str:
+    value = figures[key]
+    known = key in spreads and isinstance(value, int | float)
+    return spreads[key].text(value) if known else number(value)  # type: ignore[arg-type]
+
+
+def _of_brackets(resamples: Resamples) -> str:
+    """What stands in brackets behind a figure."""
+    count, unit = resamples.count, resamples.unit
+    if count < LEAST_UNITS:
+        return f"in brackets: the value of each {unit}; {count} of them are too few for an interval"
+    return (
+        f"in brackets: 95 % intervals, {RESAMPLES} resamples of {count} {unit}s; the value of each {unit} where fewer "
+        f"than {LEAST_UNITS} have labels"
+    )
+
+
 def _range(part: BinFigures) -> str:
     return f"{part.low:g} to {part.high:g} {part.unit}".rstrip()
 
@@ -139,9 +148,9 @@ def _bins(title: str, parts: list[BinFigures]) -> list[str]:
             _range(part),
             str(part.frames),
             str(part.labels),
-            with_interval(part.ap50_paper, part.ap50_paper_interval),
+            part.ap50_paper_spread.text(part.ap50_paper),
             number(part.precision),
-            with_interval(part.recall, part.recall_interval),
+            part.recall_spread.text(part.recall),
             number(part.f1),
         ]
         for part in parts
@@ -160,7 +169,7 @@ def _bins(title: str, parts: list[BinFigures]) -> list[str]:
 def _freshness(parts: list[BinFigures]) -> list[str]:
     if not parts:
         return []
-    rows = [[_range(part), str(part.labels), with_interval(part.recall, part.recall_interval)] for part in parts]
+    rows = [[_range(part), str(part.labels), part.recall_spread.text(part.recall)] for part in parts]
     return [
         "## Freshness",
         "",

@@ -6,6 +6,7 @@ import pandas as pd
 from perilune_shared.frames import Array
 from perilune_train.navigate.data import Descent
 from perilune_train.navigate.geometry import dead_reckoning, rotation_vectors
+from perilune_train.spread import Resamples, Spread, draw_resamples, spreads
 
 Motion = tuple[Array, Array]
 """translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one descent."""
@@ -63,15 +64,47 @@ def motion_errors(descents: list[Descent], motions: list[Motion]) -> pd.DataFram
 
 
 def summary(errors: pd.DataFrame) -> dict[str, float]:
-    """Root mean squares over all pairs of all descents; drift over all frames and at the last ones."""
+    """Root mean squares over all pairs of all descents; drift (length) over all frames and at the last ones.
+
+    Two forms of each RMSE, see `squared_errors`; those by axis beside them. docs/training.md has the formulas.
+    """
     ends = errors.groupby(["scene_id", "trajectory_id"])["drift_m"].last()
-    figures = {"position_rmse_m": _rms(errors["position_error_m"])}
+    figures = {key: float(np.sqrt(np.mean(values))) for key, values in squared_errors(errors).items()}
     figures |= {f"position_rmse_{axis}_m": _rms(errors[f"error_{axis}_m"]) for axis in "xyz"}
-    figures["orientation_rmse_deg"] = _rms(errors["orientation_error_deg"])
     figures |= {f"orientation_rmse_{axis}_deg": _rms(errors[f"error_{axis}_deg"]) for axis in "xyz"}
     figures["drift_rms_m"] = _rms(errors["drift_m"])
     figures["drift_final_m"] = _rms(ends)
     return figures
+
+
+def squared_errors(errors: pd.DataFrame) -> dict[str, Array]:
+    """The squares (pairs,) whose mean's root is each RMSE, by its key.
+
+    per_component is the paper's RMSE: each of the three components of each pair is one variable. vector and angle take
+    the length of the error vector and are sqrt(3) times as large. The components of the orientation are those of
+    the rotation vector that is left over; differences of the paper's Euler angles are the same to first order.
+    """
+    length_2 = np.square(np.asarray(errors["position_error_m"], np.float64))
+    angle_2 = np.square(np.asarray(errors["orientation_error_deg"], np.float64))
+    return {
+        "position_rmse_per_component_m": length_2 / 3,
+        "position_rmse_vector_m": length_2,
+        "orientation_rmse_per_component_deg": angle_2 / 3,
+        "orientation_rmse_angle_deg": angle_2,
+    }
+
+
+def summary_spreads(errors: pd.DataFrame, seed: int = 0) -> dict[str, Spread]:
+    """How far each RMSE of `squared_errors` varies between test scenes, or trajectories where there is one scene."""
+    scenes = errors["scene_id"].tolist()
+    names = [f"{scene}/{name}" for scene, name in zip(scenes, errors["trajectory_id"], strict=True)]
+    rows, squares = np.arange(len(errors)), squared_errors(errors)
+
+    def statistics(drawn: Resamples) -> dict[str, Array]:
+        count = drawn.totals(rows)
+        return {key: np.sqrt(drawn.totals(rows, values) / count) for key, values in squares.items()}
+
+    return spreads(statistics, rows, draw_resamples(scenes, names, names, np.random.default_rng(seed)))
 
 
 def _rms(values: pd.Series) -> float:

@@ -18,7 +18,14 @@ from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data import Descent, load_descents
 from perilune_train.navigate.figures import draw_descent, draw_errors
 from perilune_train.navigate.klt import klt_descent
-from perilune_train.navigate.metrics import Motion, mean_motion, mean_motion_at_step, motion_errors, summary
+from perilune_train.navigate.metrics import (
+    Motion,
+    mean_motion,
+    mean_motion_at_step,
+    motion_errors,
+    summary,
+    summary_spreads,
+)
 from perilune_train.navigate.task import Fusion, NavigationTask, load_navigator, predict
 from perilune_train.runs import (
     RunFolder,
@@ -87,7 +94,7 @@ def _train(
         task,
         label=f"train {fusion}",
         epochs=own.coarse_epochs + own.fine_epochs,
-        monitor="val/position_rmse_m",
+        monitor="val/position_rmse_vector_m",
         mode="min",
         resume=resume,
         precision=settings.precision,
@@ -144,11 +151,13 @@ def _write(
     drawn = {method: found[0] for method, found in motions.items() if method != "mean"}
     draw_descent(run.root / "descent.png", test[0], drawn, errors)
     draw_errors(run.root / "errors.png", errors)
-    metrics = {f"test/{key}": value for key, value in rows[fusion].items()}
+    metrics: dict[str, float | int | str | None] = {}
     for method, row in rows.items():
-        if method != fusion:
-            place = method if method in ("stack", "warp") else f"baseline/{method}"
-            metrics |= {f"{place}/{key}": value for key, value in row.items()}
+        place = method if method in ("stack", "warp") else f"baseline/{method}"
+        place = "test" if method == fusion else place
+        metrics |= {f"{place}/{key}": value for key, value in row.items()}
+        for key, spread in summary_spreads(errors[method]).items():
+            metrics |= spread.keys(f"{place}/{key}")
     write_metrics(run, metrics | details)
 
 

@@ -221,8 +221,9 @@ class NavigationTask(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         errors = motion_errors(self.validation_descents, self.validation_motions)
-        self.log("val/position_rmse_m", summary(errors)["position_rmse_m"], batch_size=1)
-        self.log("val/orientation_rmse_deg", summary(errors)["orientation_rmse_deg"], batch_size=1)
+        figures = summary(errors)
+        for key in ("position_rmse_vector_m", "orientation_rmse_angle_deg"):
+            self.log(f"val/{key}", figures[key], batch_size=1)
 
     def configure_optimizers(self) -> Any:
         total = max(1, (self.own.coarse_epochs + self.own.fine_epochs) * len(self.train_dataloader()))

@@ -1,0 +1,128 @@
+"""How far a figure varies: a 95 % interval by bootstrap over independent units, or the units' own values.
+
+Frames of one scene are alike, so whole scenes are drawn with replacement. The unit is the scene; in a split with one
+scene the trajectory; the image where neither is known. Fewer than five units give no interval: each unit's own value is
+told instead.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+Interval = tuple[float, float]
+LEAST_UNITS = 5
+RESAMPLES = 1000
+_PERCENTILES = (2.5, 97.5)
+
+
+@dataclass(frozen=True)
+class Resamples:
+    """How often each unit is in each resample."""
+
+    unit: str
+    """scene, trajectory or image."""
+    names: list[str]
+    """Of the units (U)."""
+    of_row: Rows
+    """The unit of each row, a frame or a pair of frames (N,)."""
+    weights: Array
+    """(resamples, U)."""
+
+    @property
+    def count(self) -> int:
+        """Units there are."""
+        return len(self.names)
+
+    def of_units(self, units: Rows) -> "Resamples":
+        """Resamples that hold one unit each, once."""
+        return replace(self, weights=np.eye(self.count)[units])
+
+    def totals(self, rows: Rows, values: Array | None = None) -> Array:
+        """Sum over `rows` (L,) of `values` (L,), or of 1, in every resample (R,)."""
+        return self.weights @ np.bincount(self.of_row[rows], weights=values, minlength=self.count)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far one figure varies between units."""
+
+    unit: str
+    """scene, trajectory or image."""
+    interval: Interval | None
+    """95 %; None with fewer than LEAST_UNITS units."""
+    by_unit: dict[str, float] = field(default_factory=dict)
+    """The figure of each unit, only where there is no interval."""
+
+    def text(self, value: float | None) -> str:
+        """The figure `value` with what is known of its spread, three digits behind the point; a dash if undefined."""
+        if value is None or not np.isfinite(value):
+            return "-"
+        known = {name: one for name, one in self.by_unit.items() if np.isfinite(one)}
+        if self.interval is not None and all(map(np.isfinite, self.interval)):
+            return f"{value:.3f} ({self.interval[0]:.3f} to {self.interval[1]:.3f})"
+        if known:
+            return f"{value:.3f} (" + ", ".join(f"{name} {one:.3f}" for name, one in known.items()) + ")"
+        return f"{value:.3f}"
+
+    def keys(self, key: str) -> dict[str, float | None]:
+        """For metrics.json: <key>_low and _high; or <key>_interval, null, and <key>/by_<unit>/<name>."""
+        if self.interval is not None:
+            return {f"{key}_low": self.interval[0], f"{key}_high": self.interval[1]}
+        by_unit = {f"{key}/by_{self.unit}/{name}": value for name, value in self.by_unit.items()}
+        return {f"{key}_interval": None, **by_unit}
+
+
+def read_spread(figures: Mapping[str, object], key: str) -> Spread:
+    """What `Spread.keys` wrote, from flat figures; without interval and units where there is nothing."""
+    low, high = figures.get(f"{key}_low"), figures.get(f"{key}_high")
+    if isinstance(low, float) and isinstance(high, float):
+        return Spread("", (low, high))
+    own = {name.removeprefix(f"{key}/by_"): value for name, value in figures.items() if name.startswith(f"{key}/by_")}
+    values = {name.partition("/")[2]: value for name, value in own.items() if isinstance(value, float)}
+    return Spread(next(iter(own), "").partition("/")[0], None, values)
+
+
+def draw_resamples(
+    scenes: Sequence[str], trajectories: Sequence[str], images: Sequence[str], rng: np.random.Generator
+) -> Resamples:
+    """RESAMPLES resamples of the units of N rows, from the names of their scenes, trajectories and images.
+
+    A name is "" where it is not known.
+    """
+    unit, names = "scene", scenes
+    if len(set(scenes)) < 2:
+        unit, names = ("trajectory", trajectories) if any(trajectories) else ("image", images)
+    found, of_row = np.unique(np.asarray(names, dtype=str), return_inverse=True)
+    count = len(found)
+    weights = rng.multinomial(count, np.full(count, 1 / count), RESAMPLES) if count else np.zeros((RESAMPLES, 0))
+    return Resamples(unit, found.tolist(), of_row.reshape(-1), weights.astype(np.float64))
+
+
+def spreads(statistics: Callable[[Resamples], dict[str, Array]], rows: Rows, resamples: Resamples) -> dict[str, Spread]:
+    """The spread of each figure that `statistics` computes for every resample (R,).
+
+    Units count if they hold one of `rows`, the rows that the figures are about.
+    """
+    units = np.unique(resamples.of_row[rows])
+    if len(units) >= LEAST_UNITS:
+        drawn = statistics(resamples)
+        return {name: Spread(resamples.unit, interval(values)) for name, values in drawn.items()}
+    names = [resamples.names[unit] for unit in units]
+    alone = statistics(resamples.of_units(units))
+    return {
+        name: Spread(resamples.unit, None, dict(zip(names, values.tolist(), strict=True)))
+        for name, values in alone.items()
+    }
+
+
+def interval(values: Array) -> Interval | None:
+    """The middle 95 % of resampled figures (R,); None where fewer than two of them are defined."""
+    known = values[np.isfinite(values)]
+    if len(known) < 2:
+        return None
+    low, high = np.percentile(known, _PERCENTILES)
+    return float(low), float(high)
