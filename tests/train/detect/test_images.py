@@ -169,6 +169,23 @@ def test_coco_boxes_without_an_area_are_left_out_and_told(tmp_path, capsys):
     assert "annotations.json: 3 boxes without width or height are left out" in capsys.readouterr().err
 
 
+def test_coco_as_roboflow_exports_it(tmp_path, capsys):
+    """Two categories, the first a placeholder without annotations; both are craters, and it is said."""
+    names = [(0, "Craters", "none"), (1, "Crater", "Craters"), (2, "boulder", "Craters")]
+    categories = [{"id": number, "name": name, "supercategory": above} for number, name, above in names]
+    boxes = [{"id": k, "image_id": 7, "category_id": k, "bbox": [k, 3, 10, 12], "segmentation": []} for k in (1, 2)]
+    path = coco(tmp_path, categories=categories, annotations=boxes)
+    found = read_images(path.rename(tmp_path / "_annotations.coco.json"))
+    assert found.images[0].boxes.tolist() == [[1, 3, 11, 15]]
+    assert found.categories == "categories taken as craters: Craters (0), Crater (1); left out: boulder"
+    assert f"_annotations.coco.json: {found.categories}" in " ".join(capsys.readouterr().err.split())
+    both = [{**box, "category_id": k} for k, box in enumerate(boxes)]
+    path = coco(tmp_path, categories=[*categories[:1], {"id": 1, "name": "CRATER"}], annotations=both)
+    assert len(read_images(path).images[0].boxes) == 2
+    with pytest.raises(UserError, match="categories: got Cratersx, boulder"):
+        read_images(coco(tmp_path, categories=[{"id": 0, "name": "Cratersx"}, categories[2]]))
+
+
 @pytest.mark.parametrize("text", ["[", "[]", "[" * 100_000, '"x"'])
 def test_files_that_are_no_coco(tmp_path, text):
     path = tmp_path / "a.json"

@@ -73,12 +73,13 @@ def evaluate_images(
         f"oracle, with the threshold ({best:.4f}) of best F1 on these very images, which nobody knows beforehand: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
+    about += [given.categories] * bool(given.categories)
     write_evaluation(out, evaluation, images, about)
     table = pd.concat(table_of(image.name, part) for image, part in zip(given.images, found, strict=True))
     with written_aside(out / "detections.parquet") as aside:
         table.to_parquet(aside, index=False)
     write_crops(out / "crops.png", images, evaluation)
-    figures = {"images/name": place.resolve().name} | evaluation.figures()
+    figures = {"images/name": place.resolve().name, "images/categories": given.categories} | evaluation.figures()
     figures |= {f"oracle/{name}": value for name, value in oracle.items()}
     figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}
     figures |= {

@@ -23,6 +23,7 @@ from perilune_train.detect.pictures import SUFFIXES, picture_size
 
 Array = NDArray[np.float64]
 _COLUMNS = ("X", "Y", "W", "H")
+_CRATER_NAMES = ("crater", "craters")
 _LARGEST_PX = 1e6
 
 
@@ -63,6 +64,8 @@ class ImageSet:
     """In the order of their names, or of the COCO file."""
     ends_at_edges: bool
     """Whether boxes end at the image's edge (COCO's habit), so that detections must too before they are compared."""
+    categories: str = ""
+    """Which of a COCO file's categories were taken as craters, in words; "" where nothing had to be chosen."""
 
 
 def read_images(place: Path) -> ImageSet:
@@ -134,7 +137,7 @@ def _read_coco(path: Path) -> ImageSet:
         raise UserError(path, "JSON", error, "a COCO file") from None
     if not isinstance(content, dict):
         raise UserError(path, "JSON", type(content).__name__, "an object with images and annotations")
-    category = _crater_category(_records(content, "categories", path), path)
+    craters, chosen = _crater_categories(_records(content, "categories", path), path)
     images = _records(content, "images", path)
     place = {_identity(image, "id", f"images[{k}]", path): k for k, image in enumerate(images)}
     if not images or len(place) < len(images):
@@ -144,7 +147,7 @@ def _read_coco(path: Path) -> ImageSet:
     n_empty = 0
     for n, annotation in enumerate(_records(content, "annotations", path)):
         field = f"annotations[{n}]"
-        if category is not None and annotation.get("category_id") != category:
+        if craters is not None and annotation.get("category_id") not in craters:
             continue
         row = place.get(_identity(annotation, "image_id", field, path))
         if row is None:
@@ -166,7 +169,9 @@ def _read_coco(path: Path) -> ImageSet:
         result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(marked[k], bool)))
     if n_empty:
         console.print(f"{path.name}: {n_empty} boxes without width or height are left out", markup=False)
-    return ImageSet(result, ends_at_edges=True)
+    if chosen:
+        console.print(f"{path.name}: {chosen}", markup=False)
+    return ImageSet(result, ends_at_edges=True, categories=chosen)
 
 
 def _records(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
@@ -184,15 +189,22 @@ def _identity(record: dict[str, Any], name: str, field: str, path: Path) -> int 
     return value
 
 
-def _crater_category(categories: list[dict[str, Any]], path: Path) -> int | str | None:
-    """The id of the category of craters; None where everything is one."""
+def _crater_categories(categories: list[dict[str, Any]], path: Path) -> tuple[list[int | str] | None, str]:
+    """The ids of all categories named crater or craters, in any case, and their names in words.
+
+    Several, since Roboflow's exports have a placeholder beside the real one. With fewer than two categories in the
+    file everything is a crater: None and "".
+    """
     if len(categories) < 2:
-        return None
-    for category in categories:
-        if str(category.get("name", "")).lower().rstrip("s") == "crater":
-            return _identity(category, "id", "categories", path)
-    names = ", ".join(str(category.get("name")) for category in categories)
-    raise UserError(path, "categories", names, "one category, or one named crater")
+        return None, ""
+    craters = [one for one in categories if str(one.get("name", "")).strip().lower() in _CRATER_NAMES]
+    names = [str(one.get("name")) for one in categories]
+    if not craters:
+        raise UserError(path, "categories", ", ".join(names), "one category, or one named crater or craters")
+    ids = [_identity(one, "id", "categories", path) for one in craters]
+    taken = ", ".join(f"{one.get('name')} ({number})" for one, number in zip(craters, ids, strict=True))
+    others = ", ".join(str(one.get("name")) for one in categories if one not in craters)
+    return ids, f"categories taken as craters: {taken}" + (f"; left out: {others}" if others else "")
 
 
 def _picture(path: Path, name: Any, field: str) -> Path:
