@@ -5,13 +5,17 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from tests.stored_run import store_run
 
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import open_dataset
+from perilune_shared.selection import read_labels
 from perilune_train.data.frames import load_frames
+from perilune_train.detect.evaluate_command import config_of_run
+from perilune_train.detect.run import load_detector
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.masks import detector_masks, navigator_masks
-from perilune_train.explain.run import explain_run
+from perilune_train.explain.masks import caption, detector_masks, draw_masks, navigator_masks
+from perilune_train.explain.run import detect_frames, explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.runs import save_weights
@@ -35,9 +39,8 @@ def checkpoints(tmp_path_factory):
     """Untrained networks: their masks are as real as trained ones."""
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("checkpoints")
-    save_weights(folder / "detector.ckpt", _DETECTOR, YOLOv3(None, **_DETECTOR))
     save_weights(folder / "stack.ckpt", _STACK, StackNavigator(1, 0.125, "cbam", 8))
-    return folder / "detector.ckpt", folder / "stack.ckpt"
+    return store_run(folder, "attention=cbam") / "checkpoints" / "best.ckpt", folder / "stack.ckpt"
 
 
 def _explain(checkpoints, dataset_detect, dataset_nav, folder):
@@ -54,18 +57,43 @@ def _explain(checkpoints, dataset_detect, dataset_nav, folder):
 def test_a_run_correlates_every_block(checkpoints, dataset_detect, dataset_nav, tmp_path):
     run = _explain(checkpoints, dataset_detect, dataset_nav, tmp_path)
     table = pd.read_parquet(run.root / "correlations.parquet")
-    for measure, count in (("pcc1", 3), ("pcc2", 6), ("pcc3", 3), ("pcc4", 3)):
+    for measure, count in (("pcc1_background", 3), ("pcc1_craterness", 3), ("pcc2", 6), ("pcc3", 3), ("pcc4", 3)):
         own = table[table["measure"] == measure]
         assert list(own["block"]) == _BLOCKS
         assert (own["count"] == count).all()
         assert own["value"].abs().max() <= 1 + 1e-9
     metrics = json.loads(run.metrics.read_text())
-    first = table.query("measure == 'pcc1' and block == 'B_11'")["value"].iloc[0]
-    assert metrics["pcc1/B_11"] == pytest.approx(first)
-    # Any convolution of a picture follows its craters or shuns them, but does not ignore them.
-    assert abs(first) > 0.02
+    # The sign: G is 1 on background.
+    config = config_of_run(checkpoints[0].parent.parent, ())
+    frames, truth, _ = detect_frames(ExplainConfig(n_frames=3), config, dataset_detect)
+    masks = detector_masks(load_detector(checkpoints[0]), frames, tmp_path)["B_11"]
+    own = np.mean([np.corrcoef(mask.ravel(), g.ravel())[0, 1] for mask, g in zip(masks, truth, strict=True)])
+    assert metrics["pcc1_background/B_11"] == pytest.approx(own, abs=1e-5)
+    assert metrics["pcc1_craterness/B_11"] == pytest.approx(-own, abs=1e-5)
+    assert "weaker on craters" in metrics["pcc1_sign"] and metrics["labels/selection"] == "visible"
+    both = table.query("measure == 'pcc4' and block == 'B_11'").iloc[0]
+    assert metrics["pcc4_all_pixels/B_11"] == pytest.approx(both["value_all_pixels"]) != metrics["pcc4/B_11"]
     for name in ("masks_detect.png", "masks_navigate.png", "pcc_detect.png", "pcc_navigate.png"):
         assert cv2.imread(str(run.root / name)).std() > 5, name
+
+
+def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect):
+    """A worn crater and one without contrast are background, though they are labelled."""
+    settings = ExplainConfig(n_frames=8)
+    config = config_of_run(checkpoints[0].parent.parent, ())
+    _, truth, told = detect_frames(settings, config, dataset_detect)
+    labels = read_labels(open_dataset(dataset_detect), ["ellipse_cx_px", "ellipse_cy_px"], "test")
+    seen = (labels["contrast"] >= 4) & (labels["depth_m"] >= 0.04 * labels["diameter_m"])
+    values = {True: [], False: []}
+    for (_, rows), mask in zip(labels.groupby("frame_id"), truth, strict=True):
+        for row in rows.itertuples():
+            wanted = rows[seen[rows.index]]
+            gap = np.hypot(wanted["ellipse_cx_px"] - row.ellipse_cx_px, wanted["ellipse_cy_px"] - row.ellipse_cy_px)
+            if seen[row.Index] or (gap > 1.4 * wanted["radius_px"] + 2).all():
+                values[bool(seen[row.Index])].append(mask[int(row.ellipse_cy_px), int(row.ellipse_cx_px)])
+    assert len(values[True]) > 10 and len(values[False]) > 5
+    assert set(values[True]) == {0} and set(values[False]) == {1}
+    assert told["labels/min_contrast"] == 4
 
 
 def test_masks_are_those_of_the_network_at_the_frames_size(dataset_detect, tmp_path):
@@ -92,14 +120,35 @@ def test_a_stacked_mask_holds_both_halves(tmp_path):
     assert mask[20:108].std() > 5 * mask[148:236].std()
 
 
+def test_all_gates_of_a_sheet_share_one_scale(tmp_path):
+    """Gates of 0.2, 0.5 and 0.8 get three colours; one that varies has the same colour where it has the same value."""
+    ramp = np.tile(np.linspace(0.2, 0.8, 160, dtype=np.float32), (160, 1))
+    masks = {f"B_{k}": np.full((1, 160, 160), v, np.float32) for k, v in enumerate((0.2, 0.5, 0.8))} | {
+        "B_3": ramp[None]
+    }
+    draw_masks(tmp_path / "sheet.png", np.full((1, 160, 160), 80, np.uint8), masks)
+    sheet = cv2.imread(str(tmp_path / "sheet.png")).astype(int)
+    low, middle, high = (sheet[80, 164 * (k + 1) + 82] for k in range(3))
+    assert np.abs(low - middle).max() > 50 and np.abs(high - middle).max() > 50
+    np.testing.assert_allclose(sheet[80, 164 * 4 + 82], middle, atol=6)
+    # The colour bar below has the whole scale.
+    np.testing.assert_allclose(sheet[-30, [42, -43]], [low, high], atol=6)
+    assert caption("B_1", masks["B_1"][0]) == "B_1 constant 0.50"
+    assert caption("B_3", masks["B_3"][0]) == "B_3 0.20-0.80"
+
+
 def test_what_cannot_be_explained(checkpoints, dataset_detect, dataset_nav, tmp_path):
     detector, stack = checkpoints
-    plain = _DETECTOR | {"attention": "none"}
-    save_weights(tmp_path / "plain.ckpt", plain, YOLOv3(None, **plain))
+    plain = store_run(tmp_path / "plain", "attention=none") / "checkpoints" / "best.ckpt"
     with pytest.raises(UserError, match="attention: got none"):
-        _explain((tmp_path / "plain.ckpt", stack), dataset_detect, dataset_nav, tmp_path)
+        _explain((plain, stack), dataset_detect, dataset_nav, tmp_path)
     with pytest.raises(UserError, match="no such file"):
         _explain((tmp_path / "missing.ckpt", stack), dataset_detect, dataset_nav, tmp_path)
+    alone = tmp_path / "alone" / "checkpoints" / "best.ckpt"
+    alone.parent.mkdir(parents=True)
+    alone.write_bytes(detector.read_bytes())
+    with pytest.raises(UserError, match=r"config\.yaml"):
+        _explain((alone, stack), dataset_detect, dataset_nav, tmp_path)
     with pytest.raises(UserError, match="fusion"):
         _explain((detector, detector), dataset_detect, dataset_nav, tmp_path)
     with pytest.raises(UserError, match="kind: got nav"):

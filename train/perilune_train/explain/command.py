@@ -30,7 +30,10 @@ def explain(
         ),
     ] = None,
     detector: Annotated[
-        Path | None, typer.Option(help="A detector's best.ckpt. [default: runs/detect/<name>/checkpoints/best.ckpt]")
+        Path | None,
+        typer.Option(
+            help="A detector's best.ckpt in its run's folder. [default: runs/detect/<name>/checkpoints/best.ckpt]"
+        ),
     ] = None,
     navigator: Annotated[
         Path | None,
@@ -38,6 +41,8 @@ def explain(
     ] = None,
 ) -> None:
     """Draw what the attention of both networks looks at, and correlate it: PCC1 to PCC4 of the paper.
+
+    PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
 
     Leaves runs/explain/<name>/ with config.yaml, masks_detect.png, masks_navigate.png, pcc_detect.png,
     pcc_navigate.png, correlations.parquet and metrics.json. A run of the same name is replaced.

@@ -10,11 +10,13 @@ from perilune_train.navigate.geometry import pixel_index_homography
 
 
 def pearson(a: ArrayLike, b: ArrayLike, seen: NDArray[np.bool_] | None = None) -> float:
-    """Pearson's correlation of two images of the same shape, over the pixels `seen`; NaN where one is constant."""
+    """Pearson correlation of two images over the pixels `seen`; NaN where one is constant or no pixel is seen."""
     x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if x.shape != y.shape:
         raise ValueError(f"shapes {x.shape} and {y.shape} differ")
     keep = slice(None) if seen is None else seen
+    if x[keep].size == 0:
+        return float("nan")
     return float(_standardised(x[keep].ravel()) @ _standardised(y[keep].ravel()))
 
 
@@ -38,6 +40,12 @@ def mean_defined(values: ArrayLike) -> tuple[float, int]:
     array = np.asarray(values, np.float64)
     undefined = int(np.isnan(array).sum())
     return (float(np.nanmean(array)) if undefined < array.size else float("nan")), undefined
+
+
+def is_constant(values: ArrayLike) -> bool:
+    """Whether values vary by no more than rounding: 1e-6 of the largest, root mean square."""
+    array = np.asarray(values, np.float64)
+    return bool(np.std(array) <= 1e-6 * max(float(np.abs(array).max()), 1e-30))
 
 
 def ground_truth_mask(
@@ -111,8 +119,7 @@ def warped_mask(mask: NDArray[np.floating], affine: Array) -> tuple[Array, NDArr
 
 def _standardised(values: Array) -> Array:
     """Mean 0 and length 1, so that a product is a correlation; NaN where the values are constant."""
+    if is_constant(values):
+        return np.full_like(values, np.nan)
     centred = values - values.mean()
-    length = np.linalg.norm(centred)
-    # A constant leaves rounding of its mean behind, which is no variation.
-    constant = length <= 1e-6 * np.sqrt(values.size) * max(float(np.abs(values).max()), 1e-30)
-    return np.full_like(values, np.nan) if constant else centred / length
+    return centred / np.linalg.norm(centred)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from perilune_shared.errors import UserError
 from perilune_shared.files import write_bytes
 from perilune_train.data.frames import normalised
+from perilune_train.explain.correlation import is_constant
 from perilune_train.models.darknet import AttentionDarknet53
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
@@ -20,6 +21,7 @@ Masks = dict[str, NDArray[np.float32]]
 _BATCH = 8
 _CELL_PX = 160
 _COLUMNS = 8
+_WHITE = (255, 255, 255)
 
 
 def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> Masks:
@@ -68,10 +70,13 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
 
 
 def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
-    """A sheet of PNG: for each image (N, height, width), the frame, then every block's mask laid over it in colour.
+    """A sheet of PNG: for each image (N, height, width) the frame, then every block's mask, then a colour bar.
 
-    Each mask is stretched over its own range, written under it, since late masks vary little.
+    One scale for all masks of the sheet, from the least to the greatest value. Under each mask stands its own range, or
+    "constant" where it does not vary.
     """
+    low = min(float(found.min()) for found in masks.values())
+    high = max(float(found.max()) for found in masks.values())
     sheet = []
     for n, image in enumerate(images):
         height = round(_CELL_PX * image.shape[0] / image.shape[1])
@@ -80,17 +85,41 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
         cells = [_labelled(frame, "frame")]
         for name, found in masks.items():
             mask = cv2.resize(found[n], (_CELL_PX, height))
-            low, high = float(mask.min()), float(mask.max())
-            level = (255 * (mask - low) / max(high - low, 1e-9)).astype(np.uint8)
-            laid = cv2.addWeighted(frame, 0.45, cv2.applyColorMap(level, cv2.COLORMAP_TURBO), 0.55, 0)
-            cells.append(_labelled(laid, f"{name} {low:.2f}-{high:.2f}"))
+            cells.append(_labelled(_coloured(mask, low, high), caption(name, found[n])))
         cells += [np.full_like(cells[0], 255)] * (-len(cells) % _COLUMNS)
         sheet += [np.hstack(cells[i : i + _COLUMNS]) for i in range(0, len(cells), _COLUMNS)]
+    sheet.append(_colour_bar(sheet[0].shape[1], low, high))
     write_bytes(path, cv2.imencode(".png", np.vstack(sheet))[1].tobytes())
+
+
+def caption(block: str, mask: NDArray[np.floating]) -> str:
+    """A block's name with the range of its mask, or with "constant" and the value."""
+    own = f"constant {mask.mean():.2f}" if is_constant(mask) else f"{mask.min():.2f}-{mask.max():.2f}"
+    return f"{block} {own}"
+
+
+def _coloured(values: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
+    """Values as colours of the sheet's scale, (height, width, 3) BGR."""
+    level = np.clip(255 * (values - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_TURBO), np.uint8)
+
+
+def _colour_bar(width_px: int, low: float, high: float) -> NDArray[np.uint8]:
+    """The sheet's scale with five values below it, as wide as the sheet."""
+    margin = 40
+    bar = np.tile(np.linspace(low, high, width_px - 2 * margin), (16, 1))
+    picture = cv2.copyMakeBorder(_coloured(bar, low, high), 10, 24, margin, margin, cv2.BORDER_CONSTANT, value=_WHITE)
+    for value in np.linspace(low, high, 5):
+        x = margin + (value - low) / max(high - low, 1e-9) * (width_px - 2 * margin)
+        cv2.putText(
+            picture, f"{value:.2f}", (int(x) - 16, 44), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA
+        )
+    cv2.putText(picture, "gate", (2, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    return np.asarray(picture, np.uint8)
 
 
 def _labelled(picture: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     """The picture with a line of text below and a white margin."""
-    framed = cv2.copyMakeBorder(picture, 2, 18, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+    framed = cv2.copyMakeBorder(picture, 2, 18, 2, 2, cv2.BORDER_CONSTANT, value=_WHITE)
     cv2.putText(framed, text, (4, framed.shape[0] - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
     return framed

@@ -13,22 +13,29 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
-from perilune_train.data.frames import load_frames
-from perilune_train.detect.run import load_detector
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data import load_split
+from perilune_train.detect.evaluate_command import config_of_run
+from perilune_train.detect.run import load_detector, selection_used
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.correlation import (
-    ground_affine,
-    ground_truth_mask,
-    mean_defined,
-    mean_of_others,
-    pearson,
-    pearson_between,
-    warped_mask,
-)
+from perilune_train.explain.correlation import ground_affine, ground_truth_mask
 from perilune_train.explain.masks import Masks, detector_masks, draw_masks, navigator_masks
+from perilune_train.explain.measures import PCC1_SIGN, detector_correlations, navigator_correlations
 from perilune_train.navigate.data import Descent, load_descents, pair_sequence
 from perilune_train.navigate.task import load_navigator
 from perilune_train.runs import RunFolder, choose_device, start_run, write_metrics
+
+_DETECT_BARS = {
+    "pcc1_background": "PCC1: mask and G (1 on background)",
+    "pcc1_craterness": "craterness: mask and 1 - G",
+    "pcc2": "PCC2: masks of two frames",
+}
+_DETECT_TITLE = (
+    "G is 1 on background and 0 in craters. PCC1 above 0: the gate is weaker on craters. "
+    "Craterness above 0: the gate is stronger on craters."
+)
+_NAVIGATE_BARS = {"pcc3": "PCC3: halves", "pcc4": "PCC4: halves, lower one moved"}
+_NAVIGATE_TITLE = "Bars: over the pixels that both frames see. Dots and crosses: over all pixels, as in the paper."
 
 
 def explain_run(
@@ -36,12 +43,15 @@ def explain_run(
 ) -> RunFolder:
     """Explain two checkpoints on the test frames of two datasets into runs/explain/<name>.
 
-    Raises UserError where a dataset or checkpoint is missing or of another kind, or a network has no attention.
+    `detector` is checkpoints/best.ckpt in the folder of its run, whose config.yaml says which craters are wanted.
+    Raises UserError where a dataset, a checkpoint or that file is missing or of another kind, or a network has no
+    attention.
     """
     device = choose_device(settings.device)
     network = load_detector(detector).to(device)
     stack, architecture = load_navigator(navigator, "stack")
-    frames, truth = _detect_frames(settings, detect_data)
+    own = config_of_run(detector.parent.parent, ())
+    frames, truth, labels = detect_frames(settings, own, detect_data)
     test = [descent for descent in load_descents(open_dataset(nav_data)) if descent.split == "test"]
     pairs = _spread([(descent, step) for descent in test for step in range(descent.n_pairs)], settings.n_pairs)
     run = start_run(runs, "explain", name, settings, False)
@@ -59,19 +69,26 @@ def explain_run(
     )
     both = np.stack([np.concatenate([d.images[step], d.images[step + 1]]) for d, step in pairs])
     draw_masks(run.root / "masks_navigate.png", *_some(both, stacked, settings.n_drawn))
-    rows = _detector_correlations(detected, truth) + _navigator_correlations(stacked, pairs)
+    rows = detector_correlations(detected, truth) + _navigator_rows(stacked, pairs)
     table = pd.DataFrame(rows)
     with written_aside(run.root / "correlations.parquet") as aside:
         table.to_parquet(aside, index=False)
-    draw_bars(
-        run.root / "pcc_detect.png", table, {"pcc1": "PCC1: mask and crater mask", "pcc2": "PCC2: masks of two frames"}
-    )
-    draw_bars(run.root / "pcc_navigate.png", table, {"pcc3": "PCC3: halves", "pcc4": "PCC4: halves, lower one moved"})
-    undefined = int(table["undefined"].sum())
+    draw_bars(run.root / "pcc_detect.png", table, _DETECT_BARS, _DETECT_TITLE)
+    draw_bars(run.root / "pcc_navigate.png", table, _NAVIGATE_BARS, _NAVIGATE_TITLE)
+    console.print(PCC1_SIGN, markup=False)
+    once = table[table["measure"] != "pcc1_craterness"]  # It is undefined where pcc1_background is.
+    undefined = int(once["undefined"].sum())
     if undefined:
-        console.print(f"{undefined} of {int(table['count'].sum())} correlations undefined: a mask was constant")
+        console.print(f"{undefined} of {int(once['count'].sum())} correlations undefined: a mask was constant")
     metrics: dict[str, float | int | str | None] = {f"{row['measure']}/{row['block']}": row["value"] for row in rows}
     metrics |= {
+        f"{row['measure']}_all_pixels/{row['block']}": row["value_all_pixels"]
+        for row in rows
+        if row["measure"] in ("pcc3", "pcc4")
+    }
+    metrics |= labels
+    metrics |= {
+        "pcc1_sign": PCC1_SIGN,
         "frames": len(frames),
         "pairs": len(pairs),
         "undefined": undefined,
@@ -82,35 +99,27 @@ def explain_run(
     return run
 
 
-def _detect_frames(settings: ExplainConfig, root: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Test frames (N, height, width) and the paper's masks G of their labels, float32 (N, height, width)."""
+def detect_frames(
+    settings: ExplainConfig, detector: DetectConfig, root: Path
+) -> tuple[np.ndarray, np.ndarray, dict[str, float | int | str | None]]:
+    """Test frames (N, height, width), the paper's masks G of them, float32 (N, height, width), and their labels' rule.
+
+    G holds the craters that the detector's own run selects, so none that a frame hardly shows.
+    """
     dataset = open_dataset(root)
     if dataset.info.kind != "detect":
         raise UserError(root, "kind", dataset.info.kind, "detect, a dataset with labels")
-    store = load_frames(dataset, "test")
-    chosen = _spread(range(len(store)), settings.n_frames)
-    labels = dict(list(dataset.table("labels").to_pandas().groupby("frame_id")))
+    split = load_split(dataset, "test", detector.labels)
+    chosen = _spread(range(len(split)), settings.n_frames)
+    height, width = split.frames.images.shape[1:]
     masks = []
-    for i in chosen:
-        own = labels.get(store.table["frame_id"][i])
-        centres = np.zeros((0, 2)) if own is None else own[["ellipse_cx_px", "ellipse_cy_px"]].to_numpy()
-        radii = np.zeros(0) if own is None else own["radius_px"].to_numpy()
-        height, width = store.images.shape[1:]
+    for own in (split.labels[i] for i in chosen):
+        centres, radii = own.ellipses[own.wanted, :2], own.radius_px[own.wanted]
         masks.append(ground_truth_mask(width, height, centres, radii, settings.ring_factors).astype(np.float32))
-    return store.images[chosen], np.stack(masks)
+    return split.frames.images[chosen], np.stack(masks), selection_used(detector, split)
 
 
-def _detector_correlations(masks: Masks, truth: np.ndarray) -> list[dict]:
-    rows = []
-    for block, found in masks.items():
-        value, undefined = mean_defined([pearson(mask, g) for mask, g in zip(found, truth, strict=True)])
-        rows.append(_row(block, "pcc1", value, undefined, len(found)))
-        value, undefined = mean_of_others(pearson_between(found))
-        rows.append(_row(block, "pcc2", value, undefined, len(found) * (len(found) - 1)))
-    return rows
-
-
-def _navigator_correlations(masks: Masks, pairs: list[tuple[Descent, int]]) -> list[dict]:
+def _navigator_rows(masks: Masks, pairs: list[tuple[Descent, int]]) -> list[dict]:
     affines = []
     for descent, step in pairs:
         position, rotation = descent.position_m, descent.rotation_camera_from_site
@@ -121,20 +130,9 @@ def _navigator_correlations(masks: Masks, pairs: list[tuple[Descent, int]]) -> l
     with progress_bar() as progress:
         task = progress.add_task("correlate", total=len(masks), unit="blocks", note="")
         for block, found in masks.items():
-            uppers, lowers = np.split(found, 2, axis=1)
-            plain, moved = [], []
-            for upper, lower, affine in zip(uppers, lowers, affines, strict=True):
-                plain.append(pearson(upper, lower))
-                warped, seen = warped_mask(lower, affine)
-                moved.append(pearson(upper, warped, seen))
-            rows.append(_row(block, "pcc3", *mean_defined(plain), len(found)))
-            rows.append(_row(block, "pcc4", *mean_defined(moved), len(found)))
+            rows += navigator_correlations(block, found, affines)
             progress.advance(task)
     return rows
-
-
-def _row(block: str, measure: str, value: float, undefined: int, count: int) -> dict:
-    return {"block": block, "measure": measure, "value": value, "undefined": undefined, "count": count}
 
 
 def _spread(items, count: int) -> list:
@@ -148,17 +146,27 @@ def _some(images: np.ndarray, masks: Masks, count: int) -> tuple[np.ndarray, Mas
     return images[chosen], {name: found[chosen] for name, found in masks.items()}
 
 
-def draw_bars(path: Path, table: pd.DataFrame, measures: dict[str, str]) -> None:
-    """Bars of two measures, block by block; a block without a bar was undefined in every image."""
+def draw_bars(path: Path, table: pd.DataFrame, measures: dict[str, str], title: str) -> None:
+    """Bars of several measures, block by block; a block without a bar was undefined in every image.
+
+    Dots: the same over all pixels, where the measure is over fewer.
+    """
     figure, axis = plt.subplots(figsize=(12, 4.5), constrained_layout=True)
+    width = 0.8 / len(measures)
     for i, (measure, label) in enumerate(measures.items()):
         own = table[table["measure"] == measure]
-        axis.bar(np.arange(len(own)) + 0.4 * i, own["value"], 0.4, label=label)
-        axis.set_xticks(np.arange(len(own)) + 0.2, own["block"], rotation=60)
+        place = np.arange(len(own)) + width * i
+        axis.bar(place, own["value"], width, label=label)
+        if own["value_all_pixels"].notna().any():
+            axis.plot(
+                place, own["value_all_pixels"], "ko" if i == 0 else "kx", markersize=4, label=f"{label}: all pixels"
+            )
+        axis.set_xticks(np.arange(len(own)) + 0.4 - width / 2, own["block"], rotation=60)
     axis.axhline(0, color="black", linewidth=0.8)
     axis.set(ylabel="Pearson correlation", ylim=(-1, 1))
+    axis.set_title(title, fontsize=9)
     axis.grid(axis="y", alpha=0.3)
-    axis.legend()
+    axis.legend(fontsize=8)
     with written_aside(path) as aside:
         figure.savefig(aside, dpi=120)
     plt.close(figure)
