@@ -236,3 +236,18 @@ def test_batches(split):
     assert torch.bincount(targets.frame, minlength=5).tolist() == [len(part.boxes) for part in split.labels[5:10]]
     np.testing.assert_allclose(targets.boxes[targets.frame == 2], split.labels[7].boxes, rtol=1e-6)
     assert targets.wanted[targets.frame == 2].tolist() == split.labels[7].wanted.tolist()
+
+
+def test_workers_under_spawn_give_the_same_batches(split):
+    """`spawn` pickles the frames and the function that makes batches of them."""
+    few = replace(split, frames=replace(split.frames, images=split.frames.images[:4]), labels=split.labels[:4])
+    config = DetectConfig(batch_size=2, in_channels=1, workers=1)
+    batches = loader(TrainingFrames(few, config.augment, 3, 0), config)
+    batches.multiprocessing_context = "spawn"
+    beside = list(batches)
+    alone = list(loader(TrainingFrames(few, config.augment, 3, 0), config.model_copy(update={"workers": 0})))
+    assert len(beside) == len(alone) == 2
+    for (images, targets), (own_images, own_targets) in zip(beside, alone, strict=True):
+        assert torch.equal(images, own_images)
+        own = vars(own_targets)
+        assert own and all(torch.equal(value, own[name]) for name, value in vars(targets).items())

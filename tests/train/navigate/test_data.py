@@ -7,11 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
+from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
+from perilune_shared.frames import matrix_from_rotation_vector
 from perilune_shared.manifest import open_dataset
 from perilune_train.navigate import data
-from perilune_train.navigate.data import EpochBatches, Jitter, load_descents, mirrored, pair_sequence
-from perilune_train.navigate.geometry import pixel_index_homography, plane_homography
+from perilune_train.navigate.data import Jitter, load_descents, mirrored, pair_sequence
+from perilune_train.navigate.epochs import EpochBatches
+from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +103,29 @@ def test_jitter_moves_image_and_truth_alike(descents, monkeypatch):
         assert _misfit(moved, d, pair) < 0.7 * _misfit(stale, d, pair)
 
 
+def test_jitter_off_the_nominal_pose_is_wrong_by_a_few_hundredths_of_a_pixel():
+    """The plane is nominal: error of the moved frame against the true plane (docstring of `pair_sequence`)."""
+    rng, nominal_down = np.random.default_rng(0), np.array([0, 0, 1.0])
+    camera = Camera.from_field_of_view(128, 128, 50.0).matrix
+    places = np.stack(np.meshgrid(np.arange(4, 128, 8), np.arange(4, 128, 8)), axis=-1)
+    wrong_px, moved_px = [], []
+    for altitude_m in np.repeat(np.linspace(200, 1500, 14), 50):
+        off_m, turn, tilt = 8 * rng.normal(size=(2, 3)), *np.radians(0.3) * rng.normal(size=(2, 3))
+        down, true_m = matrix_from_rotation_vector(tilt) @ nominal_down, altitude_m + off_m[0, 2]
+        t, r = np.array([20, 0, 30]) + off_m[1], matrix_from_rotation_vector(turn)
+        new_t = t + 0.3 * 8 * rng.normal(size=3)
+        new_r = matrix_from_rotation_vector(0.3 * np.radians(0.3) * rng.normal(size=3)) @ r
+        old, new = (plane_homography(camera, *motion, down, true_m) for motion in ((t, r), (new_t, new_r)))
+        change = plane_homography(camera, t, r, nominal_down, altitude_m) @ np.linalg.inv(
+            plane_homography(camera, new_t, new_r, nominal_down, altitude_m)
+        )
+        shown, labelled, before = (apply_homography(h, places) for h in (np.linalg.inv(change) @ old, new, old))
+        wrong_px.append(np.mean((shown - labelled) ** 2) * 2)
+        moved_px.append(np.mean((labelled - before) ** 2) * 2)
+    assert np.sqrt(np.mean(moved_px)) == pytest.approx(1.2, abs=0.1)
+    assert np.sqrt(np.mean(wrong_px)) == pytest.approx(0.04, abs=0.01)
+
+
 def test_mirrored_pairs_obey_the_mirrored_motion(descents):
     d = descents[0]
     plain = pair_sequence(d, 0, 2, warp=False)
@@ -130,6 +156,35 @@ def test_residual_flow_is_zero_for_the_nominal_motion_and_a_shift_by_hand(descen
     flow = pair_sequence(replace(d, position_m=beside), 0, 1, warp=True).flow_px
     assert flow.shape == (1, 12, 12, 2)
     np.testing.assert_allclose(flow[0], np.broadcast_to([-0.01 * d.camera.fx_px, 0], (12, 12, 2)), atol=1e-9)
+
+
+def test_flow_labels_of_a_mirrored_pair_are_the_mirrored_labels(descents):
+    """Also where the camera is tilted by 20 degrees, so that the ground's normal changes in the mirror."""
+    tilt = matrix_from_rotation_vector(np.radians([16.0, 12.0, 0.0]))
+    d = descents[0]
+    d = replace(
+        d,
+        rotation_camera_from_site=tilt @ d.rotation_camera_from_site,
+        nominal_rotation_camera_from_site=tilt @ d.nominal_rotation_camera_from_site,
+    )
+    assert np.degrees(np.arccos(d.down_c[2])) == pytest.approx(20, abs=0.1)
+    plain = pair_sequence(d, 0, 2, warp=True).flow_px
+    seen = set()
+    for seed in range(30):
+        flips = tuple(np.random.default_rng(seed).random(3) < 0.5)
+        if flips in seen:
+            continue
+        seen.add(flips)
+        wanted = plain
+        if flips[0]:
+            wanted = wanted[:, :, ::-1] * [-1, 1]
+        if flips[1]:
+            wanted = wanted[:, ::-1] * [1, -1]
+        if flips[2]:
+            wanted = wanted.transpose(0, 2, 1, 3)[..., ::-1]
+        found = pair_sequence(d, 0, 2, warp=True, rng=np.random.default_rng(seed)).flow_px
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
+    assert len(seen) == 8
 
 
 def test_epoch_follows_from_the_key_alone(descents):

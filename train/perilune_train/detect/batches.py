@@ -1,6 +1,7 @@
 """Frames and labels as batches: the order of an epoch, shares of several processes, the network's input."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from perilune_train.detect.config import AugmentSettings, DetectConfig
 from perilune_train.detect.data import DetectSplit
 
 Array = NDArray[np.float64]
+Sample = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
+"""A normalised frame (H, W), its boxes (M, 4) in pixels, and which of them are wanted (M,)."""
 Batch = tuple[Tensor, Targets]
 
 
@@ -28,7 +31,7 @@ class TrainingFrames(torch_data.Dataset):
     def __len__(self) -> int:
         return len(self.order)
 
-    def __getitem__(self, place: int) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
+    def __getitem__(self, place: int) -> Sample:
         index = int(self.order[place])
         labels = self.split.labels[index]
         rng = np.random.default_rng([*self.key, index])
@@ -46,7 +49,7 @@ class EvaluationFrames(torch_data.Dataset):
     def __len__(self) -> int:
         return len(self.own)
 
-    def __getitem__(self, place: int) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
+    def __getitem__(self, place: int) -> Sample:
         index = self.own[place]
         labels = self.split.labels[index]
         return normalised(self.split.frames.images[index]), labels.boxes, labels.wanted
@@ -81,19 +84,30 @@ class Share(torch_data.Sampler[list[int]]):
             yield list(range(first, min(first + step, self.count)))[self.process :: self.processes]
 
 
-def loader(
-    frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: Share | None = None
-) -> torch_data.DataLoader:
-    """Batches (images (N, in_channels, H, W), Targets) in the given order; of a share where there is one."""
+@dataclass(frozen=True)
+class Collate:
+    """Makes a batch (images (N, in_channels, H, W), Targets) of frames. A class, so that `spawn` can pickle it."""
 
-    def collate(samples: list) -> Batch:
+    in_channels: int
+    """Channels of the network's input."""
+
+    def __call__(self, samples: list[Sample]) -> Batch:
         images, boxes, wanted = zip(*samples, strict=True)
         counts = torch.tensor([len(part) for part in boxes])
-        return network_input(np.stack(images), config.in_channels), Targets(
+        return network_input(np.stack(images), self.in_channels), Targets(
             torch.as_tensor(np.concatenate(boxes), dtype=torch.float32),
             torch.repeat_interleave(torch.arange(len(samples)), counts),
             torch.as_tensor(np.concatenate(wanted)),
         )
 
-    batches = share or Share(len(frames), config.batch_size)
-    return torch_data.DataLoader(frames, batch_sampler=batches, num_workers=config.workers, collate_fn=collate)
+
+def loader(
+    frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: Share | None = None
+) -> torch_data.DataLoader:
+    """Batches (images (N, in_channels, H, W), Targets) in the given order; of a share where there is one."""
+    return torch_data.DataLoader(
+        frames,
+        batch_sampler=share or Share(len(frames), config.batch_size),
+        num_workers=config.workers,
+        collate_fn=Collate(config.in_channels),
+    )

@@ -14,7 +14,8 @@ from torch.utils.data import DataLoader
 from perilune_shared.frames import Array
 from perilune_train.models.navigator import StackNavigator, WarpNavigator
 from perilune_train.navigate.config import FusionConfig, NavigateConfig
-from perilune_train.navigate.data import Descent, EpochBatches, Jitter, Sequence, pair_sequence
+from perilune_train.navigate.data import Descent, Jitter, Sequence, pair_sequence
+from perilune_train.navigate.epochs import EpochBatches
 from perilune_train.navigate.geometry import (
     euler_from_rotation,
     rotation_from_sixd,
