@@ -90,8 +90,9 @@ explain: ## attention masks and correlations of the trained networks
 	@test -f $(EXPLAIN) && echo "$(EXPLAIN) is there; remove its folder to explain again" || \
 	  $(BIN)/perilune-train explain $(TRAIN) --dataset $(DATA)
 
-test: setup ## run all tests
-	@$(BIN)/python -m pytest
+JOBS ?= 2
+test: setup ## run all tests, in JOBS=2 processes
+	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 lint: setup ## ruff and mypy
 	@$(BIN)/ruff check .

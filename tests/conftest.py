@@ -9,24 +9,59 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
+
+# Set by pytest-xdist in each of the processes of `make test`.
+WORKER = "PYTEST_XDIST_WORKER" in os.environ
+if WORKER:
+    # One thread each, before numpy or torch is imported.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # A busy machine is no reason to fail.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
-# Scenes are grown anew by the tests, and the user's own cache is left alone.
-_cache = tempfile.TemporaryDirectory(prefix="perilune-test-cache-")
-os.environ["PERILUNE_CACHE"] = _cache.name
+# Scenes are grown anew by the tests, once for all processes, and the user's own cache is left alone.
+if not WORKER:
+    _cache = tempfile.TemporaryDirectory(prefix="perilune-test-cache-")
+    os.environ["PERILUNE_CACHE"] = _cache.name
 
+LONGEST_FIRST = (
+    "test_regenerate.py",
+    "test_processes.py",
+    "test_chains.py",
+    "test_facets.py",
+    "test_flight.py",
+    "test_every_byte.py",
+    "test_renderer.py",
+    "test_dataset.py",
+    "test_evaluate.py",
+    "test_run.py",
+    "test_transfer.py",
+    "test_hostile_rows.py",
+    "test_population.py",
+    "test_card.py",
+    "test_image_evaluation.py",
+)
+"""Files by the CPU time of their tests; handed out last, one of them would keep a process busy alone at the end."""
 
 # A shell that starts the tests in the background lets them, and all that they start, ignore Ctrl-C.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Several processes start with the longest files; one alone keeps the order of the files."""
+    if WORKER:
+        items.sort(key=lambda item: LONGEST_FIRST.index(item.path.name) if item.path.name in LONGEST_FIRST else 99)
+
+
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory) -> Path:
     """Folder with the `tiny` preset's datasets `detect` and `nav`. Read only: copy before a change."""
-    folder = tmp_path_factory.mktemp("tiny")
+    own = tmp_path_factory.getbasetemp()
+    # The parent of a worker's folder is the whole run's. The second worker to come finds the datasets complete.
+    folder = (own.parent if WORKER else own) / "tiny"
     command = [
         str(Path(sys.executable).parent / "perilune-render"),
         "dataset",
@@ -35,7 +70,10 @@ def tiny(tmp_path_factory) -> Path:
         "--out",
         str(folder),
     ]
-    subprocess.run(command, check=True, capture_output=True, text=True)
+    with FileLock(f"{folder}.lock"):
+        if not Path(f"{folder}.made").exists():
+            subprocess.run(command, check=True, capture_output=True, text=True)
+            Path(f"{folder}.made").touch()
     return folder
 
 

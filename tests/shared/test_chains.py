@@ -21,7 +21,7 @@ from perilune_shared.validate import validate
 from tests.drawn_dataset import build_dataset
 
 OLD = Path(__file__).parent / "old"
-CHAINS = int(os.environ.get("PERILUNE_CHAINS", "200"))
+CHAINS = int(os.environ.get("PERILUNE_CHAINS", "60"))
 """A thousand take minutes."""
 CONDITIONS = (
     "frame_index % 2 == 0",

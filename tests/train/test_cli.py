@@ -42,8 +42,8 @@ def test_each_command_tells_its_options(command):
     ("arguments", "words"),
     [
         (["--set", "detect.epoch=3"], ["detect.epoch", "unknown key", "epochs (nearest known)"]),
-        (["--set", "detect.width=-1"], ["detect.width", "-1", "greater than or equal to 0.125"]),
-        (["--set", "detect.epochs=many"], ["detect.epochs", "'many'", "valid integer"]),
+        (["--set", "detect.width=-1"], ["detect.width", "-1", "at least 0.125"]),
+        (["--set", "detect.epochs=many"], ["detect.epochs", "'many'", "expected an integer"]),
         (["--set", "detect.strides=[8, 16, 64]"], ["detect", "strides 8, 16, 32 or 4, 8, 16"]),
         (["--preset", "smal"], ["preset", "smal", "small (nearest known)"]),
         (["--dataset", "nowhere"], ["nowhere", "dataset.json", "no such file"]),

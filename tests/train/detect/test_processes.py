@@ -40,7 +40,7 @@ def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(dataset_detec
     with subprocess.Popen(command, env=ALONE, stderr=subprocess.PIPE, text=True) as process:
         while not (checkpoint.is_file() and state(checkpoint)["epoch_and_batches"] >= [1, 3]):
             assert process.poll() is None, process.stderr.read()
-            time.sleep(0.01)
+            time.sleep(0.1)
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
     epoch, batches = state(checkpoint)["epoch_and_batches"]
