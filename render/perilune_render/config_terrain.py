@@ -67,6 +67,16 @@ class ReliefConfig(Section):
         return self
 
 
+Outside = Literal["procedural", "refuse", "mirror"]
+
+
+class ElevationConfig(Section):
+    """How an elevation model is used."""
+
+    outside: Outside = "procedural"
+    """Ground beyond the model's edge: procedural with the model's statistics, refused, or the model's mirror image."""
+
+
 class TerrainConfig(Section):
     """The ground."""
 
@@ -86,5 +96,7 @@ class TerrainConfig(Section):
     """Relief."""
     dem: str | None = None
     """A GeoTIFF elevation model as the base, or null."""
+    elevation: ElevationConfig = ElevationConfig()
+    """Use of the elevation model."""
     catalogue: str | None = None
     """A CSV of the model's own craters (longitude_deg, latitude_deg, diameter_m), which become labels, or null."""

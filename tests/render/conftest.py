@@ -35,7 +35,8 @@ def flat_scene(extent_m: float, n: int, craters: Craters | None = None, height_m
     height = np.zeros(n * n) if height_m is None else np.ravel(height_m)
     none = craters if craters is not None else round_craters(np.empty((0, 4)))
     rims = measure_rims(height, grid, none) if len(none) else Rims(np.empty(0), np.empty((0, 3)), np.empty(0))
-    return Scene(1, 0.0, 0.0, grid, height, np.ones(n * n), none, rims, NO_BOULDERS, np.empty(0), "procedural")
+    real = np.zeros(n * n, bool)
+    return Scene(1, 0.0, 0.0, grid, height, np.ones(n * n), none, rims, NO_BOULDERS, np.empty(0), "procedural", real)
 
 
 @pytest.fixture(scope="session")

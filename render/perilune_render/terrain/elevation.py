@@ -11,6 +11,8 @@ from rasterio.errors import RasterioError
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline
 
+from perilune_render.config_terrain import Outside
+from perilune_render.terrain.continuation import continued, distance_in_holes_m, margin_m, mean_slope
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
 from perilune_shared.files import sha256_of
@@ -18,8 +20,9 @@ from perilune_shared.frames import MOON_RADIUS_M, Array, selenographic_from_site
 
 _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
 _LARGEST_PIXELS = 100_000_000
+_RESOLVED_PIXELS = 4.0
 _SWELL_M = 120.0
-"""Waves longer than about four times this keep their slope beyond the model's edge."""
+"""Waves longer than about four times this keep their slope beyond the edge of a mirrored model."""
 _SEAM_M = 100.0
 """Width of the band along the edge in which short waves keep their slope too."""
 
@@ -41,7 +44,11 @@ class ElevationModel:
     longitude_deg: float
     """Of the raster's middle."""
     pixel_m: float
-    """Ground size of a pixel, metres."""
+    """Ground size of a pixel, mean of both directions, metres."""
+    pixel_sides_m: tuple[float, float]
+    """Ground size of a pixel from row to row and from column to column, metres."""
+    hole_m: Array | None
+    """Distance of each pixel (rows, columns) from the nearest known one, metres; None without holes."""
     source: str
     """File name and SHA-256."""
 
@@ -79,10 +86,13 @@ def read_elevation(path: Path) -> ElevationModel:
         lon, lat = rasterio.warp.transform(crs, _MOON, *([v] for v in transform @ middle))
     except RasterioError as error:
         raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
-    pixel = _pixel_m(transform, crs, middle, lat[0], lon[0])
+    sides = _pixel_sides_m(transform, crs, middle, lat[0], lon[0])
+    hole = distance_in_holes_m(known, sides)
     plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
     source = f"{plain_name} sha256:{sha256_of(path)}"
-    return ElevationModel(height, known, transform, crs, float(lat[0]), float(lon[0]), pixel, source)
+    return ElevationModel(
+        height, known, transform, crs, float(lat[0]), float(lon[0]), float(np.mean(sides)), sides, hole, source
+    )
 
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
@@ -97,11 +107,46 @@ def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array,
     return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
 
 
-def base_heights(model: ElevationModel, grid: Grid) -> tuple[Array, Array]:
-    """Heights (n_vertices,) of the model on the grid in metres, site at 0, and the share (n_vertices,) that is real.
+def resolved_m(model: ElevationModel) -> float:
+    """Diameter in metres from which an elevation model shows a crater: four pixels. Smaller ones are added."""
+    return _RESOLVED_PIXELS * model.pixel_m
 
-    Bicubic inside. Beyond the model the ground is continued (see `_continued`) and the share falls to 0: what lies
-    there looks alike but is no measurement.
+
+def beyond_m(model: ElevationModel, column: Array, row: Array) -> Array:
+    """Distance in metres of raster places (...) from the model's known ground: 0 on it, more in holes and outside."""
+    rows, columns = model.height_m.shape
+    down = np.maximum(np.maximum(-row, row - rows), 0) * model.pixel_sides_m[0]
+    across = np.maximum(np.maximum(-column, column - columns), 0) * model.pixel_sides_m[1]
+    beyond = np.hypot(down, across)
+    if model.hole_m is not None:
+        beyond += ndimage.map_coordinates(model.hole_m, [row - 0.5, column - 0.5], order=1, mode="nearest")
+    return beyond
+
+
+def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
+    """Raises UserError where `outside` is "refuse" and the ground reaches beyond the model's raster."""
+    if outside != "refuse":
+        return
+    edge = grid.extent_m / 2 * np.linspace(-1, 1, 33)
+    x, y = np.concatenate([(edge, edge * 0 + side) for side in (edge[0], edge[-1])], axis=1)
+    column, row = raster_places(model, np.append(x, y), np.append(y, x))
+    rows, columns = model.height_m.shape
+    if ((row < 0) | (row > rows) | (column < 0) | (column > columns)).any():
+        down, across = rows * model.pixel_sides_m[0], columns * model.pixel_sides_m[1]
+        raise UserError(
+            model.source,
+            "dataset.terrain.elevation.outside",
+            f"a model of {across:.0f} m x {down:.0f} m for {grid.extent_m:.0f} m of ground",
+            "a larger model, a lower flight or a narrower view, or dataset.terrain.elevation.outside=procedural",
+        )
+
+
+def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedural") -> tuple[Array, Array]:
+    """Heights (n_vertices,) of the model on the grid in metres, site at 0, and the distance (n_vertices,) beyond it.
+
+    Bicubic inside. Beyond the model the ground is continued smoothly (`perilune_render.terrain.continuation`), to be
+    given relief and craters; with `outside` "mirror" it is the model's mirror image. The distance is that from known
+    ground (`beyond_m`). Raises UserError where the ground reaches beyond the model and `outside` is "refuse".
     """
     rows, columns = model.height_m.shape
     # Pixel coordinates vary slowly over a site: project a coarse net and interpolate.
@@ -109,18 +154,34 @@ def base_heights(model: ElevationModel, grid: Grid) -> tuple[Array, Array]:
     column, row = raster_places(model, *np.meshgrid(net, net))
     x, y = grid.vertices_xy()
     column, row = (RectBivariateSpline(net, net, place).ev(y, x) for place in (column, row))
-    outside = np.maximum.reduce([-row, row - rows, -column, column - columns, np.zeros_like(row)])
-    margin = int(np.ceil(outside.max())) + 2
+    beyond = beyond_m(model, column, row)
+    pixels = float(np.maximum.reduce([-row, row - rows, -column, column - columns]).max())
+    sides = rows * model.pixel_sides_m[0], columns * model.pixel_sides_m[1]
+    refuse_beyond(model, grid, outside)
+    middle = grid.n_half * (2 * grid.n_half + 2)
+    if not beyond.any():
+        height = ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="nearest")
+        return height - height[middle], beyond
+    margin = int(np.ceil(max(pixels, 0))) + 2
+    if outside == "procedural":
+        margin = min(margin, int(np.ceil(margin_m(sides) / min(model.pixel_sides_m))) + 2)
     if (rows + 2 * margin) * (columns + 2 * margin) > _LARGEST_PIXELS:
         ground = f"{grid.extent_m:.0f} m of ground"
-        raise UserError(model.source, "dem", f"{rows} x {columns} pixels for {ground}", "a model of like extent")
-    padded = _continued(model.height_m, margin, model.pixel_m)
-    height = ndimage.map_coordinates(padded, [row - 0.5 + margin, column - 0.5 + margin], order=3, mode="nearest")
-    middle = grid.n_half * (2 * grid.n_half + 2)
-    return height - height[middle], np.clip(1 - outside / 4, 0, 1)
+        raise UserError(model.source, "dem", f"{rows} x {columns} pixels for {ground}", "a model of similar extent")
+    places = [row - 0.5 + margin, column - 0.5 + margin]
+    if outside == "mirror":
+        padded = _mirrored(model.height_m, margin, model.pixel_m)
+        height = ndimage.map_coordinates(padded, places, order=3, mode="nearest")
+    else:
+        centres = [np.arange(n + 2 * margin) + 0.5 - margin for n in (rows, columns)]
+        far = beyond_m(model, *np.meshgrid(centres[1], centres[0]))
+        padded = continued(model.height_m, far, margin, model.pixel_sides_m)
+        height = ndimage.map_coordinates(padded, places, order=3, mode="nearest")
+        height += mean_slope(model.height_m, row - 0.5, column - 0.5, beyond, min(sides))
+    return height - height[middle], beyond
 
 
-def _continued(height_m: Array, margin: int, pixel_m: float) -> Array:
+def _mirrored(height_m: Array, margin: int, pixel_m: float) -> Array:
     """Heights with `margin` more pixels on each side, without a crease at the old edge.
 
     Long waves go on by point reflection, which keeps the slope across the edge; short ones by mirroring, so that
@@ -139,12 +200,13 @@ def _continued(height_m: Array, margin: int, pixel_m: float) -> Array:
     return swell + away * mirrored + (1 - away) * (point_reflected - swell)
 
 
-def _pixel_m(
+def _pixel_sides_m(
     transform: rasterio.Affine, crs: rasterio.crs.CRS, middle: tuple[float, float], lat: float, lon: float
-) -> float:
-    """Ground size of the middle pixel, from the great-circle distance of its neighbours."""
-    places = [transform @ (middle[0] + 1, middle[1]), transform @ (middle[0], middle[1] + 1)]
+) -> tuple[float, float]:
+    """Ground size of the middle pixel from row to row and from column to column, from great-circle distances."""
+    places = [transform @ (middle[0], middle[1] + 1), transform @ (middle[0] + 1, middle[1])]
     lons, lats = rasterio.warp.transform(crs, _MOON, [p[0] for p in places], [p[1] for p in places])
     to_east = np.cos(np.radians(lat)) * np.radians((np.array(lons) - lon + 180) % 360 - 180)
     to_north = np.radians(np.array(lats) - lat)
-    return float(MOON_RADIUS_M * np.hypot(to_east, to_north).mean())
+    down, across = MOON_RADIUS_M * np.hypot(to_east, to_north)
+    return float(down), float(across)

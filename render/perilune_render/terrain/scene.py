@@ -6,19 +6,29 @@ from pathlib import Path
 import numpy as np
 
 from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config_terrain import ReliefConfig, TerrainConfig
 from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.boulders import Boulders, draw_boulders
 from perilune_render.terrain.catalogue import read_catalogue
 from perilune_render.terrain.craters import Craters, draw_craters
-from perilune_render.terrain.elevation import ElevationModel, base_heights, read_elevation
+from perilune_render.terrain.elevation import (
+    ElevationModel,
+    base_heights,
+    beyond_m,
+    raster_places,
+    read_elevation,
+    refuse_beyond,
+    resolved_m,
+)
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.measure import Rims, measure_rims, value_at
+from perilune_render.terrain.profile import REACH
 from perilune_render.terrain.relief import add_relief
 from perilune_render.terrain.stamp import stamp_craters
+from perilune_render.terrain.surroundings import FittedRelief, add_fitted_relief, fitted_relief
 from perilune_shared.camera import Camera
 from perilune_shared.frames import Array
 
-_RESOLVED_PIXELS = 4.0
 _ROUGHNESS_M = 100.0
 """Shorter waves lie on top of the craters."""
 _LEAST_RIM = 0.3
@@ -51,6 +61,54 @@ class Scene:
     """Height of the boulders' centres, metres."""
     dem_source: str
     """Elevation model, or 'procedural'."""
+    real: np.ndarray
+    """Whether each vertex (n_vertices,) lies on known ground of the elevation model; false on procedural ground."""
+
+
+@dataclass(frozen=True, slots=True)
+class Base:
+    """The ground before craters: flat, or an elevation model and what surrounds it."""
+
+    height_m: Array
+    """Heights (n_vertices,), metres, changed in place."""
+    beyond_m: Array
+    """Distance (n_vertices,) from known ground of the model, metres; infinite without a model."""
+    model: ElevationModel | None
+    """The elevation model."""
+    around: FittedRelief | None
+    """Relief of procedural ground beyond the model."""
+
+    @property
+    def largest_m(self) -> float | None:
+        """Largest diameter to draw, metres; None for that of the configuration."""
+        return None if self.model is None or self.around is not None else resolved_m(self.model)
+
+    def add_waves(self, grid: Grid, relief: ReliefConfig, seed: int, shortest_m: float, longest_m: float) -> None:
+        """Add relief: on a model what it does not resolve, beyond it all wavelengths."""
+        resolved = np.inf if self.model is None else resolved_m(self.model)
+        add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved))
+        if self.around is not None:
+            add_fitted_relief(self.height_m, grid, self.around, self.beyond_m, seed, shortest_m, longest_m)
+
+    def permitted(self, craters: Craters) -> Craters:
+        """The craters that may be laid: those that a model resolves only where they leave its ground as it is."""
+        if self.model is None or self.around is None:
+            return craters
+        large = craters.diameter_m > resolved_m(self.model)
+        column, row = raster_places(self.model, craters.x_m[large], craters.y_m[large])
+        allowed = np.ones(len(craters), bool)
+        allowed[large] = beyond_m(self.model, column, row) >= REACH * craters.diameter_m[large] / 2
+        return craters.chosen(allowed)
+
+
+def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, seed: int) -> Base:
+    """Ground of an elevation model and its surroundings, or flat ground."""
+    if model is None:
+        return Base(np.zeros(grid.n_vertices), np.full(grid.n_vertices, np.inf), None, None)
+    height, beyond = base_heights(model, grid, terrain.elevation.outside)
+    needed = terrain.elevation.outside == "procedural" and bool((beyond > 0).any())
+    around = fitted_relief(model, terrain.relief, terrain.craters, seed) if needed else None
+    return Base(height, beyond, model, around)
 
 
 def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> Scene:
@@ -58,18 +116,17 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
     terrain = config.terrain
     grid = graded_grid(config, camera, flight)
     model = read_elevation(Path(terrain.dem)) if terrain.dem is not None else None
-    height = np.zeros(grid.n_vertices) if model is None else base_heights(model, grid)[0]
-    resolved = None if model is None else resolved_m(model)
-    longest = np.inf if resolved is None else resolved
-    add_relief(height, grid, terrain.relief, seed, _ROUGHNESS_M, longest)
-    craters = draw_craters(terrain.craters, grid, seed, resolved)
+    base = base_of(model, grid, terrain, seed)
+    height = base.height_m
+    base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
+    craters = base.permitted(draw_craters(terrain.craters, grid, seed, base.largest_m))
     albedo = np.ones(grid.n_vertices)
     variation = config.light.albedo_variation
     if variation > 0:
         add_patches(albedo, grid, variation, seed)
         add_rays(albedo, grid, craters, terrain.craters.n_rayed, variation, seed)
     laid = stamp_craters(height, albedo, grid, craters, variation * brightness(craters), terrain.craters.profile)
-    add_relief(height, grid, terrain.relief, seed, 0.0, min(_ROUGHNESS_M, longest))
+    base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
     kept = laid.rim_left >= _LEAST_RIM
     craters, sag = craters.chosen(kept), laid.sag_m[kept]
     if model is not None and terrain.catalogue is not None:
@@ -88,6 +145,7 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
         boulders,
         boulders.centre_height_m(value_at(height, grid, boulders.x_m, boulders.y_m)),
         "procedural" if model is None else model.source,
+        base.beyond_m == 0,
     )
 
 
@@ -96,13 +154,9 @@ def check_ground(config: DatasetConfig, camera: Camera, flight: FlightConfig) ->
     grid = graded_grid(config, camera, flight)
     if config.terrain.dem is not None:
         model = read_elevation(Path(config.terrain.dem))
+        refuse_beyond(model, grid, config.terrain.elevation.outside)
         if config.terrain.catalogue is not None:
             read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters, resolved_m(model))
-
-
-def resolved_m(model: ElevationModel) -> float:
-    """Diameter in metres from which an elevation model shows a crater: four pixels. Smaller ones are added."""
-    return _RESOLVED_PIXELS * model.pixel_m
 
 
 def _place(config: DatasetConfig, model: ElevationModel | None) -> tuple[float, float]:
