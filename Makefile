@@ -1,4 +1,5 @@
 # perilune: datasets, networks and their explanation. `make help` lists the targets.
+SHELL := /bin/bash
 PYTHON ?= python3.11
 PRESET ?= small
 KIND ?= both
@@ -17,9 +18,19 @@ ifneq ($(OUT),)
   endif
 endif
 
-COMMON := --preset $(PRESET) $(if $(CONFIG),--config $(CONFIG)) $(foreach setting,$(SET),--set $(setting))
-TRAIN := $(COMMON) --out $(RUNS) --name $(NAME)
-RENDER = $(BIN)/perilune-render dataset $(COMMON) $(if $(DEM),--dem $(DEM)) $(if $(CATALOGUE),--catalogue $(CATALOGUE)) --out $(DATA)
+# One argument of a shell command, whatever it holds.
+quoted = '$(subst ','\'',$(1))'
+# SET holds shell words, so that quotes keep a value with spaces together.
+SETTINGS := $(if $(SET),$(shell set -f; for setting in $(SET); do \
+  [[ $$setting == *.*=* ]] || exit 2; printf -- '--set %q ' "$$setting"; done))
+ifneq ($(if $(SET),$(.SHELLSTATUS),0),0)
+  $(error SET: got $(SET), expected shell words: SET="a.b=1 'c.d={low: 0, high: 1}'")
+endif
+
+COMMON := --preset $(PRESET) $(if $(CONFIG),--config $(call quoted,$(CONFIG))) $(SETTINGS)
+TRAIN := $(COMMON) --out $(call quoted,$(RUNS)) --name $(NAME)
+RENDER = $(BIN)/perilune-render dataset $(COMMON) $(if $(DEM),--dem $(call quoted,$(DEM))) \
+  $(if $(CATALOGUE),--catalogue $(call quoted,$(CATALOGUE))) --out $(call quoted,$(DATA))
 
 DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
@@ -32,6 +43,9 @@ help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
 	@echo
 	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run'
+	@echo
+	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
+	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""
 
 setup: $(VENV)/.ready ## make the environment (.venv) with everything in it
 
@@ -60,35 +74,35 @@ dataset: setup ## render the preset's datasets (KIND=detect|nav for one); goes o
 # A dataset.json may be that of a stopped rendering: then the command goes on where it was.
 .PHONY: detect-frames nav-frames
 detect-frames: setup
-	@grep -qs '"complete": true' $(DATA)/detect/dataset.json || $(RENDER) --kind detect
+	@grep -qs '"complete": true' "$(DATA)/detect/dataset.json" || $(RENDER) --kind detect
 nav-frames: setup
-	@grep -qs '"complete": true' $(DATA)/nav/dataset.json || $(RENDER) --kind nav
+	@grep -qs '"complete": true' "$(DATA)/nav/dataset.json" || $(RENDER) --kind nav
 
 train-detect: detect-frames ## train and evaluate crater detection
-	@test -f $(DETECT) && echo "$(DETECT) is there; remove its folder to train again" || \
-	  $(BIN)/perilune-train detect train $(TRAIN) --dataset $(DATA)/detect --resume
+	@test -f "$(DETECT)" && echo "$(DETECT) is there; remove its folder to train again" || \
+	  $(BIN)/perilune-train detect train $(TRAIN) --dataset "$(DATA)/detect" --resume
 
 train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
-	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out $(RUNS) --name $(NAME)-none --dataset $(DATA)/detect --resume
+	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out "$(RUNS)" --name $(NAME)-none --dataset "$(DATA)/detect" --resume
 
 # The same seeds, one change each; <name>-<change>. The first is the run of train-detect itself.
 ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
-ABLATED = $(RUNS)/detect/$(NAME) $(foreach one,$(ABLATION),$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one))))
+ABLATED = "$(RUNS)/detect/$(NAME)" $(foreach one,$(ABLATION),"$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))")
 ablate-detect: train-detect ## train without attention, with plain CBAM, other strides, other widths; one table
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
-	  --out $(RUNS) --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset $(DATA)/detect --resume &&) true
-	@$(BIN)/perilune-train detect compare $(ABLATED) --out $(RUNS)/detect/$(NAME)-ablation
-	@$(BIN)/python benchmarks/size.py $(ABLATED) --out $(RUNS)/detect/$(NAME)-ablation
+	  --out "$(RUNS)" --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset "$(DATA)/detect" --resume &&) true
+	@$(BIN)/perilune-train detect compare $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
+	@$(BIN)/python benchmarks/size.py $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
-	@test -f $(DETECT) || $(MAKE) --no-print-directory train-detect
-	@test -f $(NAVIGATE) && test -f $(RUNS)/navigate/$(NAME)-stack/metrics.json && echo "$(NAVIGATE) is there; remove its folder to train again" || \
-	  $(BIN)/perilune-train navigate $(TRAIN) --dataset $(DATA)/nav --resume
+	@test -f "$(DETECT)" || $(MAKE) --no-print-directory train-detect
+	@test -f "$(NAVIGATE)" && test -f "$(RUNS)/navigate/$(NAME)-stack/metrics.json" && echo "$(NAVIGATE) is there; remove its folder to train again" || \
+	  $(BIN)/perilune-train navigate $(TRAIN) --dataset "$(DATA)/nav" --resume
 
 explain: ## attention masks and correlations of the trained networks
-	@test -f $(NAVIGATE) -a -f $(DETECT) || $(MAKE) --no-print-directory train-nav
-	@test -f $(EXPLAIN) && echo "$(EXPLAIN) is there; remove its folder to explain again" || \
-	  $(BIN)/perilune-train explain $(TRAIN) --dataset $(DATA)
+	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory train-nav
+	@test -f "$(EXPLAIN)" && echo "$(EXPLAIN) is there; remove its folder to explain again" || \
+	  $(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)"
 
 JOBS ?= 2
 test: setup ## run all tests, in JOBS=2 processes
@@ -102,7 +116,7 @@ bench-render: setup ## time of a frame against a bare Blender loop; writes runs/
 	@$(BIN)/python benchmarks/render.py
 
 compare-nac: setup ## rendered frames beside real NAC crops (NAC=folder); writes runs/nac/
-	@$(BIN)/python benchmarks/nac.py "$(NAC)" $(COMMON) --out $(RUNS)/nac
+	@$(BIN)/python benchmarks/nac.py "$(NAC)" $(COMMON) --out "$(RUNS)/nac"
 
 bench-terrain: setup ## speed of growing the ground on one core; writes runs/bench/terrain.json
 	@$(BIN)/python benchmarks/terrain.py
@@ -120,13 +134,13 @@ bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/
 	@$(BIN)/python benchmarks/labels.py --picture docs/labels_histogram.png
 
 bench-contrast: setup ## how well contrast tells craters that the detector finds; writes runs/bench/contrast.json
-	@$(BIN)/python benchmarks/contrast.py $(DATA)/detect $(RUNS)/detect/$(NAME)
+	@$(BIN)/python benchmarks/contrast.py "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"
 
 bench-infer: setup ## time of the detector by engine, one image, two cores; writes runs/bench/infer.json
 	@$(BIN)/python benchmarks/infer.py
 
 bench-train: detect-frames ## training speed beside memory-fed and bare loops; writes runs/bench/train.json
-	@$(BIN)/python benchmarks/train.py --dataset $(DATA)/detect --preset $(PRESET)
+	@$(BIN)/python benchmarks/train.py --dataset "$(DATA)/detect" --preset $(PRESET)
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

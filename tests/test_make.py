@@ -1,0 +1,65 @@
+"""Values given to make reach the commands as one argument each, whatever they hold."""
+
+import itertools
+import os
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+AWKWARD = 'a dir/it\'s "here" ; `x` (1) *.yaml'
+
+
+def make(*arguments: str, check: bool = True) -> subprocess.CompletedProcess:
+    """Run make in the repository without what an outer make hands down."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    return subprocess.run(["make", "-C", ROOT, *arguments], capture_output=True, text=True, env=own, check=check)
+
+
+def words(target: str, program: str, *variables: str) -> list[str]:
+    """Arguments of the command that make would run, as the shell splits them."""
+    done = make("-n", target, *variables)
+    (line,) = (line for line in done.stdout.replace("\\\n", " ").splitlines() if f"/{program} " in line)
+    return shlex.split(line)
+
+
+def values(arguments: list[str], option: str) -> list[str]:
+    return [value for name, value in itertools.pairwise(arguments) if name == option]
+
+
+def test_settings_are_shell_words():
+    settings = [
+        "dataset.seed=7",
+        'dataset.terrain.dem=it\'s "a" $x',
+        "dataset.detect.sun.elevation_deg={low: 0, high: 1}",
+    ]
+    given = shlex.join(settings).replace("$", "$$")
+    assert values(words("dataset", "perilune-render", f"SET={given}"), "--set") == settings
+    plain = "SET=dataset.seed=7 detect.strides=[4,8,16]"
+    assert values(words("dataset", "perilune-render", plain), "--set") == ["dataset.seed=7", "detect.strides=[4,8,16]"]
+    assert values(words("dataset", "perilune-render"), "--set") == []
+
+
+def test_the_example_of_make_help_works():
+    example = next(line for line in make("help").stdout.splitlines() if line.startswith("  make dataset SET="))
+    found = values(words("dataset", "perilune-render", shlex.split(example)[2]), "--set")
+    assert found == ["dataset.seed=7", "dataset.detect.sun.elevation_deg={low: 5, high: 9}"]
+    assert example.strip() in (ROOT / "README.md").read_text()
+
+
+def test_paths_may_hold_anything():
+    variables = [f"{name}={AWKWARD}" for name in ("CONFIG", "DEM", "CATALOGUE", "OUT")]
+    arguments = words("dataset", "perilune-render", *variables)
+    for option in ("--config", "--dem", "--catalogue", "--out"):
+        assert values(arguments, option) == [AWKWARD]
+    arguments = words("train-detect-baseline", "perilune-train", "OUT=my runs", f"CONFIG={AWKWARD}", "NAME=a")
+    assert values(arguments, "--out") == ["my runs"] and values(arguments, "--config") == [AWKWARD]
+
+
+@pytest.mark.parametrize("given", ["detect.augment.scale={low: 0}", "detect.seed='7", "seed"])
+def test_settings_that_are_no_words_are_told(given):
+    done = make("-n", "dataset", f"SET={given}", check=False)
+    assert done.returncode == 2 and "SET: got" in done.stderr and "expected shell words" in done.stderr
+    assert "perilune-render" not in done.stdout
