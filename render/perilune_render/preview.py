@@ -13,6 +13,7 @@ from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_render.plan import make_plan
 from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.scene import check_ground
 from perilune_shared.frames import sun_direction
 from perilune_shared.selection import SELECTIONS, selected
 
@@ -21,6 +22,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     """The first scene from the first descent, evenly spaced in time: frames above, the same with labels below."""
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
+    check_ground(config, plan.exr_camera, config.ground_flight(kind))
     scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
     sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)

@@ -14,6 +14,7 @@ from scipy.interpolate import RectBivariateSpline
 from perilune_render.config_terrain import Outside
 from perilune_render.terrain.continuation import continued, distance_in_holes_m, margin_m, mean_slope
 from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.quantisation import smoothed, step_of
 from perilune_shared.errors import UserError
 from perilune_shared.files import sha256_of
 from perilune_shared.frames import MOON_RADIUS_M, Array, selenographic_from_site
@@ -47,6 +48,8 @@ class ElevationModel:
     """Ground size of a pixel, mean of both directions, metres."""
     pixel_sides_m: tuple[float, float]
     """Ground size of a pixel from row to row and from column to column, metres."""
+    step_m: float
+    """Step in which the raster holds its heights, metres, where that makes terraces; 0 otherwise."""
     hole_m: Array | None
     """Distance of each pixel (rows, columns) from the nearest known one, metres; None without holes."""
     source: str
@@ -57,7 +60,8 @@ def read_elevation(path: Path) -> ElevationModel:
     """Read a GeoTIFF. Raises UserError where it is missing, no raster, without projection or pixel size, or empty.
 
     Holes (nodata, NaN) are filled from the nearest known height. Heights may be elevations or radii: only differences
-    count, since the site is put at height 0.
+    count, since the site is put at height 0. Heights in steps are smoothed within half a step
+    (`perilune_render.terrain.quantisation`).
     """
     if not path.is_file():
         raise UserError(path, "dem", "no such file", "a GeoTIFF elevation model")
@@ -75,6 +79,7 @@ def read_elevation(path: Path) -> ElevationModel:
         raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
     if crs is None:
         raise UserError(path, "projection", "none", "a coordinate reference system of the Moon")
+    _refuse_other_bodies(path, crs)
     known = np.isfinite(height)
     if known.sum() < 16:
         raise UserError(path, "heights", f"{known.sum()} known", "an elevation model with data")
@@ -88,11 +93,27 @@ def read_elevation(path: Path) -> ElevationModel:
         raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
     sides = _pixel_sides_m(transform, crs, middle, lat[0], lon[0])
     hole = distance_in_holes_m(known, sides)
+    step = step_of(height[known], float(np.mean(sides)))
+    if step:
+        height = smoothed(height, step)
     plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
     source = f"{plain_name} sha256:{sha256_of(path)}"
-    return ElevationModel(
-        height, known, transform, crs, float(lat[0]), float(lon[0]), float(np.mean(sides)), sides, hole, source
-    )
+    place = float(lat[0]), float(lon[0])
+    return ElevationModel(height, known, transform, crs, *place, float(np.mean(sides)), sides, step, hole, source)
+
+
+def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
+    """Raises UserError where a coordinate system's ellipsoid is missing, or not the Moon's within one percent.
+
+    PROJ refuses to transform between bodies, with an error that says neither.
+    """
+    found = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
+    radius = float(found[2]) if found else 0.0
+    if abs(radius / MOON_RADIUS_M - 1) > 0.01:
+        name = f"{found[1]}, radius {radius / 1000:.0f} km" if found else "none on a sphere or ellipsoid"
+        raise UserError(
+            path, "projection", name, f"a coordinate reference system of the Moon ({MOON_RADIUS_M / 1000:.0f} km)"
+        )
 
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
@@ -139,6 +160,21 @@ def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
             f"a model of {across:.0f} m x {down:.0f} m for {grid.extent_m:.0f} m of ground",
             "a larger model, a lower flight or a narrower view, or dataset.terrain.elevation.outside=procedural",
         )
+
+
+def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
+    """What a user should know of a model before the ground is made from it, a line each."""
+    lines = []
+    name = model.source.split(" sha256:")[0]
+    if model.step_m:
+        lines.append(f"{name}: heights are in steps of {model.step_m:.3g} m; they are smoothed within half a step")
+    net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 129)
+    share = float((beyond_m(model, *raster_places(model, *np.meshgrid(net, net))) == 0).mean())
+    if share < 1:
+        rest = "procedural" if outside == "procedural" else "its mirror image"
+        side = f"{grid.extent_m:.0f} m"
+        lines.append(f"{name}: {share:.0%} of the ground, {side} x {side}, is real, the rest {rest}")
+    return lines
 
 
 def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedural") -> tuple[Array, Array]:

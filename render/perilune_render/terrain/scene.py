@@ -18,6 +18,7 @@ from perilune_render.terrain.elevation import (
     raster_places,
     read_elevation,
     refuse_beyond,
+    remarks,
     resolved_m,
 )
 from perilune_render.terrain.grid import Grid, graded_grid
@@ -28,6 +29,7 @@ from perilune_render.terrain.stamp import stamp_craters
 from perilune_render.terrain.surroundings import FittedRelief, add_fitted_relief, fitted_relief
 from perilune_shared.camera import Camera
 from perilune_shared.frames import Array
+from perilune_shared.progress import console
 
 _ROUGHNESS_M = 100.0
 """Shorter waves lie on top of the craters."""
@@ -150,11 +152,16 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
 
 
 def check_ground(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> None:
-    """Raises UserError on faults of the files that the ground is made from: they must show before the work begins."""
+    """Raises UserError on faults of the files that the ground is made from: they must show before the work begins.
+
+    Prints what a user should know of an elevation model.
+    """
     grid = graded_grid(config, camera, flight)
     if config.terrain.dem is not None:
         model = read_elevation(Path(config.terrain.dem))
         refuse_beyond(model, grid, config.terrain.elevation.outside)
+        for line in remarks(model, grid, config.terrain.elevation.outside):
+            console.print(line, style="yellow", markup=False, highlight=False, soft_wrap=True)
         if config.terrain.catalogue is not None:
             read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters, resolved_m(model))
 

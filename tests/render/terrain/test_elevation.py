@@ -10,6 +10,7 @@ from tests.render.conftest import config_with
 
 POLAR = "+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m"
 LONLAT = "+proj=longlat +R=1737400"
+UTM = rasterio.Affine(5, 0, 5e5, 0, -5, 5e6)
 METRES_PER_DEGREE = np.pi * 1737400 / 180
 
 
@@ -120,6 +121,10 @@ def test_craters_on_the_model_are_only_those_below_what_it_resolves(tmp_path, ca
         (lambda p: p.write_bytes(b"not a raster"), "readable GeoTIFF"),
         (lambda p: write(p, np.ones((50, 50)), LONLAT, rasterio.Affine.identity()), "pixel size"),
         (lambda p: write(p, np.ones((50, 50)), None, rasterio.Affine(5, 0, 0, 0, -5, 0)), "projection"),
+        (lambda p: write(p, np.ones((50, 50)), "EPSG:32633", UTM), "projection: got WGS 84, radius 6378 km, expected"),
+        (lambda p: write(p, np.ones((50, 50)), "EPSG:4326", UTM), "projection: got WGS 84"),
+        (lambda p: write(p, np.ones((50, 50)), "+proj=longlat +R=3396190", UTM), "radius 3396 km"),
+        (lambda p: write(p, np.ones((50, 50)), 'LOCAL_CS["a",UNIT["metre",1]]', UTM), "projection: got none on"),
         (lambda p: write(p, np.full((50, 50), -9999.0), POLAR, rasterio.Affine(5, 0, 0, 0, -5, 0)), "heights"),
     ],
 )

@@ -6,7 +6,7 @@ import rasterio
 
 from perilune_render.config_terrain import CratersConfig, ReliefConfig
 from perilune_render.terrain.craters import draw_craters
-from perilune_render.terrain.elevation import base_heights, read_elevation, resolved_m
+from perilune_render.terrain.elevation import base_heights, read_elevation, remarks, resolved_m
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.relief import add_relief
 from perilune_render.terrain.scene import base_of, check_ground, grow_scene
@@ -124,6 +124,16 @@ def test_ground_beyond_the_model_can_be_refused(pit, tmp_path, camera):
     config = config_with(terrain=terrain)
     with pytest.raises(UserError, match=r"dataset\.terrain\.elevation\.outside"):
         check_ground(config, camera, config.detect.flight)
+
+
+def test_what_is_real_is_said_before_the_work_begins(pit, tmp_path, camera, capsys):
+    stepped = model_of(tmp_path / "steps.tif", np.rint(pit.height_m))
+    lines = remarks(stepped, GRID, "procedural")
+    assert "steps of 1 m" in lines[0] and "8% of the ground, 1800 m x 1800 m, is real, the rest procedural" in lines[1]
+    assert remarks(pit, Grid.even(150, 30), "procedural") == []
+    config = config_with(terrain={"dem": str(tmp_path / "pit.tif"), "spacing_px": 1.0})
+    check_ground(config, camera, config.detect.flight)
+    assert "is real, the rest procedural" in capsys.readouterr().err
 
 
 def test_holes_are_smooth_and_not_real(pit):
