@@ -19,8 +19,9 @@ from perilune_render.frame import Shot, Studio
 from perilune_render.labels import Labels, RimCircles
 from perilune_render.output import begin_or_go_on, first_difference, open_finished, sync_frames, write_overview, writing
 from perilune_render.plan import camera_of
-from perilune_render.recipe import versions
+from perilune_render.recipe import settings_of
 from perilune_render.sensor import FixedPattern
+from perilune_render.versions import imaging_versions
 from perilune_shared import files
 from perilune_shared.camera import Camera
 from perilune_shared.checksums import seal
@@ -55,7 +56,7 @@ def develop_dataset(
     recipe = old.model_copy(
         update={
             "config": json.loads(config.model_dump_json()),
-            "versions": {**old.versions, **{k: v for k, v in versions().items() if k.startswith("perilune")}},
+            "versions": {**old.versions, **imaging_versions()},
             "developed_from": made_of,
         }
     )
@@ -115,8 +116,9 @@ def _develop(
 def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
     """The source's settings with the user's changes, all of which must be of the sensor or the camera."""
     where = str(source.root / "dataset.json")
-    before = resolve_over(DatasetConfig, "dataset", where, source.info.recipe().config)
-    after = resolve_over(DatasetConfig, "dataset", where, source.info.recipe().config, config_file, settings)
+    given = settings_of(source.info.recipe())
+    before = resolve_over(DatasetConfig, "dataset", where, given)
+    after = resolve_over(DatasetConfig, "dataset", where, given, config_file, settings)
     kept = set(DatasetConfig.model_fields) - {"sensor", "camera"}
     theirs, ours = before.model_dump(include=kept), after.model_dump(include=kept)
     if theirs != ours:

@@ -1,8 +1,8 @@
 """Loops over the pixels of labels, compiled by numba: how much is lit, what shading shows, which crater is where."""
 
-import numba
 import numpy as np
 
+from perilune_render.kernels import njit
 from perilune_shared.camera import Camera
 from perilune_shared.ellipse import Ellipses
 from perilune_shared.frames import Array
@@ -22,7 +22,7 @@ def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
     return _lit(ellipses.cx_px, ellipses.cy_px, *shape, ellipses.bounding_boxes(), sunlit)
 
 
-@numba.njit(cache=True)
+@njit()
 def _lit(cx, cy, a, b, theta, boxes, sunlit):
     height, width = sunlit.shape
     share = np.zeros(len(cx))
@@ -56,7 +56,7 @@ def contrasts(centre_px: Array, image_from_rim: Array, grey: np.ndarray, noise: 
     return _shading(centre_px, matrices, np.asarray(grey, np.float64), np.asarray(noise, np.float64))
 
 
-@numba.njit(cache=True)
+@njit()
 def _shading(centre, matrices, grey, noise):
     height, width = grey.shape
     result = np.zeros(len(centre))
@@ -97,7 +97,7 @@ def _shading(centre, matrices, grey, noise):
     return result
 
 
-@numba.njit(cache=True)
+@njit()
 def _over_its_error(normal, right, squares, variance, count):
     """The last fitted value over its standard error, by Cholesky's L L^T = normal (lower triangle given)."""
     for i in range(_N_FITTED):
@@ -140,7 +140,7 @@ def smallest_crater(
     return image
 
 
-@numba.njit(cache=True)
+@njit()
 def _fill(image, crater_id, centre, normal, radius, boxes, pinhole, depth):
     height, width = image.shape
     fx, fy, cx, cy = pinhole

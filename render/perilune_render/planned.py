@@ -25,7 +25,7 @@ def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progre
     """
     plan = make_plan(config, kind)
     check_ground(config, plan.exr_camera, config.ground_flight(kind))
-    recipe = recipe_of(config, kind, preset)
+    recipe = recipe_of(config, kind, preset, planned=True)
     info = info_of(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes", note="")
     with written(out, info, whole_tables=True) as writer:

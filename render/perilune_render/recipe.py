@@ -1,39 +1,42 @@
 """The recipe that a dataset records, and the way back from it to a configuration."""
 
 import json
-from importlib import metadata
 from pathlib import Path
+from typing import Any
 
-import perilune_render
-import perilune_shared
 from perilune_render.config import DatasetConfig
-from perilune_render.terrain.cache import generator
+from perilune_render.versions import all_versions, ground_versions
 from perilune_shared.config import resolve_over
 from perilune_shared.errors import UserError
 from perilune_shared.info import Recipe
 from perilune_shared.schema import Kind
 
 _FILES = ("dem", "catalogue")
+_SPEED = ("threads", "cache_gib")
+_OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
-def versions() -> dict[str, str]:
-    """Of everything that a frame's bytes depend on."""
-    return {
-        "perilune_render": perilune_render.__version__,
-        "perilune_shared": perilune_shared.__version__,
-        "blender": metadata.version("bpy"),
-        "numpy": metadata.version("numpy"),
-        "generator": generator()[:16],
-    }
+def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
+    """What a dataset is made by; where it is only planned, what its ground is made by.
 
-
-def recipe_of(config: DatasetConfig, kind: Kind, preset: str) -> Recipe:
-    """What a dataset is made by. Of files only the names are kept: their folders are nobody else's business."""
+    Of files only the names are kept. Left out is what changes no byte: settings of speed, the other kind's settings.
+    """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
         if plain["terrain"][name] is not None:
             plain["terrain"][name] = Path(plain["terrain"][name]).name
-    return Recipe(preset=preset, kind=kind, seed=config.seed, config=plain, versions=versions())
+    for name in _SPEED:
+        del plain["render"][name]
+    del plain[_OTHER[kind]]
+    with_dem = config.terrain.dem is not None
+    versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
+    return Recipe(preset=preset, kind=kind, seed=config.seed, config=plain, versions=versions)
+
+
+def settings_of(recipe: Recipe) -> dict[str, Any]:
+    """The settings of a recipe with a section for each kind, as a configuration has them."""
+    other = _OTHER[recipe.kind]
+    return {other: recipe.config[recipe.kind], **recipe.config} if recipe.kind in recipe.config else recipe.config
 
 
 def same_source(first: str, second: str) -> bool:
@@ -59,4 +62,4 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
             if given[name] is None:
                 raise UserError(where, f"terrain.{name}", terrain[name], f"--{name} with this machine's copy of it")
             terrain[name] = str(given[name])
-    return resolve_over(DatasetConfig, "dataset", str(where), {**recipe.config, "terrain": terrain})
+    return resolve_over(DatasetConfig, "dataset", str(where), {**settings_of(recipe), "terrain": terrain})

@@ -98,6 +98,26 @@ def test_what_has_no_exrs_is_not_developed(drawn, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_settings_that_change_no_byte_are_no_part_of_the_recipe():
+    recipe = recipe_of(config_with(), "detect", "tiny")
+    nav = {**config_with().nav.model_dump(), "n_frames": 77}
+    assert recipe_of(config_with(render={"threads": 3, "cache_gib": 1.0}, nav=nav), "detect", "tiny").key == recipe.key
+    assert recipe_of(config_with(render={"samples": 9}), "detect", "tiny").key != recipe.key
+    assert config_of(recipe, "dataset.json") == config_with()
+
+
+def test_another_release_with_the_same_code_resumes(tmp_path):
+    config = config_with()
+    recipe = recipe_of(config, "detect", "tiny")
+    old = recipe.model_copy(update={"versions": {**recipe.versions, "perilune_render": "0.0.1"}})
+    plan = make_plan(config, "detect")
+    write_info(tmp_path, info_of(config, plan, old))
+    assert begin_or_go_on(tmp_path, info_of(config, plan, recipe)).recipe() == old
+    other = recipe.model_copy(update={"versions": {**recipe.versions, "opencv": "0.0.1"}})
+    with pytest.raises(UserError, match="opencv"):
+        begin_or_go_on(tmp_path, info_of(config, plan, other))
+
+
 def test_settings_that_are_none_are_refused(drawn):
     recipe = open_dataset(drawn).info.recipe().model_copy(update={"config": {"terrain": 5}})
     with pytest.raises(UserError, match="terrain"):

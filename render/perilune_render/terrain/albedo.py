@@ -4,9 +4,9 @@ Fresh material is brighter than the mature soil about it and darkens as it weath
 of ours by eye beside NAC images, since published maturity trends are for far larger craters.
 """
 
-import numba
 import numpy as np
 
+from perilune_render.kernels import njit
 from perilune_render.streams import stream
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid, lines_in
@@ -60,7 +60,7 @@ def add_rays(albedo: Array, grid: Grid, craters: Craters, n_rayed: int, strength
         )
 
 
-@numba.njit(cache=True)
+@njit()
 def _add_rays(albedo, n_half, half_widths, x, y, radius, direction, width, length, fresh):
     lines = np.empty((2 * n_half + 1 + 4 * len(half_widths), 7))
     reach = length.max() * radius

@@ -7,7 +7,6 @@ that cannot be written, or a damaged file in it, only costs the time to grow the
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import json
 import os
@@ -17,12 +16,14 @@ from typing import Any
 
 import numpy as np
 
+from perilune_render.caches import cache_home
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.terrain.boulders import Boulders
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import Rims
 from perilune_render.terrain.scene import Scene, grow_scene
+from perilune_render.versions import ground_versions
 from perilune_shared.camera import Camera
 from perilune_shared.files import sha256_of, written_aside
 
@@ -33,27 +34,19 @@ def cache_folder() -> Path:
     """Where scenes are kept."""
     if "PERILUNE_CACHE" in os.environ:
         return Path(os.environ["PERILUNE_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "perilune" / "scenes"
-
-
-@functools.cache
-def generator() -> str:
-    """Hash of the code that grows scenes: whatever changes it makes other files."""
-    package = Path(__file__).parent
-    settings = sorted(package.parent.glob("config*.py"))
-    sources = [*sorted(package.glob("*.py")), package.parent / "streams.py", *settings]
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
+    return cache_home() / "scenes"
 
 
 def scene_key(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> str:
-    """Hash of all that a scene follows from: the code, settings of the ground, view, seed, files it reads."""
+    """Hash of all that a scene follows from: code, libraries, settings of the ground, view, seed, files it reads."""
     terrain = config.terrain.model_dump(mode="json")
     for name in ("dem", "catalogue"):
         if terrain[name] is not None and Path(terrain[name]).is_file():
             terrain[name] = [Path(terrain[name]).name, sha256_of(Path(terrain[name]))]
+    terrain.pop("max_vertices")  # a bound that changes no vertex
+    versions = ground_versions(with_dem=config.terrain.dem is not None)
     content = {
-        "generator": generator(),
-        "numpy": np.__version__,
+        "versions": {name: version for name, version in versions.items() if not name.startswith("perilune")},
         "terrain": terrain,
         "albedo_variation": config.light.albedo_variation,
         "camera": dataclasses.asdict(camera),

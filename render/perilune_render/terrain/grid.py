@@ -11,10 +11,10 @@ laying craters and waves needs to know.
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.kernels import njit
 from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
 from perilune_shared.frames import Array
@@ -141,13 +141,13 @@ def graded_grid(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> 
     return grid
 
 
-@numba.njit(cache=True, inline="always")
+@njit(inline="always")
 def _put(lines, row, x, y, dx, dy, first, number, ring):
     lines[row, 0], lines[row, 1], lines[row, 2], lines[row, 3] = x, y, dx, dy
     lines[row, 4], lines[row, 5], lines[row, 6] = first, number, ring
 
 
-@numba.njit(cache=True)
+@njit()
 def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
     """Write the vertices within a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns their number.
 
@@ -193,7 +193,7 @@ def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
     return count
 
 
-@numba.njit(cache=True)
+@njit()
 def place_in_ring(x, y, n_half):
     """Place along the square ring through (x, y), counted in vertices from the corner at -x, -y, with fractions."""
     distance = max(abs(x), abs(y))
@@ -208,7 +208,7 @@ def place_in_ring(x, y, n_half):
     return (2 * side + along / distance + 1) * n_half
 
 
-@numba.njit(cache=True)
+@njit()
 def vertex_of_ring(ring, place, n_half):
     """Index of a vertex by its ring (0 is the inner square's edge) and its place in it from the corner at -x, -y."""
     n = n_half

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from perilune_render.kernels import njit
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid, place_in_ring, vertex_of_ring
 from perilune_shared.frames import Array
@@ -52,7 +52,7 @@ def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | f
     return Rims(level, normal, np.maximum(level - (floor + centre) / 2 - sag_m, 0))
 
 
-@numba.njit(cache=True)
+@njit()
 def _values_at(field, n_half, half_widths, x, y):
     n = n_half
     step = half_widths[0] / n

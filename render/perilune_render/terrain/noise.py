@@ -1,8 +1,8 @@
 """Gradient noise: smooth random waves of one scale on the graded grid (compiled by numba)."""
 
-import numba
 import numpy as np
 
+from perilune_render.kernels import njit
 from perilune_render.terrain.grid import Grid, lines_in
 from perilune_shared.frames import Array
 
@@ -40,7 +40,7 @@ def add_waves(
     )
 
 
-@numba.njit(cache=True)
+@njit()
 def _add_waves(field, n_half, half_widths, half, wavelength, shift, held, amplitude, gx, gy):
     lines = np.empty((2 * n_half + 1 + 4 * len(half_widths), 7))
     count = lines_in(-half, half, -half, half, n_half, half_widths, lines)

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
+from perilune_render.kernels import njit
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid, lines_in, place_in_ring, vertex_of_ring
 from perilune_render.terrain.profile import REACH, crest_radius, profile_tables, wear_row
@@ -59,7 +59,7 @@ def stamp_craters(
     return Laid(sag, rim_left)
 
 
-@numba.njit(cache=True)
+@njit()
 def _nearest(x, y, n_half, half_widths):
     """Index of a vertex near a place; -1 outside the grid."""
     n = n_half
@@ -72,7 +72,7 @@ def _nearest(x, y, n_half, half_widths):
     return vertex_of_ring(np.searchsorted(half_widths, distance), int(np.rint(place_in_ring(x, y, n))), n)
 
 
-@numba.njit(cache=True)
+@njit()
 def _chord(lines, line, x, y, reach):
     """The part of a line within `reach` of (x, y): its start from there, its steps, its first vertex, from and to."""
     dx, dy = lines[line, 0] - x, lines[line, 1] - y
@@ -87,7 +87,7 @@ def _chord(lines, line, x, y, reach):
     return dx, dy, step_x, step_y, int(lines[line, 4]), max(int(np.ceil(low)), 0), last
 
 
-@numba.njit(cache=True)
+@njit()
 def _stamp(
     height,
     albedo,

@@ -1,0 +1,25 @@
+"""Functions compiled by numba, whose machine code is kept by the sources of all of them.
+
+numba itself keeps a function's machine code as long as the function's own file is the same, though functions and
+constants of other files are compiled into it. Here a change in any of them makes another folder.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+from perilune_render.caches import machine_code_folder
+
+
+def njit(**options: Any) -> Callable[[Callable], Any]:
+    """`numba.njit(cache=True)` with the machine code in `machine_code_folder()`."""
+
+    def decorate(function: Callable) -> Any:
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(machine_code_folder())
+        try:
+            return numba.njit(cache=True, **options)(function)
+        finally:
+            numba.config.CACHE_DIR = before
+
+    return decorate

@@ -1,0 +1,121 @@
+"""The hashes of a recipe change with all that frames follow from, and with nothing else."""
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+import perilune_render
+import perilune_shared
+from perilune_render import versions
+from perilune_render.fingerprint import Fingerprint, _fingerprint, compiled_functions, fingerprint
+
+ROOTS = {"generator": versions.GROUND, "renderer": versions.RENDERING, "imaging": versions.IMAGING}
+HOLDERS = {"pandas", "pyarrow", "mathutils"}
+"""Libraries that hold values and compute none, or come with Blender."""
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory):
+    """Folders of a copy of both packages."""
+    root = tmp_path_factory.mktemp("copy")
+    only = shutil.ignore_patterns("__pycache__", "presets")
+    return {
+        package.__name__: Path(shutil.copytree(package.__path__[0], root / package.__name__, ignore=only))
+        for package in (perilune_render, perilune_shared)
+    }
+
+
+def hashes(copy):
+    folders = tuple(sorted(copy.items()))
+    return {name: _fingerprint.__wrapped__(roots, folders).sha256 for name, roots in ROOTS.items()}
+
+
+def changed(copy, module, pattern, replacement):
+    """Names of the hashes that change with one edit of one file."""
+    package, *parts = module.split(".")
+    path = copy[package].joinpath(*parts).with_suffix(".py")
+    text = path.read_text()
+    edited, count = re.subn(pattern, replacement, text, count=1, flags=re.M)
+    assert count == 1, (module, pattern)
+    before = {name: fingerprint(*roots).sha256 for name, roots in ROOTS.items()}
+    try:
+        path.write_text(edited)
+        after = hashes(copy)
+    finally:
+        path.write_text(text)
+    return {name for name in before if before[name] != after[name]}
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "wanted"),
+    [
+        ("perilune_render.terrain.scene", "_LEAST_RIM", {"generator"}),
+        ("perilune_render.terrain.profile", "REACH", {"generator"}),
+        ("perilune_render.terrain.measure", "_N_RIM", {"generator"}),
+        ("perilune_render.blender.stage", "_EARTH_ANGULAR_DIAMETER_DEG", {"renderer"}),
+        ("perilune_render.blender.renderer", "_FAR_M", {"renderer"}),
+        ("perilune_render.photometry", "_LEAST_SINE_SQUARED", {"renderer"}),
+        ("perilune_render.sensor", "_FAINT_E", {"imaging"}),
+        ("perilune_render.label_pixels", "_N_FITTED", {"imaging"}),
+        ("perilune_render.labels", "_N_RIM", {"imaging"}),
+        ("perilune_shared.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
+        ("perilune_shared.ellipse", "_N_FITTED", {"imaging"}),
+        ("perilune_shared.camera", "_UNDISTORTED_TO", {"generator", "renderer", "imaging"}),
+        ("perilune_shared.frames", "MOON_RADIUS_M", {"generator", "imaging"}),
+    ],
+)
+def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, wanted):
+    assert changed(copy, module, rf"^{name} = .*$", f"{name} = 123.25") == wanted
+
+
+@pytest.mark.parametrize(
+    ("module", "pattern", "replacement", "wanted"),
+    [
+        ("perilune_render.resample", "INTER_LANCZOS4", "INTER_CUBIC", {"imaging"}),
+        ("perilune_render.exr", "ZIP_COMPRESSION", "NO_COMPRESSION", {"imaging"}),
+        ("perilune_render.output", '".png", stored', '".png", stored + 1', {"imaging"}),
+        ("perilune_render.blender.nodes", "MULTIPLY", "ADD", {"renderer"}),
+        ("perilune_render.terrain.noise", r"njit\(\)", "njit(fastmath=True)", {"generator"}),
+    ],
+)
+def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, replacement, wanted):
+    assert changed(copy, module, pattern, replacement) == wanted
+
+
+@pytest.mark.parametrize(
+    ("module", "pattern", "replacement"),
+    [
+        ("perilune_render.terrain.scene", '^"""', '"""Another docstring. '),
+        ("perilune_render.sensor", '    """The grey image', '    """Another docstring'),
+        ("perilune_render.terrain.scene", '"""A crater of whose rim', '"""Another text'),
+        ("perilune_render.terrain.stamp", r"^_N_RIM = 16", "# Why.\n_N_RIM = (\n    16\n)  # another comment"),
+        ("perilune_render.terrain.grid", r"raise UserError\(", "raise UserError('more', "),
+        ("perilune_render.cli", '"Folder', '"Another folder'),
+        ("perilune_render.preview", "n_frames: int = 4", "n_frames: int = 5"),
+        ("perilune_render.output", "^_SHEET_FRAMES = 12", "_SHEET_FRAMES = 13"),
+        ("perilune_render.config", "= 256$", "= 257"),
+        ("perilune_shared.card", "^def ", "def another():\n    return 1\n\n\ndef "),
+        ("perilune_shared.errors", "got", "found"),
+        ("perilune_shared.files", "LONGEST_PATH = 500", "LONGEST_PATH = 501"),
+    ],
+)
+def test_what_changes_no_frame_changes_no_hash(copy, module, pattern, replacement):
+    assert changed(copy, module, pattern, replacement) == set()
+
+
+def test_every_library_that_computes_is_recorded():
+    prints = [fingerprint(*roots) for roots in ROOTS.values()]
+    assert all(isinstance(each, Fingerprint) and sys.stdlib_module_names.isdisjoint(each.libraries) for each in prints)
+    assert set().union(*(each.libraries for each in prints)) - HOLDERS == set(versions.LIBRARIES)
+    recorded = versions.all_versions(with_dem=True)
+    assert {"blender", "numpy", "numba", "scipy", "opencv", "openexr", "trimesh", "rasterio"} < set(recorded)
+    assert set(recorded) - set(versions.all_versions(with_dem=False)) == {"rasterio"}
+    assert "blender" not in versions.ground_versions(with_dem=True) and "blender" not in versions.imaging_versions()
+
+
+def test_compiled_functions_are_found_in_every_module():
+    known = {name.partition(":")[0].rpartition(".")[2] for name in compiled_functions()}
+    assert known == {"label_pixels", "grid", "albedo", "stamp", "noise", "measure"}
