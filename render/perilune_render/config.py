@@ -157,7 +157,7 @@ class SensorConfig(Section):
     hot_pixel_share: Share = 2e-5
     """Share of the pixels that are hot."""
     hot_pixel_e: NotNegative = 6_000.0
-    """Mean of the hot pixels' exponentially distributed extra signal, electrons."""
+    """Mean of the hot pixels' exponentially distributed extra signal in an exposure of 2 ms, electrons."""
     psf_sigma_px: NotNegative = 0.45
     """Standard deviation of the point spread, a discrete Gaussian over the pixels; 0 for none."""
     motion_blur: bool = True

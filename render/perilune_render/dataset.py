@@ -31,12 +31,15 @@ from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene, check_ground
 from perilune_shared.checksums import seal
+from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.frames import sun_direction
 from perilune_shared.info import DatasetInfo, write_info
 from perilune_shared.manifest import Dataset, count_rows, open_dataset
 from perilune_shared.parts import read_part, write_part
 from perilune_shared.schema import Kind
+
+_GROUND = ("craters", "boulders")
 
 
 def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> Dataset:
@@ -103,12 +106,15 @@ def _write_scene(
         **tables.scene_tables(plan, scene, config, recipe),
         "trajectories": tables.trajectory_table(trajectories),
     }
+    paths = {name: out / "manifest" / name / f"{plan.scene_id}.parquet" for name in parts}
+    there = {name: read_part(paths[name], name) if paths[name].exists() else parts[name] for name in _GROUND}
+    # By content, since another processor's craters differ in the last digits.
+    if content_sha256(*there.values()) != content_sha256(*(parts[name] for name in _GROUND)):
+        wanted = "the elevation model and catalogue that it was begun with"
+        raise UserError(paths["craters"], "craters", "other craters or boulders", wanted)
     for name, rows in parts.items():
-        part = out / "manifest" / name / f"{plan.scene_id}.parquet"
-        if not part.exists():
+        if not paths[name].exists():
             write_part(out, name, plan.scene_id, rows)
-        elif name == "craters" and not read_part(part, name).equals(rows):
-            raise UserError(part, name, "other craters", "the elevation model and catalogue that it was begun with")
 
 
 def _render_trajectory(

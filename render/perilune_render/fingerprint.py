@@ -17,15 +17,16 @@ import perilune_render
 import perilune_shared
 
 _FOLDERS = {module.__name__: Path(module.__path__[0]) for module in (perilune_render, perilune_shared)}
+_SETTINGS = "perilune_render.config"
+"""Modules that begin so hold settings, whose values stand in the recipe: defaults, bounds and checks are left out."""
 _NO_EFFECT = (
     "perilune_render.caches",
-    "perilune_render.config",
     "perilune_render.interrupts",
     "perilune_shared.config",
     "perilune_shared.errors",
     "perilune_shared.files",
 )
-"""What begins so holds settings (a recipe has their values), stores results or reports errors."""
+"""Modules that read settings, store results or report errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +88,10 @@ def compiled_functions() -> tuple[str, ...]:
     found = []
     root = _FOLDERS["perilune_render"]
     for path in sorted(root.rglob("*.py")):
-        if "njit" in path.read_text(encoding="utf-8"):
+        text = path.read_text(encoding="utf-8")
+        if "njit" in text:
             name = ".".join(("perilune_render", *path.relative_to(root).with_suffix("").parts))
-            for own, (*_, node) in _read(path).definitions.items():
+            for own, (*_, node) in _parsed(text).definitions.items():
                 if isinstance(node, ast.FunctionDef) and any("njit" in ast.dump(each) for each in node.decorator_list):
                     found.append(f"{name}:{own}")
     return tuple(found)
@@ -140,19 +142,16 @@ class _Walk:
             package, *parts = module.split(".")
             path = self.folders[package].joinpath(*parts) if package in self.folders else None
             files = [path.with_suffix(".py"), path / "__init__.py"] if path is not None else []
-            self.sources[module] = next((_read(file) for file in files if file.is_file()), None)
+            text = next((file.read_text(encoding="utf-8") for file in files if file.is_file()), None)
+            self.sources[module] = None if text is None else _parsed(text, module.startswith(_SETTINGS))
         return self.sources[module]
 
 
-def _read(path: Path) -> _Module:
-    return _parsed(path.read_text(encoding="utf-8"))
-
-
 @functools.cache
-def _parsed(text: str) -> _Module:
-    """A source file's content, without docstrings and error messages."""
+def _parsed(text: str, settings: bool = False) -> _Module:
+    """A source file without docstrings and error messages; of settings also without fields and checks."""
     module = _Module()
-    for node in _Stripped().visit(ast.parse(text)).body:
+    for node in _Stripped(settings).visit(ast.parse(text)).body:
         if isinstance(node, ast.Import):
             for alias in node.names:
                 bound = alias.asname or alias.name.partition(".")[0]
@@ -169,7 +168,17 @@ def _parsed(text: str) -> _Module:
 
 
 class _Stripped(ast.NodeTransformer):
-    """Removes docstrings and other bare texts, and what is raised."""
+    """Removes docstrings and other bare texts, and what is raised; of settings the fields and their checks."""
+
+    def __init__(self, settings: bool):
+        self.settings = settings
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> ast.AST:
+        self.generic_visit(node)
+        if self.settings:
+            plain = [each for each in node.body if isinstance(each, ast.FunctionDef) and not each.decorator_list]
+            node.body = [*plain, ast.Pass()]
+        return node
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST:
         self.generic_visit(node)

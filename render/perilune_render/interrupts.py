@@ -1,23 +1,36 @@
-"""Ctrl-C where it must wait."""
+"""Delays Ctrl-C until a step is done."""
 
 import contextlib
+import os
 import signal
 import threading
 from collections.abc import Iterator
 
+_NOTICE = b"\nstopping after this step; press Ctrl-C again to end at once\n"
+
 
 @contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Answer Ctrl-C at the end of what is done within.
+    """Delay KeyboardInterrupt until the block ends. A second Ctrl-C ends the process at once.
 
-    Cycles' own Python callback would swallow it, and the rendering would go on; Numba, loading compiled code, may end
-    the process with a fault.
+    Cycles' own Python callback would swallow the interrupt and render on; Numba may end the process with a fault when
+    it is interrupted while it loads compiled code. Where Ctrl-C is ignored, as in a process that a shell started in
+    the background, it stays ignored.
     """
-    asked = []
-    if threading.current_thread() is not threading.main_thread():
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, lambda *_: asked.append(True))
+    asked = []
+
+    def delay(*_: object) -> None:
+        asked.append(True)
+        # The operating system answers the second one, even while no Python code runs.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        with contextlib.suppress(OSError):
+            os.write(2, _NOTICE)
+
+    signal.signal(signal.SIGINT, delay)
     try:
         yield
     finally:

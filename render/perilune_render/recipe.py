@@ -19,7 +19,8 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
     """What a dataset is made by; where it is only planned, what its ground is made by.
 
-    Of files only the names are kept. Left out is what changes no byte: settings of speed, the other kind's settings.
+    Of files only the names are kept. Left out is what changes no byte: settings of speed, and
+    the other kind's settings where the kinds share no terrain.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -27,7 +28,8 @@ def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool =
             plain["terrain"][name] = Path(plain["terrain"][name]).name
     for name in _SPEED:
         del plain["render"][name]
-    del plain[_OTHER[kind]]
+    if not config.shared_terrain:
+        del plain[_OTHER[kind]]
     with_dem = config.terrain.dem is not None
     versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
     return Recipe(preset=preset, kind=kind, seed=config.seed, config=plain, versions=versions)

@@ -32,6 +32,10 @@ _FAINT_E = 100.0
 """Above it a rounded Gaussian stands for the Poisson law, ten times faster."""
 
 
+HOT_PIXEL_S = 0.002
+"""Exposure time of the extra signal `hot_pixel_e`, seconds. It is dark current, and grows with the exposure time."""
+
+
 @dataclass(frozen=True, slots=True)
 class FixedPattern:
     """What is the same in all frames of one sensor."""
@@ -41,7 +45,7 @@ class FixedPattern:
     offset_e: np.ndarray
     """Offset of each pixel, mean 0, electrons (h, w) float32."""
     hot_e: np.ndarray
-    """Extra dark signal of the hot pixels, 0 elsewhere, electrons (h, w) float32."""
+    """Extra dark signal of the hot pixels in an exposure of HOT_PIXEL_S, 0 elsewhere, electrons (h, w) float32."""
 
     @classmethod
     def draw(cls, config: SensorConfig, camera: Camera, seed: int) -> "FixedPattern":
@@ -120,7 +124,7 @@ def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rn
     electrons = exposure.light * pattern.response
     electrons *= config.responsivity_e_per_s * exposure.time_s
     electrons += config.dark_current_e_per_s * exposure.time_s
-    electrons += pattern.hot_e
+    electrons += pattern.hot_e * np.float32(exposure.time_s / HOT_PIXEL_S)
     normal = rng.standard_normal(electrons.shape, np.float32)
     noisy = electrons + np.sqrt(electrons + np.float32(config.read_noise_e**2)) * normal
     faint = electrons < _FAINT_E

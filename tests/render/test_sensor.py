@@ -84,12 +84,21 @@ def test_fixed_pattern_has_its_sizes_and_stays():
 
 
 def test_hot_pixels_are_at_the_same_places_in_all_frames():
-    config = sensor(hot_pixel_share=0.01, hot_pixel_e=5_000, read_noise_e=5)
+    config = sensor(hot_pixel_share=0.01, hot_pixel_e=5_000, read_noise_e=5, exposure_time_s=0.002)
     hot = [photograph(0.0, config, frame) / PER_E > 100 for frame in range(3)]
     assert 0.008 < hot[0].mean() < 0.012
     assert (hot[0] != hot[1]).sum() <= 3 and (hot[0] != hot[2]).sum() <= 3
     extra = photograph(0.0, config)[hot[0]] / PER_E
     assert extra.mean() == pytest.approx(5_000, rel=0.25)
+
+
+def test_the_signal_of_hot_pixels_grows_with_the_exposure_time():
+    def brightest_e(time_s):
+        config = sensor(hot_pixel_share=0.01, hot_pixel_e=1_000, exposure_time_s=time_s, dark_current_e_per_s=0)
+        return np.sort(photograph(0.0, config) / PER_E, axis=None)[-400:].mean()
+
+    assert brightest_e(0.004) / brightest_e(0.002) == pytest.approx(2, rel=0.02)
+    assert brightest_e(0.0005) / brightest_e(0.002) == pytest.approx(0.25, rel=0.05)
 
 
 def test_read_noise_shows_in_the_dark():

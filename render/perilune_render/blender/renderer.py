@@ -5,6 +5,7 @@ import errno
 import os
 import shutil
 import tempfile
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -28,10 +29,26 @@ _LIT = 1e-4
 """Sunlight above which a pixel counts as lit: a shadow has none, and the Earth gives less."""
 
 
+_open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
+
+
 class Renderer:
-    """Renders frames of one scene. A context manager, since it keeps a temporary folder."""
+    """Renders frames of one scene. A context manager: it keeps a temporary folder, and Blender holds one scene only.
+
+    Raises RuntimeError while another one is open in this process, whose scene would be lost.
+    """
 
     def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array):
+        if _open:
+            raise RuntimeError("another Renderer is open in this process, and Blender holds one scene: close it first")
+        _open.add(self)
+        try:
+            self._build(scene, config, camera, sun)
+        except BaseException:
+            _open.discard(self)
+            raise
+
+    def _build(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> None:
         self.stage = blender_stage.build(scene, config, camera, sun)
         configure(self.stage, camera, config.render, config.light)
         self._exact = config.render.exr
@@ -43,13 +60,20 @@ class Renderer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Remove the temporary folder, and let another Renderer take Blender. Renders nothing any more."""
         self._folder.cleanup()
+        _open.discard(self)
 
     def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0) -> Radiance:
         """One frame as the radiance factor averaged over each pixel, with the depth of the ray through its centre.
 
         The normal is that ray's too where EXRs are asked for, else the mean over the pixel's samples.
         """
+        if self not in _open:
+            raise RuntimeError("this Renderer is closed")
         blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
         path = Path(self._folder.name) / "frame.exr"
         try:

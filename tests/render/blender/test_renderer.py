@@ -235,3 +235,18 @@ def test_exact_depth_and_normals_leave_the_radiance_as_it_is(scene, small_config
         # Both depths are of the pixel's centre; normals of several rays are means over ground that turns.
         assert np.allclose(plain.depth_m, exact.depth_m, rtol=1e-4)
         assert (np.abs(plain.normal - exact.normal).max(axis=-1) > 1e-3).mean() > 0.1
+
+
+def test_one_renderer_at_a_time_in_a_process():
+    """Blender holds one scene: a second Renderer would silently take the first one's place."""
+    ground, sun = flat_scene(100, 11), sun_direction(0, 60)
+    with Renderer(ground, config_with(), CAMERA, sun) as first:
+        with pytest.raises(RuntimeError, match="another Renderer is open"):
+            Renderer(ground, config_with(), CAMERA, sun)
+        assert first.stage.camera is not None
+    with pytest.raises(RuntimeError, match="closed"):
+        first.render(np.array([0, 0, 100.0]), np.diag([1.0, -1.0, -1.0]))
+    with pytest.raises(AttributeError):
+        Renderer(None, config_with(), CAMERA, sun)
+    with Renderer(ground, config_with(), CAMERA, sun) as second:
+        assert (second.render(np.array([0, 0, 100.0]), np.diag([1.0, -1.0, -1.0])).radiance_factor > 0).all()

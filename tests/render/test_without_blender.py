@@ -1,0 +1,50 @@
+"""Planning and developing on a machine without Blender."""
+
+import subprocess
+import sys
+
+from perilune_shared.manifest import open_dataset
+from perilune_shared.validate import validate
+
+HIDDEN = """
+import importlib.metadata as metadata, sys
+known = metadata.Distribution.from_name
+def from_name(name):
+    if name == "bpy":
+        raise metadata.PackageNotFoundError(name)
+    return known(name)
+metadata.Distribution.from_name = from_name
+sys.modules["bpy"] = None
+try:
+    import perilune_render.blender.renderer
+except ImportError:
+    from perilune_render.cli import main
+    main()
+"""
+PLAN = ["plan", "--preset", "tiny", "--set", "dataset.terrain.spacing_px=2.0", "--set", "dataset.detect.n_scenes=3"]
+
+
+def run(*arguments):
+    return subprocess.run([sys.executable, "-c", HIDDEN, *map(str, arguments)], capture_output=True, text=True)
+
+
+def test_plans_are_made_without_blender(tmp_path):
+    done = run(*PLAN, "--out", tmp_path / "plan")
+    assert done.returncode == 0, done.stderr
+    made = open_dataset(tmp_path / "plan")
+    assert validate(made) == [] and made.info.images == "planned"
+    versions = made.info.recipe().versions
+    assert {"generator", "numpy", "scipy", "numba"} <= set(versions) and not {"blender", "renderer"} & set(versions)
+
+
+def test_datasets_are_developed_without_blender(tiny, tmp_path):
+    done = run("develop", "--dataset", tiny / "detect", "--out", tmp_path / "new")
+    assert done.returncode == 0, done.stderr
+    old, new = open_dataset(tiny / "detect"), open_dataset(tmp_path / "new")
+    assert new.info.recipe().versions == old.info.recipe().versions
+    assert new.table("frames")["png_sha256"].equals(old.table("frames")["png_sha256"])
+
+
+def test_rendering_without_blender_says_what_is_missing(tmp_path):
+    done = run("preview", "--preset", "tiny", "--out", tmp_path / "a.png")
+    assert done.returncode != 0 and "bpy cannot be loaded" in done.stderr and not (tmp_path / "a.png").exists()
