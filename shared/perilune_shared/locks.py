@@ -53,36 +53,37 @@ def locked(folder: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def lock(path: Path, folder: Path) -> Iterator[None]:
     """Hold the lock file `path`, which protects `folder`. Raises UserError where another process holds it."""
-    held, record = FileLock(path), path.with_name(f"{path.name}.json")
+    held, record, elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
     try:
-        held.acquire(timeout=0)
-    except Timeout:
-        raise _refusal(folder, _read(record), "a free folder: wait until that process ends") from None
-    try:
-        _check_expired(folder, record)
         try:
-            with _recorded(record):
-                yield
-        finally:
-            # Before the release: afterwards the file may be another process's lock.
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
+            held.acquire(timeout=0)
+        except Timeout:
+            raise _refusal(folder, _read(record), "a free folder: wait until that process ends") from None
+        left_s = _left_s(record)
+        elsewhere = left_s > 0
+        if elsewhere:
+            wanted = f"a free folder: if that process was killed, remove {record} or wait {left_s:.0f} s"
+            raise _refusal(folder, _read(record), wanted)
+        with _recorded(record):
+            yield
     finally:
-        held.release()
+        if held.is_locked:
+            # Before the release: afterwards the file may be another process's lock.
+            if not elsewhere:
+                with contextlib.suppress(OSError):
+                    path.unlink(missing_ok=True)
+            held.release()
 
 
-def _check_expired(folder: Path, record: Path) -> None:
-    """Raises UserError where a process on another machine may still be writing.
+def _left_s(record: Path) -> float:
+    """Seconds for which a process on another machine may still be writing; 0 for none.
 
     On this machine the lock is free only where the process that wrote the record has ended.
     """
     holder = _read(record)
     if holder is None or holder.get("boot_id") == _boot_id():
-        return
-    left_s = _EXPIRED_S - (time.time() - record.stat().st_mtime)
-    if left_s > 0:
-        wanted = f"a free folder: if that process was killed, remove {record} or wait {left_s:.0f} s"
-        raise _refusal(folder, holder, wanted)
+        return 0.0
+    return max(_EXPIRED_S - (time.time() - record.stat().st_mtime), 0.0)
 
 
 @contextlib.contextmanager

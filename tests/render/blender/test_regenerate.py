@@ -70,7 +70,10 @@ def test_a_plan_is_the_dataset_before_it_is_rendered(tiny, plan, tmp_path):
     assert validate(planned) == [] and planned.info.images == "planned"
     found = {(each.place, each.column) for each in differences(planned, rendered)}
     hashes = {("frames", f"{kind}_{name}") for kind in ("png", "exr") for name in ("sha256", "bytes")}
-    assert found == hashes | {(name, "") for name in ("craters", "boulders", "labels")}
+    # A plan's recipe has the versions of the ground alone.
+    keys = {*planned.info.recipes, *rendered.info.recipes}
+    recipes = {("dataset.json", f"recipes.{key}") for key in keys} | {("scenes", "recipe")}
+    assert len(keys) == 2 and found == hashes | recipes | {(name, "") for name in ("craters", "boulders", "labels")}
     frame_id = "scene-0001/trajectory-0000/000005"
     (outcome,) = again(plan, tmp_path, [frame_id])
     assert outcome.same_ground and outcome.state == "new"
