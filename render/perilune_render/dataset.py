@@ -26,6 +26,7 @@ from perilune_render.output import (
     writing,
 )
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
+from perilune_render.real_ground import real_ground_share
 from perilune_render.recipe import recipe_of
 from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.cache import cached_scene
@@ -86,7 +87,7 @@ def _render(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, pro
         studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)
         with Renderer(scene, config, plan.exr_camera, sun) as renderer:
             for trajectory in waiting:
-                _render_trajectory(out, studio, trajectory, renderer, lambda: progress.advance(task))
+                _render_trajectory(out, studio, trajectory, scene, renderer, lambda: progress.advance(task))
     dataset = Dataset(out, info)
     finished = info.model_copy(update={"counts": count_rows(dataset), "complete": True})
     write_overview(dataset)
@@ -118,16 +119,24 @@ def _write_scene(
 
 
 def _render_trajectory(
-    out: Path, studio: Studio, trajectory: TrajectoryPlan, renderer: Renderer, advance: Callable[[], None]
+    out: Path,
+    studio: Studio,
+    trajectory: TrajectoryPlan,
+    scene: Scene,
+    renderer: Renderer,
+    advance: Callable[[], None],
 ) -> None:
-    rows, labels = [], []
+    rows: list[dict] = []
+    labels = []
     for index in range(len(trajectory.splits)):
         shot = Shot.planned(trajectory, index)
         radiance = renderer.render(shot.position_m, shot.rotation_camera_from_site, seed=shot.render_seed)
         row, exposure = studio.write_png(out, shot, radiance)
         if studio.config.render.exr:
             row |= studio.write_exr(out, shot, radiance)
-        rows.append(row)
+        pose = shot.position_m, shot.rotation_camera_from_site
+        share = real_ground_share(scene, studio.exr_camera, *pose, radiance.depth_m)
+        rows.append({**row, "real_ground_share": share})
         labels.append(tables.label_table(shot.frame_id, studio.label(shot, radiance, exposure)))
         advance()
     name = f"{trajectory.scene_id}.{trajectory.trajectory_id}"

@@ -11,15 +11,20 @@ from perilune_render.frame import Shot, Studio
 from perilune_render.labels import RimCircles
 from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_render.plan import make_plan
+from perilune_render.real_ground import draw_outline, outline_m
 from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.elevation import read_elevation
 from perilune_render.terrain.scene import check_ground
 from perilune_shared.frames import sun_direction
 from perilune_shared.selection import SELECTIONS, selected
 
 
 def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 4) -> None:
-    """The first scene from the first descent, evenly spaced in time: frames above, the same with labels below."""
+    """The first scene from the first descent, evenly spaced in time: frames above, the same with labels below.
+
+    Over an elevation model its outline is drawn there too.
+    """
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
     check_ground(config, plan.exr_camera, config.ground_flight(kind))
@@ -28,6 +33,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
     studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)
     depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
+    outline = None if config.terrain.dem is None else outline_m(read_elevation(Path(config.terrain.dem)))
     plain, drawn = [], []
     with Renderer(scene, config, plan.exr_camera, sun) as renderer:
         for index in np.linspace(0, len(trajectory.splits) - 1, n_frames).astype(int):
@@ -40,4 +46,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
             grey = image if config.sensor.bits == 8 else (image >> (config.sensor.bits - 8)).astype(np.uint8)
             plain.append(enlarge(grey, 2))
             drawn.append(draw_labels(grey, labels, selected(rows, SELECTIONS["visible"])))
+            if outline is not None:
+                pose = shot.position_m, shot.rotation_camera_from_site
+                draw_outline(drawn[-1], outline, scene, plan.camera, *pose)
     write_sheet(path, plain + drawn, n_frames)

@@ -112,7 +112,7 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table frames: one descent. `files` holds the columns png_* and exr_* of each frame."""
+    """Part of the table frames: one descent. `files` holds the columns png_*, exr_* and what was measured of each."""
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],
@@ -126,6 +126,7 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
         "rotation_wxyz": _vectors(flight.rotation_wxyz),
         "velocity_mps": _vectors(flight.velocity_mps),
         "sun_direction": _vectors(np.tile(sun, (n, 1))),
+        "real_ground_share": [row.get("real_ground_share") for row in files],
     }
     return _table("frames", columns | {name: [row.get(name) for row in files] for name in _FILES})
 

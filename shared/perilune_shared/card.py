@@ -91,6 +91,7 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
         "*Labels: green where the selection `visible` takes them, orange for craters that a frame hardly shows.*",
         "## What it holds\n\n" + _counts(dataset),
         _table(["", "lowest", "5 %", "median", "95 %", "highest"], _quantiles(gathered)),
+        *_real_ground(gathered),
         "## Scenes\n\n" + _scenes(dataset),
         "## Splits\n\n" + _splits(dataset),
         "## Files\n\n" + _files(dataset),
@@ -129,6 +130,14 @@ def _quantiles(gathered: Gathered) -> Iterable[list[str]]:
         values = values[np.isfinite(values)]
         if len(values):
             yield [TITLES[name], *(f"{value:.4g}" for value in np.quantile(values, [0, 0.05, 0.5, 0.95, 1]))]
+
+
+def _real_ground(gathered: Gathered) -> Iterable[str]:
+    by_split = gathered.measures.get("real_ground_share")
+    if by_split is not None:
+        values = np.concatenate(list(by_split.values()))
+        low, mean, high = (f"{100 * value:.0f}" for value in (np.nanmin(values), np.nanmean(values), np.nanmax(values)))
+        yield f"Real ground: {mean} % of a frame's ground in the mean, from {low} to {high} %. The rest is procedural."
 
 
 def _scenes(dataset: Dataset) -> str:

@@ -40,6 +40,7 @@ TITLES = {
     "depth_ratio": "depth / diameter of labelled craters",
     "contrast": "contrast",
     "speed_mps": "speed, m/s",
+    "real_ground_share": "share of real ground",
 }
 """Measures in their order, with what stands under their histograms."""
 
@@ -130,6 +131,9 @@ def _measured(frames: pd.DataFrame, labels: pd.DataFrame, depth_ratio: np.ndarra
         "depth_ratio": depth_ratio,
         "speed_mps": np.linalg.norm(np.stack(frames["velocity_mps"].to_list()), axis=1),
     }
+    real = frames["real_ground_share"].to_numpy(np.float64)
+    if np.nan_to_num(real).any():
+        found["real_ground_share"] = real
     names = [name for name in TITLES if name in TABLES["labels"].names]
     return found | {name: labels[name].to_numpy(np.float64) for name in names}
 

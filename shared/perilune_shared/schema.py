@@ -121,6 +121,13 @@ TABLES: dict[str, pa.Schema] = {
         _column("exr_path", _TEXT, "", "relative to the dataset; null where not written", optional=True),
         _column("exr_sha256", _TEXT, "", "of the whole file; null where not written", optional=True),
         _column("exr_bytes", _INTEGER, "B", "file size; null where not written", optional=True),
+        _column(
+            "real_ground_share",
+            _REAL,
+            "",
+            "share of the frame's ground that is an elevation model's, not procedural; null where not known",
+            optional=True,
+        ),
     ),
     "labels": _table(
         "labels",
@@ -147,7 +154,7 @@ TABLES: dict[str, pa.Schema] = {
         ),
     ),
 }
-OPTIONAL: dict[str, tuple[str, ...]] = {}
+OPTIONAL: dict[str, tuple[str, ...]] = {"frames": ("real_ground_share",)}
 """Columns that a file may lack, by table: they came after the schema version. A reader fills them with nulls, a writer
 writes them. To add one: a column with `optional=True` at the end of its table, and its name here."""
 KEYS: dict[str, list[str]] = {

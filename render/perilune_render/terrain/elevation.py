@@ -55,6 +55,11 @@ class ElevationModel:
     source: str
     """File name and SHA-256."""
 
+    def selenographic(self, column: Array, row: Array) -> tuple[Array, Array]:
+        """Latitude and longitude in degrees of places (N,) counted from the raster's top left corner."""
+        longitude, latitude = rasterio.warp.transform(self.crs, _MOON, *(self.transform @ (column, row)))
+        return np.array(latitude), np.array(longitude)
+
 
 def read_elevation(path: Path) -> ElevationModel:
     """Read a GeoTIFF. Raises UserError where it is missing, no raster, without projection or pixel size, or empty.

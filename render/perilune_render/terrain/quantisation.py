@@ -24,7 +24,7 @@ def step_of(height_m: Array, pixel_m: float) -> float:
         return 0.0
     offset = distinct - distinct[0]
     gaps = np.diff(distinct)
-    rounding = 4 * np.finfo(np.float32).eps * float(np.abs(distinct).max())
+    rounding = float(4 * np.finfo(np.float32).eps * np.abs(distinct).max())
     smallest = float(np.min(gaps[gaps > rounding])) if (gaps > rounding).any() else np.inf
     step = float(np.median(gaps[(gaps > rounding) & (gaps <= 1.5 * smallest)])) if np.isfinite(smallest) else 0.0
     if step <= max(_LEAST_SLOPE * pixel_m, 8 * rounding):
