@@ -102,6 +102,14 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
             call("evaluate", "--run", run, "--choose-threshold", *other)
 
 
+def test_figures_of_another_definition_are_not_put_beside(tmp_path):
+    """Runs evaluated earlier have the interpolated AP under the key ap50."""
+    (tmp_path / "metrics.json").write_text(json.dumps({"test/ap50": 0.9, "test/f1": 0.8}))
+    with pytest.raises(UserError, match=r"metrics\.json: ap50: .*ap50_paper"):
+        call("compare", tmp_path, "--out", tmp_path / "both")
+    assert not (tmp_path / "both").exists()
+
+
 def test_runs_side_by_side(run, dataset_detect, tmp_path):
     call("evaluate", "--run", run, "--dataset", dataset_detect, "--out", tmp_path / "b")
     text = call("compare", run, tmp_path / "b", "--out", tmp_path / "both")

@@ -133,8 +133,8 @@ def test_all_gates_of_a_sheet_share_one_scale(tmp_path):
     np.testing.assert_allclose(sheet[80, 164 * 4 + 82], middle, atol=6)
     # The colour bar below has the whole scale.
     np.testing.assert_allclose(sheet[-30, [42, -43]], [low, high], atol=6)
-    assert caption("B_1", masks["B_1"][0]) == "B_1 constant 0.50"
-    assert caption("B_3", masks["B_3"][0]) == "B_3 0.20-0.80"
+    assert caption("B_1", masks["B_1"][0]) == "B_1 constant 0.500"
+    assert caption("B_3", masks["B_3"][0]) == "B_3 0.200-0.800"
 
 
 def test_what_cannot_be_explained(checkpoints, dataset_detect, dataset_nav, tmp_path):

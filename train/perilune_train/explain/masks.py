@@ -94,7 +94,7 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
 
 def caption(block: str, mask: NDArray[np.floating]) -> str:
     """A block's name with the range of its mask, or with "constant" and the value."""
-    own = f"constant {mask.mean():.2f}" if is_constant(mask) else f"{mask.min():.2f}-{mask.max():.2f}"
+    own = f"constant {mask.mean():.3f}" if is_constant(mask) else f"{mask.min():.3f}-{mask.max():.3f}"
     return f"{block} {own}"
 
 

@@ -35,7 +35,9 @@ _DETECT_TITLE = (
     "Craterness above 0: the gate is stronger on craters."
 )
 _NAVIGATE_BARS = {"pcc3": "PCC3: halves", "pcc4": "PCC4: halves, lower one moved"}
-_NAVIGATE_TITLE = "Bars: over the pixels that both frames see. Dots and crosses: over all pixels, as in the paper."
+_NAVIGATE_TITLE = (
+    "Bars: over the pixels that both frames see. Dots and crosses: over all pixels (for PCC4 0 outside the overlap)."
+)
 
 
 def explain_run(
