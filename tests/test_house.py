@@ -3,7 +3,10 @@
 import ast
 import re
 import tomllib
+import warnings
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parent.parent
 MAY_IMPORT = {
@@ -82,11 +85,28 @@ def test_imports_have_no_circle():
 
 
 def test_licences_are_as_promised():
-    wanted = {"shared": "Apache-2.0", "render": "GPL-3.0-or-later", "train": "Apache-2.0"}
-    for house, licence in wanted.items():
-        project = tomllib.loads((ROOT / house / "pyproject.toml").read_text())["project"]
-        assert project["license"] == {"text": licence}
+    expected = {"shared": "Apache-2.0", "render": "GPL-3.0-or-later", "train": "Apache-2.0"}
+    for house, licence in expected.items():
+        content = tomllib.loads((ROOT / house / "pyproject.toml").read_text())
+        # An SPDX expression, which setuptools reads from version 77 on.
+        assert content["project"]["license"] == licence
+        assert content["project"]["license-files"] == ["LICENSE"]
+        assert content["build-system"]["requires"] == ["setuptools>=77"]
         assert (ROOT / house / "LICENSE").is_file()
+
+
+OWN_MODULES = ["perilune_shared.config", "perilune_render.cli", "perilune_train.detect.run", "tests.test_house"]
+OWN_MODULES += [path.stem for path in (ROOT / "benchmarks").glob("*.py")]
+
+
+@pytest.mark.parametrize("kind", [DeprecationWarning, PendingDeprecationWarning, FutureWarning])
+def test_deprecated_calls_of_our_own_modules_are_errors(kind):
+    """As pytest is configured for every test; those of other packages are left to them."""
+    for module in OWN_MODULES:
+        with pytest.raises(kind):
+            warnings.warn_explicit("old", kind, "a.py", 1, module=module)
+    for module in ("rasterio.transform", "torch.nn", "labelsmith"):
+        warnings.warn_explicit("old", kind, "a.py", 1, module=module)
 
 
 def test_every_direct_dependency_is_pinned():
