@@ -63,6 +63,15 @@ def _one(kind: Kind) -> Literal["detect", "nav"]:
     return _first(kind)
 
 
+def _tell_of_size(config: DatasetConfig) -> None:
+    """Tell, before hours of rendering, of frames that the detector cannot be trained on."""
+    sides = {"width_px": config.camera.width_px, "height_px": config.camera.height_px}
+    for name, side in sides.items():
+        if side % 32:
+            told = f"dataset.camera.{name}: {side} is no multiple of 32; the detector cannot be trained on such frames"
+            Console(stderr=True).print(told, soft_wrap=True)
+
+
 def _resolve(
     preset: str, config: Path | None, setting: list[str] | None, dem: Path | None, catalogue: Path | None
 ) -> DatasetConfig:
@@ -98,6 +107,8 @@ def dataset(
         _render_manifest(manifest, out, dem, catalogue, given)
         return
     resolved = _resolve(preset, config, setting, dem, catalogue)
+    if kind is not Kind.NAV:
+        _tell_of_size(resolved)
     folder = out or Path("data") / preset
     from perilune_render.dataset import (
         make_dataset,
@@ -172,6 +183,8 @@ def plan(
 ) -> None:
     """Write a dataset's plan as a manifest without frames, for others to render. Grows every scene for its hash."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
+    if kind is not Kind.NAV:
+        _tell_of_size(resolved)
     from perilune_render.planned import write_plan
 
     with progress_bar() as progress:

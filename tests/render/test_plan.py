@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
 
+from perilune_render.cli import main
 from perilune_render.config import CameraConfig, DistortionConfig, KindConfig
 from perilune_render.plan import camera_of, make_plan
 from perilune_render.streams import derived_seed, stream
 from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
+from tests import in_process
 from tests.render.conftest import config_with
 
 
@@ -83,3 +85,13 @@ def test_the_camera_is_as_configured():
 def test_a_distortion_that_folds_back_is_refused():
     with pytest.raises(UserError, match=r"dataset\.camera\.distortion.*folds? back"):
         camera_of(CameraConfig(distortion=DistortionConfig(k1=-1.5)))
+
+
+def test_frames_that_the_detector_cannot_take_are_told_before_anything_is_made(tmp_path):
+    (tmp_path / "full.txt").touch()
+    for kind, told in (("detect", True), ("nav", False)):
+        size = ("--set", "dataset.camera.width_px=200", "--set", "dataset.camera.height_px=96")
+        made = in_process.call(main, "plan", "--preset", "tiny", "--kind", kind, *size, "--out", tmp_path)
+        assert made.returncode == 2 and "--out" in made.stderr
+        assert ("dataset.camera.width_px: 200 is no multiple of 32" in made.stderr) == told
+        assert "height_px" not in made.stderr

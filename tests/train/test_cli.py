@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests import in_process
 from typer.testing import CliRunner
 
-from perilune_train.cli import app
+from perilune_train.cli import app, main
 
 
 def call(*arguments, cwd=None):
@@ -50,14 +51,21 @@ def test_each_command_tells_its_options(command):
         (["--config", "nowhere.yaml"], ["nowhere.yaml", "no such file"]),
     ],
 )
-def test_a_mistake_gets_one_line_exit_code_2_and_leaves_nothing(tmp_path, arguments, words):
-    result = call("detect", "train", *arguments, cwd=tmp_path)
+def test_a_mistake_gets_one_line_exit_code_2_and_leaves_nothing(tmp_path, arguments, words, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = in_process.call(main, "detect", "train", *arguments)
     assert result.returncode == 2
     lines = result.stderr.strip().splitlines()
     assert len(lines) == 1, result.stderr
     for word in words:
         assert word in lines[0]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mistake_ends_the_process_with_its_line_and_code(tmp_path):
+    result = call("detect", "train", "--set", "detect.epoch=3", cwd=tmp_path)
+    assert result.returncode == 2 and len(result.stderr.strip().splitlines()) == 1
+    assert "epochs (nearest known)" in result.stderr and list(tmp_path.iterdir()) == []
 
 
 def test_detect_runs(tmp_path, dataset_detect):

@@ -145,7 +145,7 @@ def test_wrong_options_in_one_line(run, dataset_detect, options, told, monkeypat
 
 
 def test_folders_that_are_no_finished_runs(run, dataset_detect, tmp_path):
-    with pytest.raises(UserError, match=r"config.yaml: configuration: got no such file"):
+    with pytest.raises(UserError, match=r"run: got a folder without config.yaml, expected a detect run; train one: "):
         call("evaluate", "--run", tmp_path, "--dataset", dataset_detect)
     with pytest.raises(UserError, match=r"metrics.json: metrics: got no such file"):
         call("compare", run, tmp_path, "--out", tmp_path / "out")

@@ -220,7 +220,7 @@ def test_when_int8_is_worth_it(loss, seconds, kept):
         (["--formats", "onnx,tflite"], "--formats: got onnx,tflite"),
         (["--int8"], "--int8: got no --dataset"),
         (["--size-px", "100"], "--size-px: got 100, expected a multiple of 32"),
-        (["--run", "nowhere"], "nowhere: --run: got no metrics.json"),
+        (["--run", "nowhere"], "nowhere: run: got no such folder, expected a detect run; train one: perilune-train"),
     ],
 )
 def test_wrong_options_leave_nothing(run_folder, tmp_path, options, words):

@@ -92,7 +92,10 @@ def test_an_image_of_one_tile_gets_what_frames_get(detector):
     for image, wanted in zip(images, frames, strict=True):
         found = detect_image(detector, image, Tiling(tile_px=128))
         assert found.scores == pytest.approx(wanted.scores, abs=1e-6)
-        assert found.boxes == pytest.approx(wanted.boxes, abs=1e-3)
+        # One image or two in a batch round differently, so that nearly equal scores may change places.
+        apart_px = np.abs(found.boxes[:, None] - wanted.boxes).max(axis=2)
+        assert apart_px.min(axis=0).max() < 1e-3 and apart_px.min(axis=1).max() < 1e-3
+        assert found.scores[apart_px.argmin(axis=0)] == pytest.approx(wanted.scores, abs=1e-6)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 300), (100, 64), (33, 257)])

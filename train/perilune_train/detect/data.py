@@ -70,7 +70,9 @@ def load_split(
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
         if size % 32:
-            raise UserError(dataset.root, field, size, "a multiple of 32, the network's coarsest stride")
+            near = max(32, round(size / 32) * 32)
+            expected = f"a multiple of 32, the network's coarsest stride; render or develop the frames with {near}"
+            raise UserError(dataset.root, field, size, expected)
     frames = load_frames(dataset, split)
     labels = read_labels(dataset, [*_BOX, *_ELLIPSE], split)
     radius_px = settings.radius_px or _labelled_range(dataset)

@@ -54,9 +54,9 @@ class Trained:
 def load_trained(root: Path) -> Trained:
     """A finished run's network, settings and threshold. Raises UserError where it is none."""
     run = RunFolder(root)
-    if not run.finished:
-        raise UserError(root, "--run", "no metrics.json", "the folder of a finished run, as runs/detect/small")
     config = config_of_run(root)
+    if not run.finished:
+        raise UserError(root, "run", "no metrics.json", "a finished run; resume it with the command that started it")
     try:
         threshold = float(json.loads(run.metrics.read_text(encoding="utf-8"))["test/threshold"])
     except (ValueError, KeyError, TypeError):
@@ -171,6 +171,8 @@ def export_run(
 
     Raises UserError, and leaves nothing, where a file differs from torch or the dataset has frames of another size.
     """
+    for name in ("onnx", "onnxruntime", *formats, *(("openvino", "onnxruntime.quantization") if int8 else ())):
+        package(name)
     trained = load_trained(root)
     channels = trained.config.in_channels
     opened = None if dataset is None else open_dataset(dataset)

@@ -15,6 +15,9 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
     `settings` replaces single settings of the evaluation. Raises UserError on a setting that would change the network.
     """
     path = run / "config.yaml"
+    if not path.is_file():
+        found = "a folder without config.yaml" if run.is_dir() else "no such folder"
+        raise UserError(run, "run", found, "a detect run; train one: perilune-train detect train --preset small")
     section = read_config_file(path).get("detect")
     if section is None:
         raise UserError(path, "detect", "no such section", "config.yaml of a detect run")
