@@ -31,7 +31,8 @@ _STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states"
 class KeepBest(Callback):
     """Saves the weights whenever the validation figure `monitor` improves (NaN never does).
 
-    The task has `architecture` (plain settings) and `evaluated` (the network whose weights are judged).
+    The task has `architecture` (plain settings) and `evaluated` (the network whose weights are judged), and may have
+    `terrain` (the plain record of the ground that it is fitted to).
     """
 
     def __init__(self, run: RunFolder, monitor: str, mode: Literal["min", "max"]):
@@ -50,7 +51,9 @@ class KeepBest(Callback):
         if value > self.best or not self.run.best.is_file():
             self.best = value if math.isfinite(value) else self.best
             if is_first_process():
-                save_weights(self.run.best, pl_module.architecture, pl_module.evaluated)
+                save_weights(
+                    self.run.best, pl_module.architecture, pl_module.evaluated, getattr(pl_module, "terrain", None)
+                )
 
 
 class KeepLast(Callback):

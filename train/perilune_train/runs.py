@@ -18,6 +18,7 @@ from perilune_shared.config import Section, read_config_file, to_yaml
 from perilune_shared.errors import UserError
 from perilune_shared.files import write_bytes, write_text
 from perilune_train.config import Precision
+from perilune_train.provenance import RECORD
 
 _NO_RESULT = {"detect.workers", "detect.checkpoint_minutes"}
 """Settings that say how a run goes on, and change nothing that comes of it."""
@@ -121,11 +122,17 @@ def write_metrics(run: RunFolder, metrics: Mapping[str, float | int | str | None
     write_text(run.metrics, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 
-def save_weights(path: Path, architecture: Mapping[str, Any], network: nn.Module) -> None:
-    """Write a network's weights beside the plain settings (`architecture`) that build it again."""
+def save_weights(
+    path: Path, architecture: Mapping[str, Any], network: nn.Module, terrain: Mapping[str, Any] | None = None
+) -> None:
+    """Write a network's weights beside the plain settings (`architecture`) that build it again.
+
+    `terrain` is the plain record of the ground that it was fitted to (provenance.py); None leaves it unknown.
+    """
     # Through memory: torch's own writer hides a full disk behind a RuntimeError.
     content = io.BytesIO()
-    torch.save({"architecture": dict(architecture), "state_dict": network.state_dict()}, content)
+    record = {} if terrain is None else {RECORD: dict(terrain)}
+    torch.save({"architecture": dict(architecture), "state_dict": network.state_dict(), **record}, content)
     write_bytes(path, content.getvalue())
 
 

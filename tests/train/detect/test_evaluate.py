@@ -49,7 +49,7 @@ def test_a_run_judged_again_has_the_same_figures(run, dataset_detect):
     for key, value in again.items():
         if key != "test/images_per_s":
             assert value == first[key], key
-    assert again["dataset/protocol"] == "unseen scenes"
+    assert again["dataset/protocol"] == "held-out scenes"
     assert (again["test/intervals_over"], again["test/intervals_units"]) == ("trajectory", 1)
     # One test trajectory: its own value, and no interval.
     assert again["test/ap50_paper_interval"] is None
@@ -117,7 +117,7 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
     rows = [line for line in written.splitlines() if line.startswith("| ")][2:]
     assert len(rows) == 2 and all(row in text for row in rows)
     assert rows[0].split("|")[2:] == rows[1].split("|")[2:]
-    assert "unseen scenes" in rows[0] and f"{figures(run)['test/ap50_paper']:.3f}" in rows[0]
+    assert "held-out scenes" in rows[0] and f"{figures(run)['test/ap50_paper']:.3f}" in rows[0]
     assert (tmp_path / "both/precision_recall.png").stat().st_size > 5000
 
 

@@ -9,11 +9,11 @@ from perilune_shared.manifest import open_dataset
 from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import load_split
-from perilune_train.detect.evaluation import protocol_of
 from perilune_train.detect.matching import EDGE
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.run import (
+    WRITTEN,
     about,
     detect_split,
     judge,
@@ -23,6 +23,8 @@ from perilune_train.detect.run import (
     told_of,
     write_detections,
 )
+from perilune_train.marks import mark_files
+from perilune_train.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
 
 
 def read_metrics(folder: Path) -> dict[str, float | int | str | None]:
@@ -62,6 +64,7 @@ def evaluate_again(
     threshold: float | None,
     out: Path | None,
     choose_threshold: bool = False,
+    allow_overlap: bool = False,
 ) -> Path:
     """Judge a run's best weights on a split of a dataset; everything it leaves is in the returned folder.
 
@@ -74,6 +77,11 @@ def evaluate_again(
     chosen_on = "chosen on the run's own val" if threshold is None else "given by hand"
     known = earlier.get("dataset/name")
     dataset = open_dataset(dataset_root)
+    best = runs.RunFolder(run).best
+    terrain = read_provenance(runs.load_weights(best), best)
+    if choose_threshold:
+        terrain = Provenance(split_terrain(dataset, "val", "calibrated")).joined([terrain])
+    terrain_check = check_terrain(terrain, dataset, split, allow_overlap)
     protocol = protocol_of(dataset.info)
     if known is not None and known != dataset.info.name:
         protocol = f"another dataset than the run's own ({known}), of itself split by {dataset.info.split_by}"
@@ -81,7 +89,7 @@ def evaluate_again(
         protocol += f"; {split} frames, which training {'saw' if split == 'train' else 'was steered by'}"
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
-    network = load_detector(runs.RunFolder(run).best)
+    network = load_detector(best)
     frames = load_split(dataset, split, config.labels, (1.0, 1 / EDGE))
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
@@ -97,5 +105,6 @@ def evaluate_again(
     metrics = selection_used(config, frames) | told_of(dataset, split, config) | {"dataset/protocol": protocol}
     metrics |= {f"{split}/{key}": value for key, value in evaluation.figures().items()}
     metrics[f"{split}/images_per_s"] = round(rate, 2)
-    runs.write_metrics(runs.RunFolder(folder), metrics)
+    mark_files(folder, WRITTEN, terrain_check.mark)
+    runs.write_metrics(runs.RunFolder(folder), metrics | terrain_check.metrics())
     return folder

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +14,8 @@ from perilune_train.detect.again import read_metrics
 from perilune_train.detect.figures import draw_curves
 from perilune_train.detect.metrics import Curve
 from perilune_train.detect.report import CURVE_FILE, number, table
+from perilune_train.marks import mark_files
+from perilune_train.provenance import Status, TerrainCheck
 from perilune_train.spread import read_spread
 
 _COLUMNS = {
@@ -24,15 +27,17 @@ _COLUMNS = {
     "recall": "recall",
     "f1": "F1",
 }
+Metrics = dict[str, float | int | str | None]
 _LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
 
 
-def compare_folders(folders: Sequence[Path], out: Path) -> str:
+def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
     """Write compare.md and precision_recall.png into `out`; returns the table.
 
-    Raises UserError where a folder lacks its metrics or its curve.
+    Raises UserError where a folder lacks its metrics or its curve, or was judged on terrain of its training, unless
+    `allow_overlap`; then table and picture say so.
     """
-    rows, curves = [], {}
+    rows, curves, marks = [], {}, []
     for folder in folders:
         metrics = read_metrics(folder)
         name = _name(folder)
@@ -52,13 +57,16 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
             figures = {key.removeprefix(f"{split}/"): metrics[key] for key in metrics if key.startswith(f"{split}/")}
             told = [metrics.get("dataset/name"), split, metrics.get("dataset/protocol")]
             told += [metrics.get("labels/selection"), metrics.get("evaluation/scales", 1)]
+        status, mark = _terrain(folder, metrics, allow_overlap)
+        marks += [f"{name}: {mark}"] if mark else []
+        told.insert(3, status)
         cells = [name, *map(_text, (*told, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
         # Of the whole curve, not of the points that are kept of it.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
-    head = ["run", "dataset", "split", "protocol", "wanted", "scales", "frames", "labels"]
+    head = ["run", "dataset", "split", "protocol", "terrain", "wanted", "scales", "frames", "labels"]
     head += [*_COLUMNS.values(), *_LOWEST.values()]
     text = "\n".join(table(head, rows)) + "\n"
     write_text(
@@ -66,7 +74,20 @@ def compare_folders(folders: Sequence[Path], out: Path) -> str:
         "# Runs side by side\n\nIn brackets: 95 % intervals, or single units where they are too few.\n\n" + text,
     )
     draw_curves(curves, out / "precision_recall.png")
+    mark_files(out, ("compare.md", "precision_recall.png"), "; ".join(marks))
     return text
+
+
+def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, str]:
+    """How an evaluation's test terrain stands to its training, and the mark that it must carry."""
+    if "images/name" in metrics:
+        return "real images", ""
+    status, mark = metrics.get("terrain/status"), metrics.get("terrain/mark")
+    if status == "overlap" and not allow_overlap:
+        wanted = "an evaluation on other terrain; --allow-overlap lets it through and marks it"
+        raise UserError(folder / "metrics.json", "terrain/mark", mark, wanted)
+    known = status in get_args(Status) and isinstance(mark, str)
+    return (str(status), str(mark)) if known else ("unknown", TerrainCheck("unknown").mark)
 
 
 def read_curve(path: Path) -> Curve:

@@ -12,8 +12,9 @@ from perilune_shared.schema import SPLITS
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.run_config import config_of_run
 from perilune_train.detect.tiling_options import BoxMargin, Overlap, Scales, TileSide
+from perilune_train.overlap_option import AllowOverlap
 
-_FOR_DATASETS = ("dataset", "split")
+_FOR_DATASETS = ("dataset", "split", "allow_overlap")
 _FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin")
 
 
@@ -43,6 +44,7 @@ def evaluate(
     out: Annotated[
         Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation, with --images <run>/images]")
     ] = None,
+    allow_overlap: AllowOverlap = False,
     images: Annotated[
         Path | None,
         typer.Option(help="Real images with boxes in place of a dataset: a folder of pictures and tables, or COCO."),
@@ -94,5 +96,5 @@ def evaluate(
     from perilune_train.detect.again import evaluate_again
 
     place = dataset or Path("data", run.resolve().name, "detect")
-    folder = evaluate_again(run, config, place, split, threshold, out, choose_threshold)
+    folder = evaluate_again(run, config, place, split, threshold, out, choose_threshold, allow_overlap)
     console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")

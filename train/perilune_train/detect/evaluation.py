@@ -16,7 +16,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_shared.info import DatasetInfo
 from perilune_train.detect.bins import BinFigures, figures_by_bin
 from perilune_train.detect.bootstrap import at_threshold_resampled, average_precisions
 from perilune_train.detect.data import FrameLabels
@@ -176,16 +175,6 @@ def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> d
             result[f"{name}_error_{ending}_p95"] = _or_nan(values, lambda known: np.percentile(known, 95))
         result[f"radius_bias_{ending}"] = _or_nan(difference / scale, np.mean)
     return result
-
-
-def protocol_of(info: DatasetInfo) -> str:
-    """What a dataset's splits share, and so what its test figures say."""
-    kinds = {
-        "scene": "unseen scenes",
-        "trajectory": "unseen descents over known terrain",
-        "frame": "random split of frames (the paper's)",
-    }
-    return kinds[info.split_by] + info.leak
 
 
 def _or_nan(values: Array, statistic) -> float:

@@ -11,7 +11,7 @@ import torch
 
 from perilune_shared.errors import UserError
 from perilune_shared.files import new_folder, sha256_of, write_text
-from perilune_shared.manifest import open_dataset
+from perilune_shared.manifest import Dataset, open_dataset
 from perilune_shared.progress import console
 from perilune_train.data.frames import normalised
 from perilune_train.detect.batches import network_input
@@ -23,9 +23,11 @@ from perilune_train.detect.flight_notes import readme
 from perilune_train.detect.int8 import Int8Verdict, try_int8
 from perilune_train.detect.run import load_detector
 from perilune_train.detect.run_config import config_of_run
+from perilune_train.marks import mark_files
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
-from perilune_train.runs import RunFolder
+from perilune_train.provenance import Provenance, TerrainCheck, check_calibration, read_provenance, split_terrain
+from perilune_train.runs import RunFolder, load_weights
 
 FORMATS = ("onnx", "openvino")
 MOST_PX = 1e-3
@@ -156,6 +158,18 @@ def noise_frames(count: int, size_px: int) -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (count, size_px, size_px)).astype(np.uint8)
 
 
+def _terrain(
+    checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
+) -> tuple[Provenance, TerrainCheck | None]:
+    """The record of the exported network, with what int8 is calibrated and chosen on, and its check."""
+    provenance = read_provenance(load_weights(checkpoint), checkpoint)
+    if calibration is None:
+        return provenance, None
+    own = split_terrain(calibration, "train", "calibrated") | split_terrain(calibration, "val", "calibrated")
+    check = check_calibration(provenance, own, calibration, allow_overlap)
+    return Provenance(provenance.uses | own, provenance.known), check
+
+
 def export_run(
     root: Path,
     out: Path,
@@ -163,13 +177,16 @@ def export_run(
     size_px: int = 256,
     dataset: Path | None = None,
     int8: bool = False,
+    allow_overlap: bool = False,
 ) -> Int8Verdict | None:
     """Write a run's detector into the new folder `out`, checked; with `int8` also quantised, if that is worth it.
 
     Leaves detector.onnx, detector.xml and .bin (as asked for), detector-int8.onnx (if kept), detector.json (the
     facts) and README.md. Compares on frames of the dataset's validation split, without one on noise.
 
-    Raises UserError, and leaves nothing, where a file differs from torch or the dataset has frames of another size.
+    Raises UserError, and leaves nothing, where a file differs from torch, the dataset has frames of another size, or
+    int8 is calibrated on terrain that the run was tested on, or that the dataset's own test split shares with what the
+    network was fitted to, unless `allow_overlap`; then facts and README say so.
     """
     for name in ("onnx", "onnxruntime", *formats, *(("openvino", "onnxruntime.quantization") if int8 else ())):
         package(name)
@@ -182,6 +199,8 @@ def export_run(
             found = f"{camera.width_px} x {camera.height_px}"
             raise UserError(opened.root, "frames", found, f"{size_px} x {size_px} pixels; --size-px gives another")
     told = facts(trained, size_px)
+    terrain, terrain_check = _terrain(trained.checkpoint, opened if int8 else None, allow_overlap)
+    told["terrain"] = {**terrain.plain(), **(terrain_check.metrics() if terrain_check is not None else {})}
     verdict = None
     with new_folder(out) as folder:
         if opened is None:
@@ -211,4 +230,6 @@ def export_run(
         told["files"] = {p.name: sha256_of(p) for p in sorted(folder.iterdir())}
         write_text(folder / "detector.json", json.dumps(told, indent=2) + "\n")
         write_text(folder / "README.md", readme(told))
+        if terrain_check is not None:
+            mark_files(folder, ("README.md",), terrain_check.mark)
     return verdict

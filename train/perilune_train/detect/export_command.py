@@ -7,6 +7,7 @@ import typer
 
 from perilune_shared.errors import UserError
 from perilune_shared.progress import console
+from perilune_train.overlap_option import AllowOverlap
 
 
 def export(
@@ -16,6 +17,7 @@ def export(
     size_px: Annotated[int, typer.Option(help="Side of the square images, a multiple of 32.")] = 256,
     dataset: Annotated[Path | None, typer.Option(help="Dataset whose validation frames to compare on.")] = None,
     int8: Annotated[bool, typer.Option("--int8", help="Also in 8-bit integers, if worth it; needs --dataset.")] = False,
+    allow_overlap: AllowOverlap = False,
 ) -> None:
     """Write a trained detector as ONNX and OpenVINO files, for flight.
 
@@ -33,5 +35,5 @@ def export(
     # Torch takes seconds to load: not for a wrong option.
     from perilune_train.detect.export import export_run
 
-    export_run(run, out, asked, size_px, dataset, int8)
+    export_run(run, out, asked, size_px, dataset, int8, allow_overlap)
     console.print(f"{out}: detector.json and README.md tell how to use the files")

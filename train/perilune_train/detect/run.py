@@ -19,18 +19,29 @@ from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors, 
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import DetectSplit, load_split
 from perilune_train.detect.distill import Teacher
-from perilune_train.detect.evaluation import Evaluation, evaluate_detections, protocol_of
+from perilune_train.detect.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.facts import facts_of
 from perilune_train.detect.matching import EDGE, Detections, Matches, match_split
 from perilune_train.detect.metrics import curve, figures
 from perilune_train.detect.report import write_evaluation
 from perilune_train.detect.scales import at_scales, detect_at_scales, multiply_adds_of_a_frame
 from perilune_train.detect.task import DetectTask
-from perilune_train.detect.transfer import start_from
+from perilune_train.detect.transfer import inherited_terrain, start_from
 from perilune_train.fit import fit, machines
+from perilune_train.marks import mark_files
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
+from perilune_train.provenance import check_terrain, protocol_of, training_provenance
 
 _ANCHOR_STREAM = 1
+WRITTEN = (
+    "report.md",
+    "detections.png",
+    "precision_recall.png",
+    "bins.png",
+    "detections.parquet",
+    "precision_recall.parquet",
+)
+"""What an evaluation leaves beside metrics.json."""
 
 
 def label_sizes(split: DetectSplit) -> np.ndarray:
@@ -93,12 +104,18 @@ def write_detections(path: Path, split: DetectSplit, found: list[Detections]) ->
 
 
 def run_detect(
-    config: DetectConfig, dataset_root: Path, runs_root: Path, name: str, resume: bool = False
+    config: DetectConfig,
+    dataset_root: Path,
+    runs_root: Path,
+    name: str,
+    resume: bool = False,
+    allow_overlap: bool = False,
 ) -> runs.RunFolder:
     """Train and evaluate a detector; everything it leaves is in the returned folder.
 
     With `resume` a stopped run goes on, and a finished one stays as it is. Raises UserError where its settings were
-    others, where its last state is damaged, and on a dataset, weights or settings that cannot be trained with.
+    others, where its last state is damaged, on a dataset, weights or settings that cannot be trained with, and where a
+    network that it starts or learns from was fitted to terrain of the test split, unless `allow_overlap`.
     """
     console.quiet = not runs.is_first_process()
     run = runs.RunFolder(runs_root / "detect" / name)
@@ -108,6 +125,9 @@ def run_detect(
             console.print(f"{run.root}: finished, and left as it is")
             return run
     dataset = open_dataset(dataset_root)
+    resuming = resume and run.last.is_file()
+    terrain = training_provenance(dataset).joined(inherited_terrain(config, run.last if resuming else None))
+    terrain_check = check_terrain(terrain, dataset, "test", allow_overlap)
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
     scale = {"train": config.augment.scale, "val": (1.0, 1.0), "test": (1.0, 1 / EDGE)}
@@ -119,7 +139,6 @@ def run_detect(
             raise UserError(dataset.root, f"{split} frames", len(splits[split]), wanted)
     sizes = label_sizes(splits["train"])
     network = build_network(config, sizes, dataset.root)
-    resuming = resume and run.last.is_file()
     if config.init_from is not None and not resuming:
         start_from(network, Path(config.init_from), config)
     teacher = None if config.teacher is None else load_teacher(Path(config.teacher), config)
@@ -133,6 +152,7 @@ def run_detect(
     if not resuming:
         console.print(told_of_anchors(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, splits["train"], splits["val"], frozen_epochs, teacher)
+    task.terrain = terrain.plain()
     seconds = fit(
         run,
         task,
@@ -163,6 +183,8 @@ def run_detect(
     }
     metrics |= selection_used(config, splits["test"])
     metrics |= told_of(dataset, "test", config) | evaluate(run, config, dataset, splits, device, bf16)
+    mark_files(run.root, WRITTEN, terrain_check.mark)
+    metrics |= terrain_check.metrics()
     runs.write_metrics(run, metrics)
     console.print(f"{run.root}: metrics.json, report.md, detections.png, precision_recall.png, bins.png")
     return run

@@ -17,6 +17,7 @@ from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.matching import Detections, match_split
 from perilune_train.detect.metrics import at_threshold, curve
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.provenance import RECORD
 
 _FINAL_RATE = 0.01
 _EVERY_STEP_UNTIL = 100
@@ -95,6 +96,7 @@ class DetectTask(lightning.LightningModule):
         self.splits = {"train": train, "val": val}
         self.judged: list[Detections] = []
         self.images_seen = 0
+        self.terrain: dict[str, Any] | None = None
         self.resumed = (0, 0)
 
     @property
@@ -117,6 +119,8 @@ class DetectTask(lightning.LightningModule):
             self.trainer.fit_loop.epoch_loop.batch_progress.current.processed,
         ]
         checkpoint["images_seen"] = self.images_seen
+        if self.terrain is not None:
+            checkpoint[RECORD] = self.terrain
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         epoch, batches = checkpoint["epoch_and_batches"]

@@ -7,6 +7,7 @@ import typer
 
 from perilune_shared.config import resolve
 from perilune_train.detect.config import DetectConfig
+from perilune_train.overlap_option import AllowOverlap
 
 
 def train(
@@ -21,6 +22,7 @@ def train(
     dataset: Annotated[Path | None, typer.Option(help="Folder of the dataset. [default: data/<preset>/detect]")] = None,
     runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
     name: Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")] = None,
+    allow_overlap: AllowOverlap = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
 ) -> None:
     """Train the crater detector (attention YOLOv3) and judge it on the test split.
@@ -35,4 +37,4 @@ def train(
     # Torch and Lightning take seconds to load: not for a wrong key.
     from perilune_train.detect.run import run_detect
 
-    run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, resume)
+    run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, resume, allow_overlap)

@@ -21,6 +21,7 @@ from perilune_train.models.darknet_weights import (
     read_darknet,
 )
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.provenance import RECORD, Provenance, read_provenance
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
 """Of photographs on Darknet's scale of 0 to 1, about. A power of two scales without rounding."""
@@ -68,6 +69,18 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
 
     kept = {key: value for key, value in network.state_dict().items() if not taken(key)}
     runs.fill(network, kept | {key: value for key, value in content["state_dict"].items() if taken(key)}, path)
+
+
+def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenance]:
+    """Records of the ground that the networks were fitted to which a run starts or learns from.
+
+    A resumed run has them in its last state, `last`. Darknet's files were trained on photographs of the Earth. Raises
+    UserError where a checkpoint is missing or damaged.
+    """
+    if last is not None:
+        return [read_provenance(runs.read_saved(last, "--resume", {RECORD}, "the last state of a run"), last)]
+    given = [Path(path) for path in (config.init_from, config.teacher) if path is not None]
+    return [read_provenance(runs.load_weights(path), path) for path in given if not is_darknet(path)]
 
 
 def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> None:

@@ -8,6 +8,7 @@ import typer
 from perilune_shared.config import resolve
 from perilune_shared.progress import console
 from perilune_train.navigate.config import NavigateConfig
+from perilune_train.overlap_option import AllowOverlap
 
 
 def navigate(
@@ -24,6 +25,7 @@ def navigate(
     dataset: Annotated[Path | None, typer.Option(help="Folder of the dataset. [default: data/<preset>/nav]")] = None,
     runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
     name: Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")] = None,
+    allow_overlap: AllowOverlap = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
 ) -> None:
     """Train the navigation networks and judge them beside the nominal motion, mean motions and KLT tracks.
@@ -40,5 +42,5 @@ def navigate(
     name = name or preset
     detector = runs / "detect" / name / "checkpoints" / "best.ckpt"
     dataset = dataset or Path("data", preset, "nav")
-    for run in navigate_run(settings, dataset, runs, name, detector, resume):
+    for run in navigate_run(settings, dataset, runs, name, detector, resume, allow_overlap):
         console.print(f"{run.root}: metrics.json, navigation.parquet, descent.png, errors.png")

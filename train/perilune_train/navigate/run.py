@@ -14,6 +14,7 @@ from perilune_shared.files import written_aside
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
 from perilune_train.fit import fit
+from perilune_train.marks import mark_files
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data import Descent, load_descents
 from perilune_train.navigate.figures import draw_descent, draw_errors
@@ -27,6 +28,13 @@ from perilune_train.navigate.metrics import (
     summary_spreads,
 )
 from perilune_train.navigate.task import Fusion, NavigationTask, load_navigator, predict
+from perilune_train.provenance import (
+    Provenance,
+    check_terrain,
+    protocol_of,
+    read_provenance,
+    training_provenance,
+)
 from perilune_train.runs import (
     RunFolder,
     check_architecture,
@@ -37,30 +45,43 @@ from perilune_train.runs import (
 )
 
 _PREFIX = "backbone."
+_WRITTEN = ("navigation.parquet", "errors.parquet", "descent.png", "errors.png")
 
 
 def navigate_run(
-    settings: NavigateConfig, dataset: Path, runs: Path, name: str, detector: Path | None, resume: bool
+    settings: NavigateConfig,
+    dataset: Path,
+    runs: Path,
+    name: str,
+    detector: Path | None,
+    resume: bool,
+    allow_overlap: bool = False,
 ) -> list[RunFolder]:
     """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
 
     `detector` is the default checkpoint for the stack network's backbone, used where it exists and fits;
-    `settings.detector` must fit. Raises UserError on bad data, a checkpoint of another architecture, or under torchrun
-    with several processes.
+    `settings.detector` must fit. Raises UserError on bad data, a checkpoint of another architecture, a detector
+    that was fitted to terrain of the test split (unless `allow_overlap`), or under torchrun with several processes.
     """
     processes = os.environ.get("WORLD_SIZE", "1")
     if processes != "1":
         raise UserError("torchrun", "processes", processes, "1: its descents are not shared out among several")
     wanted: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
-    descents = load_descents(open_dataset(dataset))
-    backbone, source = _detector_backbone(settings, detector) if "stack" in wanted else (None, "")
+    opened = open_dataset(dataset)
+    backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in wanted else (None, "", [])
+    own = training_provenance(opened)
+    terrain = {"warp": own, "stack": own.joined(inherited)}
+    # One check for both: the run of warp has the figures of stack in its table.
+    terrain_check = check_terrain(terrain["stack"], opened, "test", allow_overlap)
+    descents = load_descents(opened)
     test = [descent for descent in descents if descent.split == "test"]
     motions = _baselines([descent for descent in descents if descent.split == "train"], test)
     folders = []
     # stack comes first, so that the run of warp, finished last, holds the table of both.
     for fusion in wanted:
         run = start_run(runs, "navigate", name if fusion == "warp" else f"{name}-stack", settings, resume)
-        seconds = _train(run, settings, fusion, descents, backbone if fusion == "stack" else None, resume)
+        start = backbone if fusion == "stack" else None
+        seconds = _train(run, settings, fusion, descents, start, resume, terrain[fusion])
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
         motions = {fusion: [predict(network, architecture, descent) for descent in test], **motions}
@@ -71,6 +92,8 @@ def navigate_run(
             "test/ms_per_pair": round(1e3 * (time.monotonic() - started) / pairs, 2),
             "network/parameters": sum(p.numel() for p in network.parameters()),
             "network/backbone": source if fusion == "stack" else "from scratch",
+            "dataset/protocol": protocol_of(opened.info),
+            **terrain_check.metrics(),
         }
         _write(run, fusion, test, motions, details)
         folders.append(run)
@@ -84,10 +107,12 @@ def _train(
     descents: list[Descent],
     backbone: dict[str, Tensor] | None,
     resume: bool,
+    terrain: Provenance,
 ) -> float:
     """The seconds that it took."""
     lightning.seed_everything(settings.seed, verbose=False)
     task = NavigationTask(settings, fusion, descents, backbone)
+    task.terrain = terrain.plain()
     own = task.own
     return fit(
         run,
@@ -102,27 +127,32 @@ def _train(
     )
 
 
-def _detector_backbone(settings: NavigateConfig, default: Path | None) -> tuple[dict[str, Tensor] | None, str]:
-    """A detector's backbone weights and where they are from; None where there are none that fit, and why."""
+def _detector_backbone(
+    settings: NavigateConfig, default: Path | None
+) -> tuple[dict[str, Tensor] | None, str, list[Provenance]]:
+    """A detector's backbone weights, where they are from and the record of its terrain.
+
+    None where there are none that fit, why, and no record.
+    """
     path = settings.detector or default
     if path is None or (settings.detector is None and not path.is_file()):
         why = "from scratch: no detect run to start from"
         console.print(f"stack: backbone {why}")
-        return None, why
+        return None, why, []
     content = load_weights(path)
     wanted = {"in_channels": settings.in_channels, "width": settings.stack.width, "attention": settings.stack.attention}
     other = [key for key, value in wanted.items() if content["architecture"].get(key) != value]
     if other and settings.detector is None:
         why = f"from scratch: {path} differs in {', '.join(other)}"
         console.print(f"stack: backbone {why}")
-        return None, why
+        return None, why, []
     check_architecture(path, content["architecture"], wanted)
     weights = content["state_dict"].items()
     state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
     stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)
     source = f"stages 1 to {stages} of 5 from {path}"
     console.print(f"stack: backbone {source}")
-    return state, source
+    return state, source, [read_provenance(content, path)]
 
 
 def _baselines(training: list[Descent], test: list[Descent]) -> dict[str, list[Motion]]:
@@ -158,6 +188,7 @@ def _write(
         metrics |= {f"{place}/{key}": value for key, value in row.items()}
         for key, spread in summary_spreads(errors[method]).items():
             metrics |= spread.keys(f"{place}/{key}")
+    mark_files(run.root, _WRITTEN, str(details["terrain/mark"]))
     write_metrics(run, metrics | details)
 
 

@@ -151,6 +151,7 @@ class NavigationTask(lightning.LightningModule):
         self.pretrained = frozenset(pretrained or ())
         if pretrained:
             self.network.backbone.load_state_dict(pretrained, strict=False)
+        self.terrain: dict[str, Any] | None = None
         self.log_weights = nn.Parameter(torch.zeros(2))
         self.training_descents = [d.shrunk(self.own.size_px) for d in descents if d.split == "train"]
         self.validation_descents = [d.shrunk(self.own.size_px) for d in descents if d.split == "val"]
