@@ -144,7 +144,7 @@ def _render_manifest(
 
     plan, config, info = plan_of(given, dem, catalogue)
     with progress_bar() as progress:
-        made = render_plan(plan, config, info, out, progress)
+        made = render_plan(plan, config, info, out, progress, manifest)
     same, known, other_scenes = as_before(given, made)
     told = f"; {same} of {known} frames are the manifest's byte for byte" if known else ""
     told += f"; {other_scenes} scenes came out otherwise" if other_scenes else "; the ground came out as it says"

@@ -76,7 +76,13 @@ class SunConfig(Section):
     azimuth_deg: Span = Span(low=0.0, high=360.0)
     """Clockwise from north, degrees."""
     elevation_deg: Span = Span(low=12.0, high=55.0)
-    """Above the ground plane, degrees."""
+    """Above the ground plane, degrees, above 0 and at most 90."""
+
+    @model_validator(mode="after")
+    def _risen(self) -> "SunConfig":
+        if not (self.elevation_deg.low > 0 and self.elevation_deg.high <= 90):
+            raise ValueError("elevation_deg above 0 (the horizon) and at most 90")
+        return self
 
 
 class KindConfig(Section):
@@ -190,6 +196,12 @@ class LabelsConfig(Section):
     """Least sqrt(a b), pixels."""
     max_radius_px: Positive = 50.0
     """Largest sqrt(a b), pixels."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "LabelsConfig":
+        if self.min_radius_px >= self.max_radius_px:
+            raise ValueError(f"min_radius_px below max_radius_px, {self.max_radius_px}")
+        return self
 
 
 _GROUND_FIELDS = ("start_altitude_m", "end_altitude_m", "downrange_m")

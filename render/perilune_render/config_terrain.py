@@ -7,6 +7,9 @@ from pydantic import Field, model_validator
 from perilune_render.config_values import NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
 
+LARGEST_SPACING_PX = 4.0
+"""Largest vertex spacing over the smallest ground pixel."""
+
 
 class CratersConfig(Section):
     """The crater population."""
@@ -84,7 +87,7 @@ class TerrainConfig(Section):
     """Latitude of the site, degrees; an elevation model has its own."""
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
     """Longitude of the site, degrees; an elevation model has its own."""
-    spacing_px: Annotated[float, Field(gt=0, le=4)] = 0.5
+    spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
     """Vertex spacing over the smallest ground pixel from which a place is seen."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
     """Most vertices of the ground; a camera and flight that need more are refused."""

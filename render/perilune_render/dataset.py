@@ -20,16 +20,19 @@ from perilune_render.output import (
     begin_or_go_on,
     check_begun,
     info_of,
+    is_begun,
     open_finished,
     sync_frames,
     write_overview,
     writing,
 )
 from perilune_render.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
+from perilune_render.pose_checks import Poses, check_plan, check_poses
 from perilune_render.real_ground import real_ground_share
 from perilune_render.recipe import recipe_of
 from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import Scene, check_ground
 from perilune_shared.checksums import seal
 from perilune_shared.content import content_sha256
@@ -41,6 +44,8 @@ from perilune_shared.parts import read_part, write_part
 from perilune_shared.schema import Kind
 
 _GROUND = ("craters", "boulders")
+_DARK_SHARE = 0.01
+"""Share of the pixels that are sunlit, below which a frame is dark."""
 
 
 def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> Dataset:
@@ -48,22 +53,33 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
 
     Raises UserError where `out` holds something else.
     """
-    plan = make_plan(config, kind)
-    return render_plan(plan, config, info_of(config, plan, recipe_of(config, kind, preset)), out, progress)
+    plan, where = make_plan(config, kind), f"configuration: dataset.{kind}"
+    return render_plan(plan, config, info_of(config, plan, recipe_of(config, kind, preset)), out, progress, where)
 
 
-def render_plan(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, progress: Progress) -> Dataset:
+def render_plan(
+    plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, progress: Progress, where: object
+) -> Dataset:
     """Render a plan into `out`, or resume it; `info` is the dataset.json to begin with.
 
-    Raises UserError where `out` holds something else or another process is writing it.
+    Raises UserError where `out` holds something else or another process is writing it, and, naming `where` the plan
+    comes from, where a pose does not fit the ground. The first scene is checked before anything is written, every
+    other one before its first frame is rendered.
     """
-    check_ground(config, plan.exr_camera, config.ground_flight(info.recipe().kind))
+    flight = config.ground_flight(info.recipe().kind)
+    check_ground(config, plan.exr_camera, flight)
+    check_plan(plan, graded_grid(config, plan.exr_camera, flight), where)
     with writing(out):
-        return _render(plan, config, info, out, progress)
+        return _render(plan, config, info, out, progress, where)
 
 
-def _render(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, progress: Progress) -> Dataset:
+def _render(
+    plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, progress: Progress, where: object
+) -> Dataset:
     kind = info.recipe().kind
+    grown: dict[str, Scene] = {}
+    if not is_begun(out) and plan.scenes:
+        grown[plan.scenes[0].scene_id] = _grow(plan, plan.scenes[0], config, kind, where)
     info = begin_or_go_on(out, info)
     check_begun(out, plan)
     if info.complete:
@@ -79,21 +95,42 @@ def _render(plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, pro
         if not waiting:
             continue
         progress.update(task, note=f"{scene_plan.scene_id}: growing")
-        with interrupts_held():
-            scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
+        scene = grown.pop(scene_plan.scene_id, None) or _grow(plan, scene_plan, config, kind, where)
         _write_scene(out, scene_plan, scene, config, info.recipe().key, trajectories)
         progress.update(task, note=scene_plan.scene_id)
         sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
         studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)
         with Renderer(scene, config, plan.exr_camera, sun) as renderer:
-            for trajectory in waiting:
-                _render_trajectory(out, studio, trajectory, scene, renderer, lambda: progress.advance(task))
+            dark = [
+                frame_id
+                for trajectory in waiting
+                for frame_id in _render_trajectory(
+                    out, studio, trajectory, scene, renderer, lambda: progress.advance(task)
+                )
+            ]
+        if dark:
+            progress.console.print(
+                f"warning: {scene_plan.scene_id}: {len(dark)} of {sum(len(t.splits) for t in waiting)} frames are dark "
+                f"(less than {_DARK_SHARE:.0%} of the picture is sunlit), first {dark[0]}; the Sun is "
+                f"{scene_plan.sun_elevation_deg:.1f} degrees high",
+                soft_wrap=True,
+            )
     dataset = Dataset(out, info)
     finished = info.model_copy(update={"counts": count_rows(dataset), "complete": True})
     write_overview(dataset)
     write_info(out, finished)
     seal(out)
     return open_dataset(out)
+
+
+def _grow(plan: Plan, scene_plan: ScenePlan, config: DatasetConfig, kind: Kind, where: object) -> Scene:
+    """The ground of a scene, once all its poses are found to fit it."""
+    with interrupts_held():
+        scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
+    trajectories = plan.of_scene(scene_plan.scene_id)
+    if trajectories:
+        check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)
+    return scene
 
 
 def _frames_part(out: Path, trajectory: TrajectoryPlan) -> Path:
@@ -125,9 +162,10 @@ def _render_trajectory(
     scene: Scene,
     renderer: Renderer,
     advance: Callable[[], None],
-) -> None:
+) -> list[str]:
+    """Render and write one trajectory; the ids of its dark frames."""
     rows: list[dict] = []
-    labels = []
+    labels, dark = [], []
     for index in range(len(trajectory.splits)):
         shot = Shot.planned(trajectory, index)
         radiance = renderer.render(shot.position_m, shot.rotation_camera_from_site, seed=shot.render_seed)
@@ -138,6 +176,8 @@ def _render_trajectory(
         share = real_ground_share(scene, studio.exr_camera, *pose, radiance.depth_m)
         rows.append({**row, "real_ground_share": share})
         labels.append(tables.label_table(shot.frame_id, studio.label(shot, radiance, exposure)))
+        if radiance.sunlit.mean() < _DARK_SHARE:
+            dark.append(shot.frame_id)
         advance()
     name = f"{trajectory.scene_id}.{trajectory.trajectory_id}"
     # A labels part without its frames part is left from a stop between the two.
@@ -145,3 +185,4 @@ def _render_trajectory(
     write_part(out, "labels", name, pa.concat_tables(labels))
     sync_frames(out, rows)
     write_part(out, "frames", name, tables.frame_table(trajectory, studio.camera, studio.sun, rows))
+    return dark

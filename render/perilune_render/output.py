@@ -61,19 +61,21 @@ def sync_frames(root: Path, rows: list[dict[str, Any]]) -> None:
     files.sync_all(root / row[name] for row in rows for name in ("png_path", "exr_path") if row.get(name) is not None)
 
 
+def is_begun(out: Path) -> bool:
+    """Whether a folder holds a dataset. Raises UserError where it holds something else."""
+    begun = (out / "dataset.json").exists()
+    if not begun and out.exists() and any(not path.name.startswith(LOCK_NAME) for path in out.iterdir()):
+        wanted = "an empty or new folder, or a dataset to resume"
+        raise UserError(out, "--out", "a folder with other content", wanted)
+    return begun
+
+
 def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
     """Write the dataset.json of a new dataset, or read that of one that was begun with the same settings.
 
     Raises UserError where `out` holds something else.
     """
-    if not (out / "dataset.json").exists():
-        if out.exists() and any(not path.name.startswith(LOCK_NAME) for path in out.iterdir()):
-            raise UserError(
-                out,
-                "--out",
-                "a folder with other content",
-                "an empty or new folder, or a dataset to go on with",
-            )
+    if not is_begun(out):
         write_info(out, info)
         return info
     existing = open_dataset(out).info

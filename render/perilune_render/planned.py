@@ -10,7 +10,9 @@ from perilune_render.config import DatasetConfig
 from perilune_render.interrupts import interrupts_held
 from perilune_render.output import info_of
 from perilune_render.plan import make_plan
+from perilune_render.pose_checks import Poses, check_plan, check_poses
 from perilune_render.recipe import recipe_of
+from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground, grow_scene
 from perilune_shared.frames import sun_direction
 from perilune_shared.schema import TABLES, Kind
@@ -23,8 +25,9 @@ def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progre
     Every scene is grown once, for the hash of its content; nothing is rendered. Raises UserError on faults of the
     settings, or where `out` holds something.
     """
-    plan = make_plan(config, kind)
+    plan, where = make_plan(config, kind), f"configuration: dataset.{kind}"
     check_ground(config, plan.exr_camera, config.ground_flight(kind))
+    check_plan(plan, graded_grid(config, plan.exr_camera, config.ground_flight(kind)), where)
     recipe = recipe_of(config, kind, preset, planned=True)
     info = info_of(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes", note="")
@@ -34,6 +37,7 @@ def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progre
                 scene = grow_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
             sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
             trajectories = plan.of_scene(scene_plan.scene_id)
+            check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)
             paths = ("png", "exr") if config.render.exr else ("png",)
             frames = [
                 tables.frame_table(

@@ -11,6 +11,7 @@ from perilune_render.frame import Shot, Studio
 from perilune_render.labels import RimCircles
 from perilune_render.picture import draw_labels, enlarge, write_sheet
 from perilune_render.plan import make_plan
+from perilune_render.pose_checks import Poses, check_poses
 from perilune_render.real_ground import draw_outline, outline_m
 from perilune_render.sensor import FixedPattern
 from perilune_render.terrain.cache import cached_scene
@@ -29,6 +30,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
     check_ground(config, plan.exr_camera, config.ground_flight(kind))
     scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
+    check_poses(Poses.planned([trajectory]), plan.exr_camera, scene, f"configuration: dataset.{kind}")
     sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
     studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)

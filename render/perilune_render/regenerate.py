@@ -22,6 +22,7 @@ from perilune_render.frame import Shot, Studio
 from perilune_render.interrupts import interrupts_held
 from perilune_render.labels import RimCircles
 from perilune_render.plan import camera_of
+from perilune_render.pose_checks import Poses, check_poses
 from perilune_render.recipe import config_of, same_source
 from perilune_render.sensor import FixedPattern
 from perilune_render.tables import ground_tables
@@ -127,6 +128,8 @@ def _of_scene(
         ground = cached_scene(ground_config, exr_camera, flight, scene["seed"])
     if not same_source(ground.dem_source, scene["dem_source"]):
         raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
+    poses = (np.array([row[name] for row in rows]) for name in ("position_m", "rotation_wxyz"))
+    check_poses(Poses([row["frame_id"] for row in rows], *poses), exr_camera, ground, dataset.root)
     tables = ground_tables(scene["scene_id"], ground)
     same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
     sun = np.array(rows[0]["sun_direction"])

@@ -80,7 +80,7 @@ def test_a_folder_that_another_process_writes_is_left_alone(begun):
     info = info_of(config, plan, recipe_of(config, "detect", "tiny"))
     before = sorted(out.rglob("*"))
     with locked(out), pytest.raises(UserError, match=f"locked by PID {os.getpid()} "):
-        render_plan(plan, config, info, out, Progress())
+        render_plan(plan, config, info, out, Progress(), "configuration")
     assert sorted(out.rglob("*")) == before
 
 

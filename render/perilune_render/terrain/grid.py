@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config_terrain import LARGEST_SPACING_PX
 from perilune_render.kernels import njit
 from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
@@ -118,27 +119,45 @@ def graded_grid(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> 
     if view_angle(camera, flight) > _WIDEST_RAD:
         wide = f"frames reach {np.degrees(view_angle(camera, flight)):.0f} degrees from straight down"
         raise UserError("configuration", "dataset.camera", wide, f"at most {np.degrees(_WIDEST_RAD):.0f}")
+    spacing_px, most = config.terrain.spacing_px, config.terrain.max_vertices
+    grid = _grid_of(spacing_px, camera, flight)
+    if grid.n_vertices > most:
+        raise UserError(
+            "configuration",
+            "dataset.terrain.spacing_px",
+            f"{spacing_px} needs {grid.n_vertices:,} vertices",
+            f"{_wider(spacing_px, grid.n_vertices, most, camera, flight)} (dataset.terrain.max_vertices is {most:,})",
+        )
+    return grid
+
+
+def _wider(spacing_px: float, n_vertices: int, most: int, camera: Camera, flight: FlightConfig) -> str:
+    """What to set where a spacing needs more than `most` vertices: the least allowed spacing, to 0.01."""
+    hundredths = int(np.ceil(100 * spacing_px * np.sqrt(n_vertices / most)))
+    # The number of vertices falls a little slower or faster than the square of the spacing.
+    while hundredths > 1 and _grid_of((hundredths - 1) / 100, camera, flight).n_vertices <= most:
+        hundredths -= 1
+    while hundredths <= 100 * LARGEST_SPACING_PX:
+        if _grid_of(hundredths / 100, camera, flight).n_vertices <= most:
+            return f"at least {hundredths / 100:g}, or more dataset.terrain.max_vertices"
+        hundredths += 1
+    return "more dataset.terrain.max_vertices, fewer or wider pixels of dataset.camera, or a higher end_altitude_m"
+
+
+def _grid_of(spacing_px: float, camera: Camera, flight: FlightConfig) -> Grid:
+    """The grid of a spacing in pixels, whatever its number of vertices."""
     altitude = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, 400)
     reach = np.maximum.accumulate(reach_m(camera, flight, altitude))
     # The ground may rise towards the camera by a twentieth of the altitude too.
     lowest = np.maximum(0.95 * altitude - 3 * flight.position_sigma_m, 0.2 * altitude)
-    spacing = config.terrain.spacing_px * lowest / max(camera.fx_px, camera.fy_px)
+    spacing = spacing_px * lowest / max(camera.fx_px, camera.fy_px)
     n_half = int(np.ceil((reach / spacing).max()))
     inner = min(n_half * spacing[0], reach[-1])
     distance = np.linspace(inner, max(reach[-1], inner + spacing[0]), 20_000)
     allowed = np.interp(distance, reach, spacing)
     steps = np.concatenate([[0], np.cumsum(np.diff(distance) / allowed[:-1])])
     n_rings = int(np.ceil(steps[-1]))
-    grid = Grid(n_half, np.interp(np.linspace(0, steps[-1], n_rings + 1), steps, distance))
-    if grid.n_vertices > config.terrain.max_vertices:
-        wider = config.terrain.spacing_px * np.sqrt(grid.n_vertices / config.terrain.max_vertices)
-        raise UserError(
-            "configuration",
-            "dataset.terrain.spacing_px",
-            f"{config.terrain.spacing_px} needs {grid.n_vertices:,} vertices",
-            f"at least {wider:.2f}, or a larger dataset.terrain.max_vertices (now {config.terrain.max_vertices:,})",
-        )
-    return grid
+    return Grid(n_half, np.interp(np.linspace(0, steps[-1], n_rings + 1), steps, distance))
 
 
 @njit(inline="always")

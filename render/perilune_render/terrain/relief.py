@@ -11,7 +11,25 @@ from perilune_render.config_terrain import ReliefConfig
 from perilune_render.streams import stream
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.noise import RMS_SLOPE, add_waves
+from perilune_shared.errors import UserError
 from perilune_shared.frames import Array
+
+
+def finest_wave_m(grid: Grid) -> float:
+    """The shortest wave that a grid holds anywhere, metres: three vertex spacings."""
+    return 3 * float(grid.spacings_m.min())
+
+
+def check_waves(config: ReliefConfig, grid: Grid) -> None:
+    """Raise UserError where the longest wave is too short for the grid or for the slope's definition (1 m)."""
+    least_m = max(finest_wave_m(grid), 1.0)
+    if config.longest_wavelength_m < least_m:
+        raise UserError(
+            "configuration",
+            "dataset.terrain.relief.longest_wavelength_m",
+            config.longest_wavelength_m,
+            f"at least {np.ceil(least_m * 100) / 100:g} m: three vertex spacings, and 1 m",
+        )
 
 
 def add_relief(
@@ -22,7 +40,8 @@ def add_relief(
     `config.rms_slope_deg`, of which the seed draws one value, is that of all octaves down to a metre. Long waves are
     laid before the craters, which cut them; short ones after, since a worn crater is as rough as the ground about it.
     """
-    finest = 3 * float(grid.spacings_m.min())
+    finest = finest_wave_m(grid)
+    check_waves(config, grid)
     n_octaves = int(np.ceil(np.log2(config.longest_wavelength_m / min(finest, 1.0))))
     lengths = config.longest_wavelength_m / 2.0 ** np.arange(n_octaves)
     slopes = lengths ** (config.hurst_exponent - 1)

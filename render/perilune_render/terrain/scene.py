@@ -24,7 +24,7 @@ from perilune_render.terrain.elevation import (
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.measure import Rims, measure_rims, value_at
 from perilune_render.terrain.profile import REACH
-from perilune_render.terrain.relief import add_relief
+from perilune_render.terrain.relief import add_relief, check_waves
 from perilune_render.terrain.stamp import stamp_craters
 from perilune_render.terrain.surroundings import FittedRelief, add_fitted_relief, fitted_relief
 from perilune_shared.camera import Camera
@@ -152,11 +152,12 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
 
 
 def check_ground(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> None:
-    """Raises UserError on faults of the files that the ground is made from: they must show before the work begins.
+    """Check grid, waves and the files that the ground is made from, before the work begins. Raises UserError.
 
     Prints what a user should know of an elevation model.
     """
     grid = graded_grid(config, camera, flight)
+    check_waves(config.terrain.relief, grid)
     if config.terrain.dem is not None:
         model = read_elevation(Path(config.terrain.dem))
         refuse_beyond(model, grid, config.terrain.elevation.outside)

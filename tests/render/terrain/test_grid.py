@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 
@@ -82,10 +84,18 @@ def test_half_width_for_is_where_the_spacing_is_reached():
     assert grid.half_width_for(0.01) == 0
 
 
-def test_too_many_vertices_are_refused_and_a_spacing_is_named():
-    with pytest.raises(
-        UserError, match=r"dataset.terrain.spacing_px: got 0.5 needs 5,.* vertices, expected at least 2.39"
-    ):
-        graded_grid(config_with(terrain={"max_vertices": 250_000}), CAMERA, FLIGHT)
-    wider = config_with(terrain={"max_vertices": 300_000, "spacing_px": 2.5})
-    assert graded_grid(wider, CAMERA, FLIGHT).n_vertices <= 300_000
+@pytest.mark.parametrize("most", [250_000, 900_000, 1_234_567])
+def test_too_many_vertices_are_refused_and_a_spacing_is_named_that_passes(most):
+    with pytest.raises(UserError, match=r"dataset.terrain.spacing_px: got 0.5 needs 5,.* vertices") as refusal:
+        graded_grid(config_with(terrain={"max_vertices": most}), CAMERA, FLIGHT)
+    named = float(re.search(r"at least ([0-9.]+),", refusal.value.wanted)[1])
+    wider = config_with(terrain={"max_vertices": most, "spacing_px": named})
+    assert graded_grid(wider, CAMERA, FLIGHT).n_vertices <= most
+    finer = config_with(terrain={"max_vertices": most, "spacing_px": round(named - 0.01, 2)})
+    with pytest.raises(UserError, match="spacing_px"):
+        graded_grid(finer, CAMERA, FLIGHT)
+
+
+def test_a_mesh_that_no_spacing_makes_small_enough_names_none():
+    with pytest.raises(UserError, match=r"expected more dataset.terrain.max_vertices, fewer or wider pixels"):
+        graded_grid(config_with(terrain={"max_vertices": 10_000}), CAMERA, FLIGHT)
