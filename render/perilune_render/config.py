@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
+from perilune_shared.selection import default_label_bound_px
 
 
 class DistortionConfig(Section):
@@ -194,14 +195,19 @@ class LabelsConfig(Section):
 
     min_radius_px: Positive = 2.0
     """Least sqrt(a b), pixels."""
-    max_radius_px: Positive = 50.0
-    """Largest sqrt(a b), pixels."""
+    max_radius_px: Positive | None = None
+    """Largest sqrt(a b), pixels; null is 50, and in images wider than 256 px width x 50 / 256."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "LabelsConfig":
-        if self.min_radius_px >= self.max_radius_px:
-            raise ValueError(f"min_radius_px below max_radius_px, {self.max_radius_px}")
+        largest_px = self.max_radius_px or default_label_bound_px(1)
+        if self.min_radius_px >= largest_px:
+            raise ValueError(f"min_radius_px below max_radius_px, {largest_px}")
         return self
+
+    def bounds_px(self, width_px: int) -> tuple[float, float]:
+        """Least and largest sqrt(a b) of a label in images of a width, pixels."""
+        return self.min_radius_px, self.max_radius_px or default_label_bound_px(width_px)
 
 
 _GROUND_FIELDS = ("start_altitude_m", "end_altitude_m", "downrange_m")

@@ -174,8 +174,9 @@ def _render_trajectory(
             row |= studio.write_exr(out, shot, radiance)
         pose = shot.position_m, shot.rotation_camera_from_site
         share = real_ground_share(scene, studio.exr_camera, *pose, radiance.depth_m)
-        rows.append({**row, "real_ground_share": share})
-        labels.append(tables.label_table(shot.frame_id, studio.label(shot, radiance, exposure)))
+        found = studio.label(shot, radiance, exposure)
+        rows.append({**row, "real_ground_share": share, "n_craters_above_max_radius": found.n_above})
+        labels.append(tables.label_table(shot.frame_id, found))
         if radiance.sunlit.mean() < _DARK_SHARE:
             dark.append(shot.frame_id)
         advance()

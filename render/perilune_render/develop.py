@@ -158,15 +158,17 @@ def _develop_descent(
         known = {frame_id: rows for frame_id, rows in table.groupby("frame_id")}
         none = table.iloc[:0]
     exr_camera = studio.exr_camera
-    written, labels = [], []
+    written: list[dict] = []
+    labels = []
     for row in frames.to_pylist():
         size_px = exr_camera.width_px, exr_camera.height_px
         radiance = read_radiance(source.file(row["exr_path"]), size_px)
         shot = Shot.recorded(row, seed)
         png, exposure = studio.write_png(out, shot, radiance)
-        written.append(png)
+        written.append(dict(png))
         if known is None:
             found = studio.label(shot, radiance, exposure)
+            written[-1]["n_craters_above_max_radius"] = found.n_above
         else:
             found = studio.contrasted(Labels.from_table(known.get(shot.frame_id, none)), shot, exposure)
         labels.append(tables.label_table(shot.frame_id, found))

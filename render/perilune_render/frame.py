@@ -106,7 +106,7 @@ class Studio:
         """The labels of a frame."""
         pose = shot.position_m, shot.rotation_camera_from_site
         seen = seen_by(radiance, self.camera, self.exr_camera)
-        limits = self.config.labels.min_radius_px, self.config.labels.max_radius_px
+        limits = self.config.labels.bounds_px(self.camera.width_px)
         return self.contrasted(label_frame(self.circles, self.camera, *pose, seen, *limits), shot, exposure)
 
     def contrasted(self, labels: Labels, shot: Shot, exposure: Exposure) -> Labels:

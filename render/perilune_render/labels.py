@@ -30,6 +30,8 @@ class Labels:
     """Share of the crater's seen pixels that the Sun reaches; 0 where none is seen (N,)."""
     contrast: Array
     """The crater's own shading over its standard error, from noise and clutter; NaN where not measured (N,)."""
+    n_above: int | None = None
+    """Craters with their centre in the image and a radius above the largest of a label; None where not counted."""
 
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "Labels":
@@ -124,7 +126,8 @@ def label_frame(
     )
     visible = _visible_fraction(circles, camera, position_m, rotation_camera_from_site, radiance.depth_m, rows)
     lit = sunlit_fractions(ellipses, radiance.sunlit)
-    return Labels(circles.crater_id[rows], ellipses, visible, lit, np.full(len(rows), np.nan))
+    n_above = int((radius > max_radius_px).sum())
+    return Labels(circles.crater_id[rows], ellipses, visible, lit, np.full(len(rows), np.nan), n_above)
 
 
 def with_contrast(

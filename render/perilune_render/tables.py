@@ -16,6 +16,7 @@ from perilune_shared.schema import TABLES, complete
 
 _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
 _FILES = ("png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
+_OF_LABELS = ("n_craters_above_max_radius",)
 
 
 def _table(name: str, columns: dict) -> pa.Table:
@@ -128,14 +129,15 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
         "sun_direction": _vectors(np.tile(sun, (n, 1))),
         "real_ground_share": [row.get("real_ground_share") for row in files],
     }
-    return _table("frames", columns | {name: [row.get(name) for row in files] for name in _FILES})
+    return _table("frames", columns | {name: [row.get(name) for row in files] for name in (*_FILES, *_OF_LABELS)})
 
 
 def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) -> pa.Table:
     """Part of the table frames as in `table`, with another camera and other files (see `frame_table`)."""
     columns = {name: table[name] for name in table.column_names}
     columns |= {name: [getattr(camera, name)] * len(table) for name in _CAMERA}
-    return _table("frames", columns | {name: [row.get(name) for row in files] for name in _FILES})
+    renewed = (*_FILES, *(name for name in _OF_LABELS if name in files[0]))
+    return _table("frames", columns | {name: [row.get(name) for row in files] for name in renewed})
 
 
 def label_table(frame_id: str, labels: Labels) -> pa.Table:

@@ -128,6 +128,13 @@ TABLES: dict[str, pa.Schema] = {
             "share of the frame's ground that is an elevation model's, not procedural; null where not known",
             optional=True,
         ),
+        _column(
+            "n_craters_above_max_radius",
+            _INTEGER,
+            "",
+            "craters with their centre in the image that are too large for a label; null where not known",
+            optional=True,
+        ),
     ),
     "labels": _table(
         "labels",
@@ -154,7 +161,7 @@ TABLES: dict[str, pa.Schema] = {
         ),
     ),
 }
-OPTIONAL: dict[str, tuple[str, ...]] = {"frames": ("real_ground_share",)}
+OPTIONAL: dict[str, tuple[str, ...]] = {"frames": ("real_ground_share", "n_craters_above_max_radius")}
 """Columns that a file may lack, by table: they came after the schema version. A reader fills them with nulls, a writer
 writes them. To add one: a column with `optional=True` at the end of its table, and its name here."""
 KEYS: dict[str, list[str]] = {

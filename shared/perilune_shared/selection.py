@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from perilune_shared.config import Section
+from perilune_shared.info import DatasetInfo
 from perilune_shared.manifest import Dataset
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -24,8 +25,8 @@ Positive = Annotated[float, Field(gt=0)]
 class Selection(Section):
     """Thresholds that a label must all reach; null asks for nothing."""
 
-    radius_px: tuple[Positive, Positive] | None = None
-    """Least and largest sqrt(a b), pixels."""
+    radius_px: tuple[Positive, Positive | None] | None = None
+    """Least and largest sqrt(a b), pixels; null as the largest asks for none."""
     min_visible_fraction: Share | None = None
     """Least share of the rim that lies inside the image and is not hidden."""
     min_sunlit_fraction: Share | None = None
@@ -40,7 +41,7 @@ SELECTIONS: dict[str, Selection] = {
     "all": Selection(),
     "paper": Selection(radius_px=(2.0, 50.0)),
     "visible": Selection(
-        radius_px=(2.0, 50.0),
+        radius_px=(2.0, None),
         min_visible_fraction=0.3,
         min_sunlit_fraction=0.1,
         min_depth_ratio=0.04,
@@ -59,7 +60,8 @@ def selected(labels: pd.DataFrame, selection: Selection) -> NDArray[np.bool_]:
     value that is not known reaches no threshold."""
     chosen = np.ones(len(labels), np.bool_)
     if selection.radius_px is not None:
-        chosen &= labels["radius_px"].between(*selection.radius_px).to_numpy()
+        least_px, largest_px = selection.radius_px
+        chosen &= labels["radius_px"].between(least_px, np.inf if largest_px is None else largest_px).to_numpy()
     for column in ("visible_fraction", "sunlit_fraction", "contrast"):
         least = getattr(selection, f"min_{column}")
         if least is not None:
@@ -68,6 +70,19 @@ def selected(labels: pd.DataFrame, selection: Selection) -> NDArray[np.bool_]:
     if selection.min_depth_ratio is not None:
         chosen &= labels["depth_m"].to_numpy() >= selection.min_depth_ratio * labels["diameter_m"].to_numpy()
     return chosen
+
+
+def default_label_bound_px(width_px: int) -> float:
+    """Largest radius that becomes a label by default, pixels: 50, and in images wider than 256 px in proportion."""
+    return max(50.0, width_px * 50 / 256)
+
+
+def label_bound_px(info: DatasetInfo) -> float:
+    """Largest radius that became a label in a dataset, pixels, by its recipes; the default where they do not say."""
+    stated = [recipe.config.get("labels") for recipe in info.recipes.values()]
+    bounds = [labels.get("max_radius_px") for labels in stated if isinstance(labels, dict)]
+    numbers = [float(bound) for bound in bounds if isinstance(bound, int | float) and bound > 0]
+    return max(numbers, default=default_label_bound_px(info.camera.width_px))
 
 
 def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None = None) -> pd.DataFrame:

@@ -10,11 +10,14 @@ from perilune_shared.parts import Part
 
 
 def summary(dataset: Dataset) -> pd.DataFrame:
-    """One row a split: scenes, trajectories, frames, labels, labels per frame and quantiles of the radius in pixels.
+    """Counts and quantiles, one row a split.
+
+    Scenes, trajectories, frames, labels, labels per frame, quantiles of the radius in pixels, mean visible fraction,
+    craters in view that are too large for a label (None where not known) and megabytes of PNGs.
 
     Raises UserError where there are no frames.
     """
-    columns = ["frame_id", "scene_id", "trajectory_id", "split", "png_bytes"]
+    columns = ["frame_id", "scene_id", "trajectory_id", "split", "png_bytes", "n_craters_above_max_radius"]
     frames = dataset.table("frames", columns)
     if not len(frames):
         raise UserError(dataset.root, "frames", "none", "a dataset with frames")
@@ -50,7 +53,7 @@ class _Gathered:
 def _row(split: str, frames: pd.DataFrame, labels: _Gathered) -> dict:
     radius = np.concatenate(labels.radius_px) if labels.radius_px else np.empty(0, np.float32)
     quantiles = np.quantile(radius, [0.1, 0.5, 0.9]).round(2).tolist() if len(radius) else [None] * 3
-    png_bytes = frames["png_bytes"].sum()
+    png_bytes, too_large = frames["png_bytes"].sum(), frames["n_craters_above_max_radius"]
     return {
         "split": split,
         "scenes": frames["scene_id"].nunique(),
@@ -60,5 +63,6 @@ def _row(split: str, frames: pd.DataFrame, labels: _Gathered) -> dict:
         "labels_per_frame": round(len(radius) / len(frames), 1),
         **dict(zip(("radius_px_q10", "radius_px_median", "radius_px_q90"), quantiles, strict=True)),
         "visible_fraction_mean": round(labels.visible / len(radius), 3) if len(radius) else None,
+        "craters_too_large_for_a_label": None if too_large.isna().any() else int(too_large.sum()),
         "png_mb": round(float(png_bytes) / 1e6, 1),
     }

@@ -49,6 +49,11 @@ def test_a_rendered_dataset_has_no_fault(tiny, kind):
     assert validate(open_dataset(tiny / kind)) == []
 
 
+def test_every_rendered_frame_counts_the_craters_that_are_too_large_for_a_label(tiny):
+    counts = open_dataset(tiny / "detect").table("frames", ["n_craters_above_max_radius"]).to_pydict()
+    assert counts["n_craters_above_max_radius"] == [0] * 24
+
+
 def test_dark_frames_are_told_and_show_no_crater(tmp_path):
     changes = [f"--set=dataset.detect.{change}" for change in ("sun.elevation_deg=0.05", "n_scenes=1", "n_frames=2")]
     done = run("dataset", "--preset", "tiny", "--kind", "detect", "--out", tmp_path, *QUICK, *changes)

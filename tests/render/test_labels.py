@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perilune_render.config import SensorConfig
+from perilune_render.config import LabelsConfig, SensorConfig
 from perilune_render.exr import Radiance
 from perilune_render.label_pixels import contrasts, sunlit_fractions
 from perilune_render.labels import RimCircles, Shown, crater_index, label_frame, with_contrast
@@ -61,6 +61,20 @@ def test_contrast_is_nothing_without_depth_and_rises_with_it():
     values = [contrast(ratio, sun, rough=0.03) for ratio in (0.0, 0.005, 0.01, 0.02, 0.05)]
     assert abs(values[0]) < 3 and np.all(np.diff(values) > 1)
     assert contrast(0.1, sun) > 30 and contrast(-0.1, sun) < -30
+
+
+def test_the_bound_grows_with_the_image_and_what_it_leaves_out_is_counted():
+    assert LabelsConfig().bounds_px(128) == LabelsConfig().bounds_px(256) == (2.0, 50.0)
+    assert LabelsConfig().bounds_px(1024) == (2.0, 200.0)
+    assert LabelsConfig(max_radius_px=50.0).bounds_px(1024) == (2.0, 50.0)
+    radiance = shaded(0.1, sun_direction(70, 30))
+    for largest_px, count in ((50, 0), (5, 1)):
+        found = label_frame(CRATER, CAMERA, ABOVE, ROTATION_CAMERA_FROM_BODY, radiance, 2, largest_px)
+        assert (len(found.crater_id), found.n_above) == (1 - count, count)
+
+
+def test_a_dark_frame_gives_no_contrast():
+    assert contrast(0.1, sun_direction(70, -20)) == 0
 
 
 def test_contrast_rises_with_a_low_sun():

@@ -59,6 +59,7 @@ def test_the_papers_protocol_has_its_numbers():
 
     config = resolve(DatasetConfig, "dataset", "perilune_render", "paper")
     assert (config.detect.n_scenes, config.detect.trajectories_per_scene, config.detect.n_frames) == (1, 343, 100)
+    assert (config.labels.min_radius_px, config.labels.max_radius_px) == (2.0, 50.0)
     assert (config.nav.n_scenes, config.nav.trajectories_per_scene, config.nav.n_frames) == (1, 49, 100)
     assert config.detect.split_by == "frame" and config.nav.split_by == "trajectory"
     splits = [s for t in make_plan(config, "nav").trajectories for s in t.splits[:1]]

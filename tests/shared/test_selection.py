@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from perilune_shared.manifest import open_dataset
-from perilune_shared.selection import SELECTIONS, Selection, read_labels, selected
+from perilune_shared.selection import SELECTIONS, Selection, label_bound_px, read_labels, selected
 
 GOOD = {
     "radius_px": 5.0,
@@ -34,7 +34,18 @@ def test_the_named_selections():
     )
     assert selected(rows, SELECTIONS["all"]).all()
     assert selected(rows, SELECTIONS["paper"]).tolist() == [True, False, False, *[True] * 5]
-    assert selected(rows, SELECTIONS["visible"]).tolist() == [True, *[False] * 7]
+    assert selected(rows, SELECTIONS["visible"]).tolist() == [True, False, True, *[False] * 5]
+
+
+@pytest.mark.parametrize(
+    ("width_px", "stated", "bound"),
+    [(128, None, 50.0), (256, None, 50.0), (1024, None, 200.0), (1024, 50.0, 50.0), (1024, "much", 200.0)],
+)
+def test_the_largest_label_follows_the_recipe_and_the_image(tiny, width_px, stated, bound):
+    info = open_dataset(tiny / "detect").info
+    recipe = info.recipe().model_copy(update={"config": {"labels": {"max_radius_px": stated}}})
+    camera = info.camera.model_copy(update={"width_px": width_px})
+    assert label_bound_px(info.model_copy(update={"camera": camera, "recipes": {recipe.key: recipe}})) == bound
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,16 @@ def test_radius_bins_ignore_the_labels_and_the_detections_of_other_bins():
     assert (bins["radius_10_20_px"].precision, bins["radius_10_20_px"].recall) == (0, 0)
 
 
+def test_labels_above_50_px_have_a_bin_of_their_own():
+    truth = [labels((100, 100, 50), (300, 300, 80))]
+    ours = [found((100, 100, 50, 0.9), (300, 300, 80, 0.8))]
+    evaluation = evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 200.0))
+    bins = by_key(evaluation)
+    assert set(bins) == {"radius_20_50_px", "radius_50_inf_px"}
+    assert all((part.labels, part.precision, part.recall) == (1, 1, 1) for part in bins.values())
+    assert bins["radius_50_inf_px"].label == "above 50 px"
+
+
 def test_a_find_of_another_size_counts_for_the_labels_bin():
     truth, ours = [labels((50, 50, 4.8))], [found((50, 50, 5.2, 0.9))]
     bins = by_key(evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0)))

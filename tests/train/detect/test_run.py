@@ -67,7 +67,7 @@ def test_a_run_stores_the_selection_that_it_used(finished):
         "min_contrast": 4.0,
     }
     stored = parse_yaml(finished.config.read_text(), "")["detect"]["labels"]
-    assert stored == {**visible, "radius_px": [2.0, 50.0]}
+    assert stored == {**visible, "radius_px": [2.0, None]}
     metrics = json.loads(finished.metrics.read_text())
     told = {key.removeprefix("labels/"): value for key, value in metrics.items() if key.startswith("labels/")}
     assert told == {**visible, "min_radius_px": 2.0, "max_radius_px": 50.0}

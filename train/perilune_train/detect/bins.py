@@ -20,7 +20,9 @@ from perilune_train.spread import Resamples, Spread, spreads
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-RADIUS_BINS_PX = (2.0, 3.0, 5.0, 10.0, 20.0, 50.0)
+RADIUS_BINS_PX = (2.0, 3.0, 5.0, 10.0, 20.0, 50.0, float("inf"))
+"""Up to 50 px those of the paper's rule; above, where wider images have larger labels, one open bin."""
+_PAPERS_LARGEST_PX = 50.0
 ALTITUDE_BINS_M = (200.0, 500.0, 1000.0, 1500.0)
 SUN_BINS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 DEPTH_RATIO_BINS = (0.0, 0.04, 0.06, 0.08, 0.1, 0.15, 1.0)
@@ -61,6 +63,12 @@ class BinFigures:
         """Under which metrics.json has its figures, for example radius_2_3_px."""
         return "_".join([self.by, f"{self.low:g}", f"{self.high:g}"] + [self.unit] * bool(self.unit))
 
+    @property
+    def label(self) -> str:
+        """The bin's range as text, for example 2 to 3 px."""
+        reach = f"{self.low:g} to {self.high:g}" if self.high < float("inf") else f"above {self.low:g}"
+        return f"{reach} {self.unit}".rstrip()
+
 
 def within(values: Array, low: float, high: float, last: bool) -> Flags:
     """Whether values lie in a bin; NaN lies in none."""
@@ -83,7 +91,9 @@ def figures_by_bin(
     """
     made = []
     for low, high in pairwise(RADIUS_BINS_PX):
-        own = within(overlaps.label_radius_px, low, high, high == RADIUS_BINS_PX[-1])
+        # A radius of exactly 50 px belongs to the paper's largest bin.
+        own = within(overlaps.label_radius_px, low, high, high == _PAPERS_LARGEST_PX)
+        own &= (low < _PAPERS_LARGEST_PX) | (overlaps.label_radius_px > low)
         judged = max(low, radius_px[0]), min(high, radius_px[1])
         part = overlaps.match(match_iou, judged, overlaps.label_wanted & own)
         made.append(_of_matches("radius", "px", low, high, part, threshold, resamples))

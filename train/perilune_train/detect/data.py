@@ -12,7 +12,7 @@ from perilune_shared.ellipse import project_circles
 from perilune_shared.errors import UserError
 from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.manifest import Dataset
-from perilune_shared.selection import read_labels, selected
+from perilune_shared.selection import label_bound_px, read_labels, selected
 from perilune_train.data.frames import FrameStore, load_frames
 from perilune_train.detect.config import LabelSettings
 
@@ -75,7 +75,7 @@ def load_split(
             raise UserError(dataset.root, field, size, expected)
     frames = load_frames(dataset, split)
     labels = read_labels(dataset, [*_BOX, *_ELLIPSE], split)
-    radius_px = settings.radius_px or _labelled_range(dataset)
+    radius_px = _judged_range(dataset, settings)
     shapes, ids = labels[_SHAPE].to_numpy(np.float64), labels["crater_id"].to_numpy()
     wanted, depth_ratio = selected(labels, settings), (labels["depth_m"] / labels["diameter_m"]).to_numpy(np.float64)
     rows_of = labels.groupby("frame_id").indices
@@ -120,6 +120,14 @@ def _right_size(
     depth_m = points_m @ forward - np.asarray(frame["position_m"], np.float64) @ forward
     scaled = camera.fx_px * radius_m
     return (depth_m > 0) & (scaled > 0.8 * range_px[0] * depth_m) & (scaled < 2 * range_px[1] * depth_m)
+
+
+def _judged_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
+    """Least and largest radius that a selection asks for, pixels; where it is open, that of the dataset's labels."""
+    if settings.radius_px is None:
+        return _labelled_range(dataset)
+    least_px, largest_px = settings.radius_px
+    return least_px, label_bound_px(dataset.info) if largest_px is None else largest_px
 
 
 def _labelled_range(dataset: Dataset) -> tuple[float, float]:

@@ -64,7 +64,7 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
         for x, height in enumerate(heights):
             axes.text(x - 0.36, 0.02, f"{height:.2f}", fontsize=8, color="white")
         axes.set(xlabel=title, ylim=(0, 1), ylabel="AP" if place == 0 else "")
-        axes.set_xticks(range(len(parts)), [f"{part.low:g}-{part.high:g}\n{part.labels}" for part in parts], fontsize=8)
+        axes.set_xticks(range(len(parts)), [f"{part.label}\n{part.labels}" for part in parts], fontsize=8)
     figure.suptitle(
         f"AP (the paper's sum) with 95 % intervals; dots: single {unit}s where they are fewer than {LEAST_UNITS}; "
         "below each bin its number of labels; dashed and blue: the goal of 0.85",

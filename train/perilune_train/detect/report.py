@@ -136,16 +136,12 @@ def _of_brackets(resamples: Resamples) -> str:
     )
 
 
-def _range(part: BinFigures) -> str:
-    return f"{part.low:g} to {part.high:g} {part.unit}".rstrip()
-
-
 def _bins(title: str, parts: list[BinFigures]) -> list[str]:
     if not parts:
         return []
     rows = [
         [
-            _range(part),
+            part.label,
             str(part.frames),
             str(part.labels),
             part.ap50_paper_spread.text(part.ap50_paper),
@@ -159,7 +155,7 @@ def _bins(title: str, parts: list[BinFigures]) -> list[str]:
     return [
         f"## {title}",
         "",
-        f"Lowest AP: {number(least.ap50_paper)} at {_range(least)}.",
+        f"Lowest AP: {number(least.ap50_paper)} at {least.label}.",
         "",
         *table([title.lower(), "frames", "labels", "AP", "precision", "recall", "F1"], rows),
         "",
@@ -169,7 +165,7 @@ def _bins(title: str, parts: list[BinFigures]) -> list[str]:
 def _freshness(parts: list[BinFigures]) -> list[str]:
     if not parts:
         return []
-    rows = [[_range(part), str(part.labels), part.recall_spread.text(part.recall)] for part in parts]
+    rows = [[part.label, str(part.labels), part.recall_spread.text(part.recall)] for part in parts]
     return [
         "## Freshness",
         "",
