@@ -4,7 +4,6 @@ Nothing is rendered, so Blender is not needed. What a stop leaves goes on like a
 is written last.
 """
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from perilune_render.frame import Shot, Studio
 from perilune_render.labels import Labels, RimCircles
 from perilune_render.output import begin_or_go_on, first_difference, open_finished, sync_frames, write_overview, writing
 from perilune_render.plan import camera_of
-from perilune_render.recipe import settings_of
+from perilune_render.recipe import recorded_settings, settings_of
 from perilune_render.sensor import FixedPattern
 from perilune_render.versions import imaging_versions
 from perilune_shared import files
@@ -55,7 +54,7 @@ def develop_dataset(
     )
     recipe = old.model_copy(
         update={
-            "config": json.loads(config.model_dump_json()),
+            "config": recorded_settings(config, old.kind),
             "versions": {**old.versions, **imaging_versions()},
             "developed_from": made_of,
         }

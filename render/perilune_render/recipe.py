@@ -17,10 +17,17 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
-    """What a dataset is made by; where it is only planned, what its ground is made by.
+    """What a dataset is made by; where it is only planned, what its ground is made by."""
+    with_dem = config.terrain.dem is not None
+    versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
+    return Recipe(preset=preset, kind=kind, seed=config.seed, config=recorded_settings(config, kind), versions=versions)
 
-    Of files only the names are kept. Left out is what changes no byte: settings of speed, and
-    the other kind's settings where the kinds share no terrain.
+
+def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
+    """The settings that stand in a recipe, as plain data.
+
+    Of files only the names are kept. Left out is what changes no byte: settings of speed, and the other kind's settings
+    where the kinds share no terrain.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -30,9 +37,7 @@ def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool =
         del plain["render"][name]
     if not config.shared_terrain:
         del plain[_OTHER[kind]]
-    with_dem = config.terrain.dem is not None
-    versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
-    return Recipe(preset=preset, kind=kind, seed=config.seed, config=plain, versions=versions)
+    return plain
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
