@@ -31,8 +31,8 @@ class Dataset:
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[Path]:
         """The table's part files, sorted by name; only those that may hold rows of a scene or a descent."""
-        found = self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet")
-        found = sorted(found, key=lambda part: part.stem)
+        files = self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet")
+        found = sorted(files, key=lambda part: part.stem)
         return [part for part in found if _may_hold(part.stem, scene_id, trajectory_id)]
 
     def table(

@@ -70,8 +70,8 @@ def load_split(
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
         if size % 32:
-            near = max(32, round(size / 32) * 32)
-            expected = f"a multiple of 32, the network's coarsest stride; render or develop the frames with {near}"
+            nearest = max(32, round(size / 32) * 32)
+            expected = f"a multiple of 32, the network's coarsest stride; render or develop the frames with {nearest}"
             raise UserError(dataset.root, field, size, expected)
     frames = load_frames(dataset, split)
     labels = read_labels(dataset, [*_BOX, *_ELLIPSE], split)
