@@ -34,7 +34,6 @@ RENDER = $(BIN)/perilune-render dataset $(COMMON) $(if $(DEM),--dem $(call quote
 
 DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
-EXPLAIN := $(RUNS)/explain/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-train bench-infer clean
@@ -78,31 +77,30 @@ detect-frames: setup
 nav-frames: setup
 	@grep -qs '"complete": true' "$(DATA)/nav/dataset.json" || $(RENDER) --kind nav
 
-train-detect: detect-frames ## train and evaluate crater detection
-	@test -f "$(DETECT)" && echo "$(DETECT) is there; remove its folder to train again" || \
-	  $(BIN)/perilune-train detect train $(TRAIN) --dataset "$(DATA)/detect" --resume
+# OVERWRITE=1 replaces the runs of the targets named on the command line, and no others.
+OVER = $(if $(OVERWRITE),$(if $(filter $@,$(MAKECMDGOALS)),--overwrite))
+train-detect: detect-frames ## train and evaluate crater detection; again to resume (OVERWRITE=1 replaces)
+	@$(BIN)/perilune-train detect train $(TRAIN) --dataset "$(DATA)/detect" $(OVER)
 
 train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
-	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out "$(RUNS)" --name $(NAME)-none --dataset "$(DATA)/detect" --resume
+	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out "$(RUNS)" --name $(NAME)-none --dataset "$(DATA)/detect" $(OVER)
 
 # The same seeds, one change each; <name>-<change>. The first is the run of train-detect itself.
 ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
 ABLATED = "$(RUNS)/detect/$(NAME)" $(foreach one,$(ABLATION),"$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))")
 ablate-detect: train-detect ## train without attention, with plain CBAM, other strides, other widths; one table
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
-	  --out "$(RUNS)" --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset "$(DATA)/detect" --resume &&) true
+	  --out "$(RUNS)" --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset "$(DATA)/detect" $(OVER) &&) true
 	@$(BIN)/perilune-train detect compare $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
 	@$(BIN)/python benchmarks/size.py $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f "$(DETECT)" || $(MAKE) --no-print-directory train-detect
-	@test -f "$(NAVIGATE)" && test -f "$(RUNS)/navigate/$(NAME)-stack/metrics.json" && echo "$(NAVIGATE) is there; remove its folder to train again" || \
-	  $(BIN)/perilune-train navigate $(TRAIN) --dataset "$(DATA)/nav" --resume
+	@$(BIN)/perilune-train navigate $(TRAIN) --dataset "$(DATA)/nav" $(OVER)
 
 explain: ## attention masks and correlations of the trained networks
 	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory train-nav
-	@test -f "$(EXPLAIN)" && echo "$(EXPLAIN) is there; remove its folder to explain again" || \
-	  $(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)"
+	@$(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)" $(OVER)
 
 JOBS ?= 2
 test: setup ## run all tests, in JOBS=2 processes

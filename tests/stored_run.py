@@ -6,6 +6,7 @@ import numpy as np
 
 from perilune_shared.config import resolve
 from perilune_train import runs
+from perilune_train.begin import start_run
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.run import build_network
 from perilune_train.detect.run_config import config_of_run
@@ -17,7 +18,8 @@ def store_run(root: Path, *more: str) -> Path:
     """A run below `root`, with `more` settings; its network finds a little everywhere, at scores around 0.01."""
     settings = ("width=0.125", "precision=float32", "device=cpu", "evaluation.min_score=0.001", *more)
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, tuple(f"detect.{s}" for s in settings))
-    run = runs.start_run(root, "detect", "stored", config, False)
+    run = runs.RunFolder(root / "detect" / "stored")
+    start_run(run, "detect", config, {}, "new")
     network = build_network(config, np.random.default_rng(0).uniform(4, 40, (500, 2)), root)
     architecture = {"in_channels": config.in_channels, "width": config.width, "attention": config.attention}
     runs.save_weights(run.best, {**architecture, "strides": list(config.strides)}, network)

@@ -12,6 +12,7 @@ import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 
+from perilune_shared.errors import UserError
 from perilune_shared.progress import progress_bar
 from perilune_train.config import Precision
 from perilune_train.runs import (
@@ -25,6 +26,8 @@ from perilune_train.runs import (
 )
 
 _STEPS_BETWEEN_LOOKS = 20
+_PROCESSES = "processes"
+"""Key of the number of processes in last.ckpt: position in the epoch and schedule are in steps of all of them."""
 _STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
 
 
@@ -95,6 +98,9 @@ class KeepLast(Callback):
     def on_train_epoch_end(self, trainer, pl_module) -> None:
         self.save(trainer)
 
+    def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
+        checkpoint[_PROCESSES] = trainer.world_size
+
     def save(self, trainer: lightning.Trainer) -> None:
         """Write last.ckpt; an older one stays whole until the new one is."""
         trainer.save_checkpoint(self.run.last)
@@ -164,15 +170,20 @@ def fit(
     `architecture` and `evaluated` (see KeepBest). With `resume` training goes on from last.ckpt, if the run has one,
     and repeats exactly what an uninterrupted run does. That is kept after every epoch, and with `checkpoint_minutes`
     within epochs too; then the task's training batches must go on where the checkpoint was made. Raises UserError
-    where last.ckpt is damaged or of another network.
+    where last.ckpt is damaged, of another network or of another number of processes.
     """
+    devices, num_nodes = machines(devices, num_nodes)
     resume_from = run.last if resume and run.last.is_file() else None
     if resume_from is not None:
-        anew = "the last state of a run; start anew without --resume"
-        check_tensors(resume_from, read_saved(resume_from, "--resume", _STATE, anew)["state_dict"], task)
+        wanted = "the state of an interrupted run; --overwrite replaces it"
+        state = read_saved(resume_from, "last state", _STATE, wanted)
+        check_tensors(resume_from, state["state_dict"], task)
+        began = state.get(_PROCESSES, 1)
+        if began != devices * num_nodes:
+            wanted = f"{began}, with which the run began; --overwrite replaces the run"
+            raise UserError(resume_from, "processes", devices * num_nodes, wanted)
     keep_last = KeepLast(run, checkpoint_minutes)
     device = choose_device(device)
-    devices, num_nodes = machines(devices, num_nodes)
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     with warnings.catch_warnings():

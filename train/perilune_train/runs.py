@@ -3,9 +3,8 @@
 import io
 import json
 import math
-import shutil
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,10 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
-from perilune_shared.config import Section, read_config_file, to_yaml
 from perilune_shared.errors import UserError
 from perilune_shared.files import write_bytes, write_text
 from perilune_train.config import Precision
 from perilune_train.provenance import RECORD
-
-_NO_RESULT = {"detect.workers", "detect.checkpoint_minutes"}
-"""Settings that say how a run goes on, and change nothing that comes of it."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +30,11 @@ class RunFolder:
     def config(self) -> Path:
         """The resolved configuration."""
         return self.root / "config.yaml"
+
+    @property
+    def inputs(self) -> Path:
+        """Hashes of the dataset and of the checkpoints that the run reads."""
+        return self.root / "inputs.json"
 
     @property
     def metrics(self) -> Path:
@@ -63,55 +63,6 @@ def is_first_process() -> bool:
     It is known from the start: Lightning reads it from what torchrun, or it itself, gives the processes they start.
     """
     return int(rank_zero_only.rank) == 0
-
-
-def start_run(runs: Path, task: str, name: str, config: Section, resume: bool) -> RunFolder:
-    """The folder of a run about to start, with its config.yaml; an older run of that name is replaced.
-
-    With `resume` an older run is kept, if there is one. Raises UserError where it had other settings, and where the
-    folder holds something that is no run. Of several processes only the first touches the folder.
-    """
-    run = RunFolder(runs / task / name)
-    if resume:
-        check_settings(run, task, config)
-    # Another process would take away what the first has just made.
-    if not is_first_process():
-        return run
-    if run.root.is_dir() and any(run.root.iterdir()):
-        if not run.config.is_file():
-            raise UserError(run.root, "--name", "a folder that is no run (no config.yaml)", "another name")
-        if resume:
-            return run
-        shutil.rmtree(run.root)
-    write_text(run.config, to_yaml(task, config))
-    return run
-
-
-def check_settings(run: RunFolder, task: str, config: Section) -> None:
-    """Raise UserError naming the first setting in which an older run, if there is one, differs from `config`.
-
-    A setting that config.yaml lacks, since it is newer than the run, stands for its default.
-    """
-    if not run.config.is_file():
-        return
-    for key, old, new in _differences(task, read_config_file(run.config).get(task, {}), config):
-        if key not in _NO_RESULT:
-            raise UserError(run.config, key, old, f"{new}, as now asked for; --resume keeps what the run began with")
-
-
-def _differences(where: str, old: Mapping[str, Any], config: Section) -> Iterator[tuple[str, object, object]]:
-    """Key, old and new value of what differs between plain settings and a section."""
-    plain = config.model_dump(mode="json")
-    for name, field in type(config).model_fields.items():
-        key, value = f"{where}.{name}", getattr(config, name)
-        if isinstance(value, Section) and isinstance(old.get(name), dict):
-            yield from _differences(key, old[name], value)
-        elif name in old and old[name] != plain[name]:
-            yield key, old[name], plain[name]
-        elif name not in old and value != field.get_default(call_default_factory=True):
-            yield key, "nothing", plain[name]
-    for name in sorted(old.keys() - plain.keys()):
-        yield f"{where}.{name}", old[name], "no such setting"
 
 
 def write_metrics(run: RunFolder, metrics: Mapping[str, float | int | str | None]) -> None:

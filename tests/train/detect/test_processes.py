@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from perilune_shared.config import resolve
+from perilune_shared.errors import UserError
 from perilune_train.detect.batches import Share
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.run import run_detect
@@ -45,7 +46,7 @@ def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(dataset_detec
         assert process.wait() == -signal.SIGKILL
     epoch, batches = state(checkpoint)["epoch_and_batches"]
     assert epoch == 1 and 3 <= batches < BATCHES
-    done = subprocess.run([*command, "--resume"], env=ALONE, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, env=ALONE, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     resumed, uninterrupted = state(checkpoint), state(whole.last)
     assert resumed["global_step"] == uninterrupted["global_step"] == 2 * BATCHES
@@ -58,9 +59,10 @@ def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(dataset_detec
 
 def test_two_processes_share_the_frames_and_end_with_equal_weights(dataset_detect, tmp_path):
     run = tmp_path / "detect" / "two"
-    (run / "checkpoints").mkdir(parents=True)
-    (run / "config.yaml").write_text("detect: {}\n")
-    (run / "checkpoints" / "last.ckpt").write_text("of an older run, to be replaced")
+    # The second process has a folder of its own, as on another machine: what lies there does not make it resume alone.
+    stale = tmp_path / "other" / "detect" / "two" / "checkpoints" / "last.ckpt"
+    stale.parent.mkdir(parents=True)
+    stale.write_text("of an older run")
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     script = [str(Path(__file__).with_name("two_processes.py")), str(dataset_detect), str(tmp_path), *SETTINGS]
     done = subprocess.run([*torchrun, *script], env=ALONE, capture_output=True, text=True, timeout=120)
@@ -77,6 +79,12 @@ def test_two_processes_share_the_frames_and_end_with_equal_weights(dataset_detec
     assert_equal_tensors(saved, {key: first[key] for key in saved})
     assert (run / "metrics.json").is_file() and len(list(run.glob("events*"))) == 1
     assert done.stderr.count("load train") == done.stderr.count("train detector") == 1
+    assert stale.read_text() == "of an older run"
+    # Position and schedule of the state are those of two processes.
+    (run / "metrics.json").unlink()
+    config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, SETTINGS)
+    with pytest.raises(UserError, match=r"last.ckpt: processes: got 1, expected 2, with which the run began"):
+        run_detect(config, dataset_detect, tmp_path, "two")
 
 
 def is_weight(key: str) -> bool:

@@ -119,7 +119,7 @@ def test_the_same_seed_gives_the_same_weights_also_when_resumed(finished, datase
     with pytest.raises(KeyError):
         run_detect(settings(), dataset_detect, tmp_path, "b")
     monkeypatch.undo()
-    run = run_detect(settings(), dataset_detect, tmp_path, "b", resume=True)
+    run = run_detect(settings(), dataset_detect, tmp_path, "b")
     first, again = (torch.load(r.last, weights_only=True)["state_dict"] for r in (finished, run))
     assert first.keys() == again.keys()
     assert all(torch.equal(first[key], again[key]) for key in first)
@@ -129,16 +129,18 @@ def test_the_same_seed_gives_the_same_weights_also_when_resumed(finished, datase
     assert metrics[0] == metrics[1]
 
 
-def test_a_finished_run_is_left_as_it_is(finished, tmp_path, capsys):
+def test_a_finished_run_is_left_as_it_is(finished, few, tmp_path, capsys):
     def files():
         return {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in finished.root.rglob("*")}
 
     before = files()
-    run_detect(settings("detect.workers=1"), tmp_path / "absent", finished.root.parents[1], "a", resume=True)
-    assert "finished, and left as it is" in " ".join(capsys.readouterr().err.split())
-    with pytest.raises(UserError, match=r"config.yaml: detect.learning_rate: got 0.005, expected 0.01"):
+    run_detect(settings("detect.workers=1"), tmp_path / "absent", finished.root.parents[1], "a")
+    assert "finished, left as it is; --overwrite replaces it" in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(UserError, match=r"config.yaml: detect.learning_rate: got 0.01, expected 0.005, .*--overwrite"):
         other = settings("detect.learning_rate=0.01")
-        run_detect(other, tmp_path / "absent", finished.root.parents[1], "a", resume=True)
+        run_detect(other, tmp_path / "absent", finished.root.parents[1], "a")
+    with pytest.raises(UserError, match=r"inputs.json: dataset: got SHA-256 .*with which the run began; --overwrite"):
+        run_detect(settings(), few, finished.root.parents[1], "a")
     assert files() == before
 
 
@@ -164,7 +166,7 @@ def test_weights_to_start_from_are_not_needed_to_go_on(finished, few, tmp_path, 
     seconds = next(kept["seconds"] for kept in callbacks.values() if "seconds" in kept)
     first.unlink()
     run.metrics.unlink()
-    run_detect(config, few, tmp_path, "a", resume=True)
+    run_detect(config, few, tmp_path, "a")
     assert run.last.read_bytes() == last
     metrics = json.loads(run.metrics.read_text())
     assert metrics["train/seconds"] >= round(seconds, 1)

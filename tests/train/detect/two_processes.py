@@ -24,7 +24,7 @@ def main(dataset: Path, out: Path, *settings: str) -> None:
     task.TrainingFrames = Recorded  # type: ignore[misc]
     task.DetectTask.on_train_end = lambda self: last.append(self)  # type: ignore[method-assign]
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
-    run_detect(config, dataset, out, "two")
+    run_detect(config, dataset, out if runs.is_first_process() else out / "other", "two")
     state = {"seen": seen, "val_ap50": last[0].trainer.callback_metrics["val/ap50_paper"], **last[0].state_dict()}
     torch.save(state, out / f"{last[0].process[0]}.pt")
     assert runs.is_first_process() == (last[0].process[0] == 0)

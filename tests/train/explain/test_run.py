@@ -43,9 +43,9 @@ def checkpoints(tmp_path_factory):
     return store_run(folder, "attention=cbam") / "checkpoints" / "best.ckpt", folder / "stack.ckpt"
 
 
-def _explain(checkpoints, dataset_detect, dataset_nav, folder):
+def _explain(checkpoints, dataset_detect, dataset_nav, folder, n_drawn=2):
     return explain_run(
-        ExplainConfig(n_frames=3, n_pairs=3, n_drawn=2, device="cpu"),
+        ExplainConfig(n_frames=3, n_pairs=3, n_drawn=n_drawn, device="cpu"),
         dataset_detect,
         dataset_nav,
         *checkpoints,
@@ -75,6 +75,14 @@ def test_a_run_correlates_every_block(checkpoints, dataset_detect, dataset_nav, 
     assert metrics["pcc4_all_pixels/B_11"] == pytest.approx(both["value_all_pixels"]) != metrics["pcc4/B_11"]
     for name in ("masks_detect.png", "masks_navigate.png", "pcc_detect.png", "pcc_navigate.png"):
         assert cv2.imread(str(run.root / name)).std() > 5, name
+    # The same again leaves it alone; other settings or another checkpoint are refused.
+    before = {path: path.stat().st_mtime_ns for path in run.root.rglob("*")}
+    _explain(checkpoints, dataset_detect, dataset_nav, tmp_path)
+    with pytest.raises(UserError, match=r"explain.n_drawn: got 1, expected 2, with which the run began; --overwrite"):
+        _explain(checkpoints, dataset_detect, dataset_nav, tmp_path, n_drawn=1)
+    with pytest.raises(UserError, match=r"inputs.json: detector: got SHA-256 .*--overwrite"):
+        _explain((checkpoints[1], checkpoints[1]), dataset_detect, dataset_nav, tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in run.root.rglob("*")} == before
 
 
 def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect):

@@ -50,7 +50,7 @@ def detector(tmp_path_factory):
 def runs(dataset_nav, tmp_path_factory, detector):
     """Both networks, trained for two epochs; the stack's backbone from a detector."""
     folder = tmp_path_factory.mktemp("runs")
-    navigate_run(_settings(), dataset_nav, folder, "tiny", detector, False)
+    navigate_run(_settings(), dataset_nav, folder, "tiny", detector, True)
     return folder / "navigate"
 
 
@@ -101,15 +101,30 @@ def test_a_killed_run_goes_on_to_the_same_weights(dataset_nav, tmp_path, monkeyp
             raise KeyError("killed")
         return original(self, batch, batch_idx)
 
-    (whole,) = navigate_run(settings, dataset_nav, tmp_path, "a", None, False)
+    (whole,) = navigate_run(settings, dataset_nav, tmp_path, "a", None)
     monkeypatch.setattr(NavigationTask, "training_step", dies)
     with pytest.raises(KeyError):
-        navigate_run(settings, dataset_nav, tmp_path, "b", None, False)
+        navigate_run(settings, dataset_nav, tmp_path, "b", None)
     monkeypatch.undo()
-    (resumed,) = navigate_run(settings, dataset_nav, tmp_path, "b", None, True)
+    (resumed,) = navigate_run(settings, dataset_nav, tmp_path, "b", None)
     first, again = (torch.load(run.last, weights_only=True)["state_dict"] for run in (whole, resumed))
     assert first.keys() == again.keys()
     assert all(torch.equal(first[key], again[key]) for key in first)
+
+
+def test_finished_runs_are_left_as_they_are(runs, dataset_nav, dataset_detect, detector, capsys):
+    def files():
+        return {path: path.stat().st_mtime_ns for path in runs.rglob("*")}
+
+    before = files()
+    folders = navigate_run(_settings(), dataset_nav, runs.parent, "tiny", detector)
+    assert [run.root.name for run in folders] == ["tiny-stack", "tiny"]
+    assert " ".join(capsys.readouterr().err.split()).count("finished, left as it is") == 2
+    with pytest.raises(UserError, match=r"tiny-stack.*inputs.json: dataset: got SHA-256 .*--overwrite"):
+        navigate_run(_settings(), dataset_detect, runs.parent, "tiny", detector)
+    with pytest.raises(UserError, match=r"navigate.kappa: got 2.0, expected 1.0, with which the run began"):
+        navigate_run(_settings(kappa=2.0), dataset_nav, runs.parent, "tiny", detector)
+    assert files() == before
 
 
 def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path, detector):
@@ -117,7 +132,7 @@ def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path,
 
     def backbone(coarse, fine):
         network = _NETWORK | {"coarse_epochs": coarse, "fine_epochs": fine}
-        (run,) = navigate_run(_settings(fusion="stack", stack=network), dataset_nav, tmp_path, "t", detector, False)
+        (run,) = navigate_run(_settings(fusion="stack", stack=network), dataset_nav, tmp_path, "t", detector, True)
         state = torch.load(run.last, weights_only=True)["state_dict"]
         own = {key.removeprefix("network."): value for key, value in state.items()}
         return {key: value for key, value in own.items() if key.startswith("backbone.")}
@@ -131,10 +146,10 @@ def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path,
 
 def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
     settings = _settings(fusion="stack", stack=_NETWORK | {"width": 0.25})
-    (run,) = navigate_run(settings, dataset_nav, tmp_path, "t", detector, False)
+    (run,) = navigate_run(settings, dataset_nav, tmp_path, "t", detector, True)
     assert "width" in json.loads(run.metrics.read_text())["network/backbone"]
     with pytest.raises(UserError, match=r"width: got 0\.125"):
-        navigate_run(settings.model_copy(update={"detector": detector}), dataset_nav, tmp_path, "t", None, False)
+        navigate_run(settings.model_copy(update={"detector": detector}), dataset_nav, tmp_path, "t", None, True)
     with pytest.raises(UserError, match="fusion"):
         load_navigator(run.best, "warp")
 
@@ -142,7 +157,7 @@ def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
 def test_several_processes_are_refused_before_anything_is_written(dataset_nav, tmp_path, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(UserError, match="torchrun: processes: got 2, expected 1"):
-        navigate_run(_settings(), dataset_nav, tmp_path / "runs", "a", None, resume=False)
+        navigate_run(_settings(), dataset_nav, tmp_path / "runs", "a", None)
     assert not (tmp_path / "runs").exists()
 
 

@@ -167,7 +167,7 @@ class DetectConfig(Section):
     strategy: Strategy = "auto"
     """How several processes train together, by Lightning's names: auto takes what the settings need."""
     checkpoint_minutes: Annotated[float, Field(ge=0)] = 10.0
-    """Within an epoch the state is kept this often, for --resume; 0: after every step. It always is after an epoch."""
+    """Within an epoch the state is kept this often; 0: after every step. It always is after an epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0
     """Processes that augment frames beside the training; 0 does it in between, best on few cores."""
 

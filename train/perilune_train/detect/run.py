@@ -15,6 +15,7 @@ from perilune_shared.files import written_aside
 from perilune_shared.manifest import Dataset, open_dataset
 from perilune_shared.progress import console, progress_bar
 from perilune_train import runs
+from perilune_train.begin import hashes_of, start_run, state_of
 from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors, mean_best_iou
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import DetectSplit, load_split
@@ -108,25 +109,25 @@ def run_detect(
     dataset_root: Path,
     runs_root: Path,
     name: str,
-    resume: bool = False,
+    overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> runs.RunFolder:
     """Train and evaluate a detector; everything it leaves is in the returned folder.
 
-    With `resume` a stopped run goes on, and a finished one stays as it is. Raises UserError where its settings were
-    others, where its last state is damaged, on a dataset, weights or settings that cannot be trained with, and where a
-    network that it starts or learns from was fitted to terrain of the test split, unless `allow_overlap`.
+    An interrupted run of the same settings and dataset is resumed, a finished one left as it is; `overwrite` replaces
+    both. Raises UserError where its settings or dataset were others, where its last state is damaged, on a dataset,
+    weights or settings that cannot be trained with, and where a network that it starts or learns from was fitted to
+    terrain of the test split, unless `allow_overlap`.
     """
     console.quiet = not runs.is_first_process()
     run = runs.RunFolder(runs_root / "detect" / name)
-    if resume:
-        runs.check_settings(run, "detect", config)
-        if run.finished:
-            console.print(f"{run.root}: finished, and left as it is")
-            return run
+    inputs = hashes_of({"dataset": dataset_root, "teacher": None if config.teacher is None else Path(config.teacher)})
+    state = state_of(run, "detect", config, inputs, overwrite)
+    if state == "finished":
+        return run
+    resume = state == "resume"
     dataset = open_dataset(dataset_root)
-    resuming = resume and run.last.is_file()
-    terrain = training_provenance(dataset).joined(inherited_terrain(config, run.last if resuming else None))
+    terrain = training_provenance(dataset).joined(inherited_terrain(config, run.last if resume else None))
     terrain_check = check_terrain(terrain, dataset, "test", allow_overlap)
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
@@ -139,17 +140,17 @@ def run_detect(
             raise UserError(dataset.root, f"{split} frames", len(splits[split]), wanted)
     sizes = label_sizes(splits["train"])
     network = build_network(config, sizes, dataset.root)
-    if config.init_from is not None and not resuming:
+    if config.init_from is not None and not resume:
         start_from(network, Path(config.init_from), config)
     teacher = None if config.teacher is None else load_teacher(Path(config.teacher), config)
     if teacher is not None:
         network.anchors.copy_(teacher.network.anchors)
-    run = runs.start_run(runs_root, "detect", name, config, resume)
+    start_run(run, "detect", config, inputs, state)
     frozen_epochs = config.frozen_epochs if config.init_from is not None else 0
     if config.frozen_epochs and not frozen_epochs:
         console.print("frozen_epochs without init_from: nothing to freeze, the whole network trains from the start")
-    # The anchors of a run that goes on may be others, and are in its state.
-    if not resuming:
+    # The anchors of a resumed run may be others, and are in its state.
+    if not resume:
         console.print(told_of_anchors(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, splits["train"], splits["val"], frozen_epochs, teacher)
     task.terrain = terrain.plain()

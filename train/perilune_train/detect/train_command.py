@@ -23,13 +23,13 @@ def train(
     runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
     name: Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")] = None,
     allow_overlap: AllowOverlap = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of this name.")] = False,
 ) -> None:
     """Train the crater detector (attention YOLOv3) and judge it on the test split.
 
     Leaves runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, report.md,
-    detections.parquet, detections.png, precision_recall.png and .parquet, bins.png and TensorBoard events. A run of the
-    same name is replaced, unless --resume: then a stopped one goes on, and a finished one stays as it is.
+    detections.parquet, detections.png, precision_recall.png and .parquet, bins.png and TensorBoard events. The same
+    command resumes an interrupted run and leaves a finished one as it is; --overwrite replaces it.
 
     The baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
     """
@@ -37,4 +37,4 @@ def train(
     # Torch and Lightning take seconds to load: not for a wrong key.
     from perilune_train.detect.run import run_detect
 
-    run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, resume, allow_overlap)
+    run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, overwrite, allow_overlap)

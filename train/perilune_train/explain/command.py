@@ -39,13 +39,15 @@ def explain(
         Path | None,
         typer.Option(help="A stack navigator's best.ckpt. [default: runs/navigate/<name>-stack/checkpoints/best.ckpt]"),
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of this name.")] = False,
 ) -> None:
     """Draw what the attention of both networks looks at, and correlate it: PCC1 to PCC4 of the paper.
 
     PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
 
     Leaves runs/explain/<name>/ with config.yaml, masks_detect.png, masks_navigate.png, pcc_detect.png,
-    pcc_navigate.png, correlations.parquet and metrics.json. A run of the same name is replaced.
+    pcc_navigate.png, correlations.parquet and metrics.json. A finished run of the same
+    settings, datasets and checkpoints is left as it is; --overwrite replaces it.
     """
     settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
     # Torch and Lightning take seconds to load: not for a wrong key.
@@ -60,5 +62,6 @@ def explain(
         navigator or runs / "navigate" / f"{name}-stack" / "checkpoints" / "best.ckpt",
         runs,
         name,
+        overwrite,
     )
     console.print(f"{run.root}: metrics.json, masks_detect.png, masks_navigate.png, pcc_detect.png, pcc_navigate.png")

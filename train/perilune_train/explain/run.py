@@ -13,17 +13,18 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
+from perilune_train.begin import hashes_of, start_run, state_of
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import load_split
-from perilune_train.detect.evaluate_command import config_of_run
 from perilune_train.detect.run import load_detector, selection_used
+from perilune_train.detect.run_config import config_of_run
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation import ground_affine, ground_truth_mask
 from perilune_train.explain.masks import Masks, detector_masks, draw_masks, navigator_masks
 from perilune_train.explain.measures import PCC1_SIGN, detector_correlations, navigator_correlations
 from perilune_train.navigate.data import Descent, load_descents, pair_sequence
 from perilune_train.navigate.task import load_navigator
-from perilune_train.runs import RunFolder, choose_device, start_run, write_metrics
+from perilune_train.runs import RunFolder, choose_device, write_metrics
 
 _DETECT_BARS = {
     "pcc1_background": "PCC1: mask and G (1 on background)",
@@ -41,14 +42,29 @@ _NAVIGATE_TITLE = (
 
 
 def explain_run(
-    settings: ExplainConfig, detect_data: Path, nav_data: Path, detector: Path, navigator: Path, runs: Path, name: str
+    settings: ExplainConfig,
+    detect_data: Path,
+    nav_data: Path,
+    detector: Path,
+    navigator: Path,
+    runs: Path,
+    name: str,
+    overwrite: bool = False,
 ) -> RunFolder:
     """Explain two checkpoints on the test frames of two datasets into runs/explain/<name>.
 
     `detector` is checkpoints/best.ckpt in the folder of its run, whose config.yaml says which craters are wanted.
-    Raises UserError where a dataset, a checkpoint or that file is missing or of another kind, or a network has no
+    A finished run of the same settings, datasets and checkpoints is left as it is, unless `overwrite`. Raises UserError
+    where it had others, where a dataset, a checkpoint or that file is missing or of another kind, or a network has no
     attention.
     """
+    run = RunFolder(runs / "explain" / name)
+    inputs = hashes_of(
+        {"detection dataset": detect_data, "navigation dataset": nav_data, "detector": detector, "navigator": navigator}
+    )
+    state = state_of(run, "explain", settings, inputs, overwrite)
+    if state == "finished":
+        return run
     device = choose_device(settings.device)
     network = load_detector(detector).to(device)
     stack, architecture = load_navigator(navigator, "stack")
@@ -56,7 +72,7 @@ def explain_run(
     frames, truth, labels = detect_frames(settings, own, detect_data)
     test = [descent for descent in load_descents(open_dataset(nav_data)) if descent.split == "test"]
     pairs = _spread([(descent, step) for descent in test for step in range(descent.n_pairs)], settings.n_pairs)
-    run = start_run(runs, "explain", name, settings, False)
+    start_run(run, "explain", settings, inputs, state)
     detected = detector_masks(network, frames, detector)
     draw_masks(run.root / "masks_detect.png", *_some(frames, detected, settings.n_drawn))
     shrunk = {id(descent): descent.shrunk(architecture["size_px"]) for descent in test}

@@ -26,14 +26,15 @@ def navigate(
     runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
     name: Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")] = None,
     allow_overlap: AllowOverlap = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run that was stopped.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace runs of this name.")] = False,
 ) -> None:
     """Train the navigation networks and judge them beside the nominal motion, mean motions and KLT tracks.
 
     Leaves runs/navigate/<name>/ (fusion warp) and runs/navigate/<name>-stack/ (fusion stack, the paper's form), each
     with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, navigation.parquet (one row a method),
     errors.parquet (one row a pair), descent.png, errors.png and TensorBoard events. The stack network starts from
-    the backbone of runs/detect/<name>, where that fits. Runs of the same names are replaced, unless --resume.
+    the backbone of runs/detect/<name>, where that fits. The same command resumes an
+    interrupted run and leaves finished ones as they are; --overwrite replaces them.
     """
     settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
     # Torch and Lightning take seconds to load: not for a wrong key.
@@ -42,5 +43,5 @@ def navigate(
     name = name or preset
     detector = runs / "detect" / name / "checkpoints" / "best.ckpt"
     dataset = dataset or Path("data", preset, "nav")
-    for run in navigate_run(settings, dataset, runs, name, detector, resume, allow_overlap):
+    for run in navigate_run(settings, dataset, runs, name, detector, overwrite, allow_overlap):
         console.print(f"{run.root}: metrics.json, navigation.parquet, descent.png, errors.png")

@@ -13,6 +13,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.files import written_aside
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
+from perilune_train.begin import hashes_of, start_run, state_of
 from perilune_train.fit import fit
 from perilune_train.marks import mark_files
 from perilune_train.navigate.config import NavigateConfig
@@ -40,7 +41,6 @@ from perilune_train.runs import (
     check_architecture,
     choose_device,
     load_weights,
-    start_run,
     write_metrics,
 )
 
@@ -54,10 +54,13 @@ def navigate_run(
     runs: Path,
     name: str,
     detector: Path | None,
-    resume: bool,
+    overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> list[RunFolder]:
     """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
+
+    Interrupted runs of the same settings, dataset and detector are resumed, finished ones left as they are; `overwrite`
+    replaces both.
 
     `detector` is the default checkpoint for the stack network's backbone, used where it exists and fits;
     `settings.detector` must fit. Raises UserError on bad data, a checkpoint of another architecture, a detector
@@ -67,8 +70,16 @@ def navigate_run(
     if processes != "1":
         raise UserError("torchrun", "processes", processes, "1: its descents are not shared out among several")
     wanted: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
-    opened = open_dataset(dataset)
     backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in wanted else (None, "", [])
+    inputs: dict[Fusion, dict[str, str | None]] = {"warp": hashes_of({"dataset": dataset})}
+    used = None if backbone is None else settings.detector or detector
+    inputs["stack"] = inputs["warp"] | hashes_of({"detector": used})
+    names = {"warp": name, "stack": f"{name}-stack"}
+    folders = {fusion: RunFolder(runs / "navigate" / names[fusion]) for fusion in wanted}
+    states = {fusion: state_of(folders[fusion], "navigate", settings, inputs[fusion], overwrite) for fusion in wanted}
+    if set(states.values()) == {"finished"}:
+        return list(folders.values())
+    opened = open_dataset(dataset)
     own = training_provenance(opened)
     terrain = {"warp": own, "stack": own.joined(inherited)}
     # One check for both: the run of warp has the figures of stack in its table.
@@ -76,15 +87,18 @@ def navigate_run(
     descents = load_descents(opened)
     test = [descent for descent in descents if descent.split == "test"]
     motions = _baselines([descent for descent in descents if descent.split == "train"], test)
-    folders = []
     # stack comes first, so that the run of warp, finished last, holds the table of both.
-    for fusion in wanted:
-        run = start_run(runs, "navigate", name if fusion == "warp" else f"{name}-stack", settings, resume)
-        start = backbone if fusion == "stack" else None
-        seconds = _train(run, settings, fusion, descents, start, resume, terrain[fusion])
+    for fusion, run in folders.items():
+        seconds = None
+        if states[fusion] != "finished":
+            start_run(run, "navigate", settings, inputs[fusion], states[fusion])
+            start, resume = backbone if fusion == "stack" else None, states[fusion] == "resume"
+            seconds = _train(run, settings, fusion, descents, start, resume, terrain[fusion])
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
         motions = {fusion: [predict(network, architecture, descent) for descent in test], **motions}
+        if seconds is None:
+            continue
         pairs = sum(descent.n_pairs for descent in test)
         details = {
             "train/seconds": round(seconds, 1),
@@ -96,8 +110,7 @@ def navigate_run(
             **terrain_check.metrics(),
         }
         _write(run, fusion, test, motions, details)
-        folders.append(run)
-    return folders
+    return list(folders.values())
 
 
 def _train(
