@@ -95,11 +95,11 @@ ablate-detect: train-detect ## train without attention, with plain CBAM, other s
 	@$(BIN)/python benchmarks/size.py $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
-	@test -f "$(DETECT)" || $(MAKE) --no-print-directory train-detect
+	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect
 	@$(BIN)/perilune-train navigate $(TRAIN) --dataset "$(DATA)/nav" $(OVER)
 
 explain: ## attention masks and correlations of the trained networks
-	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory train-nav
+	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav
 	@$(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)" $(OVER)
 
 JOBS ?= 2
