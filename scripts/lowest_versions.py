@@ -1,0 +1,35 @@
+"""Print the lowest versions that perilune-shared and perilune-train declare, one a line, as constraints for pip."""
+
+import re
+import tomllib
+from pathlib import Path
+
+_ROOT = Path(__file__).resolve().parents[1]
+_BOUND = re.compile(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?>=([0-9.]+)")
+
+
+def lowest(project: Path) -> dict[str, str]:
+    """Name and lowest version of each dependency of a project. Raises ValueError on one without a lower bound."""
+    content = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))
+    found = {}
+    for requirement in content["build-system"]["requires"] + content["project"]["dependencies"]:
+        bound = _BOUND.match(requirement)
+        if bound is not None:
+            found[bound[1].lower()] = bound[2]
+        elif not requirement.startswith("perilune-"):
+            raise ValueError(f"{project.name}/pyproject.toml: {requirement}: no lower bound")
+    return found
+
+
+def main() -> None:
+    """Print the higher of both projects' bounds where both have one."""
+    bounds: dict[str, str] = {}
+    for project in ("shared", "train"):
+        for name, version in lowest(_ROOT / project).items():
+            bounds[name] = max(version, bounds.get(name, version), key=lambda text: [int(n) for n in text.split(".")])
+    for name, version in sorted(bounds.items()):
+        print(f"{name}=={version}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""Import every module of perilune-shared and perilune-train and train one step of `tiny` for each network.
+
+Usage: try_lowest.py FOLDER, an empty folder for datasets and runs. Part of scripts/test-lowest.
+"""
+
+import importlib
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import perilune_shared
+import perilune_train
+
+ROOT = Path(__file__).resolve().parents[1]
+_OPTIONAL = {"rasterio", "onnx", "onnxruntime", "openvino", "datasets"}
+
+
+def import_all() -> int:
+    """The number of modules that were imported; those of extras that are not installed are left out."""
+    count = 0
+    for package in (perilune_shared, perilune_train):
+        for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+            try:
+                importlib.import_module(module.name)
+            except ImportError as error:
+                if error.name not in _OPTIONAL:
+                    raise
+            count += 1
+    return count
+
+
+def main(folder: Path) -> None:
+    """Print what was done; raise where anything fails."""
+    print(f"imported {import_all()} modules")
+    sys.path.insert(0, str(ROOT))
+    from tests.drawn_dataset import build_dataset
+
+    splits = {"train": 1, "val": 1, "test": 1}
+    build_dataset(folder / "detect", "detect", splits=splits)
+    build_dataset(folder / "nav", "nav", splits=splits, scenes=1)
+    program = str(Path(sys.executable).with_name("perilune-train"))
+    common = ["--preset", "tiny", "--out", str(folder / "runs")]
+    for command in (
+        ["detect", "train", *common, "--dataset", str(folder / "detect"), "--set", "detect.epochs=1"],
+        ["navigate", *common, "--dataset", str(folder / "nav"), "--set", "navigate.warp.fine_epochs=0"],
+    ):
+        subprocess.run([program, *command], check=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
