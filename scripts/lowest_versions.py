@@ -9,10 +9,13 @@ _BOUND = re.compile(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?>=([0-9.]+)")
 
 
 def lowest(project: Path) -> dict[str, str]:
-    """Name and lowest version of each dependency of a project. Raises ValueError on one without a lower bound."""
+    """Name and lowest version of each dependency of a project. Raises ValueError on one without a lower bound.
+
+    Build requirements are left out: torch itself requires a newer setuptools than the build.
+    """
     content = tomllib.loads((project / "pyproject.toml").read_text(encoding="utf-8"))
     found = {}
-    for requirement in content["build-system"]["requires"] + content["project"]["dependencies"]:
+    for requirement in content["project"]["dependencies"]:
         bound = _BOUND.match(requirement)
         if bound is not None:
             found[bound[1].lower()] = bound[2]
