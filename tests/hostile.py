@@ -109,7 +109,7 @@ def command(root: Path, name: str, capsys: pytest.CaptureFixture, monkeypatch: p
     assert "Traceback" not in told and "Warning" not in told
     # The progress bar comes before it.
     lines = [line for line in err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == (code == 2 and "faults" not in out), told
+    assert len(lines) == (code == 2 and " fault" not in out), told
     assert not lines or err.rstrip().endswith(lines[0]), err
     assert name != "validate" or code == 2, told
     assert all(c.isprintable() or c == "\n" for c in told), repr(told)

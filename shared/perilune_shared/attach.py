@@ -14,15 +14,22 @@ from perilune_shared.writer import with_column, written
 
 
 def attach(
-    manifest: Dataset, frames_root: Path, out: Path, rehash: bool = False, progress: Progress | None = None
+    manifest: Dataset,
+    frames_root: Path,
+    out: Path,
+    rehash: bool = False,
+    progress: Progress | None = None,
+    *,
+    link: bool = False,
 ) -> None:
     """Write a dataset of a manifest without frames and the frames under `frames_root`, at the manifest's own paths.
 
-    Every PNG must have the hash that the manifest states. With `rehash` frames are taken as they are and their own
-    hashes written down, as for those of another kind of machine. EXRs come along where all of a scene's are there.
-    Raises UserError where a frame is missing or another, and on a plan, which has no labels.
+    Frames are copied, or linked with `link`. Every PNG must have the hash that the manifest states. With `rehash`
+    frames are taken as they are and their own hashes written down, as for those of another kind of machine. EXRs come
+    along where all of a scene's are there. Raises UserError where a frame is missing or another, and on a plan, which
+    has no labels.
     """
-    check_source(manifest, out)
+    check_source(manifest, out, progress)
     if manifest.info.images != "absent":
         wanted = "absent: a manifest with labels and without frames"
         raise UserError(manifest.root, "images", manifest.info.images, wanted)
@@ -33,12 +40,12 @@ def attach(
     task = (
         progress.add_task("attaching", total=manifest.info.counts.frames, unit="frames", note="") if progress else None
     )
-    with written(out, info) as writer:
+    with written(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = manifest.scene(scene_id)
             frames = _checked(source, tables["frames"], rehash)
             writer.add_scene({**tables, "frames": frames})
-            writer.add_images(source, frames, {name: name for name in frames["frame_id"].to_pylist()}, link=True)
+            writer.add_images(source, frames, {name: name for name in frames["frame_id"].to_pylist()}, link=link)
             if progress is not None and task is not None:
                 progress.advance(task, len(frames))
 

@@ -14,36 +14,21 @@ import numpy as np
 import pandas as pd
 from rich.progress import Progress
 
+from perilune_shared.card_head import head_of, table_configs
 from perilune_shared.card_pictures import TITLES, Gathered, draw, gather
 from perilune_shared.content import terrain_of
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.export_croissant import citation_of
-from perilune_shared.info import INFO_NAME, Recipe
+from perilune_shared.info import INFO_NAME, DatasetInfo, Recipe
 from perilune_shared.manifest import Dataset
 from perilune_shared.own_files import add_files, check_sums
 from perilune_shared.stats import summary
-from perilune_shared.yaml_text import to_yaml_text
 
 CARD_NAME = "README.md"
 _PICTURE_NAME = "card.png"
 _MARK = "<!-- written by `perilune-manifest card`, which writes it anew; changes by hand are lost -->"
 _HARMLESS = frozenset(string.ascii_letters + string.digits + " ._+,:()/%=?-")
-_TASKS = {"detect": "object-detection", "nav": "other"}
-_PURPOSE = {
-    "detect": "Crater detection: many terrains, a short descent over each.",
-    "nav": "Navigation: many descents over one terrain or a few.",
-}
-_HUB_LICENCES = {
-    "CC0-1.0",
-    "CC-BY-4.0",
-    "CC-BY-SA-4.0",
-    "CC-BY-NC-4.0",
-    "CC-BY-NC-SA-4.0",
-    "Apache-2.0",
-    "MIT",
-    "CDLA-Permissive-2.0",
-}
-_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+_PURPOSE = {"detect": "Crater detection", "nav": "Navigation"}
 _IMAGES = {
     "files": "8- or 16-bit grey PNGs under frames/",
     "packed": "grey PNGs packed in images/*.parquet",
@@ -66,10 +51,10 @@ def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[
     for path in (out, picture):
         if path.exists() and not ours:
             raise UserError(path, "--out", "a file that no card wrote", "another place, or that file moved away")
-    seal = check_sums(dataset, (out, picture))
+    known = check_sums(dataset, (out, picture), progress)
     gathered = gather(dataset, progress)
     png = draw(dataset, gathered)
-    add_files(dataset, {picture: png, out: card_of(dataset, gathered, picture.name).encode()}, seal=seal)
+    add_files(dataset, {picture: png, out: card_of(dataset, gathered, picture.name).encode()}, known)
     return out, picture
 
 
@@ -84,9 +69,9 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
     info = dataset.info
     state = "" if info.complete else "\n\n**Not complete**: the renderer is still at work, or was stopped."
     parts = [
-        _head(dataset),
+        head_of(dataset, table_configs(dataset)),
         f"{_MARK}\n\n# {code(info.name)}",
-        f"Rendered lunar descents with exact crater ellipses and camera poses. {_PURPOSE[info.kind]}{state}",
+        f"Rendered lunar descents with exact crater ellipses and camera poses. {_purpose(info)}{state}",
         f"![Frames with labels, and histograms]({quote(picture_name)})",
         "*Labels: green where the selection `visible` takes them, orange for craters that a frame hardly shows.*",
         "## What it holds\n\n" + _counts(dataset),
@@ -103,18 +88,12 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _head(dataset: Dataset) -> str:
-    info = dataset.info
-    single = info.licence in _HUB_LICENCES
-    licence = {"license": info.licence.lower()} if single else {"license": "other", "license_name": info.licence}
-    head = {
-        **licence,
-        "pretty_name": info.name,
-        "task_categories": [_TASKS[info.kind]],
-        "tags": ["moon", "craters", "lunar-landing", "synthetic", "perilune"],
-        "size_categories": [next((name for most, name in _SIZES if info.counts.frames < most), "n>1M")],
-    }
-    return "---\n" + to_yaml_text(head) + "---"
+def _purpose(info: DatasetInfo) -> str:
+    """What the dataset is for, and how many trajectories are over how many terrains."""
+    n_scenes, n_trajectories = info.counts.scenes, info.counts.trajectories
+    terrains = f"{n_scenes:,} terrains" if n_scenes != 1 else "one terrain"
+    trajectories = f"{n_trajectories:,} trajectories" if n_trajectories != 1 else "one trajectory"
+    return f"{_PURPOSE[info.kind]}: {trajectories} over {terrains}."
 
 
 def _counts(dataset: Dataset) -> str:

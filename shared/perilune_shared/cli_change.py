@@ -14,8 +14,10 @@ from perilune_shared import diff as differing
 from perilune_shared import merge as merging
 from perilune_shared import migrate as migrating
 from perilune_shared import pack as packing
+from perilune_shared.errors import UserError
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
+from perilune_shared.rewrite import ImageMode
 from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset as choose
 
@@ -25,14 +27,13 @@ EXIT_DIFFERENT = 1
 class Images(enum.StrEnum):
     """What becomes of frames."""
 
-    LINK = "link"
     COPY = "copy"
     NONE = "none"
     PLAN = "plan"
 
 
 class Unit(enum.StrEnum):
-    """What is dealt to the splits as a whole."""
+    """What stays together in one split."""
 
     SCENE = "scene"
     TRAJECTORY = "trajectory"
@@ -43,10 +44,19 @@ DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the 
 OutOption = Annotated[Path, typer.Option(help="New folder for the result.")]
 ImagesOption = Annotated[
     Images,
-    typer.Option(
-        help="Frames: link (hard links, or copies where the disk has none), copy, none; plan leaves labels too."
-    ),
+    typer.Option(help="Frames: copy, none (leave them out), plan (leave out craters, boulders and labels too)."),
 ]
+
+LinkOption = Annotated[
+    bool,
+    typer.Option("--link", help="Hard links instead of copies of frames: an edit in one dataset changes both."),
+]
+
+
+def _mode(images: Images, link: bool) -> ImageMode:
+    if link and images is not Images.COPY:
+        raise UserError("--link", "--images", images.value, "copy: the others leave frames out")
+    return "link" if link else images.value
 
 
 def add_to(app: typer.Typer) -> None:
@@ -68,11 +78,12 @@ def merge(
     datasets: Annotated[list[Path], typer.Argument(help="Folders of two datasets or more, of one kind and camera.")],
     out: OutOption,
     name: Annotated[str, typer.Option(help="Name of the result.")] = "merged",
-    images: ImagesOption = Images.LINK,
+    images: ImagesOption = Images.COPY,
+    link: LinkOption = False,
 ) -> None:
     """Make one dataset of several. The same scene or frame in two of them comes once."""
     with progress_bar() as progress:
-        merging.merge([open_dataset(path) for path in datasets], out, name, images.value, progress)
+        merging.merge([open_dataset(path) for path in datasets], out, name, _mode(images, link), progress)
     _tell(out)
 
 
@@ -85,11 +96,12 @@ def subset(
     ] = None,
     frames: Annotated[int | None, typer.Option(help="At most this many frames.")] = None,
     mb: Annotated[float | None, typer.Option(help="At most this many megabytes of PNGs.")] = None,
-    images: ImagesOption = Images.LINK,
+    images: ImagesOption = Images.COPY,
+    link: LinkOption = False,
 ) -> None:
     """Take part of a dataset: frames or labels for which conditions hold, so many frames, so many megabytes."""
     with progress_bar() as progress:
-        choose(open_dataset(dataset), out, tuple(where or ()), frames, mb, images.value, progress)
+        choose(open_dataset(dataset), out, tuple(where or ()), frames, mb, _mode(images, link), progress)
     _tell(out)
 
 
@@ -101,12 +113,13 @@ def split(
     ] = Unit.SCENE,
     val: Annotated[float, typer.Option(help="Share for validation.")] = 0.1,
     test: Annotated[float, typer.Option(help="Share for the test.")] = 0.1,
-    seed: Annotated[int, typer.Option(min=0, help="Of the deal.")] = 0,
-    images: ImagesOption = Images.LINK,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the split.")] = 0,
+    images: ImagesOption = Images.COPY,
+    link: LinkOption = False,
 ) -> None:
-    """Deal train, val and test anew, by scene, descent or frame."""
+    """Split anew into train, val and test, by scene, trajectory or frame."""
     with progress_bar() as progress:
-        split_dataset(open_dataset(dataset), out, by.value, val, test, seed, images.value, progress)
+        split_dataset(open_dataset(dataset), out, by.value, val, test, seed, _mode(images, link), progress)
     _tell(out)
 
 
@@ -124,10 +137,10 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
     raise typer.Exit(EXIT_DIFFERENT)
 
 
-def migrate(dataset: DatasetArgument, out: OutOption) -> None:
+def migrate(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
     """Bring a dataset of an older schema version to the present one."""
     with progress_bar() as progress:
-        migrating.migrate(dataset, out, progress)
+        migrating.migrate(dataset, out, progress, link=link)
     _tell(out)
 
 
@@ -142,10 +155,10 @@ def pack(
     _tell(out)
 
 
-def unpack(dataset: DatasetArgument, out: OutOption) -> None:
+def unpack(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
     """Make files of packed frames again."""
     with progress_bar() as progress:
-        packing.unpack(open_dataset(dataset), out, progress)
+        packing.unpack(open_dataset(dataset), out, progress, link=link)
     _tell(out)
 
 
@@ -156,8 +169,9 @@ def attach(
     rehash: Annotated[
         bool, typer.Option("--rehash", help="Take frames of other hashes, and write theirs down.")
     ] = False,
+    link: LinkOption = False,
 ) -> None:
     """Make a dataset of a manifest without frames and the frames that were made from it."""
     with progress_bar() as progress:
-        attaching.attach(open_dataset(manifest), frames, out, rehash, progress)
+        attaching.attach(open_dataset(manifest), frames, out, rehash, progress, link=link)
     _tell(out)

@@ -8,10 +8,11 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from perilune_shared.cli_change import DatasetArgument
+from perilune_shared.cli_change import DatasetArgument, LinkOption
 from perilune_shared.config_errors import nearest
 from perilune_shared.errors import UserError
 from perilune_shared.files import check_free
+from perilune_shared.keys import check_keys
 from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
 from perilune_shared.schema import SPLITS
@@ -26,6 +27,10 @@ class ExportFormat(StrEnum):
     TUM = "tum"
     KITTI = "kitti"
     CROISSANT = "croissant"
+    HUGGING_FACE = "huggingface"
+
+
+_WITH_LABELS = (ExportFormat.COCO, ExportFormat.YOLO, ExportFormat.HUGGING_FACE)
 
 
 def add_to(app: typer.Typer) -> None:
@@ -38,7 +43,10 @@ def export(
     dataset: DatasetArgument,
     format: Annotated[
         ExportFormat,
-        typer.Option(help="coco and yolo: boxes and ellipses; tum and kitti: camera poses; croissant: metadata."),
+        typer.Option(
+            help="coco, yolo: boxes and ellipses; tum, kitti: camera poses; huggingface: frames with pose and labels; "
+            "croissant: metadata."
+        ),
     ],
     out: Annotated[
         Path | None,
@@ -47,28 +55,40 @@ def export(
     split: Annotated[str | None, typer.Option(help="train, val or test alone (not for croissant).")] = None,
     selection: Annotated[
         str,
-        typer.Option(help="Labels to find: all, paper, visible; coco marks others as iscrowd, yolo drops them."),
+        typer.Option(
+            help="Labels to find: all, paper, visible; coco marks others as iscrowd, yolo drops them, huggingface "
+            "says which are chosen."
+        ),
     ] = "all",
+    link: LinkOption = False,
 ) -> None:
     """Write labels, trajectories or metadata in the form of another field's tools. See docs/export.md."""
     from perilune_shared.export import by_selection
     from perilune_shared.export_coco import export_coco
     from perilune_shared.export_croissant import export_croissant
+    from perilune_shared.export_hugging_face import export_hugging_face
     from perilune_shared.export_trajectory import export_kitti, export_tum
     from perilune_shared.export_yolo import export_yolo
 
     opened = open_dataset(dataset)
+    check_keys(opened)
     if split is not None and split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     if selection not in SELECTIONS:
         raise UserError("--selection", "selection", selection, nearest(selection, tuple(SELECTIONS)))
     choose = by_selection(SELECTIONS[selection]) if selection != "all" else None
-    if choose is not None and format not in (ExportFormat.COCO, ExportFormat.YOLO):
-        raise UserError("--selection", "selection", selection, "--format coco or yolo: the others hold no labels")
+    if choose is not None and format not in _WITH_LABELS:
+        raise UserError(
+            "--selection", "selection", selection, "--format coco, yolo or huggingface: the others hold no labels"
+        )
+    if link and format is not ExportFormat.YOLO:
+        raise UserError("--link", "--format", format.value, "yolo: the others hold no images")
     if format is ExportFormat.CROISSANT:
         if split is not None:
             raise UserError("--split", "split", split, "none: Croissant describes the whole dataset")
-        _say(f"{export_croissant(opened, out)}: written")
+        with progress_bar() as progress:
+            written = export_croissant(opened, out, progress)
+        _say(f"{written}: written")
         return
     if out is None:
         raise UserError("--out", "folder", "none", f"a new folder for the {format} files")
@@ -78,7 +98,9 @@ def export(
             case ExportFormat.COCO:
                 done = f"{export_coco(opened, out, progress, split, choose)} annotations"
             case ExportFormat.YOLO:
-                done = f"{export_yolo(opened, out, progress, split, choose)} boxes"
+                done = f"{export_yolo(opened, out, progress, split, choose, link=link)} boxes"
+            case ExportFormat.HUGGING_FACE:
+                done = f"{export_hugging_face(opened, out, progress, split, choose)} frames"
             case ExportFormat.TUM:
                 done = f"{export_tum(opened, out, progress, split)} descents"
             case ExportFormat.KITTI:

@@ -10,6 +10,8 @@ from perilune_shared.errors import one_line, shortened
 from perilune_shared.manifest import Dataset
 from perilune_shared.schema import KEYS, TABLES
 
+_NUMBER = "copy"
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -68,7 +70,11 @@ def _info(one: object, two: object, path: str) -> Iterator[Difference]:
 def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Difference]:
     """Differences of one table of one scene."""
     keys = KEYS[table]
-    one, two = (frame.drop_duplicates(keys).set_index(keys).sort_index() for frame in (one, two))
+    if any(frame.duplicated(keys).any() for frame in (one, two)):
+        # Rows of one key are told apart by a number, in an order that does not depend on how they are stored.
+        one, two = (_numbered(frame, keys) for frame in (one, two))
+        keys = [*keys, _NUMBER]
+    one, two = (frame.set_index(keys).sort_index() for frame in (one, two))
     for there, other, present in ((one, two, ("present", "-")), (two, one, ("-", "present"))):
         alone = there.index.difference(other.index)
         if len(alone):
@@ -86,6 +92,13 @@ def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Differen
             yield Difference(
                 table, column, int(apart.sum()), _text(common[row]), _text(a.iloc[row]), _text(b.iloc[row])
             )
+
+
+def _numbered(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
+    """Rows with a column that numbers those of one key, from 0."""
+    plain = [name for name in rows.columns if not (rows[name].dtype == object and rows[name].map(np.ndim).gt(0).any())]
+    rows = rows.sort_values(plain, kind="stable", ignore_index=True)
+    return rows.assign(**{_NUMBER: rows.groupby(keys).cumcount()})
 
 
 def _text(value: object) -> str:

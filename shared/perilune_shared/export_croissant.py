@@ -9,10 +9,13 @@ dataset's own folder, since it names files by paths from there; mlcroissant then
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pyarrow as pa
+from rich.progress import Progress
 
 from perilune_shared import files
 from perilune_shared.errors import UserError
@@ -71,7 +74,7 @@ _CONTEXT: dict[str, Any] = {
 _DATA_TYPES = {pa.string(): "sc:Text", pa.int64(): "cr:Int64", pa.float64(): "cr:Float64"}
 
 
-def export_croissant(dataset: Dataset, out: Path | None = None) -> Path:
+def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progress | None = None) -> Path:
     """Write croissant.json, or `out`, into the dataset's folder; returns its path. The checksums are kept right.
 
     Raises UserError where `out` lies elsewhere, the dataset is not complete or its checksums are wrong.
@@ -83,14 +86,17 @@ def export_croissant(dataset: Dataset, out: Path | None = None) -> Path:
         raise UserError(out, "--out", INFO_NAME, "a name that is not taken")
     if not dataset.info.complete:
         raise UserError(dataset.root, "complete", "false", "a finished dataset")
-    seal = check_sums(dataset, [out])
-    text = json.dumps(metadata_of(dataset), indent=1, allow_nan=False) + "\n"
-    add_files(dataset, {out: text.encode()}, seal=seal)
+    known = check_sums(dataset, [out], progress)
+    text = json.dumps(metadata_of(dataset, known or {}), indent=1, allow_nan=False) + "\n"
+    add_files(dataset, {out: text.encode()}, known)
     return out
 
 
-def metadata_of(dataset: Dataset) -> dict[str, Any]:
-    """The JSON-LD object. A table of one part is a FileObject with its hash; SHA256SUMS has those of many parts."""
+def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
+    """The JSON-LD object; `known` has hashes that need not be computed again.
+
+    A table of one part is a FileObject with its hash; SHA256SUMS has those of many parts.
+    """
     info = dataset.info
     distribution = [
         {
@@ -105,7 +111,7 @@ def metadata_of(dataset: Dataset) -> dict[str, Any]:
     ]
     record_sets = []
     for table, schema in TABLES.items():
-        distribution.append(_distribution(dataset, table))
+        distribution.append(_distribution(dataset, table, known))
         # A file may lack optional columns, which mlcroissant would then not find.
         missing = {
             name
@@ -163,16 +169,17 @@ def _licence(expression: str) -> str:
     return f"https://spdx.org/licenses/{expression}.html" if " " not in expression else expression
 
 
-def _distribution(dataset: Dataset, table: str) -> dict[str, Any]:
+def _distribution(dataset: Dataset, table: str, known: Mapping[str, str]) -> dict[str, Any]:
     parts = dataset.parts(table)
     common = {"name": f"{table}-parquet", "encodingFormat": _PARQUET}
     if len(parts) == 1:
+        url = parts[0].relative_to(dataset.root).as_posix()
         return {
             "@type": "cr:FileObject",
             "@id": f"{table}-parquet",
             **common,
-            "contentUrl": parts[0].relative_to(dataset.root).as_posix(),
-            "sha256": files.sha256_of(parts[0]),
+            "contentUrl": url,
+            "sha256": known.get(url) or files.sha256_of(parts[0]),
         }
     return {
         "@type": "cr:FileSet",

@@ -22,12 +22,18 @@ CRATER_CLASS = 0
 
 
 def export_yolo(
-    dataset: Dataset, out: Path, progress: Progress, split: str | None = None, choose: Choice | None = None
+    dataset: Dataset,
+    out: Path,
+    progress: Progress,
+    split: str | None = None,
+    choose: Choice | None = None,
+    *,
+    link: bool = False,
 ) -> int:
     """Write images/, labels/, <split>.txt and data.yaml into `out`; returns the number of boxes.
 
-    Images are hard links where the disk allows it, else copies. An image without craters has an empty text file.
-    Raises UserError where `out` holds something, an image is missing or no frame is of the split.
+    Images are copies, or with `link` hard links where the disk allows it. An image without craters has an empty text
+    file. Raises UserError where `out` holds something, an image is missing or no frame is of the split.
     """
     task = progress.add_task("yolo", total=len(dataset.scene_ids()), unit="scenes")
     lists: dict[str, list[str]] = defaultdict(list)
@@ -48,7 +54,7 @@ def export_yolo(
                     files.inside(folder, f"labels/{frame_id}.txt"), "".join(lines[frame_id]), durable=False
                 )
                 lists[own_split].append(f"./images/{frame_id}.png\n")
-            _bring_images(dataset, scene.frames, folder)
+            _bring_images(dataset, scene.frames, folder, link=link)
             progress.advance(task)
         for name, entries in lists.items():
             files.write_text(folder / f"{name}.txt", "".join(entries))
@@ -58,13 +64,13 @@ def export_yolo(
     return n_boxes
 
 
-def _bring_images(dataset: Dataset, frames: pd.DataFrame, folder: Path) -> None:
+def _bring_images(dataset: Dataset, frames: pd.DataFrame, folder: Path, *, link: bool) -> None:
     """The PNGs of frames as images/<frame_id>.png."""
     rows = frames[["frame_id", "png_path"]]
     if dataset.info.images == "files":
         for row in rows.to_dict("records"):
             to = files.inside(folder, f"images/{row['frame_id']}.png")
-            files.bring(dataset.file(row["png_path"]), to, link=True)
+            files.bring(dataset.file(row["png_path"]), to, link=link)
         return
     for frame_id, png in dataset.pngs(pa.Table.from_pandas(rows, preserve_index=False)):
         files.write_bytes(files.inside(folder, f"images/{frame_id}.png"), png, durable=False)

@@ -1,28 +1,29 @@
-"""Conditions on columns, as `--where` takes them: Python's own notation, of which only arithmetic is understood.
+"""Conditions on columns, as `--where` takes them: arithmetic and comparisons in Python's notation.
 
-A condition is read by `ast` and walked here; nothing of it is ever executed. Columns go by name, or by `table.column`
-where several tables have it; `position_m[2]` is an element of a vector.
+A condition is parsed by `ast`, its types are checked against the schema, and it is compiled to an expression of
+pyarrow.compute; nothing of it is ever executed. Columns go by name, or by `table.column` where several tables have it;
+`position_m[2]` is an element of a vector. As in SQL, a comparison with a null is neither true nor false.
 """
 
 import ast
 import difflib
+import functools
 import operator
 from collections.abc import Callable, Iterable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
 from perilune_shared.schema import TABLES
 
 _SEARCHED = ("frames", "labels", "scenes", "craters", "trajectories")
 """Where a bare name is looked for, first to last."""
-_BINARY: dict[type, Callable] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Mod: operator.mod,
+_COMPARED: dict[type, Callable] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
     ast.Lt: operator.lt,
@@ -30,24 +31,37 @@ _BINARY: dict[type, Callable] = {
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
 }
-_FUNCTIONS: dict[str, Callable] = {"abs": np.abs, "sqrt": np.sqrt, "log10": np.log10}
+_ARITHMETIC: dict[type, Callable] = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
+_FUNCTIONS: dict[str, Callable] = {"abs": pc.abs, "sqrt": pc.sqrt, "log10": pc.log10}
 _LONGEST = 2000
+_FORMS = "columns, numbers, text, + - * / %, abs, sqrt, log10, comparisons, in, and, or, not"
+_Kind = Literal["integer", "real", "text", "truth", "vector"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Value:
+    """A part of a condition."""
+
+    kind: _Kind
+    """Type of its values."""
+    expression: Any
+    """Its pyarrow expression."""
+    length: int = 0
+    """Number of elements of a vector."""
+
+    @property
+    def is_number(self) -> bool:
+        return self.kind in ("integer", "real")
 
 
 class Condition:
     """A parsed condition."""
 
     def __init__(self, text: str):
-        """Raises UserError on what is no condition, or names no column."""
+        """Raises UserError on what is no condition, names no column or mixes types."""
         self.text = text
-        try:
-            if len(text) > _LONGEST:
-                raise ValueError(f"{len(text)} characters")
-            self._tree = ast.parse(text.strip(), mode="eval").body
-            self.columns: set[tuple[str, str]] = set()
-            self._walk(self._tree, None)
-        except (SyntaxError, TypeError, ValueError, RecursionError, MemoryError) as error:
-            raise self._fault(text, f"a condition such as radius_px > 5 and split == 'test' ({error})") from None
+        self.columns: set[tuple[str, str]] = set()
+        self._joined = self._compiled(lambda table, name: f"{table}.{name}")
         if not self.columns:
             raise self._fault(text, "a condition on columns")
 
@@ -56,64 +70,151 @@ class Condition:
         """Whether it chooses labels rather than frames."""
         return any(table in ("labels", "craters") for table, _ in self.columns)
 
-    def holds(self, columns: dict[tuple[str, str], np.ndarray], n_rows: int) -> np.ndarray:
-        """Where it holds (n_rows,) bool, given the columns (n_rows,) or (n_rows, k) by table and name."""
+    def columns_of_only(self, table: str) -> list[str] | None:
+        """The columns that it names, where all are of one table; else None."""
+        return sorted(name for _, name in self.columns) if {table} == {own for own, _ in self.columns} else None
+
+    def within_table(self) -> Any:
+        """Its pyarrow expression on columns by their bare names, for a condition on one table."""
+        return self._compiled(lambda table, name: name)
+
+    def holds(self, rows: pa.Table) -> NDArray[np.bool_]:
+        """Where it holds (N,), given its columns as `table.column`. Raises UserError where numbers overflow."""
+        mask = np.zeros(len(rows), np.bool_)
         try:
-            with np.errstate(all="ignore"):
-                result = np.asarray(self._walk(self._tree, columns))
-        except (TypeError, ValueError, IndexError, ArithmeticError, RecursionError) as error:
-            raise self._fault(self.text, f"numbers with numbers and text with text ({error})") from None
-        if result.dtype != np.bool_ or result.shape not in ((), (n_rows,)):
+            found = rows.append_column("", pa.array(np.arange(len(rows)))).filter(self._joined)
+        except pa.ArrowException as error:
+            raise self._fault(self.text, f"numbers within the range of their columns ({error})") from None
+        mask[found[""].to_numpy()] = True
+        return mask
+
+    def _compiled(self, named: Callable[[str, str], str]) -> Any:
+        try:
+            if len(self.text) > _LONGEST:
+                raise ValueError(f"{len(self.text)} characters")
+            value = self._walk(ast.parse(self.text.strip(), mode="eval").body, named)
+        except (
+            SyntaxError,
+            TypeError,
+            ValueError,
+            OverflowError,
+            RecursionError,
+            MemoryError,
+            pa.ArrowException,
+        ) as error:
+            wanted = f"a condition such as radius_px > 5 and split == 'test' ({error})"
+            raise self._fault(self.text, wanted) from None
+        if value.kind != "truth":
             raise self._fault(self.text, "a condition that is true or false for each row")
-        return np.broadcast_to(result, (n_rows,))
+        return value.expression
 
-    def _walk(self, node: ast.expr, columns: dict[tuple[str, str], np.ndarray] | None) -> Any:
-        """The value of a node, or, without columns, a check of it that gathers the columns' names."""
-        checking = columns is None
+    def _walk(self, node: ast.expr, named: Callable[[str, str], str]) -> _Value:
+        def walk(child: ast.expr) -> _Value:
+            return self._walk(child, named)
 
-        def walk(child: ast.expr) -> Any:
-            return self._walk(child, columns)
+        match node:
+            case ast.Name() | ast.Attribute():
+                table, name = self._column(node)
+                self.columns.add((table, name))
+                return _column_value(TABLES[table].field(name).type, pc.field(named(table, name)))
+            case ast.Constant(value=bool() | int() | float() | str() as constant):
+                return _constant(constant)
+            case ast.BoolOp():
+                join = operator.and_ if isinstance(node.op, ast.And) else operator.or_
+                values = [self._truth(walk(value), value) for value in node.values]
+                return _Value("truth", functools.reduce(join, values))
+            case ast.UnaryOp(op=ast.Not()):
+                return _Value("truth", ~self._truth(walk(node.operand), node.operand))
+            case ast.UnaryOp(op=ast.USub()):
+                value = self._number(walk(node.operand), node.operand)
+                return _Value(value.kind, pc.negate_checked(value.expression))
+            case ast.BinOp():
+                left, right = (self._number(walk(side), side) for side in (node.left, node.right))
+                return self._arithmetic(node, left, right)
+            case ast.Compare():
+                return self._compare(node, walk)
+            case ast.Subscript(slice=ast.Constant(value=int() as place)) if not isinstance(place, bool):
+                value = walk(node.value)
+                if value.kind != "vector" or place >= value.length:
+                    raise self._fault(
+                        ast.unparse(node), f"an element 0 to {value.length - 1}" if value.length else _FORMS
+                    )
+                return _Value("real", pc.list_element(value.expression, place))
+            case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
+                value = self._number(walk(argument), argument)
+                if name == "abs":
+                    return _Value(value.kind, pc.abs_checked(value.expression))
+                return _Value("real", _FUNCTIONS[name](value.expression.cast(pa.float64())))
+            case ast.Call(func=ast.Name(id=name)) if name in _FUNCTIONS:
+                raise self._fault(ast.unparse(node), f"one argument of {name}, without a name")
+        raise self._fault(ast.unparse(node), _FORMS)
 
-        if isinstance(node, ast.Name | ast.Attribute):
-            key = self._column(node)
-            self.columns.add(key)
-            return None if columns is None else columns[key]
-        if isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float | str):
-            return node.value
-        if isinstance(node, ast.BoolOp):
-            values = [walk(value) for value in node.values]
-            join = np.logical_and if isinstance(node.op, ast.And) else np.logical_or
-            return None if checking else join.reduce(np.broadcast_arrays(*map(_truth, values)))
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub):
-            value = walk(node.operand)
-            return None if checking else ~_truth(value) if isinstance(node.op, ast.Not) else operator.neg(value)
-        if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
-            left, right = walk(node.left), walk(node.right)
-            if not checking and any(np.asarray(value).dtype.kind in "OU" for value in (left, right)):
-                raise TypeError("text takes part in comparisons alone")  # times a number it has no end
-            return None if checking else _BINARY[type(node.op)](left, right)
-        if isinstance(node, ast.Compare):
-            values = [walk(value) for value in (node.left, *node.comparators)]
-            found = [self._compared(op, a, b, checking) for op, a, b in zip(node.ops, values, values[1:], strict=False)]
-            return None if checking else np.logical_and.reduce(np.broadcast_arrays(*found))
-        if isinstance(node, ast.Tuple | ast.List):
-            return [walk(element) for element in node.elts]
-        if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant) and type(node.slice.value) is int:
-            value = walk(node.value)
-            return None if checking else np.asarray(value)[:, node.slice.value]
-        if isinstance(node, ast.Call) and ast.unparse(node.func) in _FUNCTIONS and len(node.args) == 1:
-            value = walk(node.args[0])
-            return None if checking else _FUNCTIONS[ast.unparse(node.func)](value)
-        raise self._fault(ast.unparse(node), "columns, numbers, text, + - * / %, comparisons, in, and, or, not")
+    def _arithmetic(self, node: ast.BinOp, left: _Value, right: _Value) -> _Value:
+        a, b = left.expression, right.expression
+        whole = left.kind == right.kind == "integer"
+        kind: _Kind = "integer" if whole else "real"
+        if type(node.op) in _ARITHMETIC:
+            return _Value(kind, _ARITHMETIC[type(node.op)](a, b))
+        if isinstance(node.right, ast.Constant) and node.right.value == 0:
+            raise self._fault(ast.unparse(node), "a divisor other than 0")
+        real_a, real_b = a.cast(pa.float64()), b.cast(pa.float64())
+        if isinstance(node.op, ast.Div):
+            return _Value("real", pc.divide(real_a, real_b))
+        if isinstance(node.op, ast.Mod) and whole:
+            # Arrow's division cuts towards zero; the remainder has the divisor's sign, as in Python.
+            rest = a - b * pc.divide(a, b)
+            return _Value(kind, pc.if_else((rest != 0) & pc.xor(rest < 0, b < 0), rest + b, rest))
+        if isinstance(node.op, ast.Mod):
+            return _Value(kind, real_a - pc.floor(pc.divide(real_a, real_b)) * real_b)
+        raise self._fault(ast.unparse(node), _FORMS)
 
-    def _compared(self, op: ast.cmpop, left: Any, right: Any, checking: bool) -> Any:
-        if type(op) in _BINARY:
-            return None if checking else _BINARY[type(op)](left, right)
-        if isinstance(op, ast.In | ast.NotIn):
-            if not isinstance(right, list):
-                raise self._fault(self.text, "a list after `in`, such as split in ('val', 'test')")
-            return None if checking else np.isin(left, right, invert=isinstance(op, ast.NotIn))
-        raise self._fault(self.text, "comparisons by == != < <= > >= in")
+    def _compare(self, node: ast.Compare, walk: Callable[[ast.expr], _Value]) -> _Value:
+        sides = [node.left, *node.comparators]
+        found = []
+        for op, left, right in zip(node.ops, sides, sides[1:], strict=False):
+            if isinstance(op, ast.In | ast.NotIn):
+                inside = self._inside(walk(left), left, right)
+                found.append(inside if isinstance(op, ast.In) else ~inside)
+            elif type(op) in _COMPARED:
+                a, b = walk(left), walk(right)
+                if not ((a.is_number and b.is_number) or a.kind == b.kind == "text"):
+                    raise self._fault(
+                        f"{ast.unparse(left)} ({a.kind}) with {ast.unparse(right)} ({b.kind})",
+                        "comparisons of numbers with numbers and text with text",
+                    )
+                found.append(_COMPARED[type(op)](a.expression, b.expression))
+            else:
+                raise self._fault(ast.unparse(node), "comparisons by == != < <= > >= in")
+        return _Value("truth", functools.reduce(operator.and_, found))
+
+    def _inside(self, value: _Value, left: ast.expr, right: ast.expr) -> Any:
+        if not isinstance(right, ast.Tuple | ast.List) or not right.elts:
+            raise self._fault(ast.unparse(right), "a list after `in`, such as split in ('val', 'test')")
+        try:
+            words = [ast.literal_eval(word) for word in right.elts]
+        except ValueError:
+            raise self._fault(ast.unparse(right), "a list of numbers or of text") from None
+        texts = all(isinstance(word, str) for word in words)
+        numbers = all(isinstance(word, int | float) and not isinstance(word, bool) for word in words)
+        if not ((texts and value.kind == "text") or (numbers and value.is_number)):
+            wanted = "comparisons of numbers with numbers and text with text"
+            raise self._fault(f"{ast.unparse(left)} ({value.kind}) in {ast.unparse(right)}", wanted)
+        if texts:
+            return value.expression.isin(pa.array(words, pa.string()))
+        if value.kind == "integer" and all(isinstance(word, int) for word in words):
+            return value.expression.isin(pa.array(words, pa.int64()))
+        return value.expression.cast(pa.float64()).isin(pa.array([float(word) for word in words]))
+
+    def _number(self, value: _Value, node: ast.expr) -> _Value:
+        if not value.is_number:
+            hint = f"; {ast.unparse(node)}[0] is one" if value.kind == "vector" else ""
+            raise self._fault(f"{ast.unparse(node)} ({value.kind})", f"a number{hint}")
+        return value
+
+    def _truth(self, value: _Value, node: ast.expr) -> Any:
+        if value.kind != "truth":
+            raise self._fault(f"{ast.unparse(node)} ({value.kind})", "conditions beside and, or, not")
+        return value.expression
 
     def _column(self, node: ast.Name | ast.Attribute) -> tuple[str, str]:
         if isinstance(node, ast.Attribute):
@@ -133,11 +234,17 @@ class Condition:
         return UserError("--where", "condition", found, wanted)
 
 
-def _truth(value: Any) -> np.ndarray:
-    array = np.asarray(value)
-    if array.dtype != np.bool_:
-        raise TypeError("and, or, not join conditions")
-    return array
+def _column_value(kind: pa.DataType, expression: Any) -> _Value:
+    if pa.types.is_fixed_size_list(kind):
+        return _Value("vector", expression, kind.list_size)
+    return _Value(
+        "text" if pa.types.is_string(kind) else "integer" if pa.types.is_integer(kind) else "real", expression
+    )
+
+
+def _constant(value: bool | float | str) -> _Value:
+    kinds: dict[type, _Kind] = {bool: "truth", int: "integer", float: "real", str: "text"}
+    return _Value(kinds[type(value)], pc.scalar(value))
 
 
 def columns_of(conditions: Iterable[Condition]) -> set[tuple[str, str]]:

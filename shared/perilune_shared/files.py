@@ -8,7 +8,8 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path, PurePosixPath
 
 from perilune_shared.errors import UserError
@@ -16,6 +17,9 @@ from perilune_shared.locks import lock
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _LONGEST_PATH = 500
+_CHUNK_BYTES = 2**20
+_FICLONE = 0x40049409
+"""Of linux/fs.h, on all processors but PowerPC, MIPS and SPARC, where it fails and files are copied."""
 
 
 def temporary_name(path: Path) -> Path:
@@ -77,10 +81,14 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
     write_bytes(path, content.encode(), durable=durable)
 
 
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's content, in hexadecimal."""
+def sha256_of(path: Path, advance: Callable[[int], object] = lambda n_bytes: None) -> str:
+    """SHA-256 of a file's content, in hexadecimal; `advance` is told how many bytes were read since its last call."""
+    digest = hashlib.sha256()
     with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+        while chunk := stream.read(_CHUNK_BYTES):
+            digest.update(chunk)
+            advance(len(chunk))
+    return digest.hexdigest()
 
 
 def is_plain(relative: object) -> bool:
@@ -155,9 +163,10 @@ def check_free(out: Path) -> None:
 
 
 def bring(path: Path, to: Path, *, link: bool) -> None:
-    """Make a frame's file present at `to` too: linked where asked for and the disk allows it, else copied.
+    """Make a frame's file present at `to` too: copied, or with `link` linked where the disk allows it.
 
-    Raises UserError where it is missing.
+    A copy shares its blocks with the original until one is changed, where the file system can (reflink). Raises
+    UserError where it is missing.
     """
     if not path.is_file():
         raise UserError(path, "frame", "no such file", "the file that the manifest names")
@@ -167,4 +176,19 @@ def bring(path: Path, to: Path, *, link: bool) -> None:
             # A link to a link would lead to what need not be here.
             os.link(path.resolve(), to)
             return
-    shutil.copyfile(path, to)
+    if not _cloned(path, to):
+        shutil.copyfile(path, to)
+
+
+def _cloned(path: Path, to: Path) -> bool:
+    """Whether `to` is now a reflink of a file: Btrfs, XFS and others on Linux have them."""
+    if not sys.platform.startswith("linux"):
+        return False
+    import fcntl
+
+    with path.open("rb") as source, to.open("wb") as target:
+        try:
+            fcntl.ioctl(target.fileno(), _FICLONE, source.fileno())
+        except OSError:
+            return False
+    return True

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -163,7 +162,7 @@ class DatasetInfo(_Info):
     """What was done since rendering, a line each."""
     counts: Counts
     """Rows in each table, once complete."""
-    licence: Name
+    licence: Annotated[str, Field(pattern=r"^[A-Za-z0-9(][A-Za-z0-9 ._+:()-]{0,499}$")]
     """SPDX expression."""
 
     @property
@@ -274,8 +273,3 @@ def write_info(root: Path, info: DatasetInfo) -> None:
     """Write dataset.json, whole or not at all. Raises UserError where its recipe names things by odd characters."""
     _check_texts(info, root / INFO_NAME)
     files.write_text(root / INFO_NAME, info.model_dump_json(indent=2) + "\n")
-
-
-def joined_licence(licences: Iterable[str]) -> str:
-    """The SPDX expression of data under all of several licences."""
-    return " AND ".join(sorted({part for licence in licences for part in licence.split(" AND ")}))

@@ -26,7 +26,7 @@ LOCK_NAME = ".perilune.lock"
 _RENEWED_S = 30.0
 _EXPIRED_S = 600.0
 _LARGEST_RECORD_BYTES = 10_000
-_LEFT_FILE = re.compile(r"\..+\.[0-9a-f]+\.part(\.[A-Za-z0-9]+)?")
+TEMPORARY_FILE = re.compile(r"\..+\.[0-9a-f]+\.part(\.[A-Za-z0-9]+)?")
 
 
 @contextlib.contextmanager
@@ -41,7 +41,7 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         with lock(folder / LOCK_NAME, folder):
             for root, _, names in os.walk(folder):
-                for name in filter(_LEFT_FILE.fullmatch, names):
+                for name in filter(TEMPORARY_FILE.fullmatch, names):
                     Path(root, name).unlink(missing_ok=True)
             yield
     finally:

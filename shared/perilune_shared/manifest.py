@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 
 from perilune_shared import files
 from perilune_shared.errors import UserError
+from perilune_shared.expression import Condition
 from perilune_shared.info import Counts, DatasetInfo, read_info
 from perilune_shared.parts import Part, is_whole
 from perilune_shared.schema import IMAGES, SPLITS, TABLES
@@ -42,9 +43,12 @@ class Dataset:
         scene_id: str | None = None,
         trajectory_id: str | None = None,
         split: str | None = None,
+        where: Condition | None = None,
     ) -> pa.Table:
         """One table as Arrow, whole or with chosen columns, of one scene, one descent (with its scene), one split.
 
+        `where` chooses rows by a condition on the table's own columns; row groups whose statistics exclude it are not
+        read.
         Only parts, row groups and columns that are asked for are read. Labels are of the split of their frame, craters
         and boulders are of none. Raises UserError where a part is truncated or of another schema, or the table or a
         column is not known.
@@ -54,16 +58,18 @@ class Dataset:
             raise UserError(table, "split", split, "one of " + ", ".join(SPLITS))
         if trajectory_id is not None and scene_id is None:
             raise UserError("table", "scene_id", "None", "the scene too: names of descents repeat in each scene")
+        if where is not None and where.columns_of_only(table) is None:
+            raise UserError(table, "where", where.text, f"a condition on columns of {table} alone")
         names = list(columns) if columns is not None else TABLES[table].names
         wanted = pa.schema([TABLES[table].field(name) for name in names])
         pieces = [
-            _chosen(Part(part, table), names, scene_id, trajectory_id, split if table != "labels" else None)
+            _chosen(Part(part, table), names, scene_id, trajectory_id, split if table != "labels" else None, where)
             for part in self.parts(table, scene_id, trajectory_id)
         ]
         rows = pa.concat_tables([piece.cast(wanted) for piece in pieces]) if pieces else wanted.empty_table()
         if split is not None and table == "labels":
             if "frame_id" not in names:
-                return self.table(table, [*names, "frame_id"], scene_id, trajectory_id, split).select(names)
+                return self.table(table, [*names, "frame_id"], scene_id, trajectory_id, split, where).select(names)
             rows = rows.filter(pc.is_in(rows["frame_id"], self._frame_ids(scene_id, trajectory_id, split)))
         return rows
 
@@ -155,7 +161,12 @@ def _may_hold(stem: str, scene_id: str | None, trajectory_id: str | None) -> boo
 
 
 def _chosen(
-    part: Part, names: Sequence[str], scene_id: str | None, trajectory_id: str | None, split: str | None
+    part: Part,
+    names: Sequence[str],
+    scene_id: str | None,
+    trajectory_id: str | None,
+    split: str | None,
+    where: Condition | None,
 ) -> pa.Table:
     """Rows of a part of one scene, descent and split, where its table has such columns; labels go by their frame_id."""
     columns = part.schema.names
@@ -170,7 +181,19 @@ def _chosen(
             groups = part.groups_within("frame_id", prefix, prefix[:-1] + "0")
         else:
             groups = part.groups_within("scene_id", scene_id, scene_id + "\x00")
-    rows = part.read(list(dict.fromkeys([*names, *equal, *(["frame_id"] if by_frame else [])])), groups)
+    needed = [*names, *equal, *(["frame_id"] if by_frame else [])]
+    expression = None
+    if where is not None:
+        expression = where.within_table()
+        needed += [name for _, name in sorted(where.columns)]
+        may_hold = set(part.groups_where(expression))
+        groups = [group for group in (range(part.n_groups) if groups is None else groups) if group in may_hold]
+    rows = part.read(list(dict.fromkeys(needed)), groups)
+    if expression is not None:
+        try:
+            rows = rows.filter(expression)
+        except pa.ArrowException as error:
+            raise UserError(part.path, "condition", error, "numbers within the range of their columns") from None
     for name, value in equal.items():
         rows = rows.filter(pc.equal(rows[name], value))
     if by_frame and (is_whole(part.path.stem) or part.path.stem == scene_id):

@@ -65,14 +65,14 @@ def frame_masks(
     or crater and on a depth of another size.
     """
     scene_id, trajectory_id = [*frame_id.split("/"), ""][:2]
-    key = {"scene_id": scene_id, "trajectory_id": trajectory_id}
-    frames = dataset.table("frames", ["frame_id", "scene_id", "position_m", "rotation_wxyz"], **key).to_pandas()
+    columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz"]
+    frames = dataset.table("frames", columns, scene_id, trajectory_id).to_pandas()
     frame = frames[frames["frame_id"] == frame_id]
     if len(frame) != 1:
         raise UserError(dataset.root, "frame_id", frame_id, "a frame of the dataset")
     pose = frame.iloc[0]
     if crater_ids is None:
-        labels = dataset.table("labels", ["frame_id", "crater_id"], **key).to_pandas()
+        labels = dataset.table("labels", ["frame_id", "crater_id"], scene_id, trajectory_id).to_pandas()
         crater_ids = labels.loc[labels["frame_id"] == frame_id, "crater_id"].tolist()
     craters = dataset.table("craters", _CRATER, scene_id=pose["scene_id"]).to_pandas().set_index("crater_id")
     unknown = [crater for crater in crater_ids if crater not in craters.index]

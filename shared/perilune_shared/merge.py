@@ -8,7 +8,8 @@ import pyarrow.compute as pc
 from rich.progress import Progress
 
 from perilune_shared.errors import UserError
-from perilune_shared.info import DatasetInfo, joined_licence
+from perilune_shared.info import CameraInfo, DatasetInfo
+from perilune_shared.licence import joined_licence
 from perilune_shared.manifest import Dataset
 from perilune_shared.rewrite import ImageMode, bare, check_source, state_of
 from perilune_shared.writer import SceneTables, check_scene, with_column, written
@@ -24,20 +25,24 @@ def merge(
     sources: Sequence[Dataset],
     out: Path,
     name: str = "merged",
-    images: ImageMode = "link",
+    images: ImageMode = "copy",
     progress: Progress | None = None,
 ) -> None:
     """Write the frames of all sources, each once, as one dataset.
 
     Scenes that are the same (recipe, seed, Sun, craters) become one; others of the same name get a new one, and so do
-    descents. A frame that several sources have is taken from the first, with that one's split and labels. Counts,
-    splits and what the splits share are reckoned from the rows. Raises UserError where kinds or cameras differ, or
-    one frame was rendered in two ways.
+    trajectories. A frame that several sources have is taken from the first, with that one's split and labels. Counts,
+    splits and what the splits share are recomputed from the rows. Raises UserError where kinds, cameras or cameras of
+    EXRs differ, a licence is no SPDX expression, or one frame was rendered in two ways.
     """
-    info = _joined_info(sources, out, name, state_of(list(sources), images))
+    if len(sources) < 2:
+        raise UserError("merge", "datasets", len(sources), "at least two")
+    for source in {source.root.resolve(): source for source in sources}.values():
+        check_source(source, out, progress)
+    info = _joined_info(sources, name, state_of(list(sources), images))
     groups = _same_scenes(sources, planned=info.images == "planned")
     task = progress.add_task("merging", total=len(groups), unit="scenes", note="") if progress else None
-    with written(out, info) as writer:
+    with written(out, info, progress=progress) as writer:
         for scene_id, members in groups.items():
             tables, brought = _join(scene_id, [(sources[i], own) for i, own in members])
             writer.add_scene(bare(tables) if info.images == "planned" else tables)
@@ -48,27 +53,38 @@ def merge(
                 progress.advance(task)
 
 
-def _joined_info(sources: Sequence[Dataset], out: Path, name: str, images: str) -> DatasetInfo:
-    if len(sources) < 2:
-        raise UserError("merge", "datasets", len(sources), "at least two")
+def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetInfo:
     first = sources[0].info
     for source in sources:
-        check_source(source, out)
         for field in ("kind", "camera"):
             if getattr(source.info, field) != getattr(first, field):
                 raise UserError(source.root, field, "another", f"the {field} of {sources[0].root}")
-    cameras = [source.info.exr_camera for source in sources if source.info.exr_camera is not None]
     info = first.model_copy(
         update={
             "name": name,
             "images": images,
-            "exr_camera": cameras[0] if cameras else None,
+            "exr_camera": _exr_camera(sources),
             "recipes": {key: recipe for source in sources for key, recipe in source.info.recipes.items()},
-            "licence": joined_licence(source.info.licence for source in sources),
+            "licence": joined_licence((source.root, source.info.licence) for source in sources),
             "history": tuple(dict.fromkeys(line for source in sources for line in source.info.history)),
         }
     )
     return info.changed("merge of " + ", ".join(source.info.name for source in sources))
+
+
+def _exr_camera(sources: Sequence[Dataset]) -> CameraInfo | None:
+    """The camera of all EXRs. Raises UserError where two sources have EXRs of different cameras."""
+    with_exrs = [source for source in sources if _has_exrs(source)]
+    for source in with_exrs:
+        if source.info.exr_camera != with_exrs[0].info.exr_camera:
+            wanted = f"the exr_camera of {with_exrs[0].root}; `perilune-manifest pack` leaves EXRs out"
+            raise UserError(source.root, "exr_camera", "another", wanted)
+    return with_exrs[0].info.exr_camera if with_exrs else None
+
+
+def _has_exrs(source: Dataset) -> bool:
+    paths = source.table("frames", ["exr_path"])["exr_path"]
+    return paths.null_count < len(paths)
 
 
 def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list[tuple[int, str]]]:

@@ -35,8 +35,8 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
 """Columns of the tables in older versions."""
 
 
-def migrate(root: Path, out: Path, progress: Progress | None = None) -> None:
-    """Write a dataset of schema version 1 or 2 as one of this version; frames are linked, or copied.
+def migrate(root: Path, out: Path, progress: Progress | None = None, *, link: bool = False) -> None:
+    """Write a dataset of schema version 1 or 2 as one of this version; frames are copied, or linked.
 
     What older versions did not record becomes null: the contrast of labels. Raises UserError where there is nothing to
     migrate, or the dataset is damaged or not complete.
@@ -54,12 +54,12 @@ def migrate(root: Path, out: Path, progress: Progress | None = None) -> None:
     source = _Old(root, info, version)
     scene_ids = sorted(source.rows("scenes")["scene_id"].to_pylist())
     task = progress.add_task("migrating", total=len(scene_ids), unit="scenes", note="") if progress else None
-    with written(out, info) as writer:
+    with written(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = {name: source.rows(name, scene_id) for name in TABLES}
             writer.add_scene(tables)
             names = {name: name for name in tables["frames"]["frame_id"].to_pylist()}
-            writer.add_images(source, tables["frames"], names, link=True)
+            writer.add_images(source, tables["frames"], names, link=link)
             if progress is not None and task is not None:
                 progress.advance(task)
 

@@ -4,34 +4,40 @@ import contextlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from rich.progress import Progress
+
 from perilune_shared import checksums, files
 from perilune_shared.errors import UserError
+from perilune_shared.expected import EXTRA_NAMES
 from perilune_shared.locks import locked
 from perilune_shared.manifest import Dataset
 
 
-def check_sums(dataset: Dataset, paths: Iterable[Path]) -> bool:
-    """Whether SHA256SUMS must be written anew once files are: where one lies in the folder of a complete dataset.
+def check_sums(dataset: Dataset, paths: Iterable[Path], progress: Progress | None = None) -> dict[str, str] | None:
+    """Hashes of the dataset's other files where SHA256SUMS must be rewritten once `paths` are written, else None.
 
-    The sums of all other files must be right before, since nobody would notice a fault after: UserError where one is
-    not. A dataset that is not complete is sealed by whoever completes it.
+    It must where one lies in the folder of a complete dataset. The sums of all other files must be right before, since
+    nobody would notice a fault after: UserError where one is not, or where a name is none that a dataset may have
+    (perilune_shared.expected). A dataset that is not complete is sealed by whoever completes it.
     """
     for path in paths:
         if any(path.resolve().is_relative_to((dataset.root / folder).resolve()) for folder in ("manifest", "images")):
             raise UserError(path, "--out", "a file among the dataset's tables", "another place")
     own = {path.name for path in paths if path.resolve().parent == dataset.root.resolve()}
+    for name in sorted(own - EXTRA_NAMES):
+        raise UserError(dataset.root / name, "--out", name, f"{', '.join(sorted(EXTRA_NAMES))}, or another folder")
     if not own or not dataset.info.complete:
-        return False
-    for name, found, wanted in checksums.faults_of(dataset.root):
+        return None
+    for name, found, wanted in checksums.faults_of(dataset.root, progress):
         if name not in own:
             raise UserError(dataset.root / name, "SHA-256", found, f"{wanted}; see `perilune-manifest validate`")
-    return True
+    return {name: sha256 for name, sha256 in checksums.sums_of(dataset.root).items() if name not in own}
 
 
-def add_files(dataset: Dataset, contents: Mapping[Path, bytes], *, seal: bool) -> None:
-    """Write files, each whole or not at all, and then SHA256SUMS where `check_sums` said so."""
-    with locked(dataset.root) if seal else contextlib.nullcontext():
+def add_files(dataset: Dataset, contents: Mapping[Path, bytes], known: Mapping[str, str] | None) -> None:
+    """Write files, each whole or not at all, and then SHA256SUMS where `check_sums` gave the hashes of the others."""
+    with locked(dataset.root) if known is not None else contextlib.nullcontext():
         for path, content in contents.items():
             files.write_bytes(path, content)
-        if seal:
-            checksums.seal(dataset.root)
+        if known is not None:
+            checksums.seal(dataset.root, known=known)

@@ -34,7 +34,7 @@ def pack(
     no file exceeds what a reader accepts (perilune_shared.parts).
     A dataset without frames is packed as its tables alone. EXRs stay behind: their columns become null.
     """
-    check_source(source, out)
+    check_source(source, out, progress)
     if not 0 < shard_mb <= _LARGEST_SHARD_MB:
         raise UserError("--shard-mb", "size", shard_mb, f"above 0, at most {_LARGEST_SHARD_MB}")
     packed = source.info.images in ("files", "packed")
@@ -43,7 +43,7 @@ def pack(
         info = info.changed("packed", images="packed", exr_camera=None)
     frames = source.table("frames").sort_by(_ORDER)
     task = progress.add_task("packing", total=len(frames), unit="frames", note="") if progress and packed else None
-    with written(out, info, whole_tables=True, most_rows=most_rows) as writer:
+    with written(out, info, whole_tables=True, most_rows=most_rows, progress=progress) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
             writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
@@ -58,10 +58,14 @@ def _images(source: Dataset, frames: pa.Table, progress: Progress | None, task) 
             progress.advance(task)
 
 
-def unpack(source: Dataset, out: Path, progress: Progress | None = None) -> None:
-    """Write a dataset with a part for each scene and descent, and frames as files."""
+def unpack(source: Dataset, out: Path, progress: Progress | None = None, *, link: bool = False) -> None:
+    """Write a dataset with a part for each scene and trajectory, and frames as files.
+
+    Frames that are files already are copied, or linked with `link`.
+    """
+    check_source(source, out, progress)
     info: DatasetInfo = source.info.changed("unpacked")
-    rewrite(source, out, info, lambda tables: tables, "link", progress)
+    rewrite(source, out, info, lambda tables: tables, "link" if link else "copy", progress)
 
 
 def _without_exr(frames: pa.Table) -> pa.Table:

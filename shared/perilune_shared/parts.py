@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.dataset as ds
 import pyarrow.parquet as pq
+from pyarrow.fs import LocalFileSystem
 
 from perilune_shared import files
 from perilune_shared.errors import UserError
@@ -190,6 +192,15 @@ class Part:
             if not far:
                 chosen.append(group)
         return chosen
+
+    def groups_where(self, condition: pc.Expression) -> list[int]:
+        """Row groups that may hold rows for which a condition on the part's columns is true, by their statistics."""
+        try:
+            # The footer was checked when the part was opened.
+            whole = ds.ParquetFileFormat().make_fragment(str(self.path.absolute()), LocalFileSystem())
+            return [group.id for group in whole.subset(filter=condition, schema=self.schema).row_groups]
+        except (pa.ArrowException, ValueError, KeyError):
+            return list(range(self.n_groups))
 
 
 def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> pa.Table:

@@ -1,6 +1,6 @@
 """One dataset rewritten as another: the way of all tools that change or choose rows."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -10,13 +10,15 @@ from rich.progress import Progress
 from perilune_shared import checksums
 from perilune_shared.errors import UserError
 from perilune_shared.info import DatasetInfo
+from perilune_shared.keys import check_keys
 from perilune_shared.manifest import Dataset
 from perilune_shared.schema import ImageState
 from perilune_shared.writer import SceneTables, written
 
-ImageMode = Literal["link", "copy", "none", "plan"]
-"""What becomes of frames: hard links where the disk allows them (the tools never change a frame), copies, or left out;
-with `plan` craters, boulders and labels are left out too, all of which follow from the scenes and poses."""
+ImageMode = Literal["copy", "link", "none", "plan"]
+"""What becomes of frames: copies; hard links where the disk allows them (then a frame edited in one dataset changes in
+the other too); or left out. With `plan` craters, boulders and labels are left out too: they follow from scenes and
+poses."""
 _FOLLOWING = ("craters", "boulders", "labels")
 
 
@@ -27,13 +29,16 @@ def rewrite(
     change: Callable[[SceneTables], SceneTables],
     images: ImageMode,
     progress: Progress | None = None,
+    scene_ids: Sequence[str] | None = None,
 ) -> None:
-    """Write every scene of `source` as `change` gives it; scenes and labels without frames fall away."""
-    check_source(source, out)
+    """Write every scene of `source`, or those named, as `change` gives it.
+
+    Scenes and labels without frames are left out. The caller has checked the source (`check_source`).
+    """
     info = info.model_copy(update={"images": state_of([source], images)})
-    scene_ids = source.scene_ids()
+    scene_ids = source.scene_ids() if scene_ids is None else scene_ids
     task = progress.add_task("writing", total=len(scene_ids), unit="scenes", note="") if progress else None
-    with written(out, info) as writer:
+    with written(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = change(source.scene(scene_id))
             frames = tables["frames"]
@@ -48,22 +53,19 @@ def rewrite(
                 progress.advance(task)
 
 
-def check_source(source: Dataset, out: Path) -> None:
+def check_source(source: Dataset, out: Path, progress: Progress | None = None) -> None:
     """Raises UserError on a dataset whose rows are not to be handed on into `out`.
 
     That is one that is still being rendered, whose files are not those of its SHA256SUMS (new sums would hide it for
-    good), that has frames of scenes which it does not list, or in whose folder `out` lies.
+    good), whose keys are broken, or in whose folder `out` lies.
     """
     if not source.info.complete:
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
     if out.resolve().is_relative_to(source.root.resolve()):
         raise UserError(out, "--out", f"a folder in {source.root}", "one outside the dataset")
-    for name, found, wanted in checksums.faults_of(source.root):
+    for name, found, wanted in checksums.faults_of(source.root, progress):
         raise UserError(source.root / name, "SHA-256", found, f"{wanted}; see `perilune-manifest validate`")
-    odd = set(source.table("frames", ["scene_id"])["scene_id"].unique().to_pylist()) - set(source.scene_ids())
-    if odd:
-        wanted = "the scene of every frame; see `perilune-manifest validate`"
-        raise UserError(source.root, "scenes", f"no {min(odd)}", wanted)
+    check_keys(source)
 
 
 def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:

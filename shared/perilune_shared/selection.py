@@ -16,6 +16,7 @@ from pydantic import Field
 
 from perilune_shared.config import Section
 from perilune_shared.info import DatasetInfo
+from perilune_shared.keys import check_keys
 from perilune_shared.manifest import Dataset
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -88,9 +89,10 @@ def label_bound_px(info: DatasetInfo) -> float:
 def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None = None) -> pd.DataFrame:
     """Labels of a dataset or of one split with all that `selected` asks for, and further `columns` of the table.
 
-    In the table's order. Depth and diameter (metres) are those of the table craters, joined by scene_id and crater_id;
-    NaN where that has no such crater. Raises UserError where a part cannot be read.
+    In the table's order. Depth and diameter (metres) are those of the table craters, joined by scene_id and crater_id.
+    Raises UserError where a part cannot be read or keys are broken.
     """
+    check_keys(dataset)
     wanted = list(dict.fromkeys(["frame_id", "crater_id", *_JUDGED, *columns]))
     frames = dataset.table("frames", ["frame_id", "scene_id"], split=split).to_pandas()
     labels = dataset.table("labels", wanted).to_pandas().merge(frames, on="frame_id", validate="many_to_one")

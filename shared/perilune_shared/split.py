@@ -1,4 +1,4 @@
-"""Train, val and test dealt out anew."""
+"""A dataset with another split into train, val and test."""
 
 from pathlib import Path
 from typing import Literal
@@ -7,10 +7,10 @@ import numpy as np
 import pyarrow as pa
 from rich.progress import Progress
 
-from perilune_shared.content import terrain_of
 from perilune_shared.errors import UserError
+from perilune_shared.flights import terrains_and_flights
 from perilune_shared.manifest import Dataset
-from perilune_shared.rewrite import ImageMode, rewrite
+from perilune_shared.rewrite import ImageMode, check_source, rewrite
 from perilune_shared.writer import SceneTables, with_column
 
 SplitBy = Literal["scene", "trajectory", "frame"]
@@ -23,24 +23,22 @@ def split_dataset(
     val_share: float = 0.1,
     test_share: float = 0.1,
     seed: int = 0,
-    images: ImageMode = "link",
+    images: ImageMode = "copy",
     progress: Progress | None = None,
 ) -> None:
-    """Write a dataset whose whole scenes, descents or single frames are dealt to train, val and test at random.
+    """Write a dataset whose whole scenes, trajectories or single frames are assigned to train, val and test at random.
 
-    Scenes with the same ground, whatever their names and Suns, go together, as do all over one elevation model. `frame`
-    with shares of 0.1 is the paper's protocol: the same ground in all three splits, which flatters the test, as
-    `split_by` in dataset.json then says. At least one unit goes to each split with a share above 0. Raises UserError
-    where there are too few.
+    Units go by content, not by name (perilune_shared.flights): scenes with the same ground stay together, whatever
+    their names and Suns, as do all over one elevation model; trajectories of one flight stay together, as where a
+    flight was rendered and developed again; and so do frames of one pose. `frame` with shares of 0.1 is the paper's
+    protocol: the same ground in all three splits, which flatters the test, as `split_by` in dataset.json then says. At
+    least one unit goes to each split with a share above 0. Raises UserError where there are too few.
     """
     if not (0 <= val_share < 1 and 0 <= test_share < 1 and val_share + test_share < 1):
         raise UserError("--val and --test", "shares", f"{val_share}, {test_share}", "from 0 to less than 1 in all")
-    frames = source.table("frames", ["frame_id", "scene_id", "trajectory_id"]).to_pandas()
-    scenes = source.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pandas()
-    scenes["terrain"] = [terrain_of(*row) for row in zip(scenes["dem_source"], scenes["content_sha256"], strict=True)]
-    frames = frames.merge(scenes, on="scene_id").sort_values("frame_id", ignore_index=True)
-    key = {"scene": "terrain", "trajectory": "trajectory", "frame": "frame_id"}[by]
-    frames["trajectory"] = frames["scene_id"] + "/" + frames["trajectory_id"]
+    check_source(source, out, progress)
+    frames = terrains_and_flights(source)
+    key = {"scene": "terrain", "trajectory": "flight", "frame": "pose"}[by]
     units = frames[key].drop_duplicates().to_numpy()
     n_val, n_test = (int(np.ceil(share * len(units))) for share in (val_share, test_share))
     if n_val + n_test >= len(units):

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pandas as pd
-import pyarrow.compute as pc
 
 from perilune_shared.errors import UserError
+from perilune_shared.keys import check_keys, places
 from perilune_shared.manifest import Dataset
 from perilune_shared.parts import Part
 
@@ -15,24 +15,23 @@ def summary(dataset: Dataset) -> pd.DataFrame:
     Scenes, trajectories, frames, labels, labels per frame, quantiles of the radius in pixels, mean visible fraction,
     craters in view that are too large for a label (None where not known) and megabytes of PNGs.
 
-    Raises UserError where there are no frames.
+    Raises UserError where there are no frames or keys are broken.
     """
     columns = ["frame_id", "scene_id", "trajectory_id", "split", "png_bytes", "n_craters_above_max_radius"]
+    check_keys(dataset)
     frames = dataset.table("frames", columns)
     if not len(frames):
         raise UserError(dataset.root, "frames", "none", "a dataset with frames")
     found = {split: _Gathered() for split in sorted(frames["split"].unique().to_pylist())}
     split_of = frames["split"].combine_chunks().dictionary_encode()
     names = np.array(split_of.dictionary.to_pylist(), object)
-    ids = frames["frame_id"].combine_chunks()
+    codes = split_of.indices.to_numpy()
+    frame_of = {name: place for place, name in enumerate(frames["frame_id"].to_pylist())}
     for part in dataset.parts("labels"):
         opened = Part(part, "labels")
         for group in range(opened.file.metadata.num_row_groups):
             rows = opened.read(["frame_id", "radius_px", "visible_fraction"], [group])
-            place = pc.index_in(rows["frame_id"], ids)
-            kept = place.is_valid()
-            rows, place = rows.filter(kept), place.filter(kept).to_numpy()
-            code = split_of.indices.to_numpy()[place]
+            code = codes[places(rows["frame_id"], frame_of)]
             radius, visible = rows["radius_px"].to_numpy(), rows["visible_fraction"].to_numpy()
             for k, name in enumerate(names):
                 own = code == k

@@ -12,7 +12,7 @@ from rich.progress import Progress
 from perilune_shared.errors import UserError
 from perilune_shared.expression import Condition, columns_of
 from perilune_shared.manifest import Dataset
-from perilune_shared.rewrite import ImageMode, rewrite
+from perilune_shared.rewrite import ImageMode, check_source, rewrite
 from perilune_shared.writer import SceneTables
 
 
@@ -22,7 +22,7 @@ def subset(
     where: Sequence[str] = (),
     n_frames: int | None = None,
     megabytes: float | None = None,
-    images: ImageMode = "link",
+    images: ImageMode = "copy",
     progress: Progress | None = None,
 ) -> None:
     """Write the frames and labels of a dataset for which all conditions hold, at most so many, at most so large.
@@ -40,6 +40,7 @@ def subset(
     if on_labels and planned:
         wanted = "conditions on frames, trajectories and scenes: a plan has no labels"
         raise UserError("--where", "condition", on_labels[0].text, wanted)
+    check_source(source, out, progress)
     kept = None
     if n_frames is not None or megabytes is not None:
         kept = _first_frames(source, on_frames, n_frames, megabytes)
@@ -57,7 +58,16 @@ def subset(
     told += [f"{megabytes:g} MB"] if megabytes is not None else []
     told += ["no craters and labels"] if images == "plan" else []
     info = source.info.changed("subset: " + ("; ".join(told) or "all").replace("<", " lt ").replace(">", " gt "))
-    rewrite(source, out, info, change, images, progress)
+    rewrite(source, out, info, change, images, progress, _scenes_with(source, on_frames))
+
+
+def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
+    """Scenes in which a frame may be chosen; of the others, only row groups' statistics or one column are read."""
+    scene_ids = set(source.scene_ids())
+    for condition in on_frames:
+        if condition.columns_of_only("frames") is not None:
+            scene_ids &= set(source.table("frames", ["scene_id"], where=condition)["scene_id"].unique().to_pylist())
+    return sorted(scene_ids)
 
 
 def _first_frames(
@@ -90,37 +100,29 @@ def _holds(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table)
     mask = np.ones(len(rows), bool)
     if not conditions or not len(rows):
         return mask
-    columns = {(table, name): _column(tables, rows, table, name) for table, name in columns_of(conditions)}
+    columns = {f"{table}.{name}": _column(tables, rows, table, name) for table, name in columns_of(conditions)}
+    joined = pa.table(columns)
     for condition in conditions:
-        mask &= condition.holds(columns, len(rows))
+        mask &= condition.holds(joined)
     return mask
 
 
-def _column(tables: SceneTables, rows: pa.Table, table: str, name: str) -> np.ndarray:
+def _column(tables: SceneTables, rows: pa.Table, table: str, name: str) -> pa.ChunkedArray:
     """A column of a table of one scene, joined to rows of frames or labels."""
-    values = _numpy(tables[table][name])
+    values = tables[table][name]
     if table == "scenes":
-        return np.repeat(values, len(rows), axis=0)
-    if "crater_id" in rows.column_names and table == "labels":
-        return values
+        return values.take(np.zeros(len(rows), np.int64))
+    on_labels = "crater_id" in rows.column_names
+    if table == "labels":
+        return rows[name]
     if table == "craters":
-        return values[_places(rows["crater_id"], tables["craters"]["crater_id"])]
+        return values.take(_places(rows["crater_id"], tables["craters"]["crater_id"]))
     frames = tables["frames"]
-    of_frame = np.arange(len(rows))
-    if "crater_id" in rows.column_names:
-        of_frame = _places(rows["frame_id"], frames["frame_id"])
+    of_frame = _places(rows["frame_id"], frames["frame_id"]) if on_labels else np.arange(len(rows))
     if table == "frames":
-        return values[of_frame]
-    return values[_places(frames["trajectory_id"], tables["trajectories"]["trajectory_id"])][of_frame]
-
-
-def _numpy(column: pa.ChunkedArray) -> np.ndarray:
-    if pa.types.is_fixed_size_list(column.type):
-        flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        return flat.reshape(len(column), column.type.list_size)
-    values = column.to_numpy()
-    # Nulls of text would not compare.
-    return np.array(["" if v is None else v for v in values], object) if values.dtype == object else values
+        return (values if on_labels else rows[name]).take(of_frame)
+    of_trajectory = _places(frames["trajectory_id"], tables["trajectories"]["trajectory_id"])
+    return values.take(of_trajectory[of_frame])
 
 
 def _places(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:

@@ -15,6 +15,7 @@ from rich.progress import Progress
 from perilune_shared import checksums
 from perilune_shared.content import content_sha256, terrain_of
 from perilune_shared.errors import UserError
+from perilune_shared.expected import unexpected
 from perilune_shared.faults import Fault, part_faults
 from perilune_shared.frames import selenographic_from_site
 from perilune_shared.manifest import Dataset, count_rows
@@ -39,8 +40,14 @@ def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
 
 def _faults(dataset: Dataset, progress: Progress | None) -> list[Fault]:
     faults = [
-        Fault.of(file, None, "SHA-256", found, wanted) for file, found, wanted in checksums.faults_of(dataset.root)
+        Fault.of(file, None, "SHA-256", found, wanted)
+        for file, found, wanted in checksums.faults_of(dataset.root, progress)
     ]
+    try:
+        wanted = "only files that a dataset is made of (docs/manifest.md)"
+        faults += [Fault.of(path, None, "file", "an unexpected file or folder", wanted) for path in unexpected(dataset)]
+    except UserError as error:
+        faults.append(Fault.told("manifest/frames", None, error))
     if not dataset.info.complete:
         wanted = "a finished dataset; run `make dataset` again to go on"
         faults.append(Fault.of("dataset.json", None, "complete", "False", wanted))

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from rich.progress import Progress
 
 from perilune_shared import checksums, files
 from perilune_shared.content import terrain_of
@@ -148,7 +149,7 @@ class DatasetWriter:
         if writer is not None:
             writer.close()
 
-    def finish(self, out: Path) -> None:
+    def finish(self, out: Path, progress: Progress | None = None) -> None:
         """Write what remains, dataset.json and the checksums. Raises UserError about `out` where no frame came."""
         if not self._rows["frames"]:
             raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
@@ -165,12 +166,17 @@ class DatasetWriter:
             update={"split_by": unit, "recipes": recipes, "exr_camera": exr_camera, "counts": Counts(**self._rows)}
         )
         write_info(self.root, info)
-        checksums.seal(self.root)
+        checksums.seal(self.root, progress)
 
 
 @contextlib.contextmanager
 def written(
-    out: Path, info: DatasetInfo, *, whole_tables: bool = False, most_rows: int = MOST_ROWS_WRITTEN
+    out: Path,
+    info: DatasetInfo,
+    *,
+    whole_tables: bool = False,
+    most_rows: int = MOST_ROWS_WRITTEN,
+    progress: Progress | None = None,
 ) -> Iterator[DatasetWriter]:
     """A writer for a new dataset in `out`, which appears whole or not at all.
 
@@ -182,7 +188,7 @@ def written(
         checked_info(json.loads(info.model_dump_json()), out)
         writer = DatasetWriter(aside, info, whole_tables=whole_tables, most_rows=most_rows)
         yield writer
-        writer.finish(out)
+        writer.finish(out, progress)
 
 
 def check_scene(where: object, tables: SceneTables) -> None:

@@ -67,6 +67,7 @@ def test_the_page_tells_what_is_there(card):
     row = re.search(r"label radius.*?</tr>", html, re.DOTALL)[0]
     cells = [float(value) for value in re.findall(r">([\d.]+)</td>", row)]
     assert np.allclose(cells, np.quantile(radius, [0, 0.05, 0.5, 0.95, 1]), rtol=1e-3)
+    assert "Crater detection: 4 trajectories over 4 terrains." in html
     assert "30 to 30" in html and "No terrain is in two splits." in html and "CC0-1.0" in html
 
 
@@ -196,3 +197,9 @@ def test_command_line(crowded, tmp_path):
     bare = subprocess.run(command, capture_output=True, text=True)
     assert bare.returncode == 2 and "perilune-shared[pictures]" in bare.stderr
     assert not (tmp_path / "b.md").exists()
+
+
+def test_one_terrain_is_called_one(tmp_path):
+    root = build_dataset(tmp_path / "d", "detect", splits={"train": 1}, n_frames=1, side_px=32, craters=40)
+    page = carded(root)[0].read_text()
+    assert "Crater detection: one trajectory over one terrain." in page and "many" not in page

@@ -1,12 +1,19 @@
-"""Hugging Face `datasets` opens packed frames as they are."""
+"""Hugging Face `datasets` loads exports by split, and never takes another frame for training data."""
 
 import io
+import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.progress import Progress
 
+from perilune_shared.card import write_card
+from perilune_shared.export import by_selection
+from perilune_shared.export_hugging_face import export_hugging_face
 from perilune_shared.manifest import open_dataset
+from perilune_shared.selection import SELECTIONS
+from perilune_shared.split import split_dataset
 
 
 @pytest.fixture
@@ -25,3 +32,51 @@ def test_shards_are_images(crowded_packed, offline, tmp_path):
     pngs = dict(dataset.pngs(dataset.table("frames")))
     for row in rows:
         assert np.array_equal(np.array(row["image"]), np.array(Image.open(io.BytesIO(pngs[row["frame_id"]]))))
+
+
+@pytest.fixture(params=["files", "packed", "split by frame"])
+def source(request, crowded, crowded_packed, tmp_path):
+    """Datasets with their frames as files, packed, and with splits that parts mix."""
+    if request.param == "split by frame":
+        split_dataset(open_dataset(crowded), tmp_path / "mixed", "frame", 0.2, 0.2)
+        return open_dataset(tmp_path / "mixed")
+    return open_dataset(crowded if request.param == "files" else crowded_packed)
+
+
+def test_an_export_has_the_splits_with_images_poses_and_labels(source, offline, tmp_path):
+    out = tmp_path / "hub"
+    with Progress(disable=True) as progress:
+        choose = by_selection(SELECTIONS["visible"])
+        assert export_hugging_face(source, out, progress, choose=choose, shard_mb=0.1) == source.info.counts.frames
+    assert len(list(out.glob("data/train/*.parquet"))) > 1
+    loaded = offline.load_dataset(str(out), cache_dir=str(tmp_path / "cache"))
+    assert set(loaded) == {"train", "val", "test"}
+    pngs = dict(source.pngs(source.table("frames")))
+    labels = source.table("labels").to_pandas()
+    chosen = []
+    for name, rows in loaded.items():
+        frames = source.table("frames", split=name).to_pandas().set_index("frame_id")
+        assert sorted(rows["frame_id"]) == sorted(frames.index)
+        for row in rows:
+            frame_id = row["frame_id"]
+            assert np.array_equal(np.array(row["image"]), np.array(Image.open(io.BytesIO(pngs[frame_id]))))
+            assert row["position_m"] == frames.loc[frame_id, "position_m"].tolist()
+            own = labels[labels["frame_id"] == frame_id].set_index("crater_id")
+            assert {each["crater_id"]: each["ellipse_a_px"] for each in row["labels"]} == own["ellipse_a_px"].to_dict()
+            chosen += [each["chosen"] for each in row["labels"]]
+    assert 0 < sum(chosen) < len(chosen) == len(labels)
+    test = offline.load_dataset(str(out), split="test", cache_dir=str(tmp_path / "cache"))
+    assert test["frame_id"] == loaded["test"]["frame_id"]
+
+
+def test_a_dataset_with_its_card_has_no_split_that_is_called_train(source, offline, tmp_path):
+    root = shutil.copytree(source.root, tmp_path / "set")
+    with Progress(disable=True) as progress:
+        write_card(open_dataset(root), None, progress)
+    loaded = offline.load_dataset(str(root), cache_dir=str(tmp_path / "cache"))
+    assert set(loaded) == {"mixed"} and set(loaded["mixed"]["split"]) == {"train", "val", "test"}
+    labels = offline.load_dataset(str(root), "labels", split="mixed", cache_dir=str(tmp_path / "cache"))
+    assert len(labels) == source.info.counts.labels
+    for split in ("train", "test"):
+        with pytest.raises(ValueError, match="Unknown split"):
+            offline.load_dataset(str(root), split=split, cache_dir=str(tmp_path / "cache"))

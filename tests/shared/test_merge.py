@@ -4,9 +4,12 @@ import shutil
 
 import pyarrow.compute as pc
 import pytest
+from license_expression import get_spdx_licensing
 
+from perilune_shared.checksums import seal
 from perilune_shared.diff import differences
 from perilune_shared.errors import UserError
+from perilune_shared.licence import joined_licence
 from perilune_shared.manifest import open_dataset
 from perilune_shared.merge import merge
 from perilune_shared.split import split_dataset
@@ -14,6 +17,7 @@ from perilune_shared.stats import summary
 from perilune_shared.subset import subset
 from perilune_shared.validate import validate
 from tests.drawn_dataset import build_dataset
+from tests.hostile import edit, rewrite
 
 
 def merged(out, *sources, **options):
@@ -77,8 +81,8 @@ def test_frames_are_left_out_on_wish(drawn, other, tmp_path):
 
 
 def test_copies_and_links(drawn, other, tmp_path):
-    merged(tmp_path / "l", drawn, other)
-    merged(tmp_path / "c", drawn, other, images="copy")
+    merged(tmp_path / "l", drawn, other, images="link")
+    merged(tmp_path / "c", drawn, other)
     relative = "frames/s000/t000/000000.png"
     assert (tmp_path / "l" / relative).samefile(drawn / relative)
     assert not (tmp_path / "c" / relative).samefile(drawn / relative)
@@ -115,3 +119,60 @@ def test_recipes_and_licences_are_kept(drawn, other, tmp_path):
     scenes = made.table("scenes")
     seeds = {made.info.recipes[key].seed for key in pc.unique(scenes["recipe"]).to_pylist()}
     assert seeds == {7, 8}
+
+
+def with_info(source, folder, **changes):
+    """A copy of a dataset with fields of dataset.json replaced."""
+    root = shutil.copytree(source, folder)
+    edit(lambda content: content.update(changes))(root)
+    seal(root)
+    return root
+
+
+def test_exrs_of_two_cameras_are_not_merged(little, tmp_path):
+    camera = open_dataset(little).info.camera.model_dump(mode="json")
+    hashes = {"exr_path": "frames/s000/t000/000000.exr", "exr_sha256": "0" * 64, "exr_bytes": 1}
+    roots = []
+    for name, fx_px in (("a", 50.0), ("b", 60.0)):
+        root = with_info(little, tmp_path / name, exr_camera={**camera, "fx_px": fx_px})
+        rewrite(root, "frames", lambda rows: rows[0].update(hashes))
+        seal(root)
+        roots.append(open_dataset(root))
+    with pytest.raises(UserError, match="exr_camera"):
+        merge(roots, tmp_path / "m", images="none")
+    same = with_info(roots[0].root, tmp_path / "same", name="same")
+    merge([roots[0], open_dataset(same), open_dataset(little)], tmp_path / "m", images="none")
+    assert open_dataset(tmp_path / "m").info.exr_camera == roots[0].info.exr_camera
+
+
+@pytest.mark.parametrize(
+    ("licences", "joined"),
+    [
+        (("CC0-1.0", "CC0-1.0"), "CC0-1.0"),
+        (("MIT OR Apache-2.0", "CC-BY-4.0"), "CC-BY-4.0 AND (MIT OR Apache-2.0)"),
+        (("MIT OR Apache-2.0", "Apache-2.0 OR MIT"), "Apache-2.0 OR MIT"),
+        (("CC0-1.0 AND MIT", "MIT", "CC-BY-4.0"), "CC-BY-4.0 AND CC0-1.0 AND MIT"),
+        (("LicenseRef-mine", "CC0-1.0"), "CC0-1.0 AND LicenseRef-mine"),
+    ],
+)
+def test_licences_are_joined(licences, joined):
+    assert equal_licences(joined_licence(("a", licence) for licence in licences), joined)
+    again = joined_licence(("a", licence) for licence in (joined, *licences))
+    assert equal_licences(again, joined) and len(again) == len(joined)
+
+
+def equal_licences(one, two):
+    spdx = get_spdx_licensing()
+    return spdx.is_equivalent(one, two)
+
+
+@pytest.mark.parametrize("licence", ["Free-For-All", "MIT AND (", "MIT OR", ""])
+def test_a_licence_that_is_none_is_refused(licence):
+    with pytest.raises(UserError, match=r"data: licence: got .*, expected an SPDX licence expression"):
+        joined_licence([("data", licence), ("b", "MIT")])
+
+
+def test_a_choice_of_licences_can_be_merged(little, tmp_path):
+    root = with_info(little, tmp_path / "either", licence="MIT OR Apache-2.0")
+    merge([open_dataset(root), open_dataset(little)], tmp_path / "m", images="none")
+    assert open_dataset(tmp_path / "m").info.licence == "(MIT OR Apache-2.0) AND CC0-1.0"

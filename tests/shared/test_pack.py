@@ -20,6 +20,7 @@ from perilune_shared.schema import OPTIONAL, TABLES
 from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset
 from perilune_shared.validate import validate
+from tests.hostile import rewrite
 
 OLD = Path(__file__).parent / "old"
 
@@ -165,6 +166,19 @@ def test_differences_are_named(drawn, tmp_path):
     assert found["labels", ""].rows == n_small
     assert found["frames", "split"].rows > 0 and found["dataset.json", "split_by"].second == "frame"
     assert ("frames", "position_m") not in found and ("craters", "") not in found
+
+
+def test_rows_twice_are_a_difference(little, tmp_path):
+    """Once with the same content, once with another."""
+    twice = shutil.copytree(little, tmp_path / "twice")
+    rewrite(twice, "labels", lambda rows: rows.append(dict(rows[2])))
+    found = differences(open_dataset(little), open_dataset(twice))
+    assert [(each.place, each.rows, each.first, each.second) for each in found] == [("labels", 1, "-", "present")]
+    other = shutil.copytree(twice, tmp_path / "other")
+    rewrite(other, "labels", lambda rows: rows[-1].update(radius_px=rows[-1]["radius_px"] + 1))
+    found = differences(open_dataset(twice), open_dataset(other))
+    assert [(each.place, each.column, each.rows) for each in found] == [("labels", "radius_px", 1)]
+    assert differences(open_dataset(other), open_dataset(other)) == []
 
 
 def test_a_manifest_and_its_frames_become_a_dataset(drawn, tmp_path):

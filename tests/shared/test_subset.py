@@ -1,67 +1,14 @@
 """Conditions and subsets."""
 
-import numpy as np
 import pytest
 
 from perilune_shared.errors import UserError
-from perilune_shared.expression import Condition
 from perilune_shared.manifest import open_dataset
+from perilune_shared.merge import merge
+from perilune_shared.pack import unpack
 from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset
 from perilune_shared.validate import validate
-
-ROWS = {
-    ("labels", "radius_px"): np.array([1.0, 5.0, 9.0, np.nan]),
-    ("frames", "split"): np.array(["train", "test", "val", "test"], object),
-    ("frames", "position_m"): np.arange(12.0).reshape(4, 3),
-}
-
-
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("radius_px > 4", [0, 1, 1, 0]),
-        ("4 < radius_px <= 9", [0, 1, 1, 0]),
-        ("not radius_px > 4", [1, 0, 0, 1]),
-        ("split == 'test'", [0, 1, 0, 1]),
-        ("split in ('val', 'test') and radius_px < 6", [0, 1, 0, 0]),
-        ("split not in ['val'] or radius_px == 9", [1, 1, 1, 1]),
-        ("position_m[2] > 5 and position_m[0] < 9", [0, 0, 1, 0]),
-        ("sqrt(labels.radius_px) * 2 - 1 >= 3.4", [0, 1, 1, 0]),
-        ("abs(-radius_px) % 4 == 1", [1, 1, 1, 0]),
-    ],
-)
-def test_conditions(text, wanted):
-    assert Condition(text).holds(ROWS, 4).astype(int).tolist() == wanted
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("radius > 4", "radius_px"),
-        ("boulders.diameter_m > 1", "table.column"),
-        ("labels.diameter_m > 1", "table.column"),
-        ("__import__('os').system('touch x')", "columns"),
-        ("radius_px.__class__", "table.column"),
-        ("(lambda: radius_px)()", "columns"),
-        ("[x for x in radius_px]", "columns"),
-        ("radius_px", "true or false"),
-        ("radius_px > 'a'", "numbers with numbers"),
-        ("split > 1", "numbers with numbers"),
-        ("position_m > 1", "true or false"),
-        ("position_m[7] > 1", "numbers with numbers"),
-        ("radius_px and split == 'test'", "conditions"),
-        ("1 < 2", "on columns"),
-        ("radius_px >", "a condition such as"),
-        ("radius_px := 3", "a condition such as"),
-        ("radius_px ** 9999 > 1", "columns"),
-        ("(" * 500 + "radius_px" + ")" * 500, "a condition such as"),
-        ("", "a condition such as"),
-    ],
-)
-def test_what_is_no_condition(text, told):
-    with pytest.raises(UserError, match=told):
-        Condition(text).holds(ROWS, 4)
 
 
 def taken(source, out, *conditions, **options):
@@ -121,24 +68,35 @@ def test_nothing_left_is_refused(drawn, tmp_path, options):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("by", ["scene", "trajectory", "frame"])
-def test_split(drawn, tmp_path, by):
-    source = open_dataset(drawn)
-    split_dataset(source, tmp_path / "s", by=by, val_share=0.2, test_share=0.2, seed=5)
-    made = open_dataset(tmp_path / "s")
-    assert validate(made) == [] and made.info.split_by == ("frame" if by == "frame" else "scene")
-    frames = made.table("frames").to_pandas()
-    assert frames["split"].value_counts().to_dict() == {"train": 24, "val": 8, "test": 8}
-    unchanged = [name for name in source.table("frames").column_names if name != "split"]
-    order = {"frame_id": "ascending"}.items()
-    before = source.table("frames", unchanged).sort_by(list(order))
-    assert made.table("frames", unchanged).sort_by(list(order)).equals(before)
-    split_dataset(source, tmp_path / "t", by=by, val_share=0.2, test_share=0.2, seed=6)
-    assert not open_dataset(tmp_path / "t").table("frames", ["split"]).equals(made.table("frames", ["split"]))
+def test_an_edited_frame_of_a_subset_leaves_its_source_alone(little, tmp_path):
+    """Frames are copies, and links on wish only."""
+    relative = "frames/s000/t000/000001.png"
+    before = (little / relative).read_bytes()
+    for k, made in enumerate(
+        [
+            taken(little, tmp_path / "s"),
+            split_of(little, tmp_path / "t"),
+            merged(little, tmp_path / "m"),
+            unpacked(little, tmp_path / "u"),
+        ]
+    ):
+        assert (made.root / relative).read_bytes() == before and not (made.root / relative).samefile(little / relative)
+        (made.root / relative).write_bytes(b"edited %d" % k)
+    assert (little / relative).read_bytes() == before
+    linked = taken(little, tmp_path / "l", images="link")
+    assert (linked.root / relative).samefile(little / relative)
 
 
-def test_too_few_to_split(drawn, tmp_path):
-    with pytest.raises(UserError, match="5 of scene"):
-        split_dataset(open_dataset(drawn), tmp_path / "s", val_share=0.5, test_share=0.4)
-    with pytest.raises(UserError, match="shares"):
-        split_dataset(open_dataset(drawn), tmp_path / "s", val_share=0.5, test_share=0.5)
+def split_of(source, out):
+    split_dataset(open_dataset(source), out, val_share=0.5, test_share=0.0)
+    return open_dataset(out)
+
+
+def merged(source, out):
+    merge([open_dataset(source)] * 2, out)
+    return open_dataset(out)
+
+
+def unpacked(source, out):
+    unpack(open_dataset(source), out)
+    return open_dataset(out)

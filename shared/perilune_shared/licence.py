@@ -1,0 +1,49 @@
+"""Licences as SPDX expressions."""
+
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from license_expression import ExpressionError, Licensing, get_spdx_licensing
+
+from perilune_shared.errors import UserError
+
+_OWN = re.compile(r"(LicenseRef-|AdditionRef-)[A-Za-z0-9.-]+")
+
+
+def joined_licence(licences: Iterable[tuple[object, str]]) -> str:
+    """The SPDX expression of data under all of several licences, each given with the place that names it.
+
+    Equal licences stand once, alternatives in parentheses. A licence of one's own is a LicenseRef-<name>, as in SPDX.
+    Raises UserError on what is no SPDX expression, or names an unknown licence.
+    """
+    spdx = get_spdx_licensing()
+    terms: dict[str, str] = {}
+    for place, text in licences:
+        for term in _terms(spdx, place, text):
+            # Simplified, the order of alternatives does not count.
+            terms.setdefault(str(term.simplify()), str(term))
+    parsed = [spdx.parse(term) for _, term in sorted(terms.items())]
+    return str(spdx.AND(*parsed)) if len(parsed) > 1 else str(parsed[0])
+
+
+def _terms(spdx: Licensing, place: object, text: str) -> list[Any]:
+    """What an expression joins by AND."""
+    wanted = "an SPDX licence expression such as CC-BY-4.0, or LicenseRef-<name>"
+    try:
+        expression = spdx.parse(text)
+        if expression is None:
+            raise UserError(place, "licence", "nothing", wanted)
+        odd = [key for key in spdx.unknown_license_keys(expression) if not _OWN.fullmatch(key)]
+    except (ExpressionError, ValueError, TypeError, RecursionError) as error:
+        raise UserError(place, "licence", f"{text!r} ({error})", wanted) from None
+    if odd:
+        raise UserError(place, "licence", ", ".join(odd), wanted)
+    waiting, terms = [expression], []
+    while waiting:
+        term = waiting.pop(0)
+        if isinstance(term, spdx.AND):
+            waiting = [*term.args, *waiting]
+        else:
+            terms.append(term)
+    return terms
