@@ -15,7 +15,6 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
-from tests import in_process
 
 from perilune_render.cli import main
 from perilune_render.regenerate import exr_far, png_far, regenerate, spread
@@ -28,6 +27,7 @@ from perilune_shared.schema import TABLES
 from perilune_shared.split import split_dataset
 from perilune_shared.subset import subset
 from perilune_shared.validate import validate
+from tests import in_process
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
 
