@@ -36,7 +36,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-train bench-infer clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-train bench-transfer bench-suppress bench-infer clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -139,6 +139,12 @@ bench-infer: setup ## time of the detector by engine, one image, two cores; writ
 
 bench-train: detect-frames ## training speed beside memory-fed and bare loops; writes runs/bench/train.json
 	@$(BIN)/python benchmarks/train.py --dataset "$(DATA)/detect" --preset $(PRESET)
+
+bench-transfer: detect-frames ## ways to start from a frozen backbone, compared; writes runs/bench/transfer.json
+	@$(BIN)/python benchmarks/transfer.py --dataset $(DATA)/detect
+
+bench-suppress: setup ## suppression of a batch against OpenCV's, frame by frame; writes runs/bench/suppress.json
+	@$(BIN)/python benchmarks/suppress.py
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

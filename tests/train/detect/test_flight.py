@@ -142,11 +142,9 @@ def test_the_readmes_program_finds_what_we_find(exported, dataset_detect, images
     done = subprocess.run([sys.executable, "-c", program], cwd=exported, capture_output=True, text=True, check=True)
     boxes, scores = map(np.array, json.loads(done.stdout))
     from perilune_train.detect.config import EvaluationSettings
-    from perilune_train.detect.task import detections_of
+    from perilune_train.detect.suppression import detections_of
 
-    own = detections_of(
-        *(part[0] for part in lively().detect(torch.as_tensor(images[:1]))), EvaluationSettings(min_score=0.4)
-    )
+    (own,) = detections_of(*lively().detect(torch.as_tensor(images[:1])), EvaluationSettings(min_score=0.4))
     assert len(own.scores) > 3
     np.testing.assert_allclose(boxes, own.boxes, atol=1e-3)
     np.testing.assert_allclose(scores, own.scores, atol=1e-4)

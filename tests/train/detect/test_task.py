@@ -14,7 +14,8 @@ from perilune_train.detect.data import load_split
 from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.run import build_network, judge, label_sizes
-from perilune_train.detect.task import DetectTask, detections_of, learning_rate_factor, pairs, update_average
+from perilune_train.detect.suppression import detections_of
+from perilune_train.detect.task import DetectTask, learning_rate_factor, pairs, update_average
 
 
 def test_learning_rate_by_hand():
@@ -37,7 +38,7 @@ def test_moving_average_by_hand():
 
 def test_weak_and_doubled_predictions_go():
     boxes = torch.tensor([[0.0, 0.0, 8.0, 8.0], [0.0, 0.0, 8.0, 7.0], [20.0, 20.0, 28.0, 28.0], [40.0, 0.0, 48.0, 8.0]])
-    found = detections_of(boxes, torch.tensor([0.3, 0.8, 0.001, 0.5]), EvaluationSettings())
+    (found,) = detections_of(boxes[None], torch.tensor([[0.3, 0.8, 0.001, 0.5]]), EvaluationSettings())
     assert found.boxes[:, 0].tolist() == [0, 40]
     np.testing.assert_allclose(found.scores, [0.8, 0.5])
 
@@ -96,7 +97,7 @@ def test_a_few_frames_can_be_learned_by_heart(split, tmp_path):
         optimizer.step()
     # Batch statistics of the very batch, since the running ones lag behind after so few steps.
     boxes, scores = network.detect(images)
-    found = [detections_of(b, s, config.evaluation) for b, s in zip(boxes, scores, strict=True)]
+    found = detections_of(boxes, scores, config.evaluation)
     assert curve(judge(few, found, config)).ap_paper() > 0.6
 
 

@@ -10,7 +10,7 @@ from perilune_shared.errors import UserError
 from perilune_train.detect.boxes import iou_matrix, suppress
 from perilune_train.detect.predict import open_detector
 from perilune_train.detect.scales import detect_at_scales
-from perilune_train.detect.task import detections_of
+from perilune_train.detect.suppression import detections_of
 from perilune_train.detect.tiles import (
     Detector,
     Tiling,
@@ -136,9 +136,9 @@ def test_many_boxes_are_suppressed_as_few_are():
 
 
 def test_long_boxes_go_before_suppression(detector):
-    boxes = torch.tensor([[0.0, 0, 20, 10], [0, 0, 12, 10], [50, 50, 60, 75]])
-    scores = torch.tensor([0.9, 0.8, 0.7])
+    boxes = torch.tensor([[[0.0, 0, 20, 10], [0, 0, 12, 10], [50, 50, 60, 75]]])
+    scores = torch.tensor([[0.9, 0.8, 0.7]])
     settings = detector.config.evaluation
-    assert detections_of(boxes, scores, settings).scores == pytest.approx([0.9, 0.7])
-    short = detections_of(boxes, scores, settings.model_copy(update={"max_aspect": 1.5}))
+    assert detections_of(boxes, scores, settings)[0].scores == pytest.approx([0.9, 0.7])
+    (short,) = detections_of(boxes, scores, settings.model_copy(update={"max_aspect": 1.5}))
     assert short.scores == pytest.approx([0.8])

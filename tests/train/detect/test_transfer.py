@@ -273,3 +273,23 @@ def test_without_a_file_nothing_is_frozen(dataset_detect, tmp_path, monkeypatch)
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, QUICK)
     with pytest.raises(KeyError, match="'0'"):
         run_detect(config, dataset_detect, tmp_path, "a")
+
+
+def test_new_plain_gates_before_a_frozen_backbone_are_refused(tmp_path):
+    """They would shrink what the frozen layers get; gates of the same run, or gates that start at 1, would not."""
+    config = DetectConfig(width=0.125, in_channels=1, epochs=2, frozen_epochs=1, strides=(4, 8, 16))
+    paths = {}
+    for attention in ("none", "cbam"):
+        architecture = {"in_channels": 1, "width": 0.125, "attention": attention, "strides": [4, 8, 16]}
+        paths[attention] = tmp_path / f"{attention}.ckpt"
+        runs.save_weights(paths[attention], architecture, YOLOv3(None, 1, 0.125, attention, (4, 8, 16)))
+
+    def begin(source: str, **settings: object) -> None:
+        changed = config.model_copy(update=settings)
+        start_from(YOLOv3(None, 1, 0.125, changed.attention, (4, 8, 16)), paths[source], changed)
+
+    with pytest.raises(UserError, match=r"none.ckpt: detect.attention: got cbam with frozen_epochs .*cbam_identity"):
+        begin("none", attention="cbam")
+    begin("cbam", attention="cbam")
+    begin("none", attention="cbam_identity")
+    begin("none", attention="cbam", frozen_epochs=0)

@@ -20,7 +20,7 @@ from perilune_train.detect.data import DetectSplit
 from perilune_train.detect.engines import Array, Engine, Precision, has_bf16, openvino_engine, package
 from perilune_train.detect.metrics import curve
 from perilune_train.detect.run import judge
-from perilune_train.detect.task import detections_of
+from perilune_train.detect.suppression import detections_of
 
 MOST_LOSS = 0.005
 """Average precision on the validation split that int8 may lose: half a point."""
@@ -130,8 +130,8 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
         task = bar.add_task(label, total=len(split), unit="frames", note="")
         for frame in split.frames.images:
             image = network_input(normalised(frame[None]), config.in_channels).contiguous().numpy()
-            boxes, scores = (torch.as_tensor(part[0]) for part in engine(image))
-            found.append(detections_of(boxes, scores, config.evaluation))
+            boxes, scores = (torch.as_tensor(part) for part in engine(image))
+            found += detections_of(boxes, scores, config.evaluation)
             bar.advance(task)
     return curve(judge(split, found, config)).ap_paper()
 

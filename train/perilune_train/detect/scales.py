@@ -9,7 +9,7 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.batches import network_input
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.matching import Detections
-from perilune_train.detect.task import detections_of
+from perilune_train.detect.suppression import detections_of
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 
@@ -64,7 +64,4 @@ def detect_at_scales(
         ratio = torch.tensor([to_width / width, to_height / height] * 2, device=device)
         boxes.append(found[0] / ratio)
         scores.append(found[1])
-    return [
-        detections_of(some_boxes, some_scores, config.evaluation)
-        for some_boxes, some_scores in zip(torch.cat(boxes, 1), torch.cat(scores, 1), strict=True)
-    ]
+    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), config.evaluation)

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from perilune_train.detect.batches import Batch, EvaluationFrames, Share, TrainingFrames, loader
-from perilune_train.detect.boxes import suppress
-from perilune_train.detect.config import DetectConfig, EvaluationSettings
+from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import DetectSplit
 from perilune_train.detect.distill import Teacher, distill_loss
 from perilune_train.detect.loss import detection_loss
 from perilune_train.detect.matching import Detections, match_split
 from perilune_train.detect.metrics import at_threshold, curve
+from perilune_train.detect.suppression import detections_of
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.provenance import RECORD
 
@@ -55,17 +55,6 @@ def update_average(tensors: Pairs, decay: float) -> None:
     old, new, old_counters, new_counters = tensors
     torch._foreach_lerp_(old, new, 1 - decay)
     torch._foreach_copy_(old_counters, new_counters)
-
-
-def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> Detections:
-    """Detections of one frame from all predictors' boxes (K, 4) and scores (K,)."""
-    strong = scores >= settings.min_score
-    if settings.max_aspect is not None:
-        sides = boxes[:, 2:] - boxes[:, :2]
-        strong &= sides.amax(1) <= settings.max_aspect * sides.amin(1)
-    some_boxes, some_scores = boxes[strong].double().cpu().numpy(), scores[strong].double().cpu().numpy()
-    kept = suppress(some_boxes, some_scores, settings.nms_iou, settings.max_detections)
-    return Detections(some_boxes[kept], some_scores[kept])
 
 
 class DetectTask(lightning.LightningModule):
@@ -199,7 +188,7 @@ class DetectTask(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         boxes, scores = self.evaluated.detect(batch[0])
-        self.judged += [detections_of(b, s, self.config.evaluation) for b, s in zip(boxes, scores, strict=True)]
+        self.judged += detections_of(boxes, scores, self.config.evaluation)
 
     def on_validation_epoch_end(self) -> None:
         split, judged = self.splits["val"], self.judged

@@ -20,7 +20,7 @@ from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.matching import Detections
 from perilune_train.detect.scales import resized
-from perilune_train.detect.task import detections_of
+from perilune_train.detect.suppression import detections_of
 from perilune_train.models.yolo import YOLOv3
 
 Array = NDArray[np.float64]
@@ -180,4 +180,4 @@ def detect_batch(detector: Detector, tiles: NDArray[np.uint8]) -> list[Detection
     images = network_input(normalised(tiles), detector.config.in_channels).to(detector.device)
     with torch.autocast(detector.device, torch.bfloat16, enabled=detector.bf16):
         boxes, scores = detector.network.detect(images)
-    return [detections_of(b, s, detector.config.evaluation) for b, s in zip(boxes, scores, strict=True)]
+    return detections_of(boxes, scores, detector.config.evaluation)

@@ -53,9 +53,11 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     """Give the network what an earlier detect run, or a Darknet file, has for it.
 
     A run of the same strides gives everything, its anchors too; one of other strides gives the backbone. Where their
-    attention differs the gates stay as they are. Raises UserError where width or in_channels are not the same.
+    attention differs the gates stay as they are. Raises UserError where width or in_channels are not the same, and
+    where the backbone is to be frozen behind new plain gates.
     """
     if is_darknet(path):
+        check_gates(path, config)
         start_from_darknet(network, path, config)
         return
     content = runs.load_weights(path)
@@ -63,12 +65,27 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     runs.check_architecture(path, architecture, {"in_channels": config.in_channels, "width": config.width})
     whole = architecture.get("strides") == list(config.strides)
     gates = architecture.get("attention") == config.attention
+    if not gates:
+        check_gates(path, config)
 
     def taken(key: str) -> bool:
         return (whole or key.startswith("backbone.")) and (gates or not key.startswith(_GATES))
 
     kept = {key: value for key, value in network.state_dict().items() if not taken(key)}
     runs.fill(network, kept | {key: value for key, value in content["state_dict"].items() if taken(key)}, path)
+
+
+def check_gates(path: Path, config: DetectConfig) -> None:
+    """Raises UserError where a frozen backbone would sit behind plain gates that start at random.
+
+    Each such gate scales its input by about 0.25, so that the frozen layers get features that they were not trained on:
+    the cosine to those of the plain backbone falls to about 0.5 (`make bench-transfer`).
+    """
+    if config.frozen_epochs and config.attention == "cbam":
+        wanted = (
+            "cbam_identity, whose gates start at 1 and keep the features of the frozen backbone, or frozen_epochs=0"
+        )
+        raise UserError(path, "detect.attention", "cbam with frozen_epochs and no gates in this file", wanted)
 
 
 def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenance]:

@@ -1,0 +1,68 @@
+"""Time of suppression: OpenCV's, frame by frame, against a whole batch on the device.
+
+A frame has 8,000 candidates, about fifteen for each crater. Both keep the same boxes. Writes runs/bench/suppress.json.
+"""
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from perilune_shared.files import write_text
+from perilune_train.detect.boxes import suppress
+from perilune_train.detect.suppression import suppress_batch
+
+CANDIDATES, THRESHOLD_IOU, ROUNDS = 8000, 0.45, 7
+
+
+def candidates(rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Boxes (K, 4) and scores (K,) of one frame of 256 px."""
+    which = rng.integers(CANDIDATES // 15, size=CANDIDATES)
+    side = rng.lognormal(1.8, 0.6, (CANDIDATES // 15, 1)).clip(3, 80)[which]
+    centre = rng.uniform(0, 256, (CANDIDATES // 15, 2))[which] + 0.1 * side * rng.normal(size=(CANDIDATES, 2))
+    half = side * np.exp(0.1 * rng.normal(size=(CANDIDATES, 2))) / 2
+    boxes = torch.tensor(np.concatenate([centre - half, centre + half], axis=1), dtype=torch.float32)
+    return boxes, torch.tensor(rng.uniform(0.01, 1, CANDIDATES), dtype=torch.float32)
+
+
+def median_s(call: Callable[[], object]) -> float:
+    """Median time of a call, seconds."""
+    times = []
+    for _ in range(ROUNDS):
+        begin = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begin)
+    return statistics.median(times)
+
+
+def main() -> None:
+    """The command."""
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    result: dict[str, object] = {"device": device, "candidates": CANDIDATES}
+    for n_frames in (1, 8):
+        rng = np.random.default_rng(0)
+        boxes, scores = (
+            torch.stack(part).to(device) for part in zip(*(candidates(rng) for _ in range(n_frames)), strict=True)
+        )
+        every = torch.ones_like(scores, dtype=torch.bool)
+
+        def by_frame(boxes: Tensor = boxes, scores: Tensor = scores) -> None:
+            for some_boxes, some_scores in zip(boxes.cpu().numpy(), scores.cpu().numpy(), strict=True):
+                suppress(some_boxes, some_scores, THRESHOLD_IOU, CANDIDATES)
+
+        def whole(boxes: Tensor = boxes, scores: Tensor = scores, every: Tensor = every) -> None:
+            suppress_batch(boxes, scores, every, THRESHOLD_IOU).cpu()
+
+        opencv_s, batch_s = median_s(by_frame), median_s(whole)
+        result[f"frames_{n_frames}"] = {"opencv_s": opencv_s, "batch_s": batch_s, "ratio": batch_s / opencv_s}
+        print(f"{n_frames} frames: OpenCV {opencv_s:.3f} s, batch on {device} {batch_s:.3f} s")
+    write_text(Path("runs/bench/suppress.json"), json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

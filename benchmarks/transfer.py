@@ -1,0 +1,168 @@
+"""How to start from a pretrained backbone with frozen weights: four choices, compared on features and loss.
+
+A plain detector (no attention) is trained from scratch. Its backbone then starts networks with attention. The backbone
+weights stay frozen while gates, neck and heads learn. Neck and heads start at random, as from darknet53.conv.74.
+
+    frozen       plain CBAM, weights and batch statistics frozen
+    adapt        plain CBAM, weights frozen, batch statistics adapt
+    recalibrate  plain CBAM, batch statistics recomputed over the training frames first, then frozen
+    identity     CBAM whose gates start at 1, weights and batch statistics frozen
+
+Prints for each: the cosine of the features after each stage to those of the plain backbone, and their size over the
+plain ones' (RMS), both before training; the mean training loss of the last 20 steps; the validation loss in evaluation
+mode. Writes runs/bench/transfer.json.
+"""
+
+import argparse
+import json
+import statistics
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from perilune_shared.files import write_text
+from perilune_shared.manifest import open_dataset
+from perilune_train.config import Attention
+from perilune_train.detect.batches import Batch, EvaluationFrames, TrainingFrames, loader
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data import DetectSplit, load_split
+from perilune_train.detect.loss import detection_loss
+from perilune_train.detect.run import build_network, label_sizes
+from perilune_train.detect.task import learning_rate_factor
+from perilune_train.models.yolo import YOLOv3
+
+CHOICES: dict[str, Attention] = {
+    "frozen": "cbam",
+    "adapt": "cbam",
+    "recalibrate": "cbam",
+    "identity": "cbam_identity",
+}
+_LAST = 20
+
+
+def batches(split: DetectSplit, config: DetectConfig) -> Iterator[Batch]:
+    """Training batches without end."""
+    epoch = 0
+    while True:
+        yield from loader(TrainingFrames(split, config.augment, config.seed, epoch), config)
+        epoch += 1
+
+
+def loss_of(network: YOLOv3, batch: Batch, config: DetectConfig) -> Tensor:
+    """The detector's training loss."""
+    images, targets = batch
+    box, confidence = detection_loss(
+        network(images), targets, network.anchors, network.strides, config.anchor_ratio, config.loss
+    )
+    return config.loss.lambda_iou * box + config.loss.lambda_obj * confidence
+
+
+def train(network: YOLOv3, split: DetectSplit, config: DetectConfig, steps: int) -> list[float]:
+    """The loss of each step; the network's parameters and modules keep their modes."""
+    learnt = [p for p in network.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(learnt, lr=config.learning_rate, weight_decay=config.weight_decay)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: learning_rate_factor(s, 20, steps))
+    losses = []
+    for batch in islice(batches(split, config), steps):
+        loss = loss_of(network, batch, config)
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(learnt, config.gradient_clip)
+        optimizer.step()
+        schedule.step()
+        losses.append(float(loss.detach()))
+    return losses
+
+
+@torch.no_grad()
+def recalibrate(network: YOLOv3, split: DetectSplit, config: DetectConfig) -> None:
+    """Replace the backbone's batch statistics by the mean of those of one epoch's batches."""
+    norms = [module for module in network.backbone.modules() if isinstance(module, nn.BatchNorm2d)]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None
+    network.backbone.train()
+    for images, _ in loader(TrainingFrames(split, config.augment, config.seed, 0), config):
+        network.backbone(images)
+    for norm in norms:
+        norm.momentum = 0.1
+
+
+@torch.no_grad()
+def likeness(network: YOLOv3, plain: YOLOv3, images: Tensor) -> dict[str, list[float]]:
+    """Cosine of the features to those of the plain backbone and ratio of their RMS, for each stage."""
+    wanted = plain.backbone(images)
+    kept = {key: value.clone() for key, value in network.state_dict().items()}
+    found = network.backbone(images)
+    network.load_state_dict(kept)
+    cosine = nn.functional.cosine_similarity
+    return {
+        "cosine": [float(cosine(a.flatten(), b.flatten(), dim=0)) for a, b in zip(found, wanted, strict=True)],
+        "size": [float(a.norm() / b.norm()) for a, b in zip(found, wanted, strict=True)],
+    }
+
+
+def compare(train_split: DetectSplit, val_split: DetectSplit, config: DetectConfig, steps: int, before: int) -> dict:
+    """Figures of every choice, all from the same plain detector."""
+    sizes = label_sizes(train_split)
+    plain = build_network(config.model_copy(update={"attention": "none"}), sizes, Path())
+    train(plain.train(), train_split, config, before)
+    plain.eval()
+    backbone = {key: value for key, value in plain.state_dict().items() if key.startswith("backbone.")}
+    val = list(loader(EvaluationFrames(val_split), config))
+    told = {}
+    for choice, attention in CHOICES.items():
+        network = build_network(config.model_copy(update={"attention": attention}), sizes, Path())
+        network.load_state_dict({**network.state_dict(), **backbone})
+        if choice == "recalibrate":
+            recalibrate(network, train_split, config)
+        network.train()
+        parts = (network.backbone.stem, network.backbone.downs, network.backbone.units)
+        for part in parts:
+            part.requires_grad_(False)
+            part.train(choice == "adapt")
+        similar = likeness(network, plain, val[0][0])
+        losses = train(network, train_split, config, steps)
+        network.eval()
+        with torch.no_grad():
+            val_loss = statistics.fmean(float(loss_of(network, batch, config)) for batch in val)
+        told[choice] = {**similar, "loss": statistics.fmean(losses[-_LAST:]), "val_loss": val_loss}
+    return told
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dataset", type=Path, required=True)
+    parser.add_argument("--width", type=float, default=0.25)
+    parser.add_argument("--steps", type=int, default=200, help="with the frozen backbone")
+    parser.add_argument("--before", type=int, default=400, help="steps of the plain detector")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path("runs/bench/transfer.json"))
+    given = parser.parse_args()
+    config = DetectConfig(width=given.width, in_channels=1, strides=(4, 8, 16), batch_size=4, learning_rate=2e-3)
+    dataset = open_dataset(given.dataset)
+    splits = [load_split(dataset, name, config.labels) for name in ("train", "val")]
+    runs = [
+        compare(splits[0], splits[1], config.model_copy(update={"seed": seed}), given.steps, given.before)
+        for seed in range(given.seeds)
+    ]
+    print(f"{'choice':12} {'cosine by stage':30} {'size by stage':30} {'loss':>18} {'val loss':>18}")
+    result = {}
+    for choice in CHOICES:
+        cosine, size = (np.mean([run[choice][key] for run in runs], axis=0) for key in ("cosine", "size"))
+        loss, val = ([run[choice][key] for run in runs] for key in ("loss", "val_loss"))
+        result[choice] = {"cosine": cosine.tolist(), "size": size.tolist(), "loss": loss, "val_loss": val}
+        shown = [" ".join(f"{value:.3f}" for value in values) for values in (cosine, loss, val)]
+        sizes = " ".join(f"{value:.0e}" for value in size)
+        print(f"{choice:12} {shown[0]:30} {sizes:30} {shown[1]:>18} {shown[2]:>18}")
+    settings = {"width": given.width, "steps": given.steps, "before": given.before, "frames": len(splits[0])}
+    write_text(given.out, json.dumps(settings | {"choices": result}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
