@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from perilune_shared.camera import Camera
+from perilune_shared.checksums import seal
 from perilune_shared.files import write_text
 from perilune_shared.info import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.manifest import count_rows, open_dataset
@@ -126,6 +127,7 @@ def _fill(root: Path, progress) -> None:
             part = f"{scene}.trajectory-0000" if name in ("frames", "labels") else scene
             write_part(root, name, part, _table(name, n, {**fixed, **own.get(name, {})}, rng))
     write_info(root, info.model_copy(update={"counts": count_rows(open_dataset(root))}))
+    seal(root)
 
 
 def _table(name: str, n: int, known: dict, rng: np.random.Generator) -> pa.Table:

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import re
+from collections import defaultdict
 from pathlib import Path
 
 import cv2
@@ -38,6 +39,16 @@ def test_it_is_whole_and_named_in_the_readme(name):
     assert re.search(rf"`{name}`.*`{sums[:16]}`", readme), f"{name}: {sums[:16]}"
 
 
+def test_no_two_manifests_share_terrain_but_the_papers():
+    """A network trained on one preset has seen no test terrain of another; the paper has one landing area."""
+    owners = defaultdict(set)
+    for name in NAMES:
+        for content in open_dataset(FOLDER / name).table("scenes", ["content_sha256"])["content_sha256"].to_pylist():
+            owners[content].add(name)
+    assert len(owners) == 343 + 49 + 10 + 1 + 1 + 1
+    assert [names for names in owners.values() if len(names) > 1] == [{"paper-detect", "paper-nav"}]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_frame_is_made_again(name, tmp_path):
     """The reference picture was rendered with the manifest; another kind of machine may differ in single pixels."""
@@ -46,8 +57,8 @@ def test_a_frame_is_made_again(name, tmp_path):
         if REAL is None:
             pytest.skip("PERILUNE_REAL_DEM is not set to the elevation model NPC_2km.tif")
         dem = Path(REAL)
-    (reference,) = (FOLDER / name).glob("frames/**/*.png")
-    frame_id = reference.relative_to(FOLDER / name / "frames").with_suffix("").as_posix()
+    (reference,) = (FOLDER / "reference_frames" / name).rglob("*.png")
+    frame_id = reference.relative_to(FOLDER / "reference_frames" / name).with_suffix("").as_posix()
     with Progress(disable=True) as progress:
         (outcome,) = regenerate(open_dataset(FOLDER / name), [frame_id], tmp_path, progress, dem)
     assert outcome.same_ground
