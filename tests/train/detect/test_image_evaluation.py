@@ -128,9 +128,10 @@ def test_compare_shows_images(run, folder, tmp_path):
     figures = evaluate_images(run, settings_of(run), folder, tmp_path / "a", Tiling(96, 32, (0.5, 1.0)), 12.0)
     text = compare_folders([tmp_path / "a"], tmp_path / "both")
     cells = [cell.strip() for cell in text.splitlines()[-1].strip("| ").split("|")]
-    assert cells[1:8] == ["images", "images", "-", "from 12.0 px", "0.5 1.0", "2", str(figures["labels"])]
-    assert cells[8].startswith(f"{figures['ap50_paper']:.3f} (a.png ") and "-" not in cells[9:15]
-    assert f"{figures['lowest_ap50_paper_by_radius']:.3f}" == cells[15]
+    wanted = ["images", "images", "-", "real images", "from 12.0 px", "0.5 1.0", "2", str(figures["labels"])]
+    assert cells[1:9] == wanted
+    assert cells[9].startswith(f"{figures['ap50_paper']:.3f} (a.png ") and "-" not in cells[10:16]
+    assert f"{figures['lowest_ap50_paper_by_radius']:.3f}" == cells[16]
 
 
 def test_images_are_looked_at_as_the_run_was_judged(folder, tmp_path):
