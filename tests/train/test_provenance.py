@@ -7,6 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from tests.stored_run import store_run
+from tests.terrain_record import store_record, uses_of
 from typer.testing import CliRunner
 
 from perilune_shared.config import resolve
@@ -23,6 +24,7 @@ from perilune_train.detect.transfer import inherited_terrain
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.run import navigate_run
 from perilune_train.provenance import (
+    UNKNOWN,
     Provenance,
     TerrainUse,
     check_calibration,
@@ -40,19 +42,11 @@ def settings(*more):
     return resolve(DetectConfig, "detect", "perilune_train", "tiny", None, (*QUICK, *more))
 
 
-def uses_of(dataset, split, use="trained", name="elsewhere"):
-    """The ground of a split as if a network had met it in another dataset."""
-    scenes = split_terrain(open_dataset(dataset), split, use)
-    return frozenset(TerrainUse(name, s.scene_id, use, s.sha256, name) for s in scenes)
-
-
 def stored(folder, uses):
     """A run without training whose checkpoint has this record; None leaves it out."""
     root = store_run(folder, "evaluation.min_score=0.9")
-    best = runs.RunFolder(root).best
     if uses is not None:
-        content = runs.load_weights(best)
-        torch.save({**content, "terrain": Provenance(frozenset(uses)).plain()}, best)
+        store_record(runs.RunFolder(root).best, uses)
     return root
 
 
@@ -78,6 +72,7 @@ def allowed(overlapping, dataset_detect):
     return evaluated(overlapping, dataset_detect, "--allow-overlap")
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_training_stores_its_terrain_and_that_of_the_network_it_starts_from(dataset_detect, tmp_path):
     parent = stored(tmp_path / "parent", [ELSEWHERE]) / "checkpoints" / "best.ckpt"
     run = run_detect(settings(f"detect.init_from={parent}"), dataset_detect, tmp_path, "child")
@@ -96,6 +91,10 @@ def test_training_stores_its_terrain_and_that_of_the_network_it_starts_from(data
     assert metrics["dataset/protocol"] == "held-out scenes"
     # A run that is resumed takes the record from its last state.
     assert inherited_terrain(settings(), run.last) == [record]
+    # One from before the record has unknown terrain.
+    older = {key: value for key, value in torch.load(run.last, weights_only=True).items() if key != "terrain"}
+    torch.save(older, run.last)
+    assert inherited_terrain(settings(), run.last) == [UNKNOWN]
 
 
 @pytest.mark.parametrize("key", ["init_from", "teacher"])
@@ -136,6 +135,7 @@ def test_compare_refuses_figures_on_terrain_of_the_training(allowed, tmp_path):
     assert cv2.imread(str(tmp_path / "precision_recall.png"))[1, 1][2] > 150
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_checkpoint_without_a_record_is_marked_as_unknown(dataset_detect, tmp_path):
     folder = evaluated(stored(tmp_path, None), dataset_detect)
     assert json.loads((folder / "metrics.json").read_text())["terrain/status"] == "unknown"

@@ -3,9 +3,11 @@ import json
 import cv2
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 import torch
 from tests.stored_run import store_run
+from tests.terrain_record import store_record, uses_of
 
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import open_dataset
@@ -18,6 +20,7 @@ from perilune_train.explain.masks import caption, detector_masks, draw_masks, na
 from perilune_train.explain.run import detect_frames, explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.provenance import training_provenance
 from perilune_train.runs import save_weights
 
 _BLOCKS = [f"B_{i + 1}{j + 1}" for i, count in enumerate((1, 2, 8, 8, 4)) for j in range(count)]
@@ -34,24 +37,31 @@ _STACK = {
 }
 
 
-@pytest.fixture(scope="module")
-def checkpoints(tmp_path_factory):
+def _store(folder):
     """Untrained networks: their masks are as real as trained ones."""
     torch.manual_seed(0)
-    folder = tmp_path_factory.mktemp("checkpoints")
     save_weights(folder / "stack.ckpt", _STACK, StackNavigator(1, 0.125, "cbam", 8))
     return store_run(folder, "attention=cbam") / "checkpoints" / "best.ckpt", folder / "stack.ckpt"
 
 
-def _explain(checkpoints, dataset_detect, dataset_nav, folder, n_drawn=2):
-    return explain_run(
-        ExplainConfig(n_frames=3, n_pairs=3, n_drawn=n_drawn, device="cpu"),
-        dataset_detect,
-        dataset_nav,
-        *checkpoints,
-        folder,
-        "t",
-    )
+@pytest.fixture(scope="module")
+def checkpoints(dataset_detect, dataset_nav, tmp_path_factory):
+    """A detector and a stack navigator with the records that training on the two datasets leaves."""
+    stored = _store(tmp_path_factory.mktemp("checkpoints"))
+    for path, dataset in zip(stored, (dataset_detect, dataset_nav), strict=True):
+        store_record(path, training_provenance(open_dataset(dataset)).uses)
+    return stored
+
+
+def _explain(checkpoints, dataset_detect, dataset_nav, folder, n_drawn=2, **options):
+    settings = ExplainConfig(n_frames=3, n_pairs=3, n_drawn=n_drawn, device="cpu")
+    return explain_run(settings, dataset_detect, dataset_nav, *checkpoints, folder, "t", **options)
+
+
+def _banded(path):
+    """Whether a picture has the red band of a terrain mark."""
+    blue, green, red = cv2.imread(str(path))[1, 1].astype(int)
+    return red > 150 and max(blue, green) < 80
 
 
 def test_a_run_correlates_every_block(checkpoints, dataset_detect, dataset_nav, tmp_path):
@@ -75,6 +85,12 @@ def test_a_run_correlates_every_block(checkpoints, dataset_detect, dataset_nav, 
     assert metrics["pcc4_all_pixels/B_11"] == pytest.approx(both["value_all_pixels"]) != metrics["pcc4/B_11"]
     for name in ("masks_detect.png", "masks_navigate.png", "pcc_detect.png", "pcc_navigate.png"):
         assert cv2.imread(str(run.root / name)).std() > 5, name
+        assert not _banded(run.root / name), name
+    # The detection dataset splits by scene, the navigation dataset by trajectory.
+    assert (metrics["detector/terrain/status"], metrics["detector/terrain/mark"]) == ("disjoint", "")
+    assert (metrics["navigator/terrain/status"], metrics["navigator/terrain/mark"]) == ("by protocol", "")
+    assert metrics["detector/dataset/protocol"] == "held-out scenes"
+    assert metrics["navigator/dataset/protocol"].startswith("held-out descents, shared terrain")
     # The same again leaves it alone; other settings or another checkpoint are refused.
     before = {path: path.stat().st_mtime_ns for path in run.root.rglob("*")}
     _explain(checkpoints, dataset_detect, dataset_nav, tmp_path)
@@ -83,6 +99,27 @@ def test_a_run_correlates_every_block(checkpoints, dataset_detect, dataset_nav, 
     with pytest.raises(UserError, match=r"inputs.json: detector: got SHA-256 .*--overwrite"):
         _explain((checkpoints[1], checkpoints[1]), dataset_detect, dataset_nav, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in run.root.rglob("*")} == before
+
+
+def test_test_terrain_that_a_network_was_fitted_to_is_refused_or_marked(dataset_detect, dataset_nav, tmp_path):
+    detector, stack = _store(tmp_path / "networks")
+    store_record(detector, uses_of(dataset_detect, "test"))
+    with pytest.raises(UserError, match=r"s004 = elsewhere/s004 \(trained\).*--allow-overlap"):
+        _explain((detector, stack), dataset_detect, dataset_nav, tmp_path)
+    store_record(detector, uses_of(dataset_detect, "train"))
+    store_record(stack, uses_of(dataset_nav, "test"))
+    with pytest.raises(UserError, match=r"s000 = elsewhere/s000 \(trained\).*--allow-overlap"):
+        _explain((detector, stack), dataset_detect, dataset_nav, tmp_path)
+    assert not (tmp_path / "explain").exists()
+    # Each picture has the mark of its own network.
+    run = _explain((detector, stack), dataset_detect, dataset_nav, tmp_path, allow_overlap=True)
+    metrics = json.loads(run.metrics.read_text())
+    assert (metrics["detector/terrain/status"], metrics["navigator/terrain/status"]) == ("disjoint", "overlap")
+    assert "s000 = elsewhere/s000" in metrics["navigator/terrain/mark"]
+    marked = {path.name for path in run.root.glob("*.png") if _banded(path)}
+    assert marked == {"masks_navigate.png", "pcc_navigate.png"}
+    table_mark = pq.read_schema(run.root / "correlations.parquet").metadata[b"terrain_mark"].decode()
+    assert table_mark == f"navigator: {metrics['navigator/terrain/mark']}"
 
 
 def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect):

@@ -21,7 +21,7 @@ from perilune_train.models.darknet_weights import (
     read_darknet,
 )
 from perilune_train.models.yolo import YOLOv3
-from perilune_train.provenance import RECORD, Provenance, read_provenance
+from perilune_train.provenance import Provenance, read_provenance
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
 """Of photographs on Darknet's scale of 0 to 1, about. A power of two scales without rounding."""
@@ -89,13 +89,14 @@ def check_gates(path: Path, config: DetectConfig) -> None:
 
 
 def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenance]:
-    """Records of the ground that the networks were fitted to which a run starts or learns from.
+    """Terrain records of the networks that a run starts or learns from.
 
     A resumed run has them in its last state, `last`. Darknet's files were trained on photographs of the Earth. Raises
     UserError where a checkpoint is missing or damaged.
     """
     if last is not None:
-        return [read_provenance(runs.read_saved(last, "--resume", {RECORD}, "the last state of a run"), last)]
+        content = runs.read_saved(last, "last state", {"state_dict"}, "the state of an interrupted run")
+        return [read_provenance(content, last)]
     given = [Path(path) for path in (config.init_from, config.teacher) if path is not None]
     return [read_provenance(runs.load_weights(path), path) for path in given if not is_darknet(path)]
 

@@ -8,6 +8,7 @@ import typer
 from perilune_shared.config import resolve
 from perilune_shared.progress import console
 from perilune_train.explain.config import ExplainConfig
+from perilune_train.overlap_option import AllowOverlap
 
 
 def explain(
@@ -39,6 +40,7 @@ def explain(
         Path | None,
         typer.Option(help="A stack navigator's best.ckpt. [default: runs/navigate/<name>-stack/checkpoints/best.ckpt]"),
     ] = None,
+    allow_overlap: AllowOverlap = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of this name.")] = False,
 ) -> None:
     """Draw what the attention of both networks looks at, and correlate it: PCC1 to PCC4 of the paper.
@@ -63,5 +65,6 @@ def explain(
         runs,
         name,
         overwrite,
+        allow_overlap,
     )
     console.print(f"{run.root}: metrics.json, masks_detect.png, masks_navigate.png, pcc_detect.png, pcc_navigate.png")

@@ -1,5 +1,6 @@
 """One explanation run: masks of both networks, their correlations, bar charts."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib
@@ -22,9 +23,11 @@ from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation import ground_affine, ground_truth_mask
 from perilune_train.explain.masks import Masks, detector_masks, draw_masks, navigator_masks
 from perilune_train.explain.measures import PCC1_SIGN, detector_correlations, navigator_correlations
+from perilune_train.marks import mark_files
 from perilune_train.navigate.data import Descent, load_descents, pair_sequence
 from perilune_train.navigate.task import load_navigator
-from perilune_train.runs import RunFolder, choose_device, write_metrics
+from perilune_train.provenance import check_terrain, protocol_of, read_provenance
+from perilune_train.runs import RunFolder, choose_device, load_weights, write_metrics
 
 _DETECT_BARS = {
     "pcc1_background": "PCC1: mask and G (1 on background)",
@@ -39,6 +42,12 @@ _NAVIGATE_BARS = {"pcc3": "PCC3: halves", "pcc4": "PCC4: halves, lower one moved
 _NAVIGATE_TITLE = (
     "Bars: over the pixels that both frames see. Dots and crosses: over all pixels (for PCC4 0 outside the overlap)."
 )
+_TABLE = "correlations.parquet"
+_PICTURES = {
+    "detector": ("masks_detect.png", "pcc_detect.png"),
+    "navigator": ("masks_navigate.png", "pcc_navigate.png"),
+}
+"""By network."""
 
 
 def explain_run(
@@ -50,13 +59,14 @@ def explain_run(
     runs: Path,
     name: str,
     overwrite: bool = False,
+    allow_overlap: bool = False,
 ) -> RunFolder:
     """Explain two checkpoints on the test frames of two datasets into runs/explain/<name>.
 
     `detector` is checkpoints/best.ckpt in the folder of its run, whose config.yaml says which craters are wanted.
     A finished run of the same settings, datasets and checkpoints is left as it is, unless `overwrite`. Raises UserError
-    where it had others, where a dataset, a checkpoint or that file is missing or of another kind, or a network has no
-    attention.
+    where it had others, where a dataset, a checkpoint or that file is missing or of another kind, where a network has
+    no attention, or was fitted to terrain of its test frames (unless `allow_overlap`).
     """
     run = RunFolder(runs / "explain" / name)
     inputs = hashes_of(
@@ -68,6 +78,9 @@ def explain_run(
     device = choose_device(settings.device)
     network = load_detector(detector).to(device)
     stack, architecture = load_navigator(navigator, "stack")
+    marks, terrain = _check_terrain(
+        {"detector": (detector, detect_data), "navigator": (navigator, nav_data)}, allow_overlap
+    )
     own = config_of_run(detector.parent.parent, ())
     frames, truth, labels = detect_frames(settings, own, detect_data)
     test = [descent for descent in load_descents(open_dataset(nav_data)) if descent.split == "test"]
@@ -89,7 +102,7 @@ def explain_run(
     draw_masks(run.root / "masks_navigate.png", *_some(both, stacked, settings.n_drawn))
     rows = detector_correlations(detected, truth) + _navigator_rows(stacked, pairs)
     table = pd.DataFrame(rows)
-    with written_aside(run.root / "correlations.parquet") as aside:
+    with written_aside(run.root / _TABLE) as aside:
         table.to_parquet(aside, index=False)
     draw_bars(run.root / "pcc_detect.png", table, _DETECT_BARS, _DETECT_TITLE)
     draw_bars(run.root / "pcc_navigate.png", table, _NAVIGATE_BARS, _NAVIGATE_TITLE)
@@ -104,7 +117,7 @@ def explain_run(
         for row in rows
         if row["measure"] in ("pcc3", "pcc4")
     }
-    metrics |= labels
+    metrics |= labels | terrain
     metrics |= {
         "pcc1_sign": PCC1_SIGN,
         "frames": len(frames),
@@ -113,8 +126,29 @@ def explain_run(
         "detector": detector.as_posix(),
         "navigator": navigator.as_posix(),
     }
+    for part, mark in marks.items():
+        mark_files(run.root, _PICTURES[part], mark)
+    mark_files(run.root, [_TABLE], "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark))
     write_metrics(run, metrics)
     return run
+
+
+def _check_terrain(
+    networks: Mapping[str, tuple[Path, Path]], allow_overlap: bool
+) -> tuple[dict[str, str], dict[str, float | int | str | None]]:
+    """Marks and entries of metrics.json by network, from each network's checkpoint and dataset.
+
+    Raises UserError where a network was fitted to terrain of its dataset's test frames, unless `allow_overlap`.
+    """
+    marks: dict[str, str] = {}
+    metrics: dict[str, float | int | str | None] = {}
+    for part, (checkpoint, root) in networks.items():
+        dataset = open_dataset(root)
+        check = check_terrain(read_provenance(load_weights(checkpoint), checkpoint), dataset, "test", allow_overlap)
+        marks[part] = check.mark
+        figures = {"dataset/protocol": protocol_of(dataset.info), **check.metrics()}
+        metrics |= {f"{part}/{key}": value for key, value in figures.items()}
+    return marks, metrics
 
 
 def detect_frames(
