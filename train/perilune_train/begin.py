@@ -88,7 +88,7 @@ def _decide(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrit
     if overwrite or not (run.finished or run.last.is_file()):
         return "new"
     check_settings(run, task, config)
-    _check_inputs(run, inputs)
+    _check_inputs(run, inputs, missing_is_fine=run.finished)
     return "finished" if run.finished else "resume"
 
 
@@ -122,19 +122,26 @@ def check_settings(run: RunFolder, task: str, config: Section) -> None:
             raise UserError(run.config, key, new, f"{old}, with which the run began{_REPLACE}")
 
 
-def _check_inputs(run: RunFolder, inputs: Hashes) -> None:
-    """Raise UserError naming the first input that is not the one the run began with. A missing one is not compared."""
+def _check_inputs(run: RunFolder, inputs: Hashes, missing_is_fine: bool) -> None:
+    """Raise UserError naming the first input that is not the one the run began with.
+
+    With `missing_is_fine` an input that is missing now, or was missing then, is not compared.
+    """
     if not run.inputs.is_file():
         return
     try:
         began = json.loads(run.inputs.read_text(encoding="utf-8"))
-        old = {name: began[name] for name in inputs if began.get(name) is not None}
-    except (ValueError, AttributeError):
-        raise UserError(run.inputs, "content", "no JSON object of hashes", f"the file as written{_REPLACE}") from None
-    for name, sha256 in inputs.items():
-        if sha256 is not None and name in old and old[name] != sha256:
-            got, wanted = f"SHA-256 {sha256[:12]}", f"{str(old[name])[:12]}, with which the run began{_REPLACE}"
-            raise UserError(run.inputs, name, got, wanted)
+    except (ValueError, RecursionError):
+        began = None
+    if not isinstance(began, dict):
+        raise UserError(run.inputs, "content", "no JSON object of hashes", f"the file as written{_REPLACE}")
+    for name, hash_now in inputs.items():
+        hash_then = began.get(name, hash_now)
+        if hash_now == hash_then or (missing_is_fine and None in (hash_now, hash_then)):
+            continue
+        got = "nothing" if hash_now is None else f"SHA-256 {hash_now[:12]}"
+        then = "nothing" if hash_then is None else str(hash_then)[:12]
+        raise UserError(run.inputs, name, got, f"{then}, with which the run began{_REPLACE}")
 
 
 def _differences(where: str, old: Mapping[str, Any], config: Section) -> Iterator[tuple[str, object, object]]:
