@@ -13,6 +13,7 @@ from rich.progress import Progress
 from perilune_render import tables
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
+from perilune_render.darkness import is_dark, warn_of_dark_frames
 from perilune_render.frame import Shot, Studio
 from perilune_render.interrupts import interrupts_held
 from perilune_render.labels import RimCircles
@@ -44,8 +45,6 @@ from perilune_shared.parts import read_part, write_part
 from perilune_shared.schema import Kind
 
 _GROUND = ("craters", "boulders")
-_DARK_SHARE = 0.01
-"""Share of the pixels that are sunlit, below which a frame is dark."""
 
 
 def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> Dataset:
@@ -108,13 +107,8 @@ def _render(
                     out, studio, trajectory, scene, renderer, lambda: progress.advance(task)
                 )
             ]
-        if dark:
-            progress.console.print(
-                f"warning: {scene_plan.scene_id}: {len(dark)} of {sum(len(t.splits) for t in waiting)} frames are dark "
-                f"(less than {_DARK_SHARE:.0%} of the picture is sunlit), first {dark[0]}; the Sun is "
-                f"{scene_plan.sun_elevation_deg:.1f} degrees high",
-                soft_wrap=True,
-            )
+        n_rendered = sum(len(t.splits) for t in waiting)
+        warn_of_dark_frames(scene_plan.scene_id, dark, n_rendered, scene_plan.sun_elevation_deg)
     dataset = Dataset(out, info)
     finished = info.model_copy(update={"counts": count_rows(dataset), "complete": True})
     write_overview(dataset)
@@ -177,7 +171,7 @@ def _render_trajectory(
         found = studio.label(shot, radiance, exposure)
         rows.append({**row, "real_ground_share": share, "n_craters_above_max_radius": found.n_above})
         labels.append(tables.label_table(shot.frame_id, found))
-        if radiance.sunlit.mean() < _DARK_SHARE:
+        if is_dark(radiance):
             dark.append(shot.frame_id)
         advance()
     name = f"{trajectory.scene_id}.{trajectory.trajectory_id}"

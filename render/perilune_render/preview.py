@@ -7,6 +7,7 @@ import numpy as np
 from perilune_render import tables
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
+from perilune_render.darkness import is_dark, warn_of_dark_frames
 from perilune_render.frame import Shot, Studio
 from perilune_render.labels import RimCircles
 from perilune_render.picture import draw_labels, enlarge, write_sheet
@@ -36,7 +37,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)
     depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
     outline = None if config.terrain.dem is None else outline_m(read_elevation(Path(config.terrain.dem)))
-    plain, drawn = [], []
+    plain, drawn, dark = [], [], []
     with Renderer(scene, config, plan.exr_camera, sun) as renderer:
         for index in np.linspace(0, len(trajectory.splits) - 1, n_frames).astype(int):
             shot = Shot.planned(trajectory, index)
@@ -51,4 +52,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
             if outline is not None:
                 pose = shot.position_m, shot.rotation_camera_from_site
                 draw_outline(drawn[-1], outline, scene, plan.camera, *pose)
+            if is_dark(radiance):
+                dark.append(shot.frame_id)
+    warn_of_dark_frames(scene_plan.scene_id, dark, n_frames, scene_plan.sun_elevation_deg)
     write_sheet(path, plain + drawn, n_frames)

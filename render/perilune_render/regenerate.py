@@ -17,6 +17,7 @@ from rich.progress import Progress
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig
+from perilune_render.darkness import is_dark, warn_of_dark_frames
 from perilune_render.exr import read_exr
 from perilune_render.frame import Shot, Studio
 from perilune_render.interrupts import interrupts_held
@@ -135,7 +136,7 @@ def _of_scene(
     sun = np.array(rows[0]["sun_direction"])
     pattern = FixedPattern.draw(config.sensor, camera, config.seed)
     studio = Studio(config, camera, exr_camera, pattern, RimCircles.of_scene(ground), sun)
-    outcomes = []
+    outcomes, dark = [], []
     with Renderer(ground, ground_config, exr_camera, sun) as renderer:
         for row in rows:
             shot = Shot.recorded(row, seed_of[row["trajectory_id"]])
@@ -147,7 +148,10 @@ def _of_scene(
             png = _compared(dataset, row, "png", out)
             exr = _compared(dataset, row, "exr", out) if row["exr_path"] is not None else None
             outcomes.append(Outcome(row["frame_id"], png, exr, same_ground, out / f"frames/{row['frame_id']}.png"))
+            if is_dark(radiance):
+                dark.append(row["frame_id"])
             advance()
+    warn_of_dark_frames(scene["scene_id"], dark, len(rows), scene["sun_elevation_deg"])
     return outcomes
 
 

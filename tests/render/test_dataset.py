@@ -1,7 +1,6 @@
 """Whole datasets through the command line: content, resuming, repeatability, faults of the user."""
 
 import json
-import re
 import resource
 import shutil
 import signal
@@ -18,7 +17,6 @@ from perilune_render.exr import CHANNELS, read_exr
 from perilune_shared.errors import UserError
 from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.manifest import open_dataset
-from perilune_shared.selection import SELECTIONS, read_labels, selected
 from perilune_shared.validate import validate
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
@@ -52,18 +50,6 @@ def test_a_rendered_dataset_has_no_fault(tiny, kind):
 def test_every_rendered_frame_counts_the_craters_that_are_too_large_for_a_label(tiny):
     counts = open_dataset(tiny / "detect").table("frames", ["n_craters_above_max_radius"]).to_pydict()
     assert counts["n_craters_above_max_radius"] == [0] * 24
-
-
-def test_dark_frames_are_told_and_show_no_crater(tmp_path):
-    changes = [f"--set=dataset.detect.{change}" for change in ("sun.elevation_deg=0.05", "n_scenes=1", "n_frames=2")]
-    done = run("dataset", "--preset", "tiny", "--kind", "detect", "--out", tmp_path, *QUICK, *changes)
-    assert done.returncode == 0, done.stderr
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("warning")]
-    told = re.fullmatch(r"warning: scene-0000: ([12]) of 2 frames are dark .* first (\S+); .*", line)
-    count, frame_id = told.groups()
-    labels = read_labels(open_dataset(tmp_path / "detect"))
-    labels = labels[(labels["frame_id"] == frame_id) | (count == "2")]
-    assert len(labels) and not selected(labels, SELECTIONS["visible"]).any()
 
 
 def test_frames_are_grey_lit_and_different(tiny):
