@@ -33,10 +33,10 @@ TEMPORARY_FILE = re.compile(r"\..+\.[0-9a-f]+\.part(\.[A-Za-z0-9]+)?")
 def locked(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder that is written in place; remove temporary files that killed writers left in it.
 
-    The folder is created where it does not exist, and removed again where it stays empty. Raises UserError where
-    another process holds the lock.
+    The folder and its parents are created where they do not exist, and removed again where they stay empty. Raises
+    UserError where another process holds the lock.
     """
-    created = not folder.exists()
+    created = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with lock(folder / LOCK_NAME, folder):
@@ -45,9 +45,9 @@ def locked(folder: Path) -> Iterator[None]:
                     Path(root, name).unlink(missing_ok=True)
             yield
     finally:
-        if created:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+        with contextlib.suppress(OSError):
+            for each in created:
+                each.rmdir()
 
 
 @contextlib.contextmanager
