@@ -40,7 +40,7 @@ def point(root: Path) -> dict[str, Any]:
 
 
 def draw(points: list[dict[str, Any]], path: Path) -> None:
-    """AP (the paper's sum) against multiply-adds, alone and distilled runs apart."""
+    """AP (the paper's sum) against multiply-adds; distilled runs have their own line."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""What a command does with the folder of a run that is already there."""
+"""Resume, keep, replace or refuse a run that exists already."""
 
 import pytest
 

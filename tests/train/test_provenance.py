@@ -68,7 +68,7 @@ def overlapping(dataset_detect, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def allowed(overlapping, dataset_detect):
-    """Its evaluation, let through."""
+    """Its evaluation with --allow-overlap."""
     return evaluated(overlapping, dataset_detect, "--allow-overlap")
 
 
@@ -159,15 +159,30 @@ def test_terrain_that_the_protocol_shares_is_declared_by_its_name(dataset_nav):
         check_terrain(Provenance(uses_of(dataset_nav, "train")), dataset)
 
 
-def test_the_papers_two_datasets_are_one_landing_area(dataset_nav):
-    """The detector's terrain is by design that of the navigator's test, but only under the same name."""
+@pytest.fixture
+def named(dataset_nav):
+    """The navigation dataset as if from a configuration of this name with `shared_terrain`."""
 
-    def named(name):
+    def change(name):
         info = open_dataset(dataset_nav).info
         recipe = info.recipe().model_copy(update={"config": {"name": name, "shared_terrain": True}})
         changed = {"name": f"perilune-{name}-{info.kind}", "recipes": recipes_of(recipe)}
         return Dataset(dataset_nav, info.model_copy(update=changed))
 
+    return change
+
+
+@pytest.mark.parametrize("name", ["p" * 300, "a\x1b[2J", 7, None])
+def test_a_record_can_be_read_whatever_a_configuration_is_called(named, name, tmp_path):
+    dataset = named("paper")
+    (key,) = dataset.info.recipes
+    dataset.info.recipes[key].config["name"] = name
+    record = training_provenance(dataset)
+    assert read_provenance({"terrain": record.plain()}, tmp_path / "best.ckpt") == record
+
+
+def test_the_papers_two_datasets_are_one_landing_area(named, dataset_nav):
+    """The detector's terrain is by design that of the navigator's test, but only under the same name."""
     detect = named("paper")
     nav = Dataset(dataset_nav, detect.info.model_copy(update={"name": "perilune-paper-nav"}))
     assert check_terrain(training_provenance(detect), nav).status == "by protocol"

@@ -1,4 +1,4 @@
-"""What a command does with a run of the same name that is already there: resume, leave, replace or refuse it."""
+"""Resume, keep, replace or refuse a run of the same name that exists already."""
 
 import functools
 import json

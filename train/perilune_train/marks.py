@@ -1,4 +1,4 @@
-"""A visible mark on everything that an evaluation on fitted terrain leaves."""
+"""Visible marks on all output of an evaluation on terrain that the network was fitted to."""
 
 import textwrap
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ _CHARACTER_PX, _LINE_PX = 9, 22
 def mark_files(folder: Path, names: Iterable[str], mark: str) -> None:
     """Write `mark` on pictures (a red band above), Markdown pages and Parquet tables (metadata) of a folder.
 
-    Names that the folder lacks are passed over. Does nothing where `mark` is empty.
+    Skips files that do not exist. Does nothing where `mark` is empty.
     """
     for path in (folder / name for name in names) if mark else ():
         if not path.is_file():

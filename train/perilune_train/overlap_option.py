@@ -1,4 +1,4 @@
-"""The option that lets a test on terrain of the training through."""
+"""The option that allows test terrain that a network was trained on."""
 
 from typing import Annotated
 
@@ -8,6 +8,6 @@ AllowOverlap = Annotated[
     bool,
     typer.Option(
         "--allow-overlap",
-        help="Go on where test terrain served for training; every figure and picture is marked then.",
+        help="Allow test terrain that the network was trained on; marks every figure and picture.",
     ),
 ]

@@ -3,7 +3,7 @@
 Every checkpoint carries a record of the ground that the network was trained, selected or calibrated on, by content hash
 (`perilune_shared.content`), with that of the networks it starts or learns from. A test figure on such ground measures
 memory, not generalisation, so the trainer refuses it unless the dataset's own protocol shares terrain or the user
-allows it; then everything that is written is marked.
+allows it. With the user's permission all output is marked.
 """
 
 import re
@@ -36,7 +36,7 @@ _PROTOCOLS = {
 
 @dataclass(frozen=True, slots=True, order=True)
 class TerrainUse:
-    """One scene's ground and what it served for."""
+    """One scene's ground and what it was used for."""
 
     dataset: str
     """Name of the dataset."""
@@ -120,27 +120,28 @@ def _group(info: DatasetInfo) -> str:
         for recipe in info.recipes.values()
     }
     (name,) = names if len(names) == 1 else ("",)
-    return f"landing area of {name}" if name else info.name
+    # Recipes are untrusted input: a name that a record cannot hold is no name.
+    return f"landing area of {name}" if name and _PLAIN.fullmatch(f"landing area of {name}") else info.name
 
 
 def protocol_of(info: DatasetInfo) -> str:
-    """What a dataset's test split holds out, by name; and what its splits share."""
+    """Name of a dataset's protocol: what its test split holds out and what its splits share."""
     return _PROTOCOLS[info.split_by] + info.leak
 
 
 @dataclass(frozen=True, slots=True)
 class TerrainCheck:
-    """How the ground of a test split stands to a network's record."""
+    """Result of comparing the ground of a test split with a network's record."""
 
     status: Status
-    """disjoint; by protocol: shared with other splits of the dataset, as its protocol has it; overlap: fitted to
-    otherwise and let through; unknown: the network has no whole record."""
+    """disjoint; by protocol: shared with other splits of the dataset by its protocol; overlap: any other shared ground,
+    allowed by the user; unknown: the record is missing or incomplete."""
     scenes: tuple[str, ...] = field(default=())
-    """Overlapping scenes, each with where it was used; at most a few are named."""
+    """Overlapping scenes, each with the scene and use in the record; only the first few are named."""
 
     @property
     def mark(self) -> str:
-        """What everything that is written must say; empty where nothing is wrong."""
+        """Text that all output must carry; empty for disjoint ground and for ground shared by protocol."""
         if self.status == "overlap":
             return f"TERRAIN OVERLAP, no test of unseen terrain: {', '.join(self.scenes)}"
         return "TRAINING TERRAIN UNKNOWN: the checkpoint has no record of it" if self.status == "unknown" else ""
@@ -159,7 +160,7 @@ def check_terrain(
     UserError naming the scenes of any other overlap with a test split, unless `allow_overlap`.
     """
     fitted = frozenset(use for use in provenance.uses if use.use != "tested")
-    # Frames of the training split are judged as such; the protocol line of the report says so.
+    # Evaluating training or validation frames is no overlap: the report names the split.
     by_design = dataset.info.split_by != "scene" or split != "test"
     tested = split_terrain(dataset, split, "tested")
     return _compared(fitted, tested, dataset, by_design, provenance.known, allow_overlap or split != "test")
@@ -200,14 +201,14 @@ def _compared(
         more = len(overlapping) - _MOST_NAMED
         named = (*overlapping[:_MOST_NAMED], *([f"{more} more"] if more > 0 else []))
         if not allow_overlap:
-            wanted = "test terrain that nothing was fitted to; --allow-overlap lets it through and marks all figures"
+            wanted = "test terrain that nothing was fitted to; --allow-overlap allows it and marks all figures"
             raise UserError(dataset.root, "test terrain", ", ".join(named), wanted)
-        return _told(TerrainCheck("overlap", named))
+        return _reported(TerrainCheck("overlap", named))
     if not known:
-        return _told(TerrainCheck("unknown"))
+        return _reported(TerrainCheck("unknown"))
     return TerrainCheck("by protocol" if by_protocol else "disjoint")
 
 
-def _told(check: TerrainCheck) -> TerrainCheck:
+def _reported(check: TerrainCheck) -> TerrainCheck:
     console.print(check.mark, markup=False, soft_wrap=True)
     return check

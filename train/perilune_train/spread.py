@@ -1,8 +1,8 @@
 """How far a figure varies: a 95 % interval by bootstrap over independent units, or the units' own values.
 
 Frames of one scene are alike, so whole scenes are drawn with replacement. The unit is the scene; in a split with one
-scene the trajectory; the image where neither is known. Fewer than five units give no interval: each unit's own value is
-told instead.
+scene the trajectory; the image where neither is known. Fewer than five units give no interval, but each unit's own
+value.
 """
 
 from collections.abc import Callable, Mapping, Sequence

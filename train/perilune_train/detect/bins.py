@@ -21,7 +21,7 @@ from perilune_train.spread import Resamples, Spread, spreads
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 RADIUS_BINS_PX = (2.0, 3.0, 5.0, 10.0, 20.0, 50.0, float("inf"))
-"""Up to 50 px those of the paper's rule; above, where wider images have larger labels, one open bin."""
+"""Up to 50 px the paper's range; above it one open bin, for the larger labels of wider images."""
 _PAPERS_LARGEST_PX = 50.0
 ALTITUDE_BINS_M = (200.0, 500.0, 1000.0, 1500.0)
 SUN_BINS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)

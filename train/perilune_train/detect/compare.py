@@ -34,8 +34,8 @@ _LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius
 def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
     """Write compare.md and precision_recall.png into `out`; returns the table.
 
-    Raises UserError where a folder lacks its metrics or its curve, or was judged on terrain of its training, unless
-    `allow_overlap`; then table and picture say so.
+    Raises UserError where a folder lacks its metrics or its curve, or was evaluated on terrain that its network was
+    trained on, unless `allow_overlap`; then table and picture are marked.
     """
     rows, curves, marks = [], {}, []
     for folder in folders:
@@ -71,7 +71,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
     text = "\n".join(table(head, rows)) + "\n"
     write_text(
         out / "compare.md",
-        "# Runs side by side\n\nIn brackets: 95 % intervals, or single units where they are too few.\n\n" + text,
+        "# Runs side by side\n\nIn brackets: 95 % intervals; with fewer than five units the value of each.\n\n" + text,
     )
     draw_curves(curves, out / "precision_recall.png")
     mark_files(out, ("compare.md", "precision_recall.png"), "; ".join(marks))
@@ -79,12 +79,12 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
 
 
 def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, str]:
-    """How an evaluation's test terrain stands to its training, and the mark that it must carry."""
+    """Terrain status of an evaluation, and the mark that its output must carry ("" for none)."""
     if "images/name" in metrics:
         return "real images", ""
     status, mark = metrics.get("terrain/status"), metrics.get("terrain/mark")
     if status == "overlap" and not allow_overlap:
-        wanted = "an evaluation on other terrain; --allow-overlap lets it through and marks it"
+        wanted = "an evaluation on other terrain; --allow-overlap allows it and marks all figures"
         raise UserError(folder / "metrics.json", "terrain/mark", mark, wanted)
     known = status in get_args(Status) and isinstance(mark, str)
     return (str(status), str(mark)) if known else ("unknown", TerrainCheck("unknown").mark)

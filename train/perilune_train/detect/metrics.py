@@ -23,7 +23,7 @@ class Curve:
     """(K,)."""
 
     def ap_paper(self) -> float:
-        """The paper's AP and the headline: sum of (R_n - R_(n-1)) P_n over all thresholds, precision as it is.
+        """The paper's AP and the headline: sum of (R_n - R_(n-1)) P_n over all thresholds, with raw precision.
 
         One threshold per distinct score, as in scikit-learn's average_precision_score: equal scores count together.
         Never above `ap_envelope`.
@@ -45,7 +45,7 @@ class Curve:
         return float(envelope[np.searchsorted(self.recall, np.linspace(0, 1, 101), side="left")].mean())
 
     def _thresholds(self) -> NDArray[np.bool_]:
-        """The points at which a threshold can stand (K,): of equal scores only the last, since it keeps all."""
+        """Which points are possible thresholds (K,): of equal scores the last, since a threshold keeps all of them."""
         return np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
 
     def best_threshold(self) -> float:

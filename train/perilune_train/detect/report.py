@@ -99,7 +99,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         ["AP at IoU 0.75", number(figures["ap75_paper"]), "", ""],
     ]
     lines += [*table(["", "usual", "edge", "strict"], rows), ""]
-    lines += ["AP without another word is the paper's: the sum of (R_n - R_(n-1)) P_n over all thresholds.", ""]
+    lines += ["AP alone means the paper's AP: the sum of (R_n - R_(n-1)) P_n over all thresholds.", ""]
     for by, title in (("radius", "Radius"), ("altitude", "Altitude"), ("sun", "Sun elevation")):
         lines += _bins(title, [part for part in evaluation.bins if part.by == by])
     lines += _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
@@ -126,7 +126,7 @@ def _cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], key: str
 
 
 def _of_brackets(resamples: Resamples) -> str:
-    """What stands in brackets behind a figure."""
+    """Explains the brackets after a figure."""
     count, unit = resamples.count, resamples.unit
     if count < LEAST_UNITS:
         return f"in brackets: the value of each {unit}; {count} of them are too few for an interval"

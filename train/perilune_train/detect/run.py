@@ -42,7 +42,7 @@ WRITTEN = (
     "detections.parquet",
     "precision_recall.parquet",
 )
-"""What an evaluation leaves beside metrics.json."""
+"""Files that an evaluation writes in addition to metrics.json."""
 
 
 def label_sizes(split: DetectSplit) -> np.ndarray:
