@@ -4,6 +4,7 @@ import contextlib
 import io
 
 import numpy as np
+from pycocotools import mask
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
@@ -12,12 +13,14 @@ IGNORED_AREA = 1e12
 
 def coco_evaluation(found, labels, copies=1):
     """COCOeval with maxDets raised and one range of areas; ignored labels lie outside that range, and
-    each is there `copies` times. AP at each of COCO's IoUs, by 101 points and by all points."""
+    each is there `copies` times; with None once for each detection that may match it. AP at each of COCO's IoUs, by
+    101 points and by all points."""
     images, annotations, results, averages = [], [], [], []
     for frame, (ours, truth) in enumerate(zip(found, labels, strict=True), start=1):
         images.append({"id": frame})
-        for (x0, y0, x1, y1), wanted in zip(truth.boxes.tolist(), truth.wanted, strict=True):
-            for _ in range(1 if wanted else copies):
+        repeats = _matchable(ours.boxes, truth.boxes) if copies is None else np.full(len(truth.boxes), copies)
+        for (x0, y0, x1, y1), wanted, repeat in zip(truth.boxes.tolist(), truth.wanted, repeats, strict=True):
+            for _ in range(1 if wanted else repeat):
                 box, area = [x0, y0, x1 - x0, y1 - y0], (x1 - x0) * (y1 - y0) if wanted else IGNORED_AREA
                 number = len(annotations) + 1
                 annotations.append(
@@ -33,10 +36,19 @@ def coco_evaluation(found, labels, copies=1):
         evaluation.params.maxDets = [100_000]
         evaluation.params.areaRng, evaluation.params.areaRngLbl = [[0, 1e10]], ["all"]
         wanted = sum(int(part.wanted.sum()) for part in labels)
+        # Matching does not depend on the recalls.
+        evaluation.evaluate()
         # At the 101 recalls; and at every recall that can be reached, over which the mean is the area under all points.
         for recalls in (np.linspace(0, 1, 101), np.arange(1, wanted + 1) / wanted):
             evaluation.params.recThrs = recalls
-            evaluation.evaluate()
             evaluation.accumulate()
             averages.append(evaluation.eval["precision"][:, :, 0, 0, 0].mean(axis=1))
     return averages
+
+
+def _matchable(found, labels):
+    """How many of the boxes `found` (N, 4) overlap each label (M, 4) by COCO's least IoU of 0.5; at least 1."""
+    if not len(found) or not len(labels):
+        return np.ones(len(labels), int)
+    sized = [np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1) for boxes in (found, labels)]
+    return np.maximum((mask.iou(*sized, np.zeros(len(labels), np.uint8)) > 0.499).sum(0), 1)

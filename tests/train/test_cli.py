@@ -68,22 +68,10 @@ def test_a_mistake_ends_the_process_with_its_line_and_code(tmp_path):
     assert "epochs (nearest known)" in result.stderr and list(tmp_path.iterdir()) == []
 
 
-def test_detect_runs(tmp_path, dataset_detect):
-    result = call(
-        "detect",
-        "train",
-        "--preset",
-        "tiny",
-        "--dataset",
-        dataset_detect,
-        "--name",
-        "x",
-        "--set",
-        "detect.epochs=1",
-        "--set",
-        "detect.precision=float32",
-        cwd=tmp_path,
-    )
+def test_detect_runs(tmp_path, few, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = ["--preset", "tiny", "--name", "x", "--set", "detect.epochs=1", "--set", "detect.precision=float32"]
+    result = in_process.call(main, "detect", "train", *given, "--dataset", few)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "runs" / "detect" / "x" / "metrics.json").is_file()
     assert "detections.png" in result.stderr

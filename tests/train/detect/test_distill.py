@@ -111,8 +111,9 @@ def teacher_path(tmp_path_factory):
     return path
 
 
-def test_a_run_with_a_teacher(teacher_path, dataset_detect, tmp_path):
-    run = run_detect(settings(f"detect.teacher={teacher_path}"), dataset_detect, tmp_path, "student")
+@pytest.mark.usefixtures("no_pictures")
+def test_a_run_with_a_teacher(teacher_path, few, tmp_path):
+    run = run_detect(settings(f"detect.teacher={teacher_path}"), few, tmp_path, "student")
     assert torch.equal(load_detector(run.best).anchors, load_detector(teacher_path).anchors)
     last = torch.load(run.last, weights_only=True)["state_dict"]
     assert not [key for key in last if "teacher" in key]

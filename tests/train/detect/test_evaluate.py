@@ -61,6 +61,7 @@ def test_a_run_judged_again_has_the_same_figures(run, dataset_detect):
         assert (run / "evaluation" / name).stat().st_size > 0, name
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_other_labels_another_threshold_another_split(run, dataset_detect, tmp_path):
     call("evaluate", "--run", run, "--dataset", dataset_detect, "--split", "val", "--threshold", 0.3, "--out", tmp_path)
     plain = figures(tmp_path)
@@ -73,6 +74,7 @@ def test_other_labels_another_threshold_another_split(run, dataset_detect, tmp_p
     assert "most detections in a frame: 7" in (tmp_path / "report.md").read_text()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path):
     judged = ("evaluate", "--run", run, "--dataset", dataset_detect, "--scale", 1, "--scale", 2)
     call(*judged, "--out", tmp_path / "own")
@@ -110,6 +112,7 @@ def test_figures_of_another_definition_are_not_put_beside(tmp_path):
     assert not (tmp_path / "both").exists()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_runs_side_by_side(run, dataset_detect, tmp_path):
     call("evaluate", "--run", run, "--dataset", dataset_detect, "--out", tmp_path / "b")
     text = call("compare", run, tmp_path / "b", "--out", tmp_path / "both")

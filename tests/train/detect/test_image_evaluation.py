@@ -98,6 +98,7 @@ def test_nothing_is_written_for_a_fault(run, folder, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_the_command(run, folder, tmp_path):
     arguments = ["detect", "evaluate", "--run", str(run), "--images", str(folder), "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, [*arguments, "--scale", "0.5", "--min-size", "20", "--threshold", "0.02"])
@@ -124,6 +125,7 @@ def test_the_runs_own_folder_keeps_its_figures(run, folder):
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_compare_shows_images(run, folder, tmp_path):
     figures = evaluate_images(run, settings_of(run), folder, tmp_path / "a", Tiling(96, 32, (0.5, 1.0)), 12.0)
     text = compare_folders([tmp_path / "a"], tmp_path / "both")
@@ -134,6 +136,7 @@ def test_compare_shows_images(run, folder, tmp_path):
     assert f"{figures['lowest_ap50_paper_by_radius']:.3f}" == cells[16]
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_images_are_looked_at_as_the_run_was_judged(folder, tmp_path):
     run = store_run(tmp_path / "runs", "evaluation.scales=[1,2]")
     arguments = ["detect", "evaluate", "--run", str(run), "--images", str(folder), "--out"]
