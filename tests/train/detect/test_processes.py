@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from tests import in_process
 
 from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
+from perilune_train.cli import main
 from perilune_train.detect.batches import Share
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.run import run_detect
@@ -31,14 +33,16 @@ def assert_equal_tensors(first: dict, second: dict) -> None:
     assert not different
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(dataset_detect, tmp_path):
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, SETTINGS)
     whole = run_detect(config, dataset_detect, tmp_path, "whole")
-    command = [sys.executable, "-m", "perilune_train.cli", "detect", "train", "--preset", "tiny", "--name", "killed"]
+    command = ["detect", "train", "--preset", "tiny", "--name", "killed"]
     command += ["--dataset", str(dataset_detect), "--out", str(tmp_path)]
     command += [part for setting in SETTINGS for part in ("--set", setting)]
+    program = [sys.executable, "-m", "perilune_train.cli"]
     checkpoint = tmp_path / "detect" / "killed" / "checkpoints" / "last.ckpt"
-    with subprocess.Popen(command, env=ALONE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([*program, *command], env=ALONE, stderr=subprocess.PIPE, text=True) as process:
         while not (checkpoint.is_file() and state(checkpoint)["epoch_and_batches"] >= [1, 3]):
             assert process.poll() is None, process.stderr.read()
             time.sleep(0.1)
@@ -46,7 +50,7 @@ def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(dataset_detec
         assert process.wait() == -signal.SIGKILL
     epoch, batches = state(checkpoint)["epoch_and_batches"]
     assert epoch == 1 and 3 <= batches < BATCHES
-    done = subprocess.run(command, env=ALONE, capture_output=True, text=True, timeout=120)
+    done = in_process.call(main, *command)
     assert done.returncode == 0, done.stderr
     resumed, uninterrupted = state(checkpoint), state(whole.last)
     assert resumed["global_step"] == uninterrupted["global_step"] == 2 * BATCHES

@@ -7,7 +7,7 @@ import torch
 
 from perilune_shared.config import resolve
 from perilune_train import runs
-from perilune_train.detect import task
+from perilune_train.detect import report, task
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.run import run_detect
 
@@ -22,6 +22,8 @@ def main(dataset: Path, out: Path, *settings: str) -> None:
             return super().__getitem__(place)
 
     task.TrainingFrames = Recorded  # type: ignore[misc]
+    for name in ("draw_bins", "draw_curves", "draw_frames"):
+        setattr(report, name, lambda *_, **__: None)
     task.DetectTask.on_train_end = lambda self: last.append(self)  # type: ignore[method-assign]
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
     run_detect(config, dataset, out if runs.is_first_process() else out / "other", "two")
