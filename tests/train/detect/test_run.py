@@ -107,6 +107,7 @@ def test_the_table_of_detections(finished, dataset_detect):
     assert table["score"].between(0.01, 1).all()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_the_same_seed_gives_the_same_weights_also_when_resumed(finished, dataset_detect, tmp_path, monkeypatch):
     original = DetectTask.training_step
 
@@ -142,12 +143,6 @@ def test_a_finished_run_is_left_as_it_is(finished, few, tmp_path, capsys):
     with pytest.raises(UserError, match=r"inputs.json: dataset: got SHA-256 .*with which the run began; --overwrite"):
         run_detect(settings(), few, finished.root.parents[1], "a")
     assert files() == before
-
-
-@pytest.fixture(scope="module")
-def few(tmp_path_factory, make_dataset):
-    """Six frames to train on, two of val and of test."""
-    return make_dataset(tmp_path_factory.mktemp("few") / "few", "detect", n_frames=2)
 
 
 @pytest.fixture
@@ -188,6 +183,7 @@ def test_the_report_tells_of_the_anchors(finished):
     assert f"- anchors: best possible recall {best:.4f}," in (finished.root / "report.md").read_text()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_run_in_bfloat16(few, tmp_path, monkeypatch):
     coarse = []
 
@@ -208,7 +204,8 @@ def test_a_run_in_bfloat16(few, tmp_path, monkeypatch):
 
 def test_a_packed_dataset_gives_the_same_weights(few, tmp_path, unjudged):
     pack(open_dataset(few), tmp_path / "packed")
-    made = [run_detect(settings(), root, tmp_path, root.name) for root in (few, tmp_path / "packed")]
+    config = settings("detect.epochs=1")
+    made = [run_detect(config, root, tmp_path, root.name) for root in (few, tmp_path / "packed")]
     first, again = (runs.load_weights(run.best)["state_dict"] for run in made)
     assert first.keys() == again.keys() and all(torch.equal(first[key], again[key]) for key in first)
 

@@ -218,7 +218,8 @@ def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> set
     return {torch.equal(first[key], second[key]) for key in first}
 
 
-def test_a_run_leaves_the_backbone_alone_in_its_frozen_epochs_only(dataset_detect, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("no_pictures")
+def test_a_run_leaves_the_backbone_alone_in_its_frozen_epochs_only(few, tmp_path, monkeypatch):
     """Weights and batch statistics, through optimiser, weight decay and moving average; gates and head learn."""
     start = YOLOv3(None, 1, 0.125, "cbam_identity", (4, 8, 16))
     for key, value in start.backbone.state_dict().items():
@@ -239,7 +240,7 @@ def test_a_run_leaves_the_backbone_alone_in_its_frozen_epochs_only(dataset_detec
         monkeypatch.setattr(DetectTask, name, recorded(getattr(DetectTask, name)))
     settings = (*QUICK, f"detect.init_from={tmp_path / 'best.ckpt'}")
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
-    run_detect(config, dataset_detect, tmp_path / "runs", "a")
+    run_detect(config, few, tmp_path / "runs", "a")
     (before, _), (frozen, frozen_average), (after, after_average) = states
     assert same(before["frozen"], parts(start)["frozen"]) == {True}
     assert same(before["frozen"], frozen["frozen"]) == {True}
@@ -265,14 +266,14 @@ def test_the_frozen_forward_keeps_no_graph_that_nobody_needs(dataset_detect, tmp
     assert all(p.grad is not None for p in task.network.heads.parameters())
 
 
-def test_without_a_file_nothing_is_frozen(dataset_detect, tmp_path, monkeypatch):
+def test_without_a_file_nothing_is_frozen(few, tmp_path, monkeypatch):
     def stop(self, batch, batch_idx):
         raise KeyError(str([p.requires_grad for p in self.network.parameters()].count(False)))
 
     monkeypatch.setattr(DetectTask, "training_step", stop)
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, QUICK)
     with pytest.raises(KeyError, match="'0'"):
-        run_detect(config, dataset_detect, tmp_path, "a")
+        run_detect(config, few, tmp_path, "a")
 
 
 def test_new_plain_gates_before_a_frozen_backbone_are_refused(tmp_path):
