@@ -164,9 +164,27 @@ def test_a_file_that_differs_is_not_left(run_folder, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture(scope="module")
+def quantise_once():
+    """`int8.quantise` that computes its file at the first call and writes the same one at later calls."""
+    made = []
+
+    def quantise(source, out, images):
+        if not made:
+            original(source, out, images)
+            made.append(out.read_bytes())
+        out.write_bytes(made[0])
+
+    original = int8.quantise
+    return quantise
+
+
 @pytest.mark.parametrize("most_loss", [-1.0, 1.0])
-def test_int8_is_judged_and_kept_only_if_worth_it(run_folder, dataset_detect, tmp_path, monkeypatch, most_loss):
+def test_int8_is_judged_and_kept_only_if_worth_it(
+    run_folder, dataset_detect, tmp_path, monkeypatch, quantise_once, most_loss
+):
     """Both verdicts: no loss is small enough, and every one is, while int8 is called the faster."""
+    monkeypatch.setattr(int8, "quantise", quantise_once)
     monkeypatch.setattr(int8, "MOST_LOSS", most_loss)
     timed = int8.interleaved
     monkeypatch.setattr(int8, "interleaved", lambda *given: timed(*given) | {"int8": [0.0]})
