@@ -67,10 +67,10 @@ demo: setup ## everything: set-up, datasets, detection, navigation, explanation 
 	@echo "Navigation  $(RUNS)/navigate/$(NAME)[-stack]      metrics.json, *.png, navigation.parquet"
 	@echo "Explanation $(RUNS)/explain/$(NAME)               metrics.json, *.png, correlations.parquet"
 
-dataset: setup ## render the preset's datasets (KIND=detect|nav for one); goes on where it was stopped
+dataset: setup ## render the preset's datasets (KIND=detect|nav for one); again to resume
 	@$(RENDER) --kind $(KIND)
 
-# A dataset.json may be that of a stopped rendering: then the command goes on where it was.
+# A dataset.json may be that of a stopped rendering: then the command resumes it.
 .PHONY: detect-frames nav-frames
 detect-frames: setup
 	@grep -qs '"complete": true' "$(DATA)/detect/dataset.json" || $(RENDER) --kind detect

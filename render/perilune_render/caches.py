@@ -1,4 +1,4 @@
-"""Where files are kept that cost only time to make again."""
+"""Folders for files that can be computed again."""
 
 import functools
 import os
@@ -40,9 +40,9 @@ def cache_home() -> Path:
 
 @functools.cache
 def machine_code_folder() -> Path:
-    """The folder for the kernels as they are, in NUMBA_CACHE_DIR where that is set, else in `cache_home()`.
+    """The folder of machine code for the current kernels, in NUMBA_CACHE_DIR where that is set, else in `cache_home()`.
 
-    Those that were not used for longest are removed.
+    Removes the folders that were used least recently.
     """
     parent = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_home() / "kernels")
     folder = parent / f"perilune-{fingerprint(*compiled_functions()).sha256[:16]}"

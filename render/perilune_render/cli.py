@@ -63,13 +63,15 @@ def _one(kind: Kind) -> Literal["detect", "nav"]:
     return _first(kind)
 
 
-def _tell_of_size(config: DatasetConfig) -> None:
-    """Tell, before hours of rendering, of frames that the detector cannot be trained on."""
+def _warn_of_size(config: DatasetConfig) -> None:
+    """Warn, before hours of rendering, of frames that the detector cannot be trained on."""
     sides = {"width_px": config.camera.width_px, "height_px": config.camera.height_px}
     for name, side in sides.items():
         if side % 32:
-            told = f"dataset.camera.{name}: {side} is no multiple of 32; the detector cannot be trained on such frames"
-            Console(stderr=True).print(told, soft_wrap=True)
+            line = (
+                f"dataset.camera.{name}: {side} is not a multiple of 32: the detector cannot be trained on such frames"
+            )
+            Console(stderr=True).print(line, soft_wrap=True)
 
 
 def _resolve(
@@ -101,14 +103,14 @@ def dataset(
         typer.Option(help="Render somebody's manifest or plan into --out, in place of a preset."),
     ] = None,
 ) -> None:
-    """Render a preset's datasets, or a manifest's. Stopped at any moment, the same command goes on where it was."""
+    """Render a preset's datasets, or a manifest's. Run the same command again to resume."""
     if manifest is not None:
         given = [name for name in ("preset", "config", "setting", "kind") if _was_given(context, name)]
         _render_manifest(manifest, out, dem, catalogue, given)
         return
     resolved = _resolve(preset, config, setting, dem, catalogue)
     if kind is not Kind.NAV:
-        _tell_of_size(resolved)
+        _warn_of_size(resolved)
     folder = out or Path("data") / preset
     from perilune_render.dataset import (
         make_dataset,
@@ -147,7 +149,7 @@ def _render_manifest(
         made = render_plan(plan, config, info, out, progress, manifest)
     same, known, other_scenes = as_before(given, made)
     told = f"; {same} of {known} frames are the manifest's byte for byte" if known else ""
-    told += f"; {other_scenes} scenes came out otherwise" if other_scenes else "; the ground came out as it says"
+    told += f"; {other_scenes} scenes have other ground" if other_scenes else "; the ground is the manifest's"
     Console().print(f"{out}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{told}", soft_wrap=True)
 
 
@@ -184,7 +186,7 @@ def plan(
     """Write a dataset's plan as a manifest without frames, for others to render. Grows every scene for its hash."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
     if kind is not Kind.NAV:
-        _tell_of_size(resolved)
+        _warn_of_size(resolved)
     from perilune_render.planned import write_plan
 
     with progress_bar() as progress:
@@ -225,7 +227,7 @@ def regenerate(
         if outcome.state != "identical" and not verify:
             Console().print(f"{outcome.png_path}: {outcome.state}", soft_wrap=True)
     told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    ground = "" if all(o.same_ground for o in outcomes) else "; the ground came out otherwise than its hash says"
+    ground = "" if all(o.same_ground for o in outcomes) else "; terrain hash mismatch"
     Console().print(f"{len(outcomes)} frames: {told}{ground}", soft_wrap=True)
     if counts["different"] or ground:
         raise typer.Exit(EXIT_USER_ERROR)

@@ -1,4 +1,4 @@
-"""Functions compiled by numba, whose machine code is kept by the sources of all of them.
+"""numba.njit with a cache of machine code that is keyed by the sources of all kernels.
 
 numba itself keeps a function's machine code as long as the function's own file is the same, though functions and
 constants of other files are compiled into it. Here a change in any of them makes another folder.

@@ -17,7 +17,7 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
-    """What a dataset is made by; where it is only planned, what its ground is made by."""
+    """The recipe of a dataset; of a plan, with the versions of its ground only."""
     with_dem = config.terrain.dem is not None
     versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
     return Recipe(preset=preset, kind=kind, seed=config.seed, config=recorded_settings(config, kind), versions=versions)

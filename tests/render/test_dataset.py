@@ -13,11 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
+from perilune_render.cli import main
 from perilune_render.exr import CHANNELS, read_exr
 from perilune_shared.errors import UserError
 from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.manifest import open_dataset
 from perilune_shared.validate import validate
+from tests import in_process
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
 QUICK = [
@@ -34,8 +36,9 @@ QUICK = [
 ]
 
 
-def run(*arguments, **options):
-    return subprocess.run([RENDER, *map(str, arguments)], capture_output=True, text=True, **options)
+def run(*arguments):
+    """In this process, where Blender is loaded once."""
+    return in_process.call(main, *arguments)
 
 
 def hashes(dataset):
@@ -162,7 +165,8 @@ def test_a_full_disk_leaves_what_was_finished(tmp_path):
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
 
-    result = run("dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", tmp_path, preexec_fn=limit)
+    command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit)
     assert result.returncode == 2 and "Traceback" not in result.stderr and "stays valid" in result.stderr
     dataset = open_dataset(tmp_path / "detect")
     for fault in validate(dataset):

@@ -1,4 +1,4 @@
-"""Machine code is compiled anew when any source changes that is compiled into it."""
+"""Kernels are compiled again when any source that is compiled into them changes."""
 
 import os
 import shutil

@@ -94,5 +94,5 @@ def test_frames_that_the_detector_cannot_take_are_told_before_anything_is_made(t
         size = ("--set", "dataset.camera.width_px=200", "--set", "dataset.camera.height_px=96")
         made = in_process.call(main, "plan", "--preset", "tiny", "--kind", kind, *size, "--out", tmp_path)
         assert made.returncode == 2 and "--out" in made.stderr
-        assert ("dataset.camera.width_px: 200 is no multiple of 32" in made.stderr) == told
+        assert ("dataset.camera.width_px: 200 is not a multiple of 32" in made.stderr) == told
         assert "height_px" not in made.stderr

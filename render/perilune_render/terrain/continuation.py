@@ -1,4 +1,4 @@
-"""Ground beyond the edge of an elevation model: level and slope of the edge go on and die away.
+"""Ground beyond the edge of an elevation model: level and slope continue and fade.
 
 Each scale of the model's relief is continued by point reflection, which keeps level and slope, and fades within about a
 third of its own wavelength, so that nothing of the model is repeated; its mean slope fades over the model's own

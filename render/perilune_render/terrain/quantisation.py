@@ -6,7 +6,7 @@ from scipy import ndimage
 from perilune_shared.frames import Array
 
 _LEAST_SLOPE = 1e-3
-"""A step that is less than this share of a pixel makes no terraces that anybody sees."""
+"""Steps below this share of a pixel make no visible terraces."""
 _FEWEST_REPEATS = 4
 """Pixels per distinct height, on average, from which heights may be in steps."""
 _WIDEST_TERRACE_PX = 64

@@ -61,12 +61,16 @@ def settled(scene, spacings, spared):
     distance = np.maximum(np.abs(c.x_m), np.abs(c.y_m))
     wide = c.diameter_m > spacings * scene.grid.spacing_at(distance + c.diameter_m)
     wide &= (distance + c.diameter_m < scene.grid.extent_m / 2) & (c.origin == ORIGINS.index("primary"))
+    # Only craters above `least` times a crater's size can disturb it: look at those alone, smallest first.
+    order, least = np.argsort(c.diameter_m), min(0.4, spared)
+    x, y, diameter, wear_m2 = c.x_m[order], c.y_m[order], c.diameter_m[order], c.wear_m2[order]
     for k in np.flatnonzero(wide):
-        younger = np.arange(len(c)) > k
-        apart = np.hypot(c.x_m - c.x_m[k], c.y_m - c.y_m[k])
-        own, other = c.diameter_m[k] / 2, c.diameter_m / 2
+        rest = slice(np.searchsorted(diameter, least * c.diameter_m[k]), None)
+        younger = order[rest] > k
+        apart = np.hypot(x[rest] - c.x_m[k], y[rest] - c.y_m[k])
+        own, other = c.diameter_m[k] / 2, diameter[rest] / 2
         near = np.abs(apart - own) < 1.6 * other
-        clear = c.wear_m2 < 0.06 * other**2
+        clear = wear_m2[rest] < 0.06 * other**2
         older = ~younger & clear & (np.abs(apart - own) < 1.25 * other) & (other > 0.4 * own) & (apart > 0)
         wide[k] = not (older | (younger & near & (other > spared * own))).any()
     return np.flatnonzero(wide)

@@ -45,7 +45,7 @@ def test_nothing_of_the_model_is_repeated_beyond_its_edge(pit):
 
 
 def test_level_and_slope_go_on_across_the_edge(tmp_path):
-    # A slope that rises across the edge goes on rising at first: a mirror image would fold it.
+    # A slope that rises across the edge continues at first; a mirror image would fold it.
     height = np.tile(np.arange(200.0), (200, 1)) + np.random.default_rng(1).normal(0, 0.2, (200, 200))
     base, beyond = base_heights(model_of(tmp_path / "a.tif", height, 5.0), Grid.even(800, 160))
     beyond = beyond.reshape(321, 321)
@@ -55,7 +55,7 @@ def test_level_and_slope_go_on_across_the_edge(tmp_path):
         np.median(slope[:, which], axis=1) for which in (beyond == 0, (beyond > 0) & (beyond < 60), beyond > 250)
     )
     assert np.linalg.norm(inside) > 0.15 and np.allclose(inside, near, atol=0.02)
-    # It does not climb for ever.
+    # Far from the edge it levels out.
     assert np.linalg.norm(far) < 0.7 * np.linalg.norm(inside)
     second = np.abs(np.diff(base.reshape(321, 321), 2, axis=0))[:, 20:-20]
     edge = (beyond[1:-1, 20:-20] > 0) & (beyond[1:-1, 20:-20] < 10)
