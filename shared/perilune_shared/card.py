@@ -89,7 +89,7 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
 
 
 def _purpose(info: DatasetInfo) -> str:
-    """What the dataset is for, and how many trajectories are over how many terrains."""
+    """The dataset's purpose, with its numbers of trajectories and terrains."""
     n_scenes, n_trajectories = info.counts.scenes, info.counts.trajectories
     terrains = f"{n_scenes:,} terrains" if n_scenes != 1 else "one terrain"
     trajectories = f"{n_trajectories:,} trajectories" if n_trajectories != 1 else "one trajectory"

@@ -21,7 +21,7 @@ _OWN_FOLDERS = ("manifest", "images")
 
 
 def seal(root: Path, progress: Progress | None = None, known: Mapping[str, str] | None = None) -> None:
-    """Write SHA256SUMS of all that lies in the dataset now, but links and odd names, which are faults.
+    """Write SHA256SUMS of all files of the dataset except links and odd names, which are faults.
 
     `known` has the hashes of files that were computed in this run and have not changed since: these are not read.
     """
@@ -77,11 +77,11 @@ def faults_of(root: Path, progress: Progress | None = None) -> Iterator[tuple[st
 
 @contextlib.contextmanager
 def _hashing(root: Path, names: list[str], progress: Progress | None) -> Iterator[Callable[[int], object]]:
-    """What to tell of bytes that were read, while files are hashed."""
+    """A function to call with the number of bytes read, which advances the progress bar."""
     if progress is None:
         yield lambda n_bytes: None
         return
-    total = sum((root / name).stat().st_size for name in names)
+    total = sum((root / name).stat().st_size for name in names if (root / name).is_file())
     task = progress.add_task("hashing", total=total / 1e6, unit="MB", note="")
     yield lambda n_bytes: progress.advance(task, n_bytes / 1e6)
     progress.update(task, completed=total / 1e6)

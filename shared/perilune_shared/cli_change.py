@@ -25,7 +25,7 @@ EXIT_DIFFERENT = 1
 
 
 class Images(enum.StrEnum):
-    """What becomes of frames."""
+    """How frames are written."""
 
     COPY = "copy"
     NONE = "none"
@@ -117,7 +117,7 @@ def split(
     images: ImagesOption = Images.COPY,
     link: LinkOption = False,
 ) -> None:
-    """Split anew into train, val and test, by scene, trajectory or frame."""
+    """Assign scenes, trajectories or frames to another train, val and test split."""
     with progress_bar() as progress:
         split_dataset(open_dataset(dataset), out, by.value, val, test, seed, _mode(images, link), progress)
     _tell(out)

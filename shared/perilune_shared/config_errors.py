@@ -1,4 +1,4 @@
-"""Validation errors of settings in plain words: source, key, what was given and what is expected."""
+"""Validation errors of settings as one line: source, key, value given and value expected."""
 
 import difflib
 import json
@@ -48,7 +48,7 @@ _COUNTED = {"too_short": ("at least", "min_length"), "too_long": ("at most", "ma
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """What is expected in place of an unknown name: the known one much like it, or else all of them."""
+    """What is expected in place of an unknown name: the most similar known name, or else all known names."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=_LEAST_LIKENESS)
     return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)

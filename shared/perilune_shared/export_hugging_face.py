@@ -1,7 +1,7 @@
 """Hugging Face: one row a frame with its image, pose and labels, in Parquet files for each split.
 
-A dataset's own tables hold frames of all splits side by side, and labels apart from frames; `datasets` would take them
-all for training data. Here `datasets.load_dataset(folder)` gives the splits, and `load_dataset(folder, split="test")`
+A dataset's own tables hold frames of all splits side by side, and labels apart from frames; `datasets` would read all
+as training data. Here `datasets.load_dataset(folder)` gives the splits, and `load_dataset(folder, split="test")`
 one of them. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
 """
 
@@ -126,7 +126,7 @@ def _labels(labels: pd.DataFrame, frame_ids: pd.Series) -> pa.ListArray:
 
 
 class _Shards:
-    """Parquet files of one split, each of about so many bytes."""
+    """Parquet files of one split, each of about `shard_bytes`."""
 
     def __init__(self, folder: Path, shard_bytes: int):
         self._folder, self._shard_bytes = folder, shard_bytes

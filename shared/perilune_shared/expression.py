@@ -200,10 +200,13 @@ class Condition:
             wanted = "comparisons of numbers with numbers and text with text"
             raise self._fault(f"{ast.unparse(left)} ({value.kind}) in {ast.unparse(right)}", wanted)
         if texts:
-            return value.expression.isin(pa.array(words, pa.string()))
-        if value.kind == "integer" and all(isinstance(word, int) for word in words):
-            return value.expression.isin(pa.array(words, pa.int64()))
-        return value.expression.cast(pa.float64()).isin(pa.array([float(word) for word in words]))
+            found = value.expression.isin(pa.array(words, pa.string()))
+        elif value.kind == "integer" and all(isinstance(word, int) for word in words):
+            found = value.expression.isin(pa.array(words, pa.int64()))
+        else:
+            found = value.expression.cast(pa.float64()).isin(pa.array([float(word) for word in words]))
+        # For pyarrow a null is in no list: `not in` would hold.
+        return pc.if_else(value.expression.is_valid(), found, pa.scalar(None, pa.bool_()))
 
     def _number(self, value: _Value, node: ast.expr) -> _Value:
         if not value.is_number:

@@ -33,8 +33,8 @@ def written_aside(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
 
     The temporary name keeps the suffix of `path`, since image writers choose their format by it. A durable file is on
-    the disk before it has its name, so that a power cut leaves no empty one; whoever writes many files synchronises
-    them together in the end (`sync_all`).
+    the disk before it has its name, so that a power cut leaves no empty one. Callers that write
+    many files synchronise them together at the end (`sync_all`).
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = temporary_name(path)
@@ -82,7 +82,7 @@ def write_text(path: Path, content: str, *, durable: bool = True) -> None:
 
 
 def sha256_of(path: Path, advance: Callable[[int], object] = lambda n_bytes: None) -> str:
-    """SHA-256 of a file's content, in hexadecimal; `advance` is told how many bytes were read since its last call."""
+    """SHA-256 of a file's content, in hexadecimal; `advance` is called with the bytes read since its last call."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while chunk := stream.read(_CHUNK_BYTES):
@@ -131,7 +131,7 @@ def check_plain_file(path: Path) -> int:
 def new_folder(out: Path) -> Iterator[Path]:
     """A hidden folder beside `out`, renamed to `out` on success and removed on any failure.
 
-    Its files are on the disk before it is renamed. What killed writers of the same `out` left is removed. Raises
+    Its files are on the disk before it is renamed. Folders left by killed writers of the same `out` are removed. Raises
     UserError where `out` is not empty or another process is writing it.
     """
     check_free(out)

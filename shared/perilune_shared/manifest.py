@@ -66,7 +66,7 @@ class Dataset:
             _chosen(Part(part, table), names, scene_id, trajectory_id, split if table != "labels" else None, where)
             for part in self.parts(table, scene_id, trajectory_id)
         ]
-        rows = pa.concat_tables([piece.cast(wanted) for piece in pieces]) if pieces else wanted.empty_table()
+        rows = pa.concat_tables(pieces).replace_schema_metadata() if pieces else wanted.empty_table()
         if split is not None and table == "labels":
             if "frame_id" not in names:
                 return self.table(table, [*names, "frame_id"], scene_id, trajectory_id, split, where).select(names)

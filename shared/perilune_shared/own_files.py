@@ -16,9 +16,9 @@ from perilune_shared.manifest import Dataset
 def check_sums(dataset: Dataset, paths: Iterable[Path], progress: Progress | None = None) -> dict[str, str] | None:
     """Hashes of the dataset's other files where SHA256SUMS must be rewritten once `paths` are written, else None.
 
-    It must where one lies in the folder of a complete dataset. The sums of all other files must be right before, since
-    nobody would notice a fault after: UserError where one is not, or where a name is none that a dataset may have
-    (perilune_shared.expected). A dataset that is not complete is sealed by whoever completes it.
+    That is where one of them lies in the folder of a complete dataset. SHA256SUMS of an incomplete dataset is written
+    when it is completed. Raises UserError where the hash of another file is wrong, since new sums would hide it, or a
+    name is not one that a dataset may have (perilune_shared.expected).
     """
     for path in paths:
         if any(path.resolve().is_relative_to((dataset.root / folder).resolve()) for folder in ("manifest", "images")):

@@ -5,7 +5,6 @@ protocol, as parquet.thrift describes it.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, BinaryIO
 
 _HEADER_BYTES = 16_384
@@ -27,27 +26,29 @@ class Pages:
     """Whether one is a dictionary."""
 
 
-def pages_of(path: Path, column: Any) -> Pages:
-    """Walk the pages of a column, given its metadata as pyarrow has it. Raises ValueError where they are damaged."""
+def pages_of(stream: BinaryIO, column: Any) -> Pages:
+    """Walk the pages of a column of an opened file, given its metadata as pyarrow has it.
+
+    Raises ValueError where they are damaged.
+    """
     start = column.data_page_offset
     if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
         start = column.dictionary_page_offset
     end = start + column.total_compressed_size
     unpacked, n_values, has_dictionary = 0, 0, False
-    with path.open("rb") as stream:
-        while start < end and n_values < column.num_values:
-            header, length = _header(stream, start)
-            sizes = header.get(_UNPACKED), header.get(_PACKED)
-            if not all(isinstance(size, int) and size >= 0 for size in sizes):
-                raise ValueError(f"a page at byte {start} without sizes")
-            unpacked += header[_UNPACKED]
-            has_dictionary |= header.get(_TYPE) == _DICTIONARY
-            for kind in (_DATA, _DATA_V2):
-                held = header.get(kind, {}).get(1, 0)
-                if held < 0:
-                    raise ValueError(f"a page at byte {start} with {held} values")
-                n_values += held
-            start += length + header[_PACKED]
+    while start < end and n_values < column.num_values:
+        header, length = _header(stream, start)
+        sizes = header.get(_UNPACKED), header.get(_PACKED)
+        if not all(isinstance(size, int) and size >= 0 for size in sizes):
+            raise ValueError(f"a page at byte {start} without sizes")
+        unpacked += header[_UNPACKED]
+        has_dictionary |= header.get(_TYPE) == _DICTIONARY
+        for kind in (_DATA, _DATA_V2):
+            held = header.get(kind, {}).get(1, 0)
+            if held < 0:
+                raise ValueError(f"a page at byte {start} with {held} values")
+            n_values += held
+        start += length + header[_PACKED]
     return Pages(unpacked, n_values, has_dictionary)
 
 

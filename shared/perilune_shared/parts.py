@@ -4,9 +4,12 @@ A part's name says whose rows it holds: `<scene_id>` or `<scene_id>.<trajectory_
 whose row groups hold a scene or a few descents each; a table above the limits continues in `all.0001` and so on.
 """
 
+import contextlib
+import io
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -22,7 +25,7 @@ from perilune_shared.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
 WHOLE_TABLE = "all"
 """Name of the part that holds all rows of its table, or the first of them."""
 MOST_ROWS_WRITTEN = 10_000_000
-"""Rows of one part that is written: of no table do so many reach a limit of the reader."""
+"""Most rows of one written part; below every limit of the reader, for every table."""
 _MOST_ROWS = 50_000_000
 _MOST_GROUP_ROWS = 2**21
 _LONGEST_TEXT = 1000
@@ -33,6 +36,7 @@ _LONGEST_FOOTER_TEXT = 10_000_000
 # No row of any table takes less room, however well it is compressed, and none shrinks more.
 _SPARE_ROWS, _BYTES_A_ROW = 10_000, 4
 _SPARE_BYTES, _MOST_SHRUNK = 2**26, 200
+_SMALL_BYTES, _FEW_WORDS = 2**18, 200
 _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
 """Scenes and descents: their names become names of files."""
@@ -59,16 +63,12 @@ class Part:
         self.path, self.schema = path, schema or TABLES[table]
         self._optional = OPTIONAL.get(table, ()) if schema is None else ()
         self._n_bytes = files.check_plain_file(path)
-        limits = {
-            "thrift_string_size_limit": _LONGEST_FOOTER_TEXT,
-            "thrift_container_size_limit": _LONGEST_LIST,
-        }
         try:
-            with pq.ParquetFile(path, **limits) as plain:
-                self.found = plain.schema_arrow
-                texts = [field.name for field in self.found if pa.types.is_string(field.type)]
-                # As dictionaries, a short file cannot grow into gigabytes of text before its length is known.
-                self.file = pq.ParquetFile(path, metadata=plain.metadata, read_dictionary=texts)
+            # A small file is read once; a large one only where its columns are asked for.
+            self._content = path.read_bytes() if self._n_bytes <= _SMALL_BYTES else None
+            texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
+            self.file = self._parquet(texts)
+            self.found = self.file.metadata.schema.to_arrow_schema()
             self._check_size()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(path, "content", error, "a whole Parquet file") from None
@@ -78,6 +78,23 @@ class Part:
             if got != wanted:
                 hint = "; see `perilune-manifest migrate`" if name == "schema_version" else ""
                 raise UserError(path, f"perilune.{name}", got, wanted + hint)
+
+    def _parquet(self, texts: Sequence[str]) -> pq.ParquetFile:
+        """The opened file; columns of `texts` are read as dictionaries.
+
+        So a short file cannot grow into gigabytes of text before its length is known.
+        """
+        source = self.path if self._content is None else pa.BufferReader(self._content)
+        options = {
+            "pre_buffer": False,
+            "thrift_string_size_limit": _LONGEST_FOOTER_TEXT,
+            "thrift_container_size_limit": _LONGEST_LIST,
+        }
+        with contextlib.suppress(KeyError):  # a text column that the file lacks
+            return pq.ParquetFile(source, read_dictionary=texts, **options)
+        with pq.ParquetFile(source, **options) as plain:
+            names = plain.metadata.schema.names
+        return pq.ParquetFile(source, read_dictionary=[name for name in texts if name in names], **options)
 
     @property
     def n_rows(self) -> int:
@@ -134,9 +151,12 @@ class Part:
             if self.found.field(place).type != field.type:
                 raise UserError(self.path, field.name, self.found.field(place).type, f"{field.type}")
         try:
-            for group in chosen:
-                self._check_pages(group, present)
-            rows = self.file.read_row_groups(chosen, columns=present)
+            opened: BinaryIO = self.path.open("rb") if self._content is None else io.BytesIO(self._content)
+            with opened as stream:
+                for group in chosen:
+                    self._check_pages(stream, group, present)
+            # Threads cost more than they save on a single row group.
+            rows = self.file.read_row_groups(chosen, columns=present, use_threads=len(chosen) > 1)
             for field in map(wanted.field, present):
                 if pa.types.is_string(field.type):
                     self._check_text(field.name, rows[field.name], None if any_ids else _IDS.get(field.name))
@@ -149,14 +169,14 @@ class Part:
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(self.path, "content", error, "a whole Parquet file") from None
 
-    def _check_pages(self, group: int, names: list[str]) -> None:
+    def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
         """The footer's sizes were checked; here that the pages keep to them."""
         metadata = self.file.metadata.row_group(group)
         for column in map(metadata.column, range(metadata.num_columns)):
             name = column.path_in_schema
             if name.split(".")[0] not in names:
                 continue
-            pages = pages_of(self.path, column)
+            pages = pages_of(stream, column)
             if pages.unpacked_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
                 found = f"{pages.unpacked_bytes} bytes unpacked and {pages.n_values} values"
                 wanted = f"at most {column.total_uncompressed_size} and {column.num_values}, as its footer says"
@@ -171,11 +191,9 @@ class Part:
             longest = pc.max(pc.binary_length(words)).as_py() or 0
             if longest > _LONGEST_TEXT:
                 raise UserError(self.path, name, f"text of {longest} bytes", f"at most {_LONGEST_TEXT}")
-            if pattern is not None:
-                fits = pc.and_not(pc.match_substring_regex(words, pattern), pc.match_substring(words, "\n"))
-                if pc.all(fits).as_py() is False:
-                    odd = words.filter(pc.invert(fits))[0].as_py()
-                    raise UserError(self.path, name, repr(odd), f"text like {pattern}")
+            odd = _first_odd(words, pattern) if pattern is not None else None
+            if odd is not None:
+                raise UserError(self.path, name, repr(odd), f"text like {pattern}")
 
     def groups_within(self, column: str, low: str, high: str) -> list[int]:
         """Row groups that may hold texts from `low` up to, but not including, `high`, by their statistics."""
@@ -201,6 +219,15 @@ class Part:
             return [group.id for group in whole.subset(filter=condition, schema=self.schema).row_groups]
         except (pa.ArrowException, ValueError, KeyError):
             return list(range(self.n_groups))
+
+
+def _first_odd(words: pa.Array, pattern: str) -> str | None:
+    """The first text that does not match a pattern, None where all match."""
+    if len(words) <= _FEW_WORDS:  # arrow would compile the pattern each time
+        fitting = re.compile(pattern)
+        return next((word for word in words.to_pylist() if word is not None and not fitting.fullmatch(word)), None)
+    fits = pc.match_substring_regex(words, pattern)  # in RE2, $ matches the end only
+    return words.filter(pc.invert(fits))[0].as_py() if pc.all(fits).as_py() is False else None
 
 
 def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> pa.Table:

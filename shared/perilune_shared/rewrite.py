@@ -16,7 +16,7 @@ from perilune_shared.schema import ImageState
 from perilune_shared.writer import SceneTables, written
 
 ImageMode = Literal["copy", "link", "none", "plan"]
-"""What becomes of frames: copies; hard links where the disk allows them (then a frame edited in one dataset changes in
+"""How frames are written: copies; hard links where the disk allows them (then a frame edited in one dataset changes in
 the other too); or left out. With `plan` craters, boulders and labels are left out too: they follow from scenes and
 poses."""
 _FOLLOWING = ("craters", "boulders", "labels")

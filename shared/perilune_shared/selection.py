@@ -16,7 +16,7 @@ from pydantic import Field
 
 from perilune_shared.config import Section
 from perilune_shared.info import DatasetInfo
-from perilune_shared.keys import check_keys
+from perilune_shared.keys import FRAME_COLUMNS, KeyCheck
 from perilune_shared.manifest import Dataset
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -92,9 +92,12 @@ def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None
     In the table's order. Depth and diameter (metres) are those of the table craters, joined by scene_id and crater_id.
     Raises UserError where a part cannot be read or keys are broken.
     """
-    check_keys(dataset)
     wanted = list(dict.fromkeys(["frame_id", "crater_id", *_JUDGED, *columns]))
     frames = dataset.table("frames", ["frame_id", "scene_id"], split=split).to_pandas()
-    labels = dataset.table("labels", wanted).to_pandas().merge(frames, on="frame_id", validate="many_to_one")
+    rows = dataset.table("labels", wanted)
+    keys = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
+    keys.add_labels(rows)
+    keys.finish()
+    labels = rows.to_pandas().merge(frames, on="frame_id", validate="many_to_one")
     craters = dataset.table("craters", _CRATER).to_pandas()
     return labels.merge(craters, on=["scene_id", "crater_id"], how="left", validate="many_to_one")

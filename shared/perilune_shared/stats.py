@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from perilune_shared.errors import UserError
-from perilune_shared.keys import check_keys, places
+from perilune_shared.keys import FRAME_COLUMNS, KeyCheck
 from perilune_shared.manifest import Dataset
 from perilune_shared.parts import Part
 
@@ -17,26 +17,25 @@ def summary(dataset: Dataset) -> pd.DataFrame:
 
     Raises UserError where there are no frames or keys are broken.
     """
-    columns = ["frame_id", "scene_id", "trajectory_id", "split", "png_bytes", "n_craters_above_max_radius"]
-    check_keys(dataset)
-    frames = dataset.table("frames", columns)
+    frames = dataset.table("frames", [*FRAME_COLUMNS, "split", "png_bytes", "n_craters_above_max_radius"])
+    keys = KeyCheck(dataset, frames)
     if not len(frames):
         raise UserError(dataset.root, "frames", "none", "a dataset with frames")
     found = {split: _Gathered() for split in sorted(frames["split"].unique().to_pylist())}
     split_of = frames["split"].combine_chunks().dictionary_encode()
     names = np.array(split_of.dictionary.to_pylist(), object)
     codes = split_of.indices.to_numpy()
-    frame_of = {name: place for place, name in enumerate(frames["frame_id"].to_pylist())}
     for part in dataset.parts("labels"):
         opened = Part(part, "labels")
-        for group in range(opened.file.metadata.num_row_groups):
-            rows = opened.read(["frame_id", "radius_px", "visible_fraction"], [group])
-            code = codes[places(rows["frame_id"], frame_of)]
+        for group in range(opened.n_groups):
+            rows = opened.read(["frame_id", "crater_id", "radius_px", "visible_fraction"], [group])
+            code = codes[keys.add_labels(rows)]
             radius, visible = rows["radius_px"].to_numpy(), rows["visible_fraction"].to_numpy()
             for k, name in enumerate(names):
                 own = code == k
                 found[name].radius_px.append(radius[own].astype(np.float32))
                 found[name].visible += float(visible[own].sum())
+    keys.finish()
     table = frames.to_pandas()
     return pd.DataFrame([_row(split, part, found[split]) for split, part in table.groupby("split")])
 

@@ -48,7 +48,7 @@ _PLAIN_TEXT = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null)$)[A-Za-z][\w
 
 
 class _Refused(ValueError):
-    """What this reader refuses though YAML allows it: what was found, and what is expected instead."""
+    """Valid YAML that this reader refuses: what was found, and what is expected."""
 
     def __init__(self, event: Event, got: str, expected: str = _EXPECTED):
         self.got, self.expected = f"{got} at line {event.start_mark.line + 1}", expected

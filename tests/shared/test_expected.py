@@ -1,4 +1,4 @@
-"""A dataset's folder holds what a dataset is made of; each file is hashed once in a run."""
+"""Unexpected files in a dataset's folder are faults; each file is hashed once in a run."""
 
 import os
 import shutil
@@ -64,6 +64,20 @@ def test_a_frame_row_does_not_make_a_table_expected(victim):
     pq.write_table(rows.set_column(place, rows.schema.field(place), [cells]), part)
     seal(victim)
     assert (path, "file") in [(fault.file, fault.column) for fault in validate(open_dataset(victim))]
+
+
+def test_a_link_that_leads_nowhere_is_a_fault(victim):
+    """Also with a progress bar, which needs the sizes of files."""
+    link = victim / "manifest/labels/other.parquet"
+    link.write_bytes(b"")
+    seal(victim)
+    link.unlink()
+    link.symlink_to("nowhere")
+    with Progress(disable=True) as progress:
+        faults = validate(open_dataset(victim), progress)
+    assert {("manifest/labels/other.parquet", "SHA-256"), ("manifest/labels/other.parquet", "part")} <= {
+        (fault.file, fault.column) for fault in faults
+    }
 
 
 def test_known_files_and_a_writers_lock_are_expected(victim):

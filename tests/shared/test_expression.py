@@ -114,6 +114,21 @@ def test_arithmetic_beyond_its_range_is_an_error(text):
         Condition(text).holds(ROWS)
 
 
+@pytest.mark.parametrize(
+    ("text", "held"),
+    [
+        ("contrast in (1, 2)", [True, False, False]),
+        ("contrast not in (1, 2)", [False, False, True]),
+        ("not contrast in (1.5,)", [True, False, True]),
+        ("contrast != 1", [False, False, True]),
+        ("photometry not in ('a', 'b')", [False, False, True]),
+    ],
+)
+def test_a_null_is_neither_in_a_list_nor_outside_it(text, held):
+    rows = pa.table({"labels.contrast": [1.0, None, 3.0], "scenes.photometry": ["a", None, "c"]})
+    assert Condition(text).holds(rows).tolist() == held
+
+
 def test_conditions_leave_out_row_groups(crowded_packed):
     """Those whose statistics exclude it are not read; the rows are those of a filter after reading."""
     dataset = open_dataset(crowded_packed)

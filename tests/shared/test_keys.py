@@ -10,6 +10,7 @@ from perilune_shared.keys import check_keys
 from perilune_shared.manifest import open_dataset
 from perilune_shared.merge import merge
 from perilune_shared.pack import pack
+from perilune_shared.parts import Part
 from perilune_shared.selection import read_labels
 from perilune_shared.split import split_dataset
 from perilune_shared.stats import summary
@@ -55,3 +56,16 @@ def test_broken_keys_stop_every_command(name, victim, tmp_path):
 def test_sound_keys_are_let_through(drawn, crowded_packed):
     for root in (drawn, crowded_packed):
         check_keys(open_dataset(root))
+
+
+@pytest.mark.parametrize("work", [summary, read_labels])
+def test_labels_are_checked_as_they_are_read(work, drawn, monkeypatch):
+    opened, plain = [], Part.__init__
+
+    def counted(part, path, *rest):
+        opened.append(path.parent.name)
+        plain(part, path, *rest)
+
+    monkeypatch.setattr(Part, "__init__", counted)
+    work(open_dataset(drawn))
+    assert opened.count("labels") == 1

@@ -69,7 +69,7 @@ def test_nothing_left_is_refused(drawn, tmp_path, options):
 
 
 def test_an_edited_frame_of_a_subset_leaves_its_source_alone(little, tmp_path):
-    """Frames are copies, and links on wish only."""
+    """Frames are copied; they are linked only with `link`."""
     relative = "frames/s000/t000/000001.png"
     before = (little / relative).read_bytes()
     for k, made in enumerate(

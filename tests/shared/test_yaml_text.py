@@ -1,4 +1,4 @@
-"""YAML 1.2 as configuration files and --set have it: the core schema's scalars, and nothing that surprises."""
+"""YAML 1.2 as configuration files and --set have it: the core schema's scalars, and no YAML 1.1 forms."""
 
 import math
 import time
