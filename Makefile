@@ -104,7 +104,7 @@ explain: ## attention masks and correlations of the trained networks
 
 JOBS ?= 2
 test: setup ## run all tests, in JOBS=2 processes
-	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 
 lint: setup ## ruff and mypy
 	@$(BIN)/ruff check .

@@ -187,7 +187,7 @@ def test_a_hidden_rim_and_a_dark_crater_are_told():
 
 
 def test_ctrl_c_during_a_frame_is_not_swallowed():
-    config = config_with(render=RenderConfig(samples=300))
+    config = config_with(render=RenderConfig(samples=60))
     with Renderer(flat_scene(400, 41), config, CAMERA, sun_direction(0, 40)) as renderer:
         renderer.render(POSITION, TILTED)
         timer = threading.Timer(0.02, lambda: os.kill(os.getpid(), signal.SIGINT))

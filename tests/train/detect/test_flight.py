@@ -114,6 +114,29 @@ def test_files_give_torchs_boxes_for_any_number_of_images(exported, images):
     np.testing.assert_allclose(one(images[1:2])[1], scores[1:2], atol=1e-4)
 
 
+INTERRUPTED = """
+import os, signal, sys, time
+from pathlib import Path
+from perilune_train.detect.engines import has_bf16, openvino_engine
+for _ in range(3):
+    engine = openvino_engine(Path(sys.argv[1]), threads=1)
+has_bf16()
+del engine
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(10)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+def test_ctrl_c_after_several_engines(exported):
+    """OpenVINO replaces the signal stack of the thread; several cores left one that was unmapped, and Python died."""
+    command = [sys.executable, "-c", INTERRUPTED, str(exported / "detector.xml")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "interrupted\n"), done.stderr
+
+
 def test_no_batch_norm_remains_and_the_facts_are_inside(exported):
     model = onnx.load(str(exported / "detector.onnx"))
     kinds = {node.op_type for node in model.graph.node}

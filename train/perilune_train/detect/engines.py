@@ -1,6 +1,7 @@
 """One detector, several engines: each becomes a function from images to boxes and scores."""
 
 import contextlib
+import functools
 import importlib
 from collections.abc import Callable
 from pathlib import Path
@@ -51,13 +52,22 @@ def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
     return lambda images: tuple(session.run(["boxes", "scores"], {"images": images}))
 
 
+@functools.cache
+def openvino_core() -> Any:
+    """The one `openvino.Core` of this process, kept to its end.
+
+    Each core replaces the thread's signal stack and restores the one before when it goes. Where several overlap, the
+    last one restores a stack that is unmapped, and the next Ctrl-C ends Python with a segmentation fault.
+    """
+    return package("openvino").Core()
+
+
 def openvino_engine(path: Path, precision: Precision = "f32", threads: int = 0, batch: int | None = None) -> Engine:
     """A written .onnx or .xml file by OpenVINO; with `batch` for that many images only, which is faster.
 
     Left alone OpenVINO takes bfloat16 where the processor has it; here `precision` says so.
     """
-    openvino = package("openvino")
-    core = openvino.Core()
+    core = openvino_core()
     with _readable(path):
         model = core.read_model(str(path))
     if batch is not None:
@@ -76,7 +86,7 @@ def openvino_engine(path: Path, precision: Precision = "f32", threads: int = 0, 
 
 def has_bf16() -> bool:
     """Whether OpenVINO computes in bfloat16 on this processor."""
-    return "BF16" in package("openvino").Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    return "BF16" in openvino_core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
 @contextlib.contextmanager

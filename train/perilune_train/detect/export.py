@@ -17,7 +17,7 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.batches import network_input
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data import load_split
-from perilune_train.detect.engines import Array, Engine, onnxruntime_engine, openvino_engine, package
+from perilune_train.detect.engines import Array, Engine, onnxruntime_engine, openvino_core, openvino_engine, package
 from perilune_train.detect.flight import FlightDetector
 from perilune_train.detect.flight_notes import readme
 from perilune_train.detect.int8 import Int8Verdict, try_int8
@@ -123,7 +123,7 @@ def write_openvino(onnx_path: Path, path: Path) -> None:
     """OpenVINO's own form of an ONNX file: `path` (.xml) and, beside it, the weights (.bin) in float32."""
     openvino = package("openvino")
     # Read by the runtime, not by the converter, which reports its use over the network.
-    openvino.save_model(openvino.Core().read_model(str(onnx_path)), str(path), compress_to_fp16=False)
+    openvino.save_model(openvino_core().read_model(str(onnx_path)), str(path), compress_to_fp16=False)
 
 
 @torch.no_grad()
