@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.manifest import Dataset
-from perilune_shared.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, Part, is_whole
+from perilune_shared.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, is_whole
 from perilune_shared.schema import OPTIONAL, SPLITS, TABLES
 
 _PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
@@ -104,7 +104,7 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
         yield Fault.of(where, None, "part", path.stem, f"a name like {PART_PATTERN}")
         return
     try:
-        part = Part(path, table)
+        part = dataset.open_part(path, table)
         names, known = part.found.names, TABLES[table].names
         missing = set(known) - set(names) - set(OPTIONAL.get(table, ()))
         odd = sorted({name for name in names if name not in known and not matches(_COLUMN, name)} | missing)

@@ -6,6 +6,7 @@ Parts are written once, aside and renamed, and never rewritten. Use::
     labels = dataset.table("labels", ["frame_id", "radius_px"], split="test").to_pandas()
 """
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -21,14 +22,40 @@ from perilune_shared.schema import IMAGES, SPLITS, TABLES
 
 LARGEST_FRAME_BYTES = 2**30
 """Of a PNG or an EXR."""
+_MOST_KEPT_OPEN = 32
 
 
 class Dataset:
     """A dataset opened for reading."""
 
+    _opened: dict[Path, Part] | None = None
+
     def __init__(self, root: Path, info: DatasetInfo):
         self.root = root
         self.info = info
+
+    @contextlib.contextmanager
+    def parts_kept_open(self) -> Iterator[None]:
+        """Open and check each part's footer once within the block, for callers that read scene by scene.
+
+        Only while nobody writes to the dataset: a part that changes is not read again.
+        """
+        self._opened = {}
+        try:
+            yield
+        finally:
+            self._opened = None
+
+    def open_part(self, path: Path, table: str) -> Part:
+        """A part of a table, opened. Raises UserError as `Part` does."""
+        if self._opened is None:
+            return Part(path, table)
+        if path not in self._opened:
+            part = Part(path, table)
+            while len(self._opened) >= _MOST_KEPT_OPEN:
+                del self._opened[next(iter(self._opened))]
+            self._opened[path] = part
+        return self._opened[path]
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[Path]:
         """The table's part files, sorted by name; only those that may hold rows of a scene or a descent."""
@@ -62,8 +89,9 @@ class Dataset:
             raise UserError(table, "where", where.text, f"a condition on columns of {table} alone")
         names = list(columns) if columns is not None else TABLES[table].names
         wanted = pa.schema([TABLES[table].field(name) for name in names])
+        of_split = split if table != "labels" else None
         pieces = [
-            _chosen(Part(part, table), names, scene_id, trajectory_id, split if table != "labels" else None, where)
+            _chosen(self.open_part(part, table), names, scene_id, trajectory_id, of_split, where)
             for part in self.parts(table, scene_id, trajectory_id)
         ]
         rows = pa.concat_tables(pieces).replace_schema_metadata() if pieces else wanted.empty_table()
@@ -141,7 +169,8 @@ def open_dataset(root: str | Path) -> Dataset:
 
 def count_rows(dataset: Dataset) -> Counts:
     """Rows present in each table, read from the parts' footers."""
-    return Counts(**{name: sum(Part(part, name).n_rows for part in dataset.parts(name)) for name in TABLES})
+    counts = {name: sum(dataset.open_part(part, name).n_rows for part in dataset.parts(name)) for name in TABLES}
+    return Counts(**counts)
 
 
 def _check_names(table: str, columns: Sequence[str] | None) -> None:

@@ -63,6 +63,7 @@ class Part:
         self.path, self.schema = path, schema or TABLES[table]
         self._optional = OPTIONAL.get(table, ()) if schema is None else ()
         self._n_bytes = files.check_plain_file(path)
+        self._checked: set[tuple[int, str]] = set()
         try:
             # A small file is read once; a large one only where its columns are asked for.
             self._content = path.read_bytes() if self._n_bytes <= _SMALL_BYTES else None
@@ -174,7 +175,7 @@ class Part:
         metadata = self.file.metadata.row_group(group)
         for column in map(metadata.column, range(metadata.num_columns)):
             name = column.path_in_schema
-            if name.split(".")[0] not in names:
+            if name.split(".")[0] not in names or (group, name) in self._checked:
                 continue
             pages = pages_of(stream, column)
             if pages.unpacked_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
@@ -184,6 +185,7 @@ class Part:
             # One image repeated by a dictionary would be a small file that unpacks without end.
             if name.startswith("image.") and pages.has_dictionary:
                 raise UserError(self.path, name, "a dictionary", "plain bytes for each frame")
+            self._checked.add((group, name))
 
     def _check_text(self, name: str, column: pa.ChunkedArray, pattern: str | None) -> None:
         for chunk in column.chunks:

@@ -19,7 +19,7 @@ from perilune_shared.expected import unexpected
 from perilune_shared.faults import Fault, part_faults
 from perilune_shared.frames import selenographic_from_site
 from perilune_shared.manifest import Dataset, count_rows
-from perilune_shared.parts import Part, is_whole
+from perilune_shared.parts import is_whole
 from perilune_shared.schema import KEYS, TABLES
 from perilune_shared.validate_descent import descent_faults
 from perilune_shared.validate_images import image_faults
@@ -34,7 +34,7 @@ def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
     Faults of the same file and column are told once, at their first row. The labels' projections are all made again.
     """
     # What makes numbers overflow is told as a fault; numpy's warnings would come between the lines.
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"), dataset.parts_kept_open():
         return _faults(dataset, progress)
 
 
@@ -161,7 +161,7 @@ def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, told: set[tupl
             continue
         told.add((fault.file, fault.column))
         if fault.row is not None and is_whole(path.stem):
-            part = Part(path, path.parent.name)
+            part = dataset.open_part(path, path.parent.name)
             key = "frame_id" if "frame_id" in part.schema.names else "scene_id"
             keys = part.read([key])[key]
             found = pc.starts_with(keys, own) if key == "frame_id" else pc.equal(keys, own)

@@ -27,7 +27,7 @@ def image_faults(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]
     for part in dataset.parts("frames"):
         where = part.relative_to(dataset.root).as_posix()
         first_row = 0
-        for rows in _groups(part, columns):
+        for rows in _groups(dataset, part, columns):
             places = {frame_id: first_row + row for row, frame_id in enumerate(rows["frame_id"].to_pylist())}
             records = rows.to_pylist()
             for row, frame in enumerate(records, first_row):
@@ -49,10 +49,10 @@ def image_faults(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]
         yield from _shards(dataset)
 
 
-def _groups(part: Path, columns: list[str]) -> Iterator[pa.Table]:
+def _groups(dataset: Dataset, part: Path, columns: list[str]) -> Iterator[pa.Table]:
     """The row groups of a part of `frames`, as far as it can be read; why not further, the part's own checks tell."""
     with contextlib.suppress(UserError):
-        opened = Part(part, "frames")
+        opened = dataset.open_part(part, "frames")
         for group in range(opened.n_groups):
             yield opened.read(columns, [group])
 

@@ -10,12 +10,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from perilune_shared import manifest
+from perilune_shared.cli import main
 from perilune_shared.errors import UserError
 from perilune_shared.manifest import count_rows, open_dataset
 from perilune_shared.parts import read_part, write_part
 from perilune_shared.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.stats import summary
 from perilune_shared.validate import validate
+from tests import in_process
 
 MANIFEST = str(Path(sys.executable).parent / "perilune-manifest")
 
@@ -147,14 +150,31 @@ def test_summary_counts_what_is_there(tiny):
     assert frame["labels"].sum() == dataset.table("labels").num_rows == dataset.info.counts.labels
 
 
+def test_every_part_is_opened_once(little, monkeypatch):
+    opened = []
+
+    class Counted(manifest.Part):
+        def __init__(self, path, *arguments):
+            opened.append(path)
+            super().__init__(path, *arguments)
+
+    monkeypatch.setattr(manifest, "Part", Counted)
+    dataset = open_dataset(little)
+    assert validate(dataset) == []
+    assert sorted(opened) == sorted(part for name in TABLES for part in dataset.parts(name))
+    # Only as long as it is validated: a part is read as it is now.
+    dataset.table("frames")
+    assert len(opened) == len(set(opened)) + 1
+
+
 def test_command_line(tiny, tiny_detect):
-    whole = subprocess.run([MANIFEST, "validate", str(tiny / "nav")], capture_output=True, text=True)
+    whole = in_process.call(main, "validate", tiny / "nav")
     assert whole.returncode == 0 and "no fault" in whole.stdout
-    shown = subprocess.run([MANIFEST, "stats", str(tiny / "nav")], capture_output=True, text=True)
+    shown = in_process.call(main, "stats", tiny / "nav")
     assert shown.returncode == 0 and "45 frames" in shown.stdout
     next(tiny_detect.rglob("000000.png")).write_bytes(b"")
     broken = subprocess.run([MANIFEST, "validate", str(tiny_detect)], capture_output=True, text=True)
     assert broken.returncode == 2 and "png_bytes" in broken.stdout
     (tiny_detect / "dataset.json").write_text(json.dumps({"schema_version": SCHEMA_VERSION}))
-    bad = subprocess.run([MANIFEST, "stats", str(tiny_detect)], capture_output=True, text=True)
+    bad = in_process.call(main, "stats", tiny_detect)
     assert bad.returncode == 2 and len(bad.stderr.strip().splitlines()) == 1 and "name" in bad.stderr
