@@ -13,10 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
+from perilune_render.cli import main
 from perilune_shared.ellipse import project_circles
 from perilune_shared.frames import matrix_from_quaternion
 from perilune_shared.manifest import open_dataset
 from perilune_shared.validate import validate
+from tests import in_process
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
 SAME_TABLES = ("craters", "boulders", "trajectories")
@@ -27,8 +29,20 @@ def settings(*changes):
 
 
 def develop(source, out, *arguments):
-    command = [RENDER, "develop", "--dataset", str(source), "--out", str(out), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True)
+    return in_process.call(main, "develop", "--dataset", source, "--out", out, *arguments)
+
+
+@pytest.fixture(scope="module")
+def developed(tiny, tmp_path_factory):
+    """The tiny detection dataset developed with its own settings, in a process that tells what it loaded. Read only."""
+    out = tmp_path_factory.mktemp("developed") / "new"
+    arguments = ["develop", "--dataset", str(tiny / "detect"), "--out", str(out)]
+    program = (
+        "import sys; from perilune_render.cli import app\n"
+        f"app({arguments!r}, standalone_mode=False)\n"
+        "assert 'perilune_render.develop' in sys.modules and 'bpy' not in sys.modules"
+    )
+    return out, subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
 
 
 def images(root):
@@ -43,10 +57,9 @@ def assert_labels_differ_in_contrast_alone(old, new):
     assert after.equals(before)
 
 
-def test_developed_alike_the_frames_are_the_same_bytes(tiny, tmp_path):
+def test_developed_alike_the_frames_are_the_same_bytes(tiny, developed):
     """What the renderer wrote in one go and what comes of its EXRs afterwards."""
-    assert develop(tiny / "detect", tmp_path / "new").returncode == 0
-    old, new = open_dataset(tiny / "detect"), open_dataset(tmp_path / "new")
+    old, new = open_dataset(tiny / "detect"), open_dataset(developed[0])
     assert validate(new) == []
     for table in SAME_TABLES:
         assert new.table(table).equals(old.table(table))
@@ -62,7 +75,7 @@ def test_developed_alike_the_frames_are_the_same_bytes(tiny, tmp_path):
     recipe = new.info.recipe()
     assert new.info.exr_camera is None and recipe.developed_from.name == old.info.name
     assert recipe.config == old.info.recipe().config and new.info.camera == old.info.camera
-    assert not list((tmp_path / "new").rglob("*.exr"))
+    assert not list(developed[0].rglob("*.exr"))
 
 
 def test_another_sensor_changes_the_pixels_and_of_the_labels_their_contrast(tiny, tmp_path):
@@ -141,9 +154,8 @@ def test_what_needs_a_new_rendering_is_refused(tiny, tmp_path, arguments, parts)
     assert all(part in result.stderr for part in parts) and not (tmp_path / "new").exists()
 
 
-def test_a_dataset_without_exrs_is_refused(tiny, tmp_path):
-    assert develop(tiny / "detect", tmp_path / "new").returncode == 0
-    again = develop(tmp_path / "new", tmp_path / "again")
+def test_a_dataset_without_exrs_is_refused(developed, tmp_path):
+    again = develop(developed[0], tmp_path / "again")
     assert again.returncode == 2 and "exr_path" in again.stderr and not (tmp_path / "again").exists()
 
 
@@ -171,28 +183,22 @@ def test_stopped_it_looks_incomplete_and_goes_on(tiny, tmp_path):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert not open_dataset(tmp_path / "new").info.complete
-    assert subprocess.run(command, capture_output=True).returncode == 0
+    assert develop(tiny / "nav", tmp_path / "new").returncode == 0
     new = open_dataset(tmp_path / "new")
     hashes = [d.table("frames")["png_sha256"].to_pylist() for d in (new, open_dataset(tiny / "nav"))]
     assert validate(new) == [] and hashes[0] == hashes[1]
 
 
-def test_blender_is_not_loaded(tiny, tmp_path):
-    arguments = ["develop", "--dataset", str(tiny / "detect"), "--out", str(tmp_path / "new")]
-    program = (
-        "import sys; from perilune_render.cli import app\n"
-        f"app({arguments!r}, standalone_mode=False)\n"
-        "assert 'perilune_render.develop' in sys.modules and 'bpy' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+def test_blender_is_not_loaded(developed):
+    assert developed[1].returncode == 0, developed[1].stderr
 
 
 def test_a_distorted_dataset_is_rendered_labelled_and_developed(tmp_path):
     """From the lens to the label: an EXR of the wider pinhole, frames and ellipses of the distorted camera."""
     lens = settings("camera.distortion.k1=-0.2", "camera.distortion.p2=0.003", "camera.principal_y_px=60")
     quick = settings("terrain.spacing_px=2", "detect.n_scenes=1", "detect.val_share=0", "detect.test_share=0")
-    command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", "--out", str(tmp_path), *lens, *quick]
-    subprocess.run(command, check=True, capture_output=True)
+    made = in_process.call(main, "dataset", "--preset", "tiny", "--kind", "detect", "--out", tmp_path, *lens, *quick)
+    assert made.returncode == 0, made.stderr
     dataset = open_dataset(tmp_path / "detect")
     assert validate(dataset) == []
     camera, exr_camera = dataset.info.camera.intrinsics(), dataset.info.exr_camera.intrinsics()

@@ -46,8 +46,8 @@ def run(*arguments):
 def plan(tmp_path_factory):
     """The plan of the tiny detection dataset, by the command line."""
     out = tmp_path_factory.mktemp("plan") / "tiny"
-    command = [RENDER, "plan", "--preset", "tiny", "--kind", "detect", "--out", str(out)]
-    subprocess.run(command, check=True, capture_output=True)
+    made = run("plan", "--preset", "tiny", "--kind", "detect", "--out", out)
+    assert made.returncode == 0, made.stderr
     return out
 
 
