@@ -28,23 +28,27 @@ if not WORKER:
     os.environ["PERILUNE_CACHE"] = _cache.name
 
 LONGEST_FIRST = (
+    "test_data_manifests.py",
     "test_regenerate.py",
     "test_processes.py",
-    "test_chains.py",
     "test_facets.py",
-    "test_flight.py",
-    "test_every_byte.py",
-    "test_renderer.py",
+    "test_chains.py",
     "test_dataset.py",
+    "test_population.py",
+    "test_every_byte.py",
+    "test_flight.py",
+    "test_develop.py",
     "test_evaluate.py",
     "test_run.py",
-    "test_transfer.py",
-    "test_hostile_rows.py",
-    "test_population.py",
     "test_card.py",
+    "test_transfer.py",
+    "test_renderer.py",
     "test_image_evaluation.py",
 )
-"""Files by the CPU time of their tests; handed out last, one of them would keep a process busy alone at the end."""
+"""Files by the CPU time of their tests; handed out last, one of them would keep a process busy alone at the end.
+
+Of the first two, only the second needs `tiny`: no process waits for another to render it.
+"""
 
 # No test cuts the power: what is written need not be on the disk. test_files.py counts the calls by its own means.
 os.fsync = lambda descriptor: None
