@@ -77,7 +77,8 @@ def _fingerprint(roots: tuple[str, ...], folders: tuple[tuple[str, Path], ...]) 
     for root in roots:
         module, _, name = root.partition(":")
         walk.follow(module, (name,) if name else ())
-    code = "\n".join(f"{module}:{name}\n{text}" for (module, name), text in sorted(walk.code.items()))
+    # Without the names of modules, so that code may move from file to file.
+    code = "\n".join(sorted(f"{name}\n{text}" for (_, name), text in walk.code.items()))
     modules = frozenset(module for module, _ in walk.code)
     libraries = frozenset(walk.libraries - sys.stdlib_module_names)
     return Fingerprint(hashlib.sha256(code.encode()).hexdigest(), modules, libraries)
