@@ -19,17 +19,17 @@ import pyarrow.parquet as pq
 import typer
 from numpy.typing import NDArray
 
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.selection import SELECTIONS, read_labels, selected
 from perilune_shared.errors import run_command_line
-from perilune_shared.files import write_text
-from perilune_shared.frames import Array
-from perilune_shared.manifest import Dataset, open_dataset
-from perilune_shared.selection import SELECTIONS, read_labels, selected
-from perilune_train.detect.bins import RADIUS_BINS_PX
-from perilune_train.detect.boxes import iou_matrix
+from perilune_shared.geometry.frames import Array
+from perilune_shared.storage.files import write_text
 from perilune_train.detect.config import LabelSettings
-from perilune_train.detect.data import load_split
-from perilune_train.detect.matching import Detections, match_split
-from perilune_train.detect.metrics import figures
+from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.bins import RADIUS_BINS_PX
+from perilune_train.detect.evaluate.boxes import iou_matrix
+from perilune_train.detect.evaluate.matching import Detections, match_split
+from perilune_train.detect.evaluate.metrics import figures
 
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]

@@ -12,11 +12,11 @@ import time
 from pathlib import Path
 
 from perilune_render.config import DatasetConfig
-from perilune_render.dataset import make_dataset
-from perilune_render.develop import develop_dataset
+from perilune_render.dataset.develop import develop_dataset
+from perilune_render.dataset.render import make_dataset
 from perilune_shared.config import resolve
-from perilune_shared.files import write_text
 from perilune_shared.progress import progress_bar
+from perilune_shared.storage.files import write_text
 
 SETTINGS = (
     "dataset.render.exr=true",

@@ -18,12 +18,12 @@ import torch
 import typer
 
 from perilune_shared.errors import run_command_line
-from perilune_shared.files import write_text
 from perilune_shared.progress import progress_bar
-from perilune_train.detect.engines import Engine, has_bf16, onnxruntime_engine, openvino_engine, torch_engine
-from perilune_train.detect.export import load_trained, write_onnx
-from perilune_train.detect.flight import FlightDetector
-from perilune_train.detect.int8 import interleaved, quantise
+from perilune_shared.storage.files import write_text
+from perilune_train.detect.deploy.engines import Engine, has_bf16, onnxruntime_engine, openvino_engine, torch_engine
+from perilune_train.detect.deploy.export import load_trained, write_onnx
+from perilune_train.detect.deploy.flight_detector import FlightDetector
+from perilune_train.detect.deploy.int8 import interleaved, quantise
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 

@@ -13,22 +13,22 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from perilune_shared.camera import Camera
-from perilune_shared.checksums import seal
-from perilune_shared.files import write_text
-from perilune_shared.info import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
-from perilune_shared.manifest import count_rows, open_dataset
-from perilune_shared.pack import pack
-from perilune_shared.parts import write_part
+from perilune_shared.dataset.manifest import count_rows, open_dataset
+from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
+from perilune_shared.dataset.parts import write_part
+from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.editing.pack import pack
+from perilune_shared.geometry.camera import Camera
 from perilune_shared.progress import progress_bar
-from perilune_shared.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.storage.checksums import seal
+from perilune_shared.storage.files import write_text
 
 N_SCENES, N_FRAMES, N_LABELS, N_CRATERS = 1000, 100, 50, 2000
 """Scenes of one descent each, frames of each, labels of each frame, craters of each scene."""
 _MEASURED = """
 import sys, time
-from perilune_shared.manifest import open_dataset
-from perilune_shared.stats import summary
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.stats import summary
 import pandas
 
 def peak_gib():

@@ -20,19 +20,19 @@ from nac_plots import draw_curves
 from nac_sun import sun_over, time_of
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig
-from perilune_render.exr import Radiance
-from perilune_render.labels import RimCircles, label_frame
-from perilune_render.picture import write_sheet
-from perilune_render.sensor import FixedPattern, develop
+from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.sensor import FixedPattern, develop
+from perilune_render.labels.drawing import write_sheet
+from perilune_render.labels.frame_labels import RimCircles, label_frame
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.camera import Camera
 from perilune_shared.config import resolve
-from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.errors import UserError, run_command_line
-from perilune_shared.files import write_text
-from perilune_shared.frames import Array, sun_direction
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.frames import Array, sun_direction
 from perilune_shared.progress import progress_bar
+from perilune_shared.storage.files import write_text
 
 FRAME_PX, FOV_DEG = 400, 12.0
 THRESHOLDS_PX = (8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)

@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import nac_statistics as st
-from perilune_shared.files import written_aside
+from perilune_shared.storage.files import written_aside
 
 REAL, OURS = "tab:orange", "tab:blue"
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from perilune_shared.errors import UserError
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 FREQUENCY_EDGES = np.geomspace(0.01, 0.5, 17)
 """Of the power spectra's bands, cycles per pixel."""

@@ -15,21 +15,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perilune_render import tables
 from perilune_render.blender import bpy
 from perilune_render.blender.renderer import Renderer, one_ray_a_pixel, quiet, render_through
 from perilune_render.blender.stage import aim
 from perilune_render.config import DatasetConfig
-from perilune_render.exr import read_exr
-from perilune_render.frame import Shot, Studio
-from perilune_render.labels import RimCircles
-from perilune_render.plan import make_plan
-from perilune_render.sensor import FixedPattern
+from perilune_render.dataset import tables
+from perilune_render.dataset.frame import Shot, Studio
+from perilune_render.flight.plan import make_plan
+from perilune_render.imaging.exr import read_exr
+from perilune_render.imaging.sensor import FixedPattern
+from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import resolve
-from perilune_shared.files import write_text
-from perilune_shared.frames import sun_direction
+from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.progress import progress_bar
+from perilune_shared.storage.files import write_text
 
 N_FRAMES = 38
 

@@ -15,11 +15,11 @@ from perilune_render.blender import bpy
 from perilune_render.blender.renderer import configure, render_through
 from perilune_render.blender.stage import aim, mesh_from_arrays, sunlit_stage
 from perilune_render.config import LightConfig, RenderConfig
-from perilune_render.exr import Radiance
-from perilune_render.labels import Labels, RimCircles, label_frame
-from perilune_shared.camera import Camera, camera_from_site
-from perilune_shared.ellipse import Ellipses, rim_points
-from perilune_shared.frames import Array
+from perilune_render.imaging.exr import Radiance
+from perilune_render.labels.frame_labels import Labels, RimCircles, label_frame
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.ellipse import Ellipses, rim_points
+from perilune_shared.geometry.frames import Array
 
 TUBE_PX = 1.5
 """Half a ring's width, pixels of the picture."""

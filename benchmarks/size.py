@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import typer
 
 from perilune_shared.errors import UserError, run_command_line
-from perilune_shared.files import write_text, written_aside
-from perilune_train.detect.export import load_trained
-from perilune_train.detect.scales import multiply_adds_of_a_frame
+from perilune_shared.storage.files import write_text, written_aside
+from perilune_train.detect.deploy.export import load_trained
+from perilune_train.detect.inference.scales import multiply_adds_of_a_frame
 
 SIZE_PX = 256
 

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from perilune_shared.files import write_text
-from perilune_train.detect.boxes import suppress
-from perilune_train.detect.suppression import suppress_batch
+from perilune_shared.storage.files import write_text
+from perilune_train.detect.evaluate.boxes import suppress
+from perilune_train.detect.inference.suppression import suppress_batch
 
 CANDIDATES, THRESHOLD_IOU, ROUNDS = 8000, 0.45, 7
 

@@ -17,7 +17,7 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import CratersConfig
 from perilune_render.config_values import Span
-from perilune_render.plan import camera_of, make_plan
+from perilune_render.flight.plan import camera_of, make_plan
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.craters import Craters, draw_craters
@@ -27,9 +27,9 @@ from perilune_render.terrain.profile import profile_tables
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.config import resolve
-from perilune_shared.files import write_text
-from perilune_shared.frames import sun_direction
+from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.progress import progress_bar
+from perilune_shared.storage.files import write_text
 
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000)
 

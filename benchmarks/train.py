@@ -25,18 +25,18 @@ from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
 from perilune_shared.config import resolve
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import run_command_line
-from perilune_shared.files import write_text
-from perilune_shared.manifest import open_dataset
-from perilune_train import runs
-from perilune_train.detect.batches import TrainingFrames, loader
+from perilune_shared.storage.files import write_text
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import DetectSplit, load_split
-from perilune_train.detect.loss import detection_loss
-from perilune_train.detect.run import build_network, label_sizes
-from perilune_train.detect.task import DetectTask
-from perilune_train.fit import fit
+from perilune_train.detect.data.batches import TrainingFrames, loader
+from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.train.loss import detection_loss
+from perilune_train.detect.train.run import build_network, label_sizes
+from perilune_train.detect.train.task import DetectTask
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.training import runs
+from perilune_train.training.fit import fit
 
 _UNCOUNTED = 3
 

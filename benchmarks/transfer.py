@@ -24,15 +24,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from perilune_shared.files import write_text
-from perilune_shared.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.storage.files import write_text
 from perilune_train.config import Attention
-from perilune_train.detect.batches import Batch, EvaluationFrames, TrainingFrames, loader
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import DetectSplit, load_split
-from perilune_train.detect.loss import detection_loss
-from perilune_train.detect.run import build_network, label_sizes
-from perilune_train.detect.task import learning_rate_factor
+from perilune_train.detect.data.batches import Batch, EvaluationFrames, TrainingFrames, loader
+from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.train.loss import detection_loss
+from perilune_train.detect.train.run import build_network, label_sizes
+from perilune_train.detect.train.task import learning_rate_factor
 from perilune_train.models.yolo import YOLOv3
 
 CHOICES: dict[str, Attention] = {

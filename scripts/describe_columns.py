@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from perilune_shared.files import write_text
-from perilune_shared.manifest import Dataset, open_dataset
-from perilune_shared.schema import TABLES
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.storage.files import write_text
 
 PAGE = Path(__file__).parent.parent / "docs" / "manifest.md"
 BEGIN, END = "<!-- columns -->", "<!-- end of columns -->"

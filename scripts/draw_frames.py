@@ -8,7 +8,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from perilune_shared.descent import NominalDescent
+from perilune_shared.geometry.descent import NominalDescent
 
 
 def axes(ax, origin, vectors, names, colour, length):

@@ -15,15 +15,15 @@ import numpy as np
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
-from perilune_render.plan import camera_of
-from perilune_render.sensor import FixedPattern, develop
+from perilune_render.flight.plan import camera_of
+from perilune_render.imaging.sensor import FixedPattern, develop
 from perilune_render.terrain import profile
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene
 from perilune_shared.config import resolve
-from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
-from perilune_shared.files import written_aside
-from perilune_shared.frames import sun_direction
+from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.frames import sun_direction
+from perilune_shared.storage.files import written_aside
 
 SEED = 23
 

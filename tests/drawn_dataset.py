@@ -13,15 +13,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 import perilune_shared
-from perilune_shared import frames
-from perilune_shared.camera import Camera, camera_from_site
-from perilune_shared.checksums import seal
 from perilune_shared.content import content_sha256
-from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY, NominalDescent
-from perilune_shared.ellipse import project_circles
-from perilune_shared.info import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
-from perilune_shared.parts import WHOLE_TABLE, write_part
-from perilune_shared.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
+from perilune_shared.dataset.parts import WHOLE_TABLE, write_part
+from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.geometry import frames
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY, NominalDescent
+from perilune_shared.geometry.ellipse import project_circles
+from perilune_shared.storage.checksums import seal
 
 _TEXEL_M = 2.0
 _GROUND_TEXELS = 1400

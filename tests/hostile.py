@@ -13,11 +13,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from perilune_shared import checksums, cli
+from perilune_shared.cli import main as cli
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.schema import IMAGES, TABLES
 from perilune_shared.errors import UserError, run_command_line
-from perilune_shared.manifest import Dataset, open_dataset
-from perilune_shared.schema import IMAGES, TABLES
-from perilune_shared.validate import validate
+from perilune_shared.storage import checksums
+from perilune_shared.validation.validate import validate
 
 Told = list[tuple[str, str]]
 """File and column of each fault; of a refusal by one line, the line twice."""

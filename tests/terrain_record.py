@@ -5,9 +5,9 @@ from pathlib import Path
 
 import torch
 
-from perilune_shared.manifest import open_dataset
-from perilune_train import runs
-from perilune_train.provenance import Provenance, TerrainUse, Use, split_terrain
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_train.evaluation.provenance import Provenance, TerrainUse, Use, split_terrain
+from perilune_train.training import runs
 
 
 def uses_of(dataset: Path, split: str, use: Use = "trained", name: str = "elsewhere") -> frozenset[TerrainUse]:

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import rings
-from perilune_render.labels import RimCircles
-from perilune_render.resample import refined
-from perilune_shared.camera import Camera, camera_from_site
-from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
-from perilune_shared.frames import matrix_from_rotation_vector
+from perilune_render.imaging.resampling import refined
+from perilune_render.labels.frame_labels import RimCircles
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.frames import matrix_from_rotation_vector
 
 CAMERA = Camera(160, 128, 170.0, 170.0, 70.0, 68.0)
 SCALE = 8

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from perilune_render.regenerate import OUTLIERS, png_far, regenerate
-from perilune_shared.manifest import open_dataset
-from perilune_shared.validate import validate
+from perilune_render.dataset.regenerate import OUTLIERS, png_far, regenerate
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.validation.validate import validate
 
 FOLDER = Path(__file__).parent.parent / "data_manifests"
 NAMES = sorted(path.parent.name for path in FOLDER.glob("*/dataset.json"))

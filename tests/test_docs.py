@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from perilune_shared.schema import TABLES
+from perilune_shared.dataset.schema import TABLES
 
 DOCS = Path(__file__).parent.parent / "docs"
 BLOCKS = [

@@ -95,7 +95,7 @@ def test_licences_are_as_promised():
         assert (ROOT / house / "LICENSE").is_file()
 
 
-OWN_MODULES = ["perilune_shared.config", "perilune_render.cli", "perilune_train.detect.run", "tests.test_house"]
+OWN_MODULES = ["perilune_shared.config", "perilune_render.cli", "perilune_train.detect.train.run", "tests.test_house"]
 OWN_MODULES += [path.stem for path in (ROOT / "benchmarks").glob("*.py")]
 
 

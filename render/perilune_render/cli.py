@@ -9,10 +9,10 @@ import typer
 from rich.console import Console
 
 from perilune_render.config import DatasetConfig
-from perilune_render.plan import make_plan
+from perilune_render.flight.plan import make_plan
 from perilune_shared.config import resolve
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import EXIT_USER_ERROR, UserError, run_command_line
-from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import progress_bar
 
 app = typer.Typer(
@@ -112,7 +112,7 @@ def dataset(
     if kind is not Kind.NAV:
         _warn_of_size(resolved)
     folder = out or Path("data") / preset
-    from perilune_render.dataset import (
+    from perilune_render.dataset.render import (
         make_dataset,
     )  # Blender is loaded only once the settings are known to be right.
 
@@ -141,8 +141,8 @@ def _render_manifest(
         wanted = "--out, and --dem and --catalogue where its recipe names them; the rest is the manifest's"
         raise UserError("--manifest", "options", found, wanted)
     given = open_dataset(manifest)
-    from perilune_render.dataset import render_plan
-    from perilune_render.manifest_plan import as_before, plan_of
+    from perilune_render.dataset.read_plan import as_before, plan_of
+    from perilune_render.dataset.render import render_plan
 
     plan, config, info = plan_of(given, dem, catalogue)
     with progress_bar() as progress:
@@ -163,7 +163,7 @@ def develop(
     setting: Setting = None,
 ) -> None:
     """Make a dataset from another one's EXRs, with another sensor or camera, without Blender."""
-    from perilune_render.develop import develop_dataset
+    from perilune_render.dataset.develop import develop_dataset
 
     with progress_bar() as progress:
         made = develop_dataset(open_dataset(dataset), out, progress, config, tuple(setting or ()))
@@ -187,7 +187,7 @@ def plan(
     resolved = _resolve(preset, config, setting, dem, catalogue)
     if kind is not Kind.NAV:
         _warn_of_size(resolved)
-    from perilune_render.planned import write_plan
+    from perilune_render.dataset.write_plan import write_plan
 
     with progress_bar() as progress:
         write_plan(resolved, _one(kind), preset, out, progress)
@@ -214,8 +214,8 @@ def regenerate(
     if not verify and (out is None or not (frames or everything)):
         raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
     dataset = open_dataset(manifest)
-    from perilune_render.regenerate import State, spread
-    from perilune_render.regenerate import regenerate as make_again
+    from perilune_render.dataset.regenerate import State, spread
+    from perilune_render.dataset.regenerate import regenerate as make_again
 
     if frames and everything:
         raise UserError("regenerate", "options", "--frames and --all", "one of them")
@@ -247,7 +247,7 @@ def preview(
 ) -> None:
     """Make one contact sheet of a configuration, with and without labels, in seconds."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
-    from perilune_render.preview import write_preview
+    from perilune_render.dataset.preview import write_preview
 
     write_preview(resolved, _first(kind), out)
     Console().print(f"look at {out}")

@@ -10,7 +10,7 @@ from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import Rims, measure_rims
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.camera import Camera
+from perilune_shared.geometry.camera import Camera
 
 NO_BOULDERS = Boulders(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty((0, 4)))
 

@@ -6,24 +6,24 @@ from dataclasses import replace
 import pytest
 from rich.progress import Progress
 
-from perilune_render import tables
 from perilune_render.config import KindConfig
 from perilune_render.config_terrain import TerrainConfig
-from perilune_render.dataset import render_plan
-from perilune_render.develop import develop_dataset
-from perilune_render.output import begin_or_go_on, check_begun, info_of, open_finished
-from perilune_render.plan import make_plan
-from perilune_render.recipe import config_of, recipe_of, same_source
-from perilune_render.regenerate import png_far, regenerate
-from perilune_shared.checksums import SUMS_NAME
+from perilune_render.dataset import tables
+from perilune_render.dataset.develop import develop_dataset
+from perilune_render.dataset.output import begin_or_go_on, check_begun, info_of, open_finished
+from perilune_render.dataset.regenerate import png_far, regenerate
+from perilune_render.dataset.render import render_plan
+from perilune_render.flight.plan import make_plan
+from perilune_render.provenance.recipe import config_of, recipe_of, same_source
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import write_info
+from perilune_shared.dataset.parts import write_part
+from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
-from perilune_shared.frames import sun_direction
-from perilune_shared.info import write_info
-from perilune_shared.locks import locked
-from perilune_shared.manifest import open_dataset
-from perilune_shared.parts import write_part
-from perilune_shared.subset import subset
-from perilune_shared.validate import validate
+from perilune_shared.geometry.frames import sun_direction
+from perilune_shared.storage.checksums import SUMS_NAME
+from perilune_shared.storage.locks import locked
+from perilune_shared.validation.validate import validate
 from tests.drawn_dataset import build_dataset
 from tests.render.conftest import config_with
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from perilune_render.caches import cache_home
+from perilune_render.provenance.caches import cache_home
 
 
 @pytest.fixture

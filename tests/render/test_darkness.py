@@ -5,8 +5,8 @@ import re
 import pytest
 
 from perilune_render.cli import main
-from perilune_shared.manifest import open_dataset
-from perilune_shared.selection import SELECTIONS, read_labels, selected
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.selection import SELECTIONS, read_labels, selected
 from tests import in_process
 
 DARK = [

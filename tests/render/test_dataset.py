@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from perilune_render.cli import main
-from perilune_render.exr import CHANNELS, read_exr
+from perilune_render.imaging.exr import CHANNELS, read_exr
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.frames import matrix_from_quaternion
-from perilune_shared.manifest import open_dataset
-from perilune_shared.validate import validate
+from perilune_shared.geometry.frames import matrix_from_quaternion
+from perilune_shared.validation.validate import validate
 from tests import in_process
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")

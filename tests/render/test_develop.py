@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from perilune_render.cli import main
-from perilune_shared.ellipse import project_circles
-from perilune_shared.frames import matrix_from_quaternion
-from perilune_shared.manifest import open_dataset
-from perilune_shared.validate import validate
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.geometry.ellipse import project_circles
+from perilune_shared.geometry.frames import matrix_from_quaternion
+from perilune_shared.validation.validate import validate
 from tests import in_process
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
@@ -40,7 +40,7 @@ def developed(tiny, tmp_path_factory):
     program = (
         "import sys; from perilune_render.cli import app\n"
         f"app({arguments!r}, standalone_mode=False)\n"
-        "assert 'perilune_render.develop' in sys.modules and 'bpy' not in sys.modules"
+        "assert 'perilune_render.dataset.develop' in sys.modules and 'bpy' not in sys.modules"
     )
     return out, subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
 

@@ -6,8 +6,8 @@ import rasterio
 from rich.progress import Progress
 
 from perilune_render.cli import main
-from perilune_shared.card import write_card
-from perilune_shared.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.export.card import write_card
 from tests import in_process
 from tests.render.terrain.test_elevation import POLAR, write
 

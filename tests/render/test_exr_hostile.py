@@ -11,7 +11,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from perilune_render.exr import CHANNELS, read_exr, read_radiance
+from perilune_render.imaging.exr import CHANNELS, read_exr, read_radiance
 from perilune_shared.errors import UserError
 
 _HEADER = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -86,7 +86,7 @@ def test_a_bomb_takes_no_memory(tmp_path):
     path = exr(tmp_path / "a.exr")
     resized(path, 16_384, 8192)
     code = (
-        "import resource, sys\nfrom pathlib import Path\nfrom perilune_render.exr import read_radiance\n"
+        "import resource, sys\nfrom pathlib import Path\nfrom perilune_render.imaging.exr import read_radiance\n"
         "from perilune_shared.errors import UserError\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "try:\n    read_radiance(Path(sys.argv[1]), (32, 24))\nexcept UserError:\n"

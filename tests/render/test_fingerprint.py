@@ -9,8 +9,8 @@ import pytest
 
 import perilune_render
 import perilune_shared
-from perilune_render import versions
-from perilune_render.fingerprint import Fingerprint, _fingerprint, compiled_functions, fingerprint
+from perilune_render.provenance import versions
+from perilune_render.provenance.fingerprint import Fingerprint, _fingerprint, compiled_functions, fingerprint
 
 ROOTS = {"generator": versions.GROUND, "renderer": versions.RENDERING, "imaging": versions.IMAGING}
 HOLDERS = {"pandas", "pyarrow", "mathutils"}
@@ -57,15 +57,15 @@ def changed(copy, module, pattern, replacement):
         ("perilune_render.terrain.measure", "_N_RIM", {"generator"}),
         ("perilune_render.blender.stage", "_EARTH_ANGULAR_DIAMETER_DEG", {"renderer"}),
         ("perilune_render.blender.renderer", "_FAR_M", {"renderer"}),
-        ("perilune_render.photometry", "_LEAST_SINE_SQUARED", {"renderer"}),
-        ("perilune_render.sensor", "_FAINT_E", {"imaging"}),
+        ("perilune_render.imaging.photometry", "_LEAST_SINE_SQUARED", {"renderer"}),
+        ("perilune_render.imaging.sensor", "_FAINT_E", {"imaging"}),
         ("perilune_render.config", "_SPREAD_FIELDS", {"generator", "renderer", "imaging"}),
-        ("perilune_render.label_pixels", "_N_FITTED", {"imaging"}),
-        ("perilune_render.labels", "_N_RIM", {"imaging"}),
-        ("perilune_shared.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
-        ("perilune_shared.ellipse", "_N_FITTED", {"imaging"}),
-        ("perilune_shared.camera", "_UNDISTORTED_TO", {"generator", "renderer", "imaging"}),
-        ("perilune_shared.frames", "MOON_RADIUS_M", {"generator", "imaging"}),
+        ("perilune_render.labels.pixels", "_N_FITTED", {"imaging"}),
+        ("perilune_render.labels.frame_labels", "_N_RIM", {"imaging"}),
+        ("perilune_shared.dataset.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
+        ("perilune_shared.geometry.ellipse", "_N_FITTED", {"imaging"}),
+        ("perilune_shared.geometry.camera", "_UNDISTORTED_TO", {"generator", "renderer", "imaging"}),
+        ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "imaging"}),
     ],
 )
 def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, wanted):
@@ -75,9 +75,9 @@ def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, wante
 @pytest.mark.parametrize(
     ("module", "pattern", "replacement", "wanted"),
     [
-        ("perilune_render.resample", "INTER_LANCZOS4", "INTER_CUBIC", {"imaging"}),
-        ("perilune_render.exr", "ZIP_COMPRESSION", "NO_COMPRESSION", {"imaging"}),
-        ("perilune_render.output", '".png", stored', '".png", stored + 1', {"imaging"}),
+        ("perilune_render.imaging.resampling", "INTER_LANCZOS4", "INTER_CUBIC", {"imaging"}),
+        ("perilune_render.imaging.exr", "ZIP_COMPRESSION", "NO_COMPRESSION", {"imaging"}),
+        ("perilune_render.dataset.output", '".png", stored', '".png", stored + 1', {"imaging"}),
         ("perilune_render.blender.nodes", "MULTIPLY", "ADD", {"renderer"}),
         ("perilune_render.terrain.noise", r"njit\(\)", "njit(fastmath=True)", {"generator"}),
     ],
@@ -90,19 +90,19 @@ def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, repla
     ("module", "pattern", "replacement"),
     [
         ("perilune_render.terrain.scene", '^"""', '"""Another docstring. '),
-        ("perilune_render.sensor", '    """The grey image', '    """Another docstring'),
+        ("perilune_render.imaging.sensor", '    """The grey image', '    """Another docstring'),
         ("perilune_render.terrain.scene", '"""A crater of whose rim', '"""Another text'),
         ("perilune_render.terrain.stamp", r"^_N_RIM = 16", "# Why.\n_N_RIM = (\n    16\n)  # another comment"),
         ("perilune_render.terrain.grid", r"raise UserError\(", "raise UserError('more', "),
         ("perilune_render.cli", '"Folder', '"Another folder'),
-        ("perilune_render.preview", "n_frames: int = 4", "n_frames: int = 5"),
-        ("perilune_render.output", "^_SHEET_FRAMES = 12", "_SHEET_FRAMES = 13"),
+        ("perilune_render.dataset.preview", "n_frames: int = 4", "n_frames: int = 5"),
+        ("perilune_render.dataset.output", "^_SHEET_FRAMES = 12", "_SHEET_FRAMES = 13"),
         ("perilune_render.config", "= 256$", "= 257"),
         ("perilune_render.config", "_GROUND_FIELDS = ", "_GROUND_FIELDS = 1, "),
         ("perilune_render.config", "gt=0", "gt=1"),
-        ("perilune_shared.card", "^def ", "def another():\n    return 1\n\n\ndef "),
+        ("perilune_shared.export.card", "^def ", "def another():\n    return 1\n\n\ndef "),
         ("perilune_shared.errors", "got", "found"),
-        ("perilune_shared.files", "LONGEST_PATH = 500", "LONGEST_PATH = 501"),
+        ("perilune_shared.storage.files", "LONGEST_PATH = 500", "LONGEST_PATH = 501"),
     ],
 )
 def test_what_changes_no_frame_changes_no_hash(copy, module, pattern, replacement):

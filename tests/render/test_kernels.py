@@ -9,10 +9,12 @@ from pathlib import Path
 import perilune_render
 import perilune_shared
 
-CALLEE = "from perilune_render.kernels import njit\nSTEP = {step}\n@njit()\ndef add(x):\n    return x + STEP\n"
+CALLEE = (
+    "from perilune_render.provenance.kernels import njit\nSTEP = {step}\n@njit()\ndef add(x):\n    return x + STEP\n"
+)
 CALLER = """
 from perilune_render.callee import STEP, add
-from perilune_render.kernels import njit
+from perilune_render.provenance.kernels import njit
 @njit()
 def both(x):
     return add(x) * 100 + STEP

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from perilune_render.config import LabelsConfig, SensorConfig
-from perilune_render.exr import Radiance
-from perilune_render.label_pixels import contrasts, sunlit_fractions
-from perilune_render.labels import RimCircles, Shown, crater_index, label_frame, with_contrast
-from perilune_render.sensor import expected, expose
-from perilune_shared.camera import Camera, camera_from_site
-from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
-from perilune_shared.ellipse import Ellipses
-from perilune_shared.frames import matrix_from_rotation_vector, sun_direction
-from perilune_shared.masks import crater_masks
+from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.sensor import expected, expose
+from perilune_render.labels.frame_labels import RimCircles, Shown, crater_index, label_frame, with_contrast
+from perilune_render.labels.pixels import contrasts, sunlit_fractions
+from perilune_shared.dataset.masks import crater_masks
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.ellipse import Ellipses
+from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
 
 CAMERA = Camera.from_field_of_view(128, 128, 50.0)
 ABOVE = np.array([0.0, 0.0, 500.0])

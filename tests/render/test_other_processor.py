@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 from numpy.core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 
-from perilune_render.dataset import _write_scene
-from perilune_render.plan import make_plan
+from perilune_render.dataset.render import _write_scene
+from perilune_render.flight.plan import make_plan
 from perilune_render.terrain.scene import grow_scene
-from perilune_shared.camera import Camera
+from perilune_shared.dataset.parts import read_part
 from perilune_shared.errors import UserError
-from perilune_shared.parts import read_part
+from perilune_shared.geometry.camera import Camera
 from tests.render.conftest import config_with
 
 CAMERA = Camera.from_field_of_view(32, 32, 50.0)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from perilune_render.photometry import HIGHLAND, LAWS, MARE, MEAN, hapke, radiance_factor, roughness
+from perilune_render.imaging.photometry import HIGHLAND, LAWS, MARE, MEAN, hapke, radiance_factor, roughness
 
 GEOMETRIES = list(
     itertools.product((0, 10, 30, 45, 60, 70, 80, 85), (0, 15, 30, 45, 60, 75, 85), (0, 30, 60, 90, 120, 150, 180))

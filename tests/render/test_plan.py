@@ -3,10 +3,10 @@ import pytest
 
 from perilune_render.cli import main
 from perilune_render.config import CameraConfig, DistortionConfig, KindConfig
-from perilune_render.plan import camera_of, make_plan
+from perilune_render.flight.plan import camera_of, make_plan
 from perilune_render.streams import derived_seed, stream
-from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
 from tests import in_process
 from tests.render.conftest import config_with
 

@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perilune_render.cli import main
-from perilune_render.flight import fly
-from perilune_render.plan import make_plan
-from perilune_render.pose_checks import Poses, check_plan, check_poses
+from perilune_render.flight.plan import make_plan
+from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
+from perilune_render.flight.trajectories import fly
+from perilune_shared.dataset.writer import with_column
 from perilune_shared.errors import UserError
-from perilune_shared.frames import quaternion_from_matrix
-from perilune_shared.writer import with_column
+from perilune_shared.geometry.frames import quaternion_from_matrix
 from tests.render.conftest import config_with, flat_scene
 
 NADIR = np.diag([1.0, -1.0, -1.0])

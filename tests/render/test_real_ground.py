@@ -3,10 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from perilune_render.real_ground import draw_outline, outline_m, real_ground_share
-from perilune_render.terrain.elevation import beyond_m, raster_places, read_elevation
-from perilune_shared.camera import Camera
-from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_render.dataset.real_ground import draw_outline, outline_m, real_ground_share
+from perilune_render.terrain.elevation.model import beyond_m, raster_places, read_elevation
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
 from tests.render.conftest import flat_scene
 from tests.render.terrain.test_elevation import POLAR, write
 from tests.render.terrain.test_quantisation import PLACED, rough

@@ -7,17 +7,17 @@ import pytest
 
 from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig, KindConfig, SunConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
-from perilune_render.manifest_plan import plan_of
-from perilune_render.output import info_of
-from perilune_render.plan import make_plan
-from perilune_render.recipe import recipe_of
-from perilune_render.tables import ground_tables
+from perilune_render.dataset.output import info_of
+from perilune_render.dataset.read_plan import plan_of
+from perilune_render.dataset.tables import ground_tables
+from perilune_render.flight.plan import make_plan
+from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import PRESETS, resolve
 from perilune_shared.content import content_sha256
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.metadata import recipes_of
 from perilune_shared.errors import UserError
-from perilune_shared.info import recipes_of
-from perilune_shared.manifest import Dataset, open_dataset
 from tests.render.conftest import config_with
 
 COARSE = TerrainConfig(spacing_px=3.0, boulders=BouldersConfig(density=0.0))

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from perilune_render.config import SensorConfig
-from perilune_render.exr import Radiance
-from perilune_render.sensor import FixedPattern, develop, expected, expose, motion_px, psf_kernel
-from perilune_shared.camera import Camera
+from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.sensor import FixedPattern, develop, expected, expose, motion_px, psf_kernel
+from perilune_shared.geometry.camera import Camera
 
 CAMERA = Camera(200, 160, 220.0, 220.0, 100.0, 80.0)
 BARREL = Camera(200, 160, 220.0, 220.0, 104.0, 77.0, (-0.15, 0.03, 0.002, -0.001, 0.0))

@@ -3,8 +3,8 @@
 import subprocess
 import sys
 
-from perilune_shared.manifest import open_dataset
-from perilune_shared.validate import validate
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.validation.validate import validate
 
 HIDDEN = """
 import importlib.metadata as metadata, sys

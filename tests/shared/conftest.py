@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from perilune_shared.info import read_info
-from perilune_shared.manifest import open_dataset
-from perilune_shared.writer import written
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import read_info
+from perilune_shared.dataset.writer import written
 from tests.drawn_dataset import build_dataset
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perilune_shared.camera import Camera, camera_from_site
+from perilune_shared.geometry.camera import Camera, camera_from_site
 
 CAMERA = Camera(width_px=256, height_px=200, fx_px=300.0, fy_px=310.0, cx_px=128.0, cy_px=90.0)
 

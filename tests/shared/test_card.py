@@ -19,15 +19,15 @@ from PIL import Image
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from perilune_shared import checksums
-from perilune_shared.card import code, write_card
-from perilune_shared.cli import app
+from perilune_shared.cli.main import app
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import write_info
+from perilune_shared.dataset.parts import read_part
+from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
-from perilune_shared.info import write_info
-from perilune_shared.manifest import open_dataset
-from perilune_shared.parts import read_part
-from perilune_shared.schema import TABLES
-from perilune_shared.validate import validate
+from perilune_shared.export.card import code, write_card
+from perilune_shared.storage import checksums
+from perilune_shared.validation.validate import validate
 from tests.drawn_dataset import build_dataset
 
 EVIL = '`</code><script>alert(1)</script> ![x](http://evil) [y](javascript:z) | $(rm) &lt; "\n# owned\n<img src=x>'
@@ -192,7 +192,7 @@ def test_command_line(crowded, tmp_path):
     done = CliRunner().invoke(app, ["card", str(crowded), "--out", str(tmp_path / "about.md")])
     assert done.exit_code == 0 and (tmp_path / "about.png").is_file()
     assert "](about.png)" in (tmp_path / "about.md").read_text()
-    without = "import sys; sys.modules['matplotlib'] = None; from perilune_shared.cli import main; main()"
+    without = "import sys; sys.modules['matplotlib'] = None; from perilune_shared.cli.main import main; main()"
     command = [sys.executable, "-c", without, "card", str(crowded), "--out", str(tmp_path / "b.md")]
     bare = subprocess.run(command, capture_output=True, text=True)
     assert bare.returncode == 2 and "perilune-shared[pictures]" in bare.stderr

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from perilune_shared.dataset.manifest import count_rows, open_dataset
+from perilune_shared.dataset.stats import summary
+from perilune_shared.editing.merge import merge
+from perilune_shared.editing.migrate import migrate
+from perilune_shared.editing.pack import pack, unpack
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import count_rows, open_dataset
-from perilune_shared.merge import merge
-from perilune_shared.migrate import migrate
-from perilune_shared.pack import pack, unpack
-from perilune_shared.split import split_dataset
-from perilune_shared.stats import summary
-from perilune_shared.subset import subset
-from perilune_shared.validate import validate
+from perilune_shared.validation.validate import validate
 from tests.drawn_dataset import build_dataset
 
 OLD = Path(__file__).parent / "old"

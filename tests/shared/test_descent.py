@@ -1,6 +1,6 @@
 import numpy as np
 
-from perilune_shared.descent import NominalDescent
+from perilune_shared.geometry.descent import NominalDescent
 
 DESCENT = NominalDescent.parabola(1500, 200, 500, 90.0, 65.0)
 

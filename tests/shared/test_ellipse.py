@@ -5,8 +5,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from perilune_shared.camera import Camera
-from perilune_shared.ellipse import Ellipses, fit_ellipses, project_circles, rim_points
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.ellipse import Ellipses, fit_ellipses, project_circles, rim_points
 
 CAMERA = Camera(256, 256, 280.0, 260.0, 120.0, 131.0)
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 
-from perilune_shared import checksums
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_shared.validate import validate
+from perilune_shared.storage import checksums
+from perilune_shared.validation.validate import validate
 from tests.hostile import digest, edit, pack, put, rewrite, sealed
 
 _HUGE = 2**32

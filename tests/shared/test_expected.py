@@ -7,16 +7,16 @@ import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
 
-from perilune_shared import files
-from perilune_shared.card import write_card
-from perilune_shared.checksums import SUMS_NAME, seal
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.editing.merge import merge
+from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
-from perilune_shared.export_croissant import export_croissant
-from perilune_shared.locks import locked
-from perilune_shared.manifest import open_dataset
-from perilune_shared.merge import merge
-from perilune_shared.pack import pack
-from perilune_shared.validate import validate
+from perilune_shared.export.card import write_card
+from perilune_shared.export.croissant import export_croissant
+from perilune_shared.storage import files
+from perilune_shared.storage.checksums import SUMS_NAME, seal
+from perilune_shared.storage.locks import locked
+from perilune_shared.validation.validate import validate
 from tests.hostile import digest, edit, part_of
 
 UNEXPECTED = {

@@ -16,13 +16,13 @@ from pycocotools.cocoeval import COCOeval
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from perilune_shared.cli import app
+from perilune_shared.cli.main import app
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.parts import read_part
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.selection import SELECTIONS, read_labels, selected
 from perilune_shared.errors import UserError
-from perilune_shared.export_coco import area_of, cut_at_edges, export_coco
-from perilune_shared.manifest import open_dataset
-from perilune_shared.parts import read_part
-from perilune_shared.schema import TABLES
-from perilune_shared.selection import SELECTIONS, read_labels, selected
+from perilune_shared.export.coco import area_of, cut_at_edges, export_coco
 
 SMALLEST_PX = 4.0
 

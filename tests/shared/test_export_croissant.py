@@ -13,13 +13,13 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from perilune_shared.cli import app
+from perilune_shared.cli.main import app
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.writer import written
 from perilune_shared.errors import UserError
-from perilune_shared.export_croissant import export_croissant
-from perilune_shared.manifest import open_dataset
-from perilune_shared.schema import TABLES
-from perilune_shared.validate import validate
-from perilune_shared.writer import written
+from perilune_shared.export.croissant import export_croissant
+from perilune_shared.validation.validate import validate
 
 
 @pytest.fixture(scope="module", params=["crowded", "crowded_packed", "parts"])

@@ -7,9 +7,9 @@ from evo.core.trajectory import PosePath3D, PoseTrajectory3D
 from evo.tools import file_interface
 from rich.progress import Progress
 
-from perilune_shared.camera import Camera
-from perilune_shared.export_trajectory import export_kitti, export_tum
-from perilune_shared.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.export.trajectory import export_kitti, export_tum
+from perilune_shared.geometry.camera import Camera
 
 DESCENTS = ["s000/t000", "s001/t001", "s002/t002", "s003/t003"]
 

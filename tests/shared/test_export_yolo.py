@@ -7,10 +7,10 @@ import pytest
 import yaml
 from rich.progress import Progress
 
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.export_yolo import export_yolo
-from perilune_shared.files import sha256_of
-from perilune_shared.manifest import open_dataset
+from perilune_shared.export.yolo import export_yolo
+from perilune_shared.storage.files import sha256_of
 
 
 def exported(root, out, **choice):

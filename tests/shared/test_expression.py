@@ -6,10 +6,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from perilune_shared.dataset.expression import Condition
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.parts import Part
 from perilune_shared.errors import UserError
-from perilune_shared.expression import Condition
-from perilune_shared.manifest import open_dataset
-from perilune_shared.parts import Part
 
 ROWS = pa.table(
     {

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from perilune_shared import files
 from perilune_shared.errors import UserError
+from perilune_shared.storage import files
 
 
 def test_a_file_is_there_whole_or_not_at_all(tmp_path):

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perilune_shared import frames
+from perilune_shared.geometry import frames
 
 ANGLES = st.floats(-np.pi, np.pi)
 

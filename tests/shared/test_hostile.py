@@ -6,12 +6,12 @@ import shutil
 
 import pytest
 
-from perilune_shared import files
-from perilune_shared.checksums import SUMS_NAME
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import recipes_of, write_info
+from perilune_shared.dataset.parts import write_part
 from perilune_shared.errors import UserError
-from perilune_shared.info import recipes_of, write_info
-from perilune_shared.manifest import open_dataset
-from perilune_shared.parts import write_part
+from perilune_shared.storage import files
+from perilune_shared.storage.checksums import SUMS_NAME
 from tests.hostile import assert_refused, edit, sealed
 
 

@@ -5,9 +5,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from perilune_shared.dataset.parts import Part
+from perilune_shared.dataset.schema import IMAGES, TABLES
 from perilune_shared.errors import UserError
-from perilune_shared.parts import Part
-from perilune_shared.schema import IMAGES, TABLES
 from tests import hostile_parquet as forged
 from tests.hostile import edit, part_of, sealed, told_within
 

@@ -8,10 +8,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from perilune_shared.checksums import seal
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_shared.validate import validate
+from perilune_shared.storage.checksums import seal
+from perilune_shared.validation.validate import validate
 from tests import hostile_parquet as forged
 from tests.hostile import assert_refused, part_of, sealed
 

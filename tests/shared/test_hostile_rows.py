@@ -8,12 +8,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import Counts
+from perilune_shared.dataset.schema import IMAGES
+from perilune_shared.dataset.writer import written
 from perilune_shared.errors import UserError
-from perilune_shared.info import Counts
-from perilune_shared.manifest import open_dataset
-from perilune_shared.schema import IMAGES
-from perilune_shared.validate import validate
-from perilune_shared.writer import written
+from perilune_shared.validation.validate import validate
 from tests import hostile_parquet as forged
 from tests.hostile import assert_refused, digest, edit, pack, part_of, put, rewrite, sealed
 

@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 from rich.progress import Progress
 
-from perilune_shared.card import write_card
-from perilune_shared.export import by_selection
-from perilune_shared.export_hugging_face import export_hugging_face
-from perilune_shared.manifest import open_dataset
-from perilune_shared.selection import SELECTIONS
-from perilune_shared.split import split_dataset
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.selection import SELECTIONS
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.export.card import write_card
+from perilune_shared.export.hugging_face import export_hugging_face
+from perilune_shared.export.rows import by_selection
 
 
 @pytest.fixture

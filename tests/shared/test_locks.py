@@ -9,13 +9,13 @@ import threading
 import pytest
 
 from perilune_shared.errors import UserError
-from perilune_shared.files import new_folder, written_aside
-from perilune_shared.locks import LOCK_NAME, locked
+from perilune_shared.storage.files import new_folder, written_aside
+from perilune_shared.storage.locks import LOCK_NAME, locked
 
 HOLD = """
 import sys, pathlib
-from perilune_shared.files import new_folder
-from perilune_shared.locks import locked
+from perilune_shared.storage.files import new_folder
+from perilune_shared.storage.locks import locked
 with {"locked": locked, "new_folder": new_folder}[sys.argv[1]](pathlib.Path(sys.argv[2])) as folder:
     if folder is not None:
         folder.joinpath("first").write_text("first")

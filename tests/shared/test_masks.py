@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perilune_render.exr import read_exr
-from perilune_shared.camera import Camera, camera_from_site
-from perilune_shared.ellipse import plane_basis
+from perilune_render.imaging.exr import read_exr
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.masks import crater_masks, frame_masks
 from perilune_shared.errors import UserError
-from perilune_shared.frames import matrix_from_quaternion
-from perilune_shared.manifest import open_dataset
-from perilune_shared.masks import crater_masks, frame_masks
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.ellipse import plane_basis
+from perilune_shared.geometry.frames import matrix_from_quaternion
 
 CAMERA = Camera(120, 90, 130.0, 120.0, 57.0, 48.0)
 BARREL = replace(CAMERA, distortion=(-0.25, 0.04, 0.003, -0.002, 0.0))

@@ -6,16 +6,16 @@ import pyarrow.compute as pc
 import pytest
 from license_expression import get_spdx_licensing
 
-from perilune_shared.checksums import seal
-from perilune_shared.diff import differences
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.stats import summary
+from perilune_shared.editing.diff import differences
+from perilune_shared.editing.licence import joined_licence
+from perilune_shared.editing.merge import merge
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
-from perilune_shared.licence import joined_licence
-from perilune_shared.manifest import open_dataset
-from perilune_shared.merge import merge
-from perilune_shared.split import split_dataset
-from perilune_shared.stats import summary
-from perilune_shared.subset import subset
-from perilune_shared.validate import validate
+from perilune_shared.storage.checksums import seal
+from perilune_shared.validation.validate import validate
 from tests.drawn_dataset import build_dataset
 from tests.hostile import edit, rewrite
 

@@ -8,22 +8,22 @@ import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
 
-from perilune_shared.attach import attach
-from perilune_shared.card import write_card
-from perilune_shared.checksums import seal
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import Recipe, write_info
+from perilune_shared.dataset.parts import write_part
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.writer import with_column
+from perilune_shared.editing.attach import attach
+from perilune_shared.editing.merge import merge
+from perilune_shared.editing.pack import pack, unpack
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
-from perilune_shared.export_coco import export_coco
-from perilune_shared.files import new_folder
-from perilune_shared.info import Recipe, write_info
-from perilune_shared.manifest import open_dataset
-from perilune_shared.merge import merge
-from perilune_shared.pack import pack, unpack
-from perilune_shared.parts import write_part
-from perilune_shared.schema import TABLES
-from perilune_shared.split import split_dataset
-from perilune_shared.subset import subset
-from perilune_shared.validate import validate
-from perilune_shared.writer import with_column
+from perilune_shared.export.card import write_card
+from perilune_shared.export.coco import export_coco
+from perilune_shared.storage.checksums import seal
+from perilune_shared.storage.files import new_folder
+from perilune_shared.validation.validate import validate
 
 
 def replaced(root, table, rows):

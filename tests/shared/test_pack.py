@@ -8,18 +8,18 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from perilune_shared import parts
-from perilune_shared.attach import attach
-from perilune_shared.diff import differences
+from perilune_shared.dataset import parts
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.schema import OPTIONAL, TABLES
+from perilune_shared.editing.attach import attach
+from perilune_shared.editing.diff import differences
+from perilune_shared.editing.migrate import migrate
+from perilune_shared.editing.pack import pack, unpack
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
-from perilune_shared.export_croissant import metadata_of
-from perilune_shared.manifest import open_dataset
-from perilune_shared.migrate import migrate
-from perilune_shared.pack import pack, unpack
-from perilune_shared.schema import OPTIONAL, TABLES
-from perilune_shared.split import split_dataset
-from perilune_shared.subset import subset
-from perilune_shared.validate import validate
+from perilune_shared.export.croissant import metadata_of
+from perilune_shared.validation.validate import validate
 from tests.hostile import rewrite
 
 OLD = Path(__file__).parent / "old"

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from perilune_shared.manifest import open_dataset
-from perilune_shared.selection import SELECTIONS, Selection, label_bound_px, read_labels, selected
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.selection import SELECTIONS, Selection, label_bound_px, read_labels, selected
 
 GOOD = {
     "radius_px": 5.0,

@@ -4,12 +4,12 @@ import shutil
 
 import pytest
 
-from perilune_shared.checksums import seal
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.editing.merge import merge
+from perilune_shared.editing.split import split_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_shared.merge import merge
-from perilune_shared.split import split_dataset
-from perilune_shared.validate import validate
+from perilune_shared.storage.checksums import seal
+from perilune_shared.validation.validate import validate
 from tests.drawn_dataset import build_dataset
 from tests.hostile import edit, rewrite
 

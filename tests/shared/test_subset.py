@@ -2,13 +2,13 @@
 
 import pytest
 
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.editing.merge import merge
+from perilune_shared.editing.pack import unpack
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_shared.merge import merge
-from perilune_shared.pack import unpack
-from perilune_shared.split import split_dataset
-from perilune_shared.subset import subset
-from perilune_shared.validate import validate
+from perilune_shared.validation.validate import validate
 
 
 def taken(source, out, *conditions, **options):

@@ -10,14 +10,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from perilune_shared import manifest
-from perilune_shared.cli import main
+from perilune_shared.cli.main import main
+from perilune_shared.dataset import manifest
+from perilune_shared.dataset.manifest import count_rows, open_dataset
+from perilune_shared.dataset.parts import read_part, write_part
+from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.dataset.stats import summary
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import count_rows, open_dataset
-from perilune_shared.parts import read_part, write_part
-from perilune_shared.schema import SCHEMA_VERSION, TABLES
-from perilune_shared.stats import summary
-from perilune_shared.validate import validate
+from perilune_shared.validation.validate import validate
 from tests import in_process
 
 MANIFEST = str(Path(sys.executable).parent / "perilune-manifest")

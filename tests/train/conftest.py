@@ -8,7 +8,7 @@ import torch
 from tests.drawn_dataset import build_dataset
 
 DRAWING = {
-    "perilune_train.detect.report": ("draw_bins", "draw_curves", "draw_frames"),
+    "perilune_train.detect.evaluate.report": ("draw_bins", "draw_curves", "draw_frames"),
     "perilune_train.navigate.run": ("draw_descent", "draw_errors"),
 }
 """Functions that write pictures, by the module that calls them."""

@@ -4,10 +4,10 @@ import pytest
 
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError
-from perilune_train import begin as begin_module
-from perilune_train import runs
-from perilune_train.begin import check_settings, hashes_of, start_run, state_of
-from perilune_train.runs import RunFolder
+from perilune_train.training import begin as begin_module
+from perilune_train.training import runs
+from perilune_train.training.begin import check_settings, hashes_of, start_run, state_of
+from perilune_train.training.runs import RunFolder
 
 
 class Part(Section):

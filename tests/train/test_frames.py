@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
 from perilune_train.data.frames import decode, load_frames
 
 

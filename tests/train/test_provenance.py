@@ -11,19 +11,16 @@ from tests.terrain_record import store_record, uses_of
 from typer.testing import CliRunner
 
 from perilune_shared.config import resolve
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.metadata import recipes_of
 from perilune_shared.errors import UserError
-from perilune_shared.info import recipes_of
-from perilune_shared.manifest import Dataset, open_dataset
-from perilune_train import runs
 from perilune_train.cli import app
-from perilune_train.detect.compare import compare_folders
+from perilune_train.detect.compare_runs import compare_folders
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.export import export_run
-from perilune_train.detect.run import WRITTEN, run_detect
-from perilune_train.detect.transfer import inherited_terrain
-from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.run import navigate_run
-from perilune_train.provenance import (
+from perilune_train.detect.deploy.export import export_run
+from perilune_train.detect.train.run import WRITTEN, run_detect
+from perilune_train.detect.train.transfer import inherited_terrain
+from perilune_train.evaluation.provenance import (
     UNKNOWN,
     Provenance,
     TerrainUse,
@@ -33,6 +30,9 @@ from perilune_train.provenance import (
     split_terrain,
     training_provenance,
 )
+from perilune_train.navigate.config import NavigateConfig
+from perilune_train.navigate.run import navigate_run
+from perilune_train.training import runs
 
 QUICK = ("detect.epochs=1", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
 ELSEWHERE = TerrainUse("elsewhere", "scene-0007", "trained", "ab" * 32, "elsewhere")

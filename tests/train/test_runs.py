@@ -13,10 +13,10 @@ from torch import nn
 
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError
-from perilune_train import fit as fitting
-from perilune_train import runs
-from perilune_train.begin import start_run
-from perilune_train.runs import RunFolder
+from perilune_train.training import fit as fitting
+from perilune_train.training import runs
+from perilune_train.training.begin import start_run
+from perilune_train.training.runs import RunFolder
 
 
 class Settings(Section):
@@ -31,7 +31,7 @@ def started(root, name="a"):
 
 
 def test_a_process_that_lightning_starts_knows_at_once_that_it_is_not_the_first():
-    ask = "from perilune_train.runs import is_first_process; print(is_first_process())"
+    ask = "from perilune_train.training.runs import is_first_process; print(is_first_process())"
     own = {**os.environ, "LOCAL_RANK": "1"}
     done = subprocess.run([sys.executable, "-c", ask], env=own, capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr

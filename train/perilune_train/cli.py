@@ -3,7 +3,7 @@
 import typer
 
 from perilune_shared.errors import run_command_line
-from perilune_train.detect.command import app as detect
+from perilune_train.detect.cli.main import app as detect
 from perilune_train.explain.command import explain
 from perilune_train.navigate.command import navigate
 

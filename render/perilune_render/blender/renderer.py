@@ -16,12 +16,12 @@ import numpy as np
 
 from perilune_render.blender import stage as blender_stage
 from perilune_render.config import DatasetConfig, LightConfig, RenderConfig
-from perilune_render.exr import Radiance, read_exr
+from perilune_render.imaging.exr import Radiance, read_exr
 from perilune_render.interrupts import interrupts_held
 from perilune_render.terrain.scene import Scene
-from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
-from perilune_shared.frames import Array
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
 
 _FAR_M = 1e9
 _LEAST_FREE_BYTES = 16_000_000

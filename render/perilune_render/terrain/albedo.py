@@ -6,12 +6,12 @@ of ours by eye beside NAC images, since published maturity trends are for far la
 
 import numpy as np
 
-from perilune_render.kernels import njit
+from perilune_render.provenance.kernels import njit
 from perilune_render.streams import stream
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid, lines_in
 from perilune_render.terrain.noise import add_waves
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 _PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03))
 """Wavelengths in metres and amplitudes of the patches."""

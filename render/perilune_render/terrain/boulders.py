@@ -16,7 +16,7 @@ from perilune_render.streams import stream
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.size_frequency import BoulderLaw, draw_diameters, log_bins
-from perilune_shared.frames import Array, matrix_from_quaternion
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 _BURIED_SHARE = 0.3
 """Share of a boulder's height that lies below the ground."""

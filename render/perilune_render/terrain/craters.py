@@ -27,7 +27,7 @@ from perilune_render.terrain.size_frequency import (
     draw_diameters,
     log_bins,
 )
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 ORIGINS = ("primary", "secondary", "elevation model")
 """What `Craters.origin` counts: drawn alone, drawn in a cluster, or read from a catalogue of real ground."""

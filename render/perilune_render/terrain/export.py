@@ -11,8 +11,8 @@ from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import value_at
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
-from perilune_shared.files import written_aside
-from perilune_shared.frames import MOON_RADIUS_M
+from perilune_shared.geometry.frames import MOON_RADIUS_M
+from perilune_shared.storage.files import written_aside
 
 MESH_SUFFIXES = (".glb", ".ply", ".obj", ".stl")
 RASTER_SUFFIXES = (".tif", ".tiff")

@@ -15,10 +15,10 @@ import numpy as np
 
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import LARGEST_SPACING_PX
-from perilune_render.kernels import njit
-from perilune_shared.camera import Camera
+from perilune_render.provenance.kernels import njit
 from perilune_shared.errors import UserError
-from perilune_shared.frames import Array
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
 
 _WIDEST_RAD = np.radians(80)
 

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.kernels import njit
+from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.craters import Craters
 from perilune_render.terrain.grid import Grid, place_in_ring, vertex_of_ring
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 _N_RIM = 16
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from perilune_render.kernels import njit
+from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.grid import Grid, lines_in
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 RMS_SLOPE = 0.87
 """Root mean square slope times wavelength of `add_waves` with amplitude 1, measured over 4 million places."""

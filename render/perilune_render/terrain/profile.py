@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 REACH = 3.0
 """Profiles are cut at this distance over the radius."""

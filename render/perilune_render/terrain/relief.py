@@ -12,7 +12,7 @@ from perilune_render.streams import stream
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.noise import RMS_SLOPE, add_waves
 from perilune_shared.errors import UserError
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 
 def finest_wave_m(grid: Grid) -> float:

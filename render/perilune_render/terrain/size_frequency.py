@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 _NEUKUM_2001 = (
     -3.557528,

@@ -17,16 +17,16 @@ import pytest
 from rich.progress import Progress
 
 from perilune_render.cli import main
-from perilune_render.regenerate import exr_far, png_far, regenerate, spread
-from perilune_shared.diff import differences
+from perilune_render.dataset.regenerate import exr_far, png_far, regenerate, spread
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.editing.diff import differences
+from perilune_shared.editing.merge import merge
+from perilune_shared.editing.pack import pack
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_shared.merge import merge
-from perilune_shared.pack import pack
-from perilune_shared.schema import TABLES
-from perilune_shared.split import split_dataset
-from perilune_shared.subset import subset
-from perilune_shared.validate import validate
+from perilune_shared.validation.validate import validate
 from tests import in_process
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
@@ -188,7 +188,7 @@ def test_a_recipe_opens_no_file_of_its_own_choice(tiny_detect):
 
 def open_dataset_with_right_key(root):
     """Write the changed recipe under the key of its content, in dataset.json and in the scenes."""
-    from perilune_shared.info import Recipe
+    from perilune_shared.dataset.metadata import Recipe
 
     path = root / "dataset.json"
     info = json.loads(path.read_text())

@@ -14,14 +14,14 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import RenderConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
-from perilune_render.exr import read_radiance, write_exr
+from perilune_render.imaging.exr import read_radiance, write_exr
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.export import vertices
 from perilune_render.terrain.measure import value_at
 from perilune_render.terrain.scene import grow_scene
-from perilune_shared.camera import Camera, camera_from_site
-from perilune_shared.descent import ROTATION_CAMERA_FROM_BODY
-from perilune_shared.frames import matrix_from_rotation_vector, sun_direction
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
 from tests.render.conftest import config_with
 
 CAMERA = Camera.from_field_of_view(160, 128, 50.0)

@@ -7,7 +7,7 @@ import pytest
 from perilune_render.config import FlightConfig
 from perilune_render.terrain import cache
 from perilune_render.terrain.scene import grow_scene
-from perilune_shared.camera import Camera
+from perilune_shared.geometry.camera import Camera
 from tests.render.conftest import config_with
 
 CAMERA = Camera.from_field_of_view(32, 32, 50.0)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import rasterio
 
-from perilune_render.terrain.catalogue import read_catalogue
 from perilune_render.terrain.craters import ORIGINS
-from perilune_render.terrain.elevation import raster_places, read_elevation
+from perilune_render.terrain.elevation.catalogue import read_catalogue
+from perilune_render.terrain.elevation.model import raster_places, read_elevation
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.errors import UserError
-from perilune_shared.frames import selenographic_from_site
+from perilune_shared.geometry.frames import selenographic_from_site
 from tests.render.conftest import config_with
 from tests.render.terrain.test_elevation import POLAR, write
 
@@ -26,7 +26,7 @@ def model(tmp_path):
     column, row = np.meshgrid(np.arange(400) + 0.5, np.arange(400) + 0.5)
     east, north = placed() @ (column, row)
     lon, lat = rasterio.warp.transform(POLAR, "+proj=longlat +R=1737400", east.ravel(), north.ravel())
-    from perilune_shared.frames import site_from_selenographic
+    from perilune_shared.geometry.frames import site_from_selenographic
 
     x, y = site_from_selenographic(lat, lon, flat.latitude_deg, flat.longitude_deg)
     height = np.zeros(400 * 400)

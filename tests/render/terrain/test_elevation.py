@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from perilune_render.terrain.elevation import base_heights, read_elevation
+from perilune_render.terrain.elevation.model import base_heights, read_elevation
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.errors import UserError

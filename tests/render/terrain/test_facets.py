@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from perilune_render.config import DatasetConfig
-from perilune_render.plan import make_plan
+from perilune_render.flight.plan import make_plan
 from perilune_render.terrain.scene import grow_scene
-from perilune_shared.camera import camera_from_site
 from perilune_shared.config import resolve
+from perilune_shared.geometry.camera import camera_from_site
 
 
 def largest_facet_px(vertices, faces, camera, position_m, rotation):

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from perilune_render.config import FlightConfig
-from perilune_render.flight import fly
+from perilune_render.flight.trajectories import fly
 from perilune_render.terrain.grid import Grid, graded_grid, lines_in, reach_m
 from perilune_render.terrain.measure import value_at
-from perilune_shared.camera import Camera
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
 from tests.render.conftest import config_with
 
 CAMERA = Camera.from_field_of_view(256, 256, 50.0)

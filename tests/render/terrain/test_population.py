@@ -15,8 +15,8 @@ from perilune_render.terrain.measure import value_at
 from perilune_render.terrain.profile import REACH, crest_radius, profile_tables, wear_row
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_render.terrain.size_frequency import EQUILIBRIA, Minimum, NeukumProduction
-from perilune_shared.camera import Camera
 from perilune_shared.config import resolve
+from perilune_shared.geometry.camera import Camera
 from tests.render.conftest import config_with
 
 EVEN = Grid.even(1500, 1500)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from perilune_render.terrain.elevation import read_elevation
-from perilune_render.terrain.quantisation import smoothed, step_of
+from perilune_render.terrain.elevation.model import read_elevation
+from perilune_render.terrain.elevation.quantisation import smoothed, step_of
 from tests.render.terrain.test_elevation import POLAR, write
 
 PLACED = rasterio.Affine(5, 0, 1e5, 0, -5, 0)

@@ -6,12 +6,12 @@ import rasterio
 
 from perilune_render.config_terrain import CratersConfig, ReliefConfig
 from perilune_render.terrain.craters import draw_craters
-from perilune_render.terrain.elevation import base_heights, read_elevation, remarks, resolved_m
+from perilune_render.terrain.elevation.model import base_heights, read_elevation, remarks, resolved_m
+from perilune_render.terrain.elevation.surroundings import add_fitted_relief, fitted_relief, second_differences
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.relief import add_relief
 from perilune_render.terrain.scene import base_of, check_ground, grow_scene
 from perilune_render.terrain.stamp import stamp_craters
-from perilune_render.terrain.surroundings import add_fitted_relief, fitted_relief, second_differences
 from perilune_shared.errors import UserError
 from tests.render.conftest import config_with
 from tests.render.terrain.test_elevation import POLAR, write

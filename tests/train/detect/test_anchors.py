@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from perilune_train.detect.anchors import best_possible_recall, kmeans_anchors, mean_best_iou, size_iou
+from perilune_train.detect.train.anchors import best_possible_recall, kmeans_anchors, mean_best_iou, size_iou
 
 
 def test_size_iou_by_hand():

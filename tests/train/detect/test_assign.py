@@ -2,7 +2,7 @@
 
 import torch
 
-from perilune_train.detect.assign import Targets, assign, matching_anchors
+from perilune_train.detect.data.assign import Targets, assign, matching_anchors
 
 ANCHORS = torch.tensor([[[4.0, 4.0], [8.0, 8.0], [16.0, 16.0]], [[32.0, 32.0], [64.0, 64.0], [100.0, 100.0]]])
 SHAPES = [(2, 16, 16), (2, 8, 8)]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from perilune_train.detect.boxes import iou_matrix, suppress
+from perilune_train.detect.evaluate.boxes import iou_matrix, suppress
 
 
 def test_iou_by_hand():

@@ -6,9 +6,9 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from tests.coco_reference import coco_evaluation
 
-from perilune_train.detect.data import FrameLabels
-from perilune_train.detect.matching import COCO_IOUS, Detections, find_overlaps
-from perilune_train.detect.metrics import curve, figures_over_ious
+from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.evaluate.matching import COCO_IOUS, Detections, find_overlaps
+from perilune_train.detect.evaluate.metrics import curve, figures_over_ious
 
 SIZE_PX = 1000
 EVERY_RADIUS = (0.0, 1e9)

@@ -8,8 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import contrast
-from perilune_shared.manifest import open_dataset
-from perilune_shared.selection import SELECTIONS, read_labels, selected
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.selection import SELECTIONS, read_labels, selected
 
 
 def test_auc_by_hand():

@@ -9,14 +9,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perilune_shared.camera import Camera
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.frames import quaternion_from_matrix
-from perilune_shared.manifest import open_dataset
-from perilune_train.detect.augment import augment, grey_levels, rescale, turn
-from perilune_train.detect.batches import EvaluationFrames, TrainingFrames, loader
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import quaternion_from_matrix
 from perilune_train.detect.config import AugmentSettings, DetectConfig, LabelSettings
-from perilune_train.detect.data import load_split, unlabelled_craters
+from perilune_train.detect.data.augment import augment, grey_levels, rescale, turn
+from perilune_train.detect.data.batches import EvaluationFrames, TrainingFrames, loader
+from perilune_train.detect.data.split import load_split, unlabelled_craters
 
 PLAIN = AugmentSettings(flips_and_turns=False, gain=0.0, gamma=0.0, blur_px=0.0, noise=0.0)
 

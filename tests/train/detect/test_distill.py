@@ -7,17 +7,17 @@ import pytest
 import torch
 
 from perilune_shared.config import resolve
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_train import runs
-from perilune_train.detect.batches import EvaluationFrames, loader
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import load_split
-from perilune_train.detect.distill import Teacher, distill_loss
-from perilune_train.detect.run import build_network, label_sizes, load_detector, load_teacher, run_detect
-from perilune_train.detect.task import DetectTask
+from perilune_train.detect.data.batches import EvaluationFrames, loader
+from perilune_train.detect.data.split import load_split
+from perilune_train.detect.train.distill import Teacher, distill_loss
+from perilune_train.detect.train.run import build_network, label_sizes, load_detector, load_teacher, run_detect
+from perilune_train.detect.train.task import DetectTask
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.training import runs
 
 ANCHORS, STRIDES = torch.full((3, 3, 2), 8.0), (4, 8, 16)
 

@@ -11,15 +11,15 @@ from tests.coco_reference import coco_evaluation
 from typer.testing import CliRunner
 
 from perilune_shared.config import resolve
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
 from perilune_train.cli import app
 from perilune_train.detect.config import DetectConfig, LabelSettings
-from perilune_train.detect.data import FrameLabels, load_split
-from perilune_train.detect.facts import facts_of
-from perilune_train.detect.matching import COCO_IOUS, Detections, find_overlaps
-from perilune_train.detect.metrics import curve
-from perilune_train.detect.run import run_detect
+from perilune_train.detect.data.frame_facts import facts_of
+from perilune_train.detect.data.split import FrameLabels, load_split
+from perilune_train.detect.evaluate.matching import COCO_IOUS, Detections, find_overlaps
+from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.train.run import run_detect
 
 QUICK = ("detect.epochs=4", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
 

@@ -7,15 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from perilune_train.detect.bootstrap import average_precisions
-from perilune_train.detect.data import FrameLabels
-from perilune_train.detect.evaluation import evaluate_detections
-from perilune_train.detect.facts import FrameFacts, unknown_facts
-from perilune_train.detect.figures import choose_frames
-from perilune_train.detect.matching import FALSE, FOUND, Detections, Matches
-from perilune_train.detect.metrics import curve
-from perilune_train.detect.report import write_evaluation
-from perilune_train.spread import Spread, draw_resamples, read_spread
+from perilune_train.detect.data.frame_facts import FrameFacts, unknown_facts
+from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.evaluate.bootstrap import average_precisions
+from perilune_train.detect.evaluate.evaluation import evaluate_detections
+from perilune_train.detect.evaluate.figures import choose_frames
+from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections, Matches
+from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.evaluate.report import write_evaluation
+from perilune_train.evaluation.spread import Spread, draw_resamples, read_spread
 
 
 def circles(*rows):

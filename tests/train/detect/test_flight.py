@@ -11,16 +11,16 @@ import torch
 from torch import nn
 from typer.testing import CliRunner
 
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_train import runs
 from perilune_train.cli import app
 from perilune_train.data.frames import load_frames, normalised
-from perilune_train.detect import export, int8
-from perilune_train.detect.engines import onnxruntime_engine, openvino_engine, torch_engine
-from perilune_train.detect.flight import FlightDetector
+from perilune_train.detect.deploy import export, int8
+from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, torch_engine
+from perilune_train.detect.deploy.flight_detector import FlightDetector
 from perilune_train.detect.run_config import config_of_run
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.training import runs
 
 onnx = pytest.importorskip("onnx", reason="the extra `export` is not installed")
 SIZE = 96
@@ -117,7 +117,7 @@ def test_files_give_torchs_boxes_for_any_number_of_images(exported, images):
 INTERRUPTED = """
 import os, signal, sys, time
 from pathlib import Path
-from perilune_train.detect.engines import has_bf16, openvino_engine
+from perilune_train.detect.deploy.engines import has_bf16, openvino_engine
 for _ in range(3):
     engine = openvino_engine(Path(sys.argv[1]), threads=1)
 has_bf16()
@@ -165,7 +165,7 @@ def test_the_readmes_program_finds_what_we_find(exported, dataset_detect, images
     done = subprocess.run([sys.executable, "-c", program], cwd=exported, capture_output=True, text=True, check=True)
     boxes, scores = map(np.array, json.loads(done.stdout))
     from perilune_train.detect.config import EvaluationSettings
-    from perilune_train.detect.suppression import detections_of
+    from perilune_train.detect.inference.suppression import detections_of
 
     (own,) = detections_of(*lively().detect(torch.as_tensor(images[:1])), EvaluationSettings(min_score=0.4))
     assert len(own.scores) > 3

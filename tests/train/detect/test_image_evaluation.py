@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 
 from perilune_shared.errors import UserError
 from perilune_train.cli import app
-from perilune_train.detect.compare import compare_folders
-from perilune_train.detect.image_evaluation import evaluate_images, judge_images
-from perilune_train.detect.images import ImageSet, LabelledImage, read_images
-from perilune_train.detect.matching import Detections
-from perilune_train.detect.tiles import Tiling
+from perilune_train.detect.compare_runs import compare_folders
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.images.evaluate import evaluate_images, judge_images
+from perilune_train.detect.images.labelled import ImageSet, LabelledImage, read_images
+from perilune_train.detect.inference.tiles import Tiling
 
 
 def given(boxes, ends_at_edges=False):

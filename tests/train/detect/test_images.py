@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from perilune_shared.errors import UserError
-from perilune_train.detect.images import read_images, read_table
-from perilune_train.detect.pictures import picture_size, read_grey
+from perilune_train.detect.images.labelled import read_images, read_table
+from perilune_train.detect.images.read import picture_size, read_grey
 
 
 def picture(path, width=40, height=30):

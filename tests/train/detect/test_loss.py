@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from perilune_train.detect.assign import Targets
 from perilune_train.detect.config import LossSettings
-from perilune_train.detect.loss import ciou_loss, detection_loss
+from perilune_train.detect.data.assign import Targets
+from perilune_train.detect.train.loss import ciou_loss, detection_loss
 
 
 def test_equal_circles_cost_nothing():

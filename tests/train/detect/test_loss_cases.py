@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from perilune_train.detect.assign import Targets, assign
 from perilune_train.detect.config import LossSettings
-from perilune_train.detect.loss import ciou_loss, detection_loss
+from perilune_train.detect.data.assign import Targets, assign
+from perilune_train.detect.train.loss import ciou_loss, detection_loss
 
 ANCHORS = torch.tensor([[[8.0, 8.0], [16.0, 16.0], [30.0, 30.0]]])
 LN2 = math.log(2)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from perilune_train.detect.data import FrameLabels
-from perilune_train.detect.matching import (
+from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.evaluate.matching import (
     FALSE,
     FOUND,
     IGNORED,
@@ -14,7 +14,7 @@ from perilune_train.detect.matching import (
     find_overlaps,
     match_split,
 )
-from perilune_train.detect.metrics import Curve, at_threshold, curve, figures
+from perilune_train.detect.evaluate.metrics import Curve, at_threshold, curve, figures
 
 
 def square(x, y, side=10.0):

@@ -8,7 +8,7 @@ import pytest
 import rasterio
 
 from perilune_shared.errors import UserError
-from perilune_train.detect.pictures import picture_format, picture_size, read_grey
+from perilune_train.detect.images.read import picture_format, picture_size, read_grey
 
 ISIS_NULL = -3.4028226550889045e38
 

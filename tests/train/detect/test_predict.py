@@ -13,12 +13,12 @@ from tests.stored_run import THRESHOLD, settings_of, store_run
 from typer.testing import CliRunner
 
 from perilune_shared.errors import UserError
-from perilune_shared.frames import MOON_RADIUS_M
+from perilune_shared.geometry.frames import MOON_RADIUS_M
 from perilune_train.cli import app
-from perilune_train.detect.georeference import MOON_CRS, features, read_georeference
-from perilune_train.detect.matching import Detections
-from perilune_train.detect.predict import predict_images
-from perilune_train.detect.tiles import Tiling
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.images.georeference import MOON_CRS, features, read_georeference
+from perilune_train.detect.images.predict import predict_images
+from perilune_train.detect.inference.tiles import Tiling
 
 EARTH = CRS.from_epsg(4326)
 POLAR = CRS.from_proj4(f"+proj=stere +lat_0=-90 +R={MOON_RADIUS_M:.0f} +units=m +no_defs")

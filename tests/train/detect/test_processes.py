@@ -14,9 +14,9 @@ from tests import in_process
 from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
 from perilune_train.cli import main
-from perilune_train.detect.batches import Share
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.run import run_detect
+from perilune_train.detect.data.batches import Share
+from perilune_train.detect.train.run import run_detect
 
 SETTINGS = ("detect.precision=float32", "detect.device=cpu", "detect.checkpoint_minutes=0")
 BATCHES = 6

@@ -8,17 +8,17 @@ import pytest
 import torch
 
 from perilune_shared.config import resolve
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_shared.pack import pack
 from perilune_shared.yaml_text import parse_yaml
-from perilune_train import runs
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.loss import detection_loss
-from perilune_train.detect.run import build_network, load_detector, run_detect
 from perilune_train.detect.run_config import config_of_run
-from perilune_train.detect.task import DetectTask
-from perilune_train.detect.transfer import start_from
+from perilune_train.detect.train.loss import detection_loss
+from perilune_train.detect.train.run import build_network, load_detector, run_detect
+from perilune_train.detect.train.task import DetectTask
+from perilune_train.detect.train.transfer import start_from
+from perilune_train.training import runs
 
 QUICK = ("detect.epochs=2", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
 
@@ -148,7 +148,7 @@ def test_a_finished_run_is_left_as_it_is(finished, few, tmp_path, capsys):
 @pytest.fixture
 def unjudged(monkeypatch):
     """Runs are trained alone: judging takes most of the time of a small one."""
-    monkeypatch.setattr("perilune_train.detect.run.evaluate", lambda *_: {})
+    monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
 
 
 def test_weights_to_start_from_are_not_needed_to_go_on(finished, few, tmp_path, unjudged):
@@ -172,7 +172,7 @@ def test_the_anchors_are_told_before_training(few, tmp_path, monkeypatch, capsys
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("perilune_train.detect.run.fit", stopped)
+    monkeypatch.setattr("perilune_train.detect.train.run.fit", stopped)
     with pytest.raises(KeyboardInterrupt):
         run_detect(settings(), few, tmp_path, "a")
     assert "anchors: best possible recall" in capsys.readouterr().err
@@ -191,7 +191,7 @@ def test_a_run_in_bfloat16(few, tmp_path, monkeypatch):
         coarse.extend(torch.equal(part, part.bfloat16().float()) for part in outputs)
         return detection_loss(outputs, *more)
 
-    monkeypatch.setattr("perilune_train.detect.task.detection_loss", recorded)
+    monkeypatch.setattr("perilune_train.detect.train.task.detection_loss", recorded)
     run = run_detect(settings("detect.epochs=1", "detect.precision=bf16"), few, tmp_path, "a")
     assert coarse and all(coarse)
     weights = runs.load_weights(run.best)["state_dict"].values()

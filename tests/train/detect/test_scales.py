@@ -8,10 +8,10 @@ from tests.stored_run import settings_of, store_run
 
 from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
-from perilune_train.detect.boxes import suppress
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.predict import open_detector
-from perilune_train.detect.scales import detect_at_scales, multiply_adds_of_a_frame, resized, scaled_size
+from perilune_train.detect.evaluate.boxes import suppress
+from perilune_train.detect.images.predict import open_detector
+from perilune_train.detect.inference.scales import detect_at_scales, multiply_adds_of_a_frame, resized, scaled_size
 from perilune_train.models.size import multiply_adds
 
 

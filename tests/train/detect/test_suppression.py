@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from perilune_train.detect.boxes import suppress
-from perilune_train.detect.suppression import suppress_batch
+from perilune_train.detect.evaluate.boxes import suppress
+from perilune_train.detect.inference.suppression import suppress_batch
 
 
 def crowd(rng: np.random.Generator, count: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -7,15 +7,15 @@ import pytest
 import torch
 from torch import nn
 
-from perilune_shared.manifest import open_dataset
-from perilune_train.detect.batches import EvaluationFrames, loader
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.detect.config import AugmentSettings, DetectConfig, EvaluationSettings, LabelSettings
-from perilune_train.detect.data import load_split
-from perilune_train.detect.loss import detection_loss
-from perilune_train.detect.metrics import curve
-from perilune_train.detect.run import build_network, judge, label_sizes
-from perilune_train.detect.suppression import detections_of
-from perilune_train.detect.task import DetectTask, learning_rate_factor, pairs, update_average
+from perilune_train.detect.data.batches import EvaluationFrames, loader
+from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.detect.train.loss import detection_loss
+from perilune_train.detect.train.run import build_network, judge, label_sizes
+from perilune_train.detect.train.task import DetectTask, learning_rate_factor, pairs, update_average
 
 
 def test_learning_rate_by_hand():

@@ -7,11 +7,11 @@ import torch
 from tests.stored_run import settings_of, store_run
 
 from perilune_shared.errors import UserError
-from perilune_train.detect.boxes import iou_matrix, suppress
-from perilune_train.detect.predict import open_detector
-from perilune_train.detect.scales import detect_at_scales
-from perilune_train.detect.suppression import detections_of
-from perilune_train.detect.tiles import (
+from perilune_train.detect.evaluate.boxes import iou_matrix, suppress
+from perilune_train.detect.images.predict import open_detector
+from perilune_train.detect.inference.scales import detect_at_scales
+from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.detect.inference.tiles import (
     Detector,
     Tiling,
     count_tiles,

@@ -10,18 +10,18 @@ from tests.train.models import darknet_by_hand as by_hand
 from typer.testing import CliRunner
 
 from perilune_shared.config import resolve
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_train import runs
 from perilune_train.cli import app
 from perilune_train.detect.config import DetectConfig, LabelSettings
-from perilune_train.detect.data import load_split
-from perilune_train.detect.run import build_network, label_sizes, run_detect
-from perilune_train.detect.task import DetectTask
-from perilune_train.detect.transfer import darknet_content, rescale_input, start_from
+from perilune_train.detect.data.split import load_split
+from perilune_train.detect.train.run import build_network, label_sizes, run_detect
+from perilune_train.detect.train.task import DetectTask
+from perilune_train.detect.train.transfer import darknet_content, rescale_input, start_from
 from perilune_train.models.darknet import AttentionDarknet53
 from perilune_train.models.darknet_weights import read_darknet, write_darknet
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.training import runs
 
 N_BACKBONE = 40_620_640
 FULL = DetectConfig(attention="cbam_identity")

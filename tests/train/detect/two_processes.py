@@ -6,10 +6,11 @@ from pathlib import Path
 import torch
 
 from perilune_shared.config import resolve
-from perilune_train import runs
-from perilune_train.detect import report, task
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.run import run_detect
+from perilune_train.detect.evaluate import report
+from perilune_train.detect.train import task
+from perilune_train.detect.train.run import run_detect
+from perilune_train.training import runs
 
 
 def main(dataset: Path, out: Path, *settings: str) -> None:

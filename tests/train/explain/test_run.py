@@ -9,19 +9,19 @@ import torch
 from tests.stored_run import store_run
 from tests.terrain_record import store_record, uses_of
 
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.selection import read_labels
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
-from perilune_shared.selection import read_labels
 from perilune_train.data.frames import load_frames
-from perilune_train.detect.evaluate_command import config_of_run
-from perilune_train.detect.run import load_detector
+from perilune_train.detect.cli.evaluate import config_of_run
+from perilune_train.detect.train.run import load_detector
+from perilune_train.evaluation.provenance import training_provenance
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.masks import caption, detector_masks, draw_masks, navigator_masks
 from perilune_train.explain.run import detect_frames, explain_run
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
-from perilune_train.provenance import training_provenance
-from perilune_train.runs import save_weights
+from perilune_train.training.runs import save_weights
 
 _BLOCKS = [f"B_{i + 1}{j + 1}" for i, count in enumerate((1, 2, 8, 8, 4)) for j in range(count)]
 _DETECTOR = {"in_channels": 1, "width": 0.125, "attention": "cbam", "strides": [4, 8, 16]}

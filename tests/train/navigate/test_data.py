@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from perilune_shared.camera import Camera
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.frames import matrix_from_rotation_vector
-from perilune_shared.manifest import open_dataset
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.navigate import data
 from perilune_train.navigate.data import Jitter, load_descents, mirrored, pair_sequence
 from perilune_train.navigate.epochs import EpochBatches

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_shared.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.navigate.data import load_descents
 from perilune_train.navigate.klt import klt_descent, klt_motion
 from perilune_train.navigate.metrics import motion_errors, summary

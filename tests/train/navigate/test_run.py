@@ -5,14 +5,14 @@ import pandas as pd
 import pytest
 import torch
 
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import open_dataset
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data import load_descents, pair_sequence
 from perilune_train.navigate.run import navigate_run
 from perilune_train.navigate.task import NavigationTask, Scales, load_navigator, predict, translation_units
-from perilune_train.runs import save_weights
+from perilune_train.training.runs import save_weights
 
 _NETWORK = {
     "size_px": 64,

@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
-from perilune_shared.manifest import Dataset
-from perilune_shared.png import png_header
 from perilune_shared.progress import progress_bar
+from perilune_shared.storage.png import png_header
 
 _AT_ONCE = 256
 """Packed frames that wait for a free thread."""

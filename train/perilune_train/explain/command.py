@@ -7,8 +7,8 @@ import typer
 
 from perilune_shared.config import resolve
 from perilune_shared.progress import console
+from perilune_train.evaluation.overlap_option import AllowOverlap
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.overlap_option import AllowOverlap
 
 
 def explain(

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from perilune_shared.camera import Camera, camera_from_site
-from perilune_shared.frames import Array
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.frames import Array
 from perilune_train.navigate.geometry import pixel_index_homography
 
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
-from perilune_shared.files import write_bytes
+from perilune_shared.storage.files import write_bytes
 from perilune_train.data.frames import normalised
 from perilune_train.explain.correlation import is_constant
 from perilune_train.models.darknet import AttentionDarknet53

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 from perilune_train.explain.correlation import mean_defined, mean_of_others, pearson, pearson_between, warped_mask
 from perilune_train.explain.masks import Masks
 

@@ -10,24 +10,24 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.files import written_aside
-from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
-from perilune_train.begin import hashes_of, start_run, state_of
+from perilune_shared.storage.files import written_aside
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data import load_split
-from perilune_train.detect.run import load_detector, selection_used
+from perilune_train.detect.data.split import load_split
 from perilune_train.detect.run_config import config_of_run
+from perilune_train.detect.train.run import load_detector, selection_used
+from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation import ground_affine, ground_truth_mask
 from perilune_train.explain.masks import Masks, detector_masks, draw_masks, navigator_masks
 from perilune_train.explain.measures import PCC1_SIGN, detector_correlations, navigator_correlations
-from perilune_train.marks import mark_files
 from perilune_train.navigate.data import Descent, load_descents, pair_sequence
 from perilune_train.navigate.task import load_navigator
-from perilune_train.provenance import check_terrain, protocol_of, read_provenance
-from perilune_train.runs import RunFolder, choose_device, load_weights, write_metrics
+from perilune_train.training.begin import hashes_of, start_run, state_of
+from perilune_train.training.runs import RunFolder, choose_device, load_weights, write_metrics
 
 _DETECT_BARS = {
     "pcc1_background": "PCC1: mask and G (1 on background)",

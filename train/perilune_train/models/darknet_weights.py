@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from perilune_shared.errors import UserError
-from perilune_shared.files import write_bytes
+from perilune_shared.storage.files import write_bytes
 from perilune_train.models.darknet import UNITS, AttentionDarknet53
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, OUTPUTS, YOLOv3
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from perilune_shared.camera import Camera
-from perilune_shared.descent import NominalDescent
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.schema import SPLITS
 from perilune_shared.errors import UserError
-from perilune_shared.frames import Array, matrix_from_quaternion, matrix_from_rotation_vector
-from perilune_shared.manifest import Dataset
-from perilune_shared.schema import SPLITS
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.descent import NominalDescent
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion, matrix_from_rotation_vector
 from perilune_train.data.frames import load_frames, normalised
 from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography, relative_poses
 

@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from perilune_shared.files import written_aside
+from perilune_shared.storage.files import written_aside
 from perilune_train.navigate.data import Descent
 from perilune_train.navigate.geometry import dead_reckoning
 from perilune_train.navigate.metrics import Motion

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn import functional
 
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 
 
 def relative_poses(position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> tuple[Array, Array]:

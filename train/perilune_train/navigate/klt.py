@@ -9,8 +9,8 @@ reprojection error with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/004017
 import cv2
 import numpy as np
 
-from perilune_shared.camera import Camera
-from perilune_shared.frames import Array, matrix_from_rotation_vector
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_train.data.frames import normalised
 from perilune_train.navigate.data import Descent
 from perilune_train.navigate.geometry import (

@@ -3,10 +3,10 @@
 import numpy as np
 import pandas as pd
 
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
+from perilune_train.evaluation.spread import Resamples, Spread, draw_resamples, spreads
 from perilune_train.navigate.data import Descent
 from perilune_train.navigate.geometry import dead_reckoning, rotation_vectors
-from perilune_train.spread import Resamples, Spread, draw_resamples, spreads
 
 Motion = tuple[Array, Array]
 """translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one descent."""

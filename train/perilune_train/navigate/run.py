@@ -9,13 +9,18 @@ import lightning
 import pandas as pd
 from torch import Tensor
 
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.files import written_aside
-from perilune_shared.manifest import open_dataset
 from perilune_shared.progress import console, progress_bar
-from perilune_train.begin import hashes_of, start_run, state_of
-from perilune_train.fit import fit
-from perilune_train.marks import mark_files
+from perilune_shared.storage.files import written_aside
+from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.provenance import (
+    Provenance,
+    check_terrain,
+    protocol_of,
+    read_provenance,
+    training_provenance,
+)
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data import Descent, load_descents
 from perilune_train.navigate.figures import draw_descent, draw_errors
@@ -29,14 +34,9 @@ from perilune_train.navigate.metrics import (
     summary_spreads,
 )
 from perilune_train.navigate.task import Fusion, NavigationTask, load_navigator, predict
-from perilune_train.provenance import (
-    Provenance,
-    check_terrain,
-    protocol_of,
-    read_provenance,
-    training_provenance,
-)
-from perilune_train.runs import (
+from perilune_train.training.begin import hashes_of, start_run, state_of
+from perilune_train.training.fit import fit
+from perilune_train.training.runs import (
     RunFolder,
     check_architecture,
     choose_device,

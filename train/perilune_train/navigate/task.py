@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from perilune_shared.frames import Array
+from perilune_shared.geometry.frames import Array
 from perilune_train.models.navigator import StackNavigator, WarpNavigator
 from perilune_train.navigate.config import FusionConfig, NavigateConfig
 from perilune_train.navigate.data import Descent, Jitter, Sequence, pair_sequence
@@ -22,7 +22,7 @@ from perilune_train.navigate.geometry import (
     rotation_vectors,
 )
 from perilune_train.navigate.metrics import Motion, motion_errors, summary
-from perilune_train.runs import check_architecture, fill, load_weights
+from perilune_train.training.runs import check_architecture, fill, load_weights
 
 Fusion = Literal["warp", "stack"]
 

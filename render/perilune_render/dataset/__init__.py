@@ -1,0 +1,1 @@
+"""Datasets: render, resume, regenerate, develop, preview."""

@@ -1,0 +1,176 @@
+"""What every command that makes a dataset does alike: begin or go on, write a PNG, draw the overview."""
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from perilune_render.config import DatasetConfig
+from perilune_render.flight.plan import Plan
+from perilune_render.labels.drawing import draw_labels, enlarge, write_sheet
+from perilune_render.labels.frame_labels import Labels
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
+from perilune_shared.dataset.parts import read_part
+from perilune_shared.dataset.schema import SCHEMA_VERSION
+from perilune_shared.dataset.selection import SELECTIONS, selected
+from perilune_shared.errors import UserError
+from perilune_shared.storage import files
+from perilune_shared.storage.checksums import SUMS_NAME, seal
+from perilune_shared.storage.locks import LOCK_NAME, locked
+
+LICENCE = "CC-BY-4.0"
+_SHEET_FRAMES = 12
+_SAME_PLACE_M = 1e-6
+
+
+def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
+    """The dataset.json of a dataset that is begun."""
+    settings = config.kind(recipe.kind)
+    split_by = settings.split_by
+    if split_by == "scene" and config.terrain.dem is not None and settings.n_scenes > 1:
+        split_by = "trajectory"  # all scenes are of the elevation model's one ground
+    return DatasetInfo(
+        name=f"perilune-{config.name}-{recipe.kind}",
+        kind=recipe.kind,
+        schema_version=SCHEMA_VERSION,
+        complete=False,
+        images="files",
+        split_by=split_by,
+        camera=CameraInfo.of(plan.camera),
+        exr_camera=CameraInfo.of(plan.exr_camera) if config.render.exr else None,
+        recipes=recipes_of(recipe),
+        counts=Counts(),
+        licence=LICENCE,
+    )
+
+
+def writing(out: Path) -> contextlib.AbstractContextManager[None]:
+    """The lock of a dataset's folder, but none where the dataset is finished: it is only read, perhaps from a disk that
+    cannot be written."""
+    return contextlib.nullcontext() if (out / SUMS_NAME).exists() else locked(out)
+
+
+def sync_frames(root: Path, rows: list[dict[str, Any]]) -> None:
+    """Wait until the files of frames, given by their columns png_path and exr_path, are on the disk.
+
+    Frames are written without waiting. Once they stand in the manifest they count as finished.
+    """
+    files.sync_all(root / row[name] for row in rows for name in ("png_path", "exr_path") if row.get(name) is not None)
+
+
+def is_begun(out: Path) -> bool:
+    """Whether a folder holds a dataset. Raises UserError where it holds something else."""
+    begun = (out / "dataset.json").exists()
+    if not begun and out.exists() and any(not path.name.startswith(LOCK_NAME) for path in out.iterdir()):
+        wanted = "an empty or new folder, or a dataset to resume"
+        raise UserError(out, "--out", "a folder with other content", wanted)
+    return begun
+
+
+def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
+    """Write the dataset.json of a new dataset, or read that of one that was begun with the same settings.
+
+    Raises UserError where `out` holds something else.
+    """
+    if not is_begun(out):
+        write_info(out, info)
+        return info
+    existing = open_dataset(out).info
+    if len(existing.recipes) != 1 or existing.history != info.history:
+        raise UserError(out, "--out", f"a dataset put together otherwise: {existing.name}", "another folder")
+    if existing.images != info.images:
+        raise UserError(out, "--out", f"a dataset whose frames are {existing.images}", "another folder")
+    for name in ("kind", "config", "versions", "developed_from"):
+        theirs, ours = (_compared(each.recipe(), name) for each in (existing, info))
+        if theirs != ours:
+            raise UserError(
+                out / "dataset.json",
+                name,
+                first_difference(theirs, ours),
+                "the settings that this dataset was begun with, or another --out",
+            )
+    return existing
+
+
+def check_begun(out: Path, plan: Plan) -> None:
+    """Raises UserError where descents that a dataset holds already are not those of the plan it is to go on with.
+
+    Two manifests may tell of the same settings and differ in their descents, frames and splits.
+    """
+    planned = {f"{t.scene_id}.{t.trajectory_id}": t for t in plan.trajectories}
+    for part in sorted(out.joinpath("manifest", "frames").glob("[A-Za-z0-9]*.parquet")):
+        own = planned.get(part.stem)
+        rows = read_part(part, "frames", ["frame_index", "split", "position_m"])
+        if (
+            own is None
+            or rows["frame_index"].to_pylist() != list(own.frame_index)
+            or rows["split"].to_pylist() != list(own.splits)
+            or not np.allclose(rows["position_m"].to_pylist(), own.flight.position_m, rtol=0, atol=_SAME_PLACE_M)
+        ):
+            raise UserError(part, "frames", "those of another plan", "the manifest that it was begun with")
+    for part in sorted(out.joinpath("manifest", "trajectories").glob("[A-Za-z0-9]*.parquet")):
+        found = read_part(part, "trajectories", ["trajectory_id", "seed", "n_frames", "split"]).to_pydict()
+        wanted = [(t.trajectory_id, t.seed, len(t.splits), t.split) for t in plan.of_scene(part.stem)]
+        if list(zip(*found.values(), strict=True)) != wanted:
+            raise UserError(part, "trajectories", "those of another plan", "the manifest that it was begun with")
+
+
+def open_finished(out: Path) -> Dataset:
+    """A complete dataset; its checksums are written where it was stopped just before they were."""
+    if not (out / SUMS_NAME).exists():
+        seal(out)
+    return open_dataset(out)
+
+
+def _compared(recipe: Recipe, name: str) -> object:
+    """One field of a recipe, without the numbers of perilune's own releases: its code has hashes."""
+    value = getattr(recipe, name)
+    return {k: v for k, v in value.items() if not k.startswith("perilune")} if name == "versions" else value
+
+
+def first_difference(theirs: object, ours: object, path: str = "") -> str:
+    """The first setting, by name, in which two trees of plain data differ, with both values."""
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        for key in sorted({*theirs, *ours}):
+            if theirs.get(key) != ours.get(key):
+                return first_difference(theirs.get(key), ours.get(key), f"{path}.{key}".lstrip("."))
+    return f"{path} {theirs!r} there, {ours!r} asked for".strip()
+
+
+def write_png(root: Path, frame_id: str, image: np.ndarray, bits: int) -> dict[str, str | int]:
+    """Write a frame's PNG; its columns png_* of the manifest.
+
+    Above 8 bits a grey value stands in the upper bits of a 16-bit number, with zeros below.
+    """
+    path = f"frames/{frame_id}.png"
+    stored = image if bits == 8 else image << (16 - bits)
+    files.write_bytes(files.inside(root, path), cv2.imencode(".png", stored)[1].tobytes(), durable=False)
+    return file_columns(root, "png", path)
+
+
+def file_columns(root: Path, kind: str, path: str) -> dict[str, str | int]:
+    """The columns png_* or exr_* of a file that was written."""
+    whole = root / path
+    return {
+        f"{kind}_path": path,
+        f"{kind}_bytes": whole.stat().st_size,
+        f"{kind}_sha256": files.sha256_of(whole),
+    }
+
+
+def write_overview(dataset: Dataset) -> None:
+    """overview.png: frames from the whole dataset, each beside itself with its labels, green where they are visible."""
+    frames = dataset.table("frames", ["frame_id", "scene_id", "trajectory_id", "png_path"]).to_pandas()
+    chosen = frames.iloc[np.unique(np.linspace(0, len(frames) - 1, _SHEET_FRAMES).astype(int))]
+    pictures = []
+    for frame in chosen.itertuples():
+        image = cv2.imread(str(dataset.file(frame.png_path)), cv2.IMREAD_GRAYSCALE)
+        labels = dataset.table("labels", scene_id=frame.scene_id, trajectory_id=frame.trajectory_id).to_pandas()
+        craters = dataset.table("craters", ["crater_id", "depth_m", "diameter_m"], scene_id=frame.scene_id).to_pandas()
+        own = labels[labels["frame_id"] == frame.frame_id].merge(craters, on="crater_id")
+        drawn = draw_labels(image, Labels.from_table(own), selected(own, SELECTIONS["visible"]))
+        pictures += [enlarge(image, 2), drawn]
+    write_sheet(dataset.root / "overview.png", pictures, 6)

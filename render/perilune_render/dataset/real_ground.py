@@ -1,0 +1,58 @@
+"""How much of a frame shows real ground, and where the elevation model ends in it."""
+
+import cv2
+import numpy as np
+
+from perilune_render.terrain.elevation.model import ElevationModel
+from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.scene import Scene
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.frames import Array, site_from_selenographic
+
+_POINTS_PER_SIDE = 200
+_OUTLINE = (230, 190, 60)
+
+
+def real_ground_share(
+    scene: Scene, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth_m: np.ndarray
+) -> float:
+    """Share of a frame's pixels on the ground that lie on known ground of the elevation model; 0 where none does.
+
+    depth_m (h, w) is along the camera's axis, infinite where nothing is hit.
+    """
+    hit = np.isfinite(depth_m)
+    if not hit.any() or not scene.real.any():
+        return 0.0
+    seen = camera.rays(camera.pixel_centres()[hit]) * depth_m[hit][:, None]
+    place = seen @ rotation_camera_from_site + position_m
+    return float((value_at(scene.real.astype(np.float64), scene.grid, place[:, 0], place[:, 1]) > 0.5).mean())
+
+
+def outline_m(model: ElevationModel) -> Array:
+    """Places (N, 2) in O_L's plane, metres, around the edge of an elevation model's raster."""
+    rows, columns = model.height_m.shape
+    along, zero = np.linspace(0, 1, _POINTS_PER_SIDE, endpoint=False), np.zeros(_POINTS_PER_SIDE)
+    column = np.concatenate([along, zero + 1, 1 - along, zero]) * columns
+    row = np.concatenate([zero, along, zero + 1, 1 - along]) * rows
+    latitude, longitude = model.selenographic(column, row)
+    x, y = site_from_selenographic(latitude, longitude, model.latitude_deg, model.longitude_deg)
+    return np.stack([x, y], axis=-1)
+
+
+def draw_outline(
+    picture: np.ndarray,
+    outline: Array,
+    scene: Scene,
+    camera: Camera,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+) -> None:
+    """Draw the model's outline (N, 2) on a colour picture of a frame, of any whole scale, in place."""
+    scale = picture.shape[1] / camera.width_px
+    height = value_at(scene.height_m.astype(np.float64), scene.grid, outline[:, 0], outline[:, 1])
+    pixels = camera.project(camera_from_site(np.column_stack([outline, height]), position_m, rotation_camera_from_site))
+    for first, second in zip(pixels, np.roll(pixels, -1, axis=0), strict=True):
+        ends = np.array([first, second]) * scale
+        if np.isfinite(ends).all() and (np.abs(ends) < 1e4).all():
+            (a, b), (c, d) = np.rint(ends).astype(int).tolist()
+            cv2.line(picture, (a, b), (c, d), _OUTLINE, 1, cv2.LINE_AA)

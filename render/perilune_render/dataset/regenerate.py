@@ -1,0 +1,217 @@
+"""Frames of a manifest made again from the manifest alone: seeds, poses and the recorded recipe.
+
+On the same kind of machine a frame comes out byte for byte. Elsewhere rays may meet the ground a rounding apart, which
+can move single pixels: then the two are compared within a stated tolerance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.progress import Progress
+
+from perilune_render.blender.renderer import Renderer
+from perilune_render.config import CameraConfig, DatasetConfig
+from perilune_render.dataset.frame import Shot, Studio
+from perilune_render.dataset.tables import ground_tables
+from perilune_render.flight.plan import camera_of
+from perilune_render.flight.pose_checks import Poses, check_poses
+from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
+from perilune_render.imaging.exr import read_exr
+from perilune_render.imaging.sensor import FixedPattern
+from perilune_render.interrupts import interrupts_held
+from perilune_render.labels.frame_labels import RimCircles
+from perilune_render.provenance.recipe import config_of, same_source
+from perilune_render.terrain.cache import cached_scene
+from perilune_shared.config import resolve_over
+from perilune_shared.content import content_sha256
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import Recipe
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import sha256_of
+from perilune_shared.storage.locks import locked
+from perilune_shared.storage.png import png_header
+
+GREY_TOLERANCE = 2
+"""Grey levels of 255 by which pixels may differ."""
+RELATIVE_TOLERANCE = 1e-3
+"""Relative difference by which values of an EXR may differ."""
+OUTLIERS = 0.001
+"""Share of pixels that may differ by more: rays that meet another facet."""
+State = Literal["identical", "within tolerance", "different", "new"]
+_ORDER: tuple[State, ...] = ("identical", "new", "within tolerance", "different")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How one frame came out."""
+
+    frame_id: str
+    """Of the manifest."""
+    png: State
+    """The PNG against the manifest's hash, else against the dataset's own file; new where the manifest has no hash."""
+    exr: State | None
+    """The EXR likewise; None where the frame has none."""
+    same_ground: bool
+    """Whether craters and boulders have the content that the scene's row states."""
+    png_path: Path
+    """The new PNG."""
+
+    @property
+    def state(self) -> State:
+        """The worse of both files."""
+        return max((state for state in (self.png, self.exr) if state is not None), key=_ORDER.index)
+
+
+def regenerate(
+    dataset: Dataset,
+    frame_ids: Sequence[str],
+    out: Path,
+    progress: Progress,
+    dem: Path | None = None,
+    catalogue: Path | None = None,
+) -> list[Outcome]:
+    """Make frames again as `out`/frames/<frame_id>.png and .exr, and compare them.
+
+    `dem` and `catalogue` are this machine's copies of files that the recipes name; the manifest's own paths are never
+    opened. Raises UserError on frames that the manifest has not, on recipes that this version cannot follow, and where
+    `out` is a dataset.
+    """
+    if (out / "dataset.json").exists():
+        raise UserError(out, "--out", "a dataset, whose frames would be replaced", "another folder")
+    frames = dataset.table("frames")
+    known = set(frames["frame_id"].to_pylist())
+    for frame_id in frame_ids:
+        if frame_id not in known:
+            raise UserError(dataset.root, "frame_id", frame_id, f"a frame of the manifest, such as {min(known)}")
+    frames = frames.filter(pc.is_in(frames["frame_id"], pa.array(list(frame_ids), pa.string())))
+    task = progress.add_task("regenerate", total=len(frames), unit="frames", note="")
+    outcomes = []
+    with locked(out):
+        for scene in dataset.table("scenes").sort_by("scene_id").to_pylist():
+            own = frames.filter(pc.equal(frames["scene_id"], scene["scene_id"])).sort_by("frame_id").to_pylist()
+            if own:
+                progress.update(task, note=f"{scene['scene_id']}: growing")
+                outcomes += _of_scene(dataset, scene, own, out, dem, catalogue, lambda: progress.advance(task))
+    return outcomes
+
+
+def spread(dataset: Dataset, n_frames: int) -> list[str]:
+    """Ids of frames evenly spread over a dataset."""
+    ids = sorted(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())
+    return [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(n_frames, len(ids))).round().astype(int))]
+
+
+def _of_scene(
+    dataset: Dataset, scene: dict, rows: list[dict], out: Path, dem: Path | None, catalogue: Path | None, advance
+) -> list[Outcome]:
+    where = dataset.root / "dataset.json"
+    recipe = dataset.info.recipes.get(scene["recipe"])
+    if recipe is None:
+        raise UserError(where, "recipes", f"no {scene['recipe']}", f"the recipe of {scene['scene_id']}")
+    seeds = dataset.table("trajectories", ["trajectory_id", "seed"], scene_id=scene["scene_id"]).to_pydict()
+    seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
+    for row in rows:
+        if row["trajectory_id"] not in seed_of:
+            raise UserError(dataset.root, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
+    config = config_of(recipe, where, dem, catalogue)
+    ground_config = _ground_config(recipe, config, where)
+    camera, flight = camera_of(config.camera), ground_config.ground_flight(recipe.kind)
+    exr_camera = camera_of(ground_config.camera).covering_pinhole()
+    if camera != dataset.info.camera.intrinsics():
+        raise UserError(where, "camera", dataset.info.camera.intrinsics(), f"that of its recipe, {camera}")
+    with interrupts_held():
+        ground = cached_scene(ground_config, exr_camera, flight, scene["seed"])
+    if not same_source(ground.dem_source, scene["dem_source"]):
+        raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
+    poses = (np.array([row[name] for row in rows]) for name in ("position_m", "rotation_wxyz"))
+    check_poses(Poses([row["frame_id"] for row in rows], *poses), exr_camera, ground, dataset.root)
+    tables = ground_tables(scene["scene_id"], ground)
+    same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
+    sun = np.array(rows[0]["sun_direction"])
+    pattern = FixedPattern.draw(config.sensor, camera, config.seed)
+    studio = Studio(config, camera, exr_camera, pattern, RimCircles.of_scene(ground), sun)
+    outcomes, dark = [], []
+    with Renderer(ground, ground_config, exr_camera, sun) as renderer:
+        for row in rows:
+            shot = Shot.recorded(row, seed_of[row["trajectory_id"]])
+            radiance = renderer.render(shot.position_m, shot.rotation_camera_from_site, seed=shot.render_seed)
+            studio.write_png(out, shot, radiance)
+            # Frames that were developed again have no EXR, though their recipe has.
+            if row["exr_path"] is not None:
+                studio.write_exr(out, shot, radiance)
+            png = _compared(dataset, row, "png", out)
+            exr = _compared(dataset, row, "exr", out) if row["exr_path"] is not None else None
+            outcomes.append(Outcome(row["frame_id"], png, exr, same_ground, out / f"frames/{row['frame_id']}.png"))
+            if is_dark(radiance):
+                dark.append(row["frame_id"])
+            advance()
+    warn_of_dark_frames(scene["scene_id"], dark, len(rows), scene["sun_elevation_deg"])
+    return outcomes
+
+
+def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> DatasetConfig:
+    """The settings that ground and EXRs were made by: of a dataset that was developed again, with the first camera."""
+    origin = recipe.developed_from
+    if origin is None:
+        return config
+    if origin.camera_config is None:
+        raise UserError(
+            where, "developed_from", "no camera", "a dataset that says which camera its ground was made for"
+        )
+    camera = resolve_over(CameraConfig, "dataset.camera", str(where), origin.camera_config)
+    return config.model_copy(update={"camera": camera})
+
+
+def _compared(dataset: Dataset, row: dict, kind: str, out: Path) -> State:
+    """A new file against the hash of the old one, and against the old file where it is here and the hash differs."""
+    new = out / f"frames/{row['frame_id']}.{kind}"
+    if row[f"{kind}_sha256"] is None:
+        return "new"
+    if sha256_of(new) == row[f"{kind}_sha256"]:
+        return "identical"
+    try:
+        if kind == "png" and dataset.info.images in ("files", "packed"):
+            frames = dataset.table("frames", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
+            old = dict(dataset.pngs(frames.filter(pc.equal(frames["frame_id"], row["frame_id"]))))[row["frame_id"]]
+            return _state(png_far(old, new.read_bytes()))
+        if kind == "exr" and dataset.info.images == "files":
+            return _state(exr_far(read_exr(dataset.file(row["exr_path"])), read_exr(new)))
+    except UserError:
+        pass  # the old file is missing or damaged, and the hash differs
+    return "different"
+
+
+def _state(far: float) -> State:
+    return "within tolerance" if far <= OUTLIERS else "different"
+
+
+def png_far(first: bytes, second: bytes) -> float:
+    """Share of the pixels of two PNGs that differ by more than GREY_TOLERANCE; 1 where they are not of one shape."""
+    try:
+        # A small file may unpack to any size.
+        if png_header(first) != png_header(second):
+            return 1.0
+    except ValueError:
+        return 1.0
+    one, two = (cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) for png in (first, second))
+    if one is None or two is None or one.shape != two.shape or one.dtype != two.dtype:
+        return 1.0
+    scale = 255 / np.iinfo(one.dtype).max
+    return float((np.abs(one.astype(float) - two) * scale > GREY_TOLERANCE).mean())
+
+
+def exr_far(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> float:
+    """Largest share, over the channels, of pixels that differ by more than RELATIVE_TOLERANCE."""
+    if {k: v.shape for k, v in first.items()} != {k: v.shape for k, v in second.items()}:
+        return 1.0
+    shares = []
+    for name, one in first.items():
+        close = np.isclose(one, second[name], rtol=RELATIVE_TOLERANCE, atol=RELATIVE_TOLERANCE, equal_nan=True)
+        shares.append(1 - float(close.mean()))
+    return max(shares, default=1.0)

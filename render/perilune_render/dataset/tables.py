@@ -1,0 +1,165 @@
+"""The manifest's rows, from scenes, plans and labels."""
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import ArrayLike
+
+from perilune_render.config import DatasetConfig
+from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
+from perilune_render.labels.frame_labels import Labels
+from perilune_render.terrain.craters import ORIGINS
+from perilune_render.terrain.scene import Scene
+from perilune_shared.content import content_sha256
+from perilune_shared.dataset.schema import TABLES, complete
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, selenographic_from_site
+
+_CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
+_FILES = ("png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
+_OF_LABELS = ("n_craters_above_max_radius",)
+
+
+def _table(name: str, columns: dict) -> pa.Table:
+    return complete(name, pa.table(columns, schema=pa.schema([TABLES[name].field(column) for column in columns])))
+
+
+def _vectors(values: ArrayLike) -> pa.Array:
+    rows = np.asarray(values, np.float64)
+    return pa.FixedSizeListArray.from_arrays(pa.array(rows.ravel()), rows.shape[1])
+
+
+def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
+    """Parts of the tables craters and boulders for one scene."""
+    craters, rims, boulders = scene.craters, scene.rims, scene.boulders
+    latitude, longitude = selenographic_from_site(craters.x_m, craters.y_m, scene.latitude_deg, scene.longitude_deg)
+    return {
+        "craters": _table(
+            "craters",
+            {
+                "scene_id": [scene_id] * len(craters),
+                "crater_id": np.arange(len(craters)),
+                "x_m": craters.x_m,
+                "y_m": craters.y_m,
+                "z_m": rims.z_m,
+                "normal_x": rims.normal[:, 0],
+                "normal_y": rims.normal[:, 1],
+                "normal_z": rims.normal[:, 2],
+                "diameter_m": craters.diameter_m,
+                "depth_m": rims.depth_m,
+                "fresh_depth_m": pa.array(craters.fresh_depth_m, from_pandas=True),
+                "age_myr": pa.array(craters.age_myr, from_pandas=True),
+                "origin": np.array(ORIGINS)[craters.origin],
+                "latitude_deg": latitude,
+                "longitude_deg": longitude,
+            },
+        ),
+        "boulders": _table(
+            "boulders",
+            {
+                "scene_id": [scene_id] * len(boulders),
+                "boulder_id": np.arange(len(boulders)),
+                "x_m": boulders.x_m,
+                "y_m": boulders.y_m,
+                "z_m": scene.boulder_z_m,
+                "diameter_m": boulders.diameter_m,
+                "shape_id": boulders.shape_id.astype(np.int64),
+                "rotation_wxyz": _vectors(boulders.rotation_wxyz.reshape(-1, 4)),
+            },
+        ),
+    }
+
+
+def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str) -> dict[str, pa.Table]:
+    """Parts of the tables scenes, craters and boulders for one scene, made by the recipe of a key."""
+    ground = ground_tables(plan.scene_id, scene)
+    return {
+        "scenes": _table(
+            "scenes",
+            {
+                "scene_id": [plan.scene_id],
+                "seed": [plan.seed],
+                "latitude_deg": [scene.latitude_deg],
+                "longitude_deg": [scene.longitude_deg],
+                "sun_azimuth_deg": [plan.sun_azimuth_deg],
+                "sun_elevation_deg": [plan.sun_elevation_deg],
+                "photometry": [config.light.photometry],
+                "dem_source": [scene.dem_source],
+                "extent_m": [scene.grid.extent_m],
+                "recipe": [recipe],
+                "content_sha256": [content_sha256(ground["craters"], ground["boulders"])],
+            },
+        ),
+        **ground,
+    }
+
+
+def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
+    """Part of the table trajectories: the descents over one scene."""
+    nominal = [trajectory.flight.nominal for trajectory in trajectories]
+    return _table(
+        "trajectories",
+        {
+            "scene_id": [t.scene_id for t in trajectories],
+            "trajectory_id": [t.trajectory_id for t in trajectories],
+            "seed": [t.seed for t in trajectories],
+            "n_frames": [len(t.splits) for t in trajectories],
+            "split": [t.split for t in trajectories],
+            "nominal_position_m": _vectors([n.position_m for n in nominal]),
+            "nominal_velocity_mps": _vectors([n.velocity_mps for n in nominal]),
+            "nominal_acceleration_mps2": _vectors([n.acceleration_mps2 for n in nominal]),
+            "duration_s": [n.duration_s for n in nominal],
+        },
+    )
+
+
+def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
+    """Part of the table frames: one descent. `files` holds the columns png_*, exr_* and what was measured of each."""
+    flight, n = trajectory.flight, len(trajectory.splits)
+    columns: dict = {
+        "frame_id": [trajectory.frame_id(i) for i in range(n)],
+        "scene_id": [trajectory.scene_id] * n,
+        "trajectory_id": [trajectory.trajectory_id] * n,
+        "frame_index": np.array(trajectory.frame_index),
+        "time_s": flight.time_s,
+        "split": list(trajectory.splits),
+        **{name: [getattr(camera, name)] * n for name in _CAMERA},
+        "position_m": _vectors(flight.position_m),
+        "rotation_wxyz": _vectors(flight.rotation_wxyz),
+        "velocity_mps": _vectors(flight.velocity_mps),
+        "sun_direction": _vectors(np.tile(sun, (n, 1))),
+        "real_ground_share": [row.get("real_ground_share") for row in files],
+    }
+    return _table("frames", columns | {name: [row.get(name) for row in files] for name in (*_FILES, *_OF_LABELS)})
+
+
+def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) -> pa.Table:
+    """Part of the table frames as in `table`, with another camera and other files (see `frame_table`)."""
+    columns = {name: table[name] for name in table.column_names}
+    columns |= {name: [getattr(camera, name)] * len(table) for name in _CAMERA}
+    renewed = (*_FILES, *(name for name in _OF_LABELS if name in files[0]))
+    return _table("frames", columns | {name: [row.get(name) for row in files] for name in renewed})
+
+
+def label_table(frame_id: str, labels: Labels) -> pa.Table:
+    """Rows of the table labels: one frame."""
+    e, boxes = labels.ellipses, labels.ellipses.bounding_boxes()
+    return _table(
+        "labels",
+        {
+            "frame_id": [frame_id] * len(labels.crater_id),
+            "crater_id": labels.crater_id.astype(np.int64),
+            "ellipse_cx_px": e.cx_px,
+            "ellipse_cy_px": e.cy_px,
+            "ellipse_a_px": e.a_px,
+            "ellipse_b_px": e.b_px,
+            "ellipse_theta_rad": e.theta_rad,
+            "bbox_x0_px": boxes[:, 0],
+            "bbox_y0_px": boxes[:, 1],
+            "bbox_x1_px": boxes[:, 2],
+            "bbox_y1_px": boxes[:, 3],
+            "radius_px": e.radius_px(),
+            "visible_fraction": labels.visible_fraction,
+            "sunlit_fraction": labels.sunlit_fraction,
+            "contrast": labels.contrast,
+        },
+    )

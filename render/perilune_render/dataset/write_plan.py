@@ -1,0 +1,62 @@
+"""A plan as a dataset without a frame: scenes, trajectories and frames as Parquet, for others to render."""
+
+from pathlib import Path
+
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_render.config import DatasetConfig
+from perilune_render.dataset import tables
+from perilune_render.dataset.output import info_of
+from perilune_render.flight.plan import make_plan
+from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
+from perilune_render.interrupts import interrupts_held
+from perilune_render.provenance.recipe import recipe_of
+from perilune_render.terrain.grid import graded_grid
+from perilune_render.terrain.scene import check_ground, grow_scene
+from perilune_shared.dataset.schema import TABLES, Kind
+from perilune_shared.dataset.writer import written
+from perilune_shared.geometry.frames import sun_direction
+
+
+def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> None:
+    """Write the plan of the dataset `detect` or `nav` into the new folder `out`.
+
+    Every scene is grown once, for the hash of its content; nothing is rendered. Raises UserError on faults of the
+    settings, or where `out` holds something.
+    """
+    plan, where = make_plan(config, kind), f"configuration: dataset.{kind}"
+    check_ground(config, plan.exr_camera, config.ground_flight(kind))
+    check_plan(plan, graded_grid(config, plan.exr_camera, config.ground_flight(kind)), where)
+    recipe = recipe_of(config, kind, preset, planned=True)
+    info = info_of(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
+    task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes", note="")
+    with written(out, info, whole_tables=True) as writer:
+        for scene_plan in plan.scenes:
+            with interrupts_held():
+                scene = grow_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
+            sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
+            trajectories = plan.of_scene(scene_plan.scene_id)
+            check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)
+            paths = ("png", "exr") if config.render.exr else ("png",)
+            frames = [
+                tables.frame_table(
+                    trajectory,
+                    plan.camera,
+                    sun,
+                    [
+                        {f"{kind}_path": f"frames/{trajectory.frame_id(i)}.{kind}" for kind in paths}
+                        for i in range(len(trajectory.splits))
+                    ],
+                )
+                for trajectory in trajectories
+            ]
+            writer.add_scene(
+                {
+                    "scenes": tables.scene_tables(scene_plan, scene, config, recipe.key)["scenes"],
+                    "trajectories": tables.trajectory_table(trajectories),
+                    "frames": pa.concat_tables(frames),
+                    **{name: TABLES[name].empty_table() for name in ("craters", "boulders", "labels")},
+                }
+            )
+            progress.advance(task)

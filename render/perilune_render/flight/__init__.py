@@ -1,0 +1,1 @@
+"""Plans: scenes, perturbed trajectories, poses, and the checks of poses."""

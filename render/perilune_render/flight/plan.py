@@ -1,0 +1,145 @@
+"""The plan: every scene, descent and frame of a dataset, decided before a pixel is rendered.
+
+The plan is plain data and follows from the configuration alone. Scenes are planned by their seed: their craters and
+boulders (`perilune_render.terrain.scene.grow_scene`) follow from it without rendering.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.config import CameraConfig, DatasetConfig, KindConfig
+from perilune_render.flight.trajectories import Flight, fly
+from perilune_render.streams import derived_seed, stream
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+
+_LARGEST_COVER = 9
+"""Pixels rendered over pixels wanted, at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePlan:
+    """One terrain under one Sun."""
+
+    scene_id: str
+    """Unique in the dataset."""
+    seed: int
+    """Of the scene's own streams."""
+    sun_azimuth_deg: float
+    """Clockwise from north, degrees."""
+    sun_elevation_deg: float
+    """Above the ground plane, degrees."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryPlan:
+    """One descent."""
+
+    scene_id: str
+    """Its terrain."""
+    trajectory_id: str
+    """Unique in its scene."""
+    seed: int
+    """Of the descent's own streams."""
+    frame_index: tuple[int, ...]
+    """Place of each frame in the descent, from 0; with gaps where only some of its frames are wanted."""
+    splits: tuple[str, ...]
+    """Split of each frame."""
+    flight: Flight
+    """True motion."""
+
+    def frame_id(self, place: int) -> str:
+        """The name, unique in the dataset, of the frame at a place in these lists."""
+        return f"{self.scene_id}/{self.trajectory_id}/{self.frame_index[place]:06d}"
+
+    @property
+    def split(self) -> str | None:
+        """The descent's split, or None where its frames are split among several."""
+        return self.splits[0] if len(set(self.splits)) == 1 else None
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A dataset before rendering."""
+
+    camera: Camera
+    """Of all frames."""
+    exr_camera: Camera
+    """What Blender renders and the EXRs hold: a pinhole that sees all that `camera` sees."""
+    scenes: tuple[ScenePlan, ...]
+    """Terrains."""
+    trajectories: tuple[TrajectoryPlan, ...]
+    """Descents, in the order of their scenes."""
+
+    def of_scene(self, scene_id: str) -> list[TrajectoryPlan]:
+        """The descents over one terrain."""
+        return [trajectory for trajectory in self.trajectories if trajectory.scene_id == scene_id]
+
+
+def camera_of(config: CameraConfig) -> Camera:
+    """The camera of a configuration. Raises UserError where the distortion folds back within the image."""
+    width, height, lens = config.width_px, config.height_px, config.distortion
+    focal = config.focal_length_px or width / 2 / np.tan(np.radians(config.horizontal_fov_deg) / 2)
+    camera = Camera(
+        width,
+        height,
+        float(focal),
+        float(focal),
+        width / 2 if config.principal_x_px is None else config.principal_x_px,
+        height / 2 if config.principal_y_px is None else config.principal_y_px,
+        (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3),
+    )
+    if camera.folds_back():
+        raise UserError(
+            "configuration",
+            "dataset.camera.distortion",
+            camera.distortion,
+            "a distortion that does not fold back within the image: weaker, or a narrower view",
+        )
+    covering = camera.covering_pinhole()
+    if covering.width_px * covering.height_px > _LARGEST_COVER * width * height:
+        raise UserError(
+            "configuration",
+            "dataset.camera.distortion",
+            camera.distortion,
+            f"a weaker one: it needs a rendering of {covering.width_px} x {covering.height_px} pixels",
+        )
+    return camera
+
+
+def make_plan(config: DatasetConfig, kind: str) -> Plan:
+    """The plan of the dataset `detect` or `nav`. Raises UserError on an impossible camera.
+
+    Seeds follow from the configuration's seed and name and from the kind, so that no two presets share terrain, nor do
+    the two kinds of one preset, unless `shared_terrain` says so.
+    """
+    settings = config.kind(kind)
+    camera = camera_of(config.camera)
+    splits = _splits(settings, stream(config.seed, config.name, kind, "splits"))
+    ground = "shared" if config.shared_terrain else kind
+    scenes, trajectories = [], []
+    for s in range(settings.n_scenes):
+        seed = derived_seed(config.seed, config.name, ground, "scene", s)
+        sun = stream(seed, "sun")
+        azimuth = sun.uniform(settings.sun.azimuth_deg.low, settings.sun.azimuth_deg.high)
+        elevation = sun.uniform(settings.sun.elevation_deg.low, settings.sun.elevation_deg.high)
+        scenes.append(ScenePlan(f"scene-{s:04d}", seed, float(azimuth), float(elevation)))
+        for t in range(settings.trajectories_per_scene):
+            own = derived_seed(seed, kind, "trajectory", t)
+            flight = fly(settings.flight, settings.n_frames, own)
+            name, places = f"trajectory-{t:04d}", tuple(range(settings.n_frames))
+            trajectories.append(TrajectoryPlan(scenes[-1].scene_id, name, own, places, tuple(splits[s, t]), flight))
+    return Plan(camera, camera.covering_pinhole(), tuple(scenes), tuple(trajectories))
+
+
+def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:
+    """Split names (n_scenes, trajectories_per_scene, n_frames); whole units of `split_by` go together."""
+    shape = (settings.n_scenes, settings.trajectories_per_scene, settings.n_frames)
+    n_axes = ("scene", "trajectory", "frame").index(settings.split_by) + 1
+    n_units = int(np.prod(shape[:n_axes]))
+    n_test = min(int(np.ceil(settings.test_share * n_units)), max(n_units - 2, 0))
+    n_val = min(int(np.ceil(settings.val_share * n_units)), max(n_units - n_test - 1, 0))
+    names = np.array(["train"] * (n_units - n_val - n_test) + ["val"] * n_val + ["test"] * n_test)
+    units = rng.permutation(names).reshape(shape[:n_axes] + (1,) * (3 - n_axes))
+    return np.broadcast_to(units, shape)

@@ -1,0 +1,140 @@
+"""Check the poses of a plan against the ground: the camera stands above it and every frame shows nothing else."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.flight.plan import Plan, TrajectoryPlan
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.scene import Scene
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+
+LEAST_CLEARANCE_M = 1.0
+"""Least height of the camera above the ground right below it, metres."""
+_POINTS_PER_SIDE = 8
+_UNIT_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Where the camera stands in N frames of one scene."""
+
+    frame_id: Sequence[str]
+    """Names of the frames (N,)."""
+    position_m: Array
+    """Camera, O_L, metres (N, 3)."""
+    rotation_wxyz: Array
+    """rotation_camera_from_site, quaternions (N, 4)."""
+
+    @classmethod
+    def planned(cls, trajectories: Sequence[TrajectoryPlan]) -> "Poses":
+        """All frames of some trajectories over one scene."""
+        return cls(
+            [t.frame_id(i) for t in trajectories for i in range(len(t.splits))],
+            np.concatenate([t.flight.position_m for t in trajectories]),
+            np.concatenate([t.flight.rotation_wxyz for t in trajectories]),
+        )
+
+
+def check_plan(plan: Plan, grid: Grid, where: object) -> None:
+    """Check what is known before the ground is grown: the Sun up, poses over the mesh, no horizon in view.
+
+    Raises UserError with `where` (the configuration or the manifest) and the first frame at fault.
+    """
+    for scene in plan.scenes:
+        if not 0 < scene.sun_elevation_deg <= 90:
+            found = f"{scene.sun_elevation_deg:g} degrees"
+            raise UserError(where, f"{scene.scene_id}: sun_elevation_deg", found, "above 0 (the horizon), at most 90")
+        trajectories = plan.of_scene(scene.scene_id)
+        if trajectories:
+            _check_mesh(Poses.planned(trajectories), plan.exr_camera, grid, where)
+
+
+def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:
+    """Check poses against the ground of a scene.
+
+    The camera stands at least LEAST_CLEARANCE_M above the ground, and the ray through every tested point of the image's
+    edge meets the mesh. A ray from above the ground meets it exactly where it leaves the mesh's square below the height
+    of the mesh's edge there. Raises UserError with `where` and the first frame at fault.
+    """
+    rays = _check_mesh(poses, camera, scene.grid, where)
+    x, y, z = poses.position_m.T
+    ground = value_at(scene.height_m, scene.grid, x, y)
+    _refuse(
+        z < ground + LEAST_CLEARANCE_M,
+        poses,
+        where,
+        lambda n: f"a camera {z[n] - ground[n]:.1f} m above the ground",
+        lambda n: f"at least {LEAST_CLEARANCE_M:g} m: position_m[2] at least {ground[n] + LEAST_CLEARANCE_M:.1f}",
+    )
+    edge, leaves_x, leaves_y = _leaving(poses.position_m, rays, scene.grid.extent_m / 2)
+    beyond = edge > value_at(scene.height_m, scene.grid, leaves_x, leaves_y)
+    _refuse(
+        beyond.any(axis=1),
+        poses,
+        where,
+        lambda n: f"{beyond[n].mean():.0%} of the image's edge looks past the terrain's edge",
+        lambda n: (
+            f"only ground in view: within {scene.grid.extent_m / 2:.0f} m of the site; lower, nearer, less tilted"
+        ),
+    )
+
+
+def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object) -> Array:
+    """Directions (N, S, 3), O_L, through points of the image's edge, once the poses are over the mesh and look down."""
+    position, rotation = poses.position_m, poses.rotation_wxyz
+    unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= _UNIT_TOLERANCE
+    _refuse(
+        ~(np.isfinite(position).all(axis=1) & unit),
+        poses,
+        where,
+        lambda n: f"position {position[n]}, rotation {rotation[n]}",
+        lambda n: "finite numbers and a unit quaternion",
+    )
+    half = grid.extent_m / 2
+    _refuse(
+        np.abs(position[:, :2]).max(axis=1) > half,
+        poses,
+        where,
+        lambda n: f"a camera at x {position[n, 0]:.0f} m, y {position[n, 1]:.0f} m",
+        lambda n: f"|x| and |y| at most {half:.0f} m, over the terrain",
+    )
+    matrices = matrix_from_quaternion(rotation)
+    rays = np.einsum("nji,sj->nsi", matrices, camera.rays(_edge_points(camera)))
+    off_nadir = np.degrees(np.arccos(np.clip(-matrices[:, 2, 2], -1, 1)))
+    _refuse(
+        (rays[..., 2] >= 0).any(axis=1),
+        poses,
+        where,
+        lambda n: f"a camera axis {off_nadir[n]:.0f} degrees from straight down, with the horizon in view",
+        lambda n: "a view of the ground alone",
+    )
+    return rays
+
+
+def _edge_points(camera: Camera) -> Array:
+    """Image coordinates (S, 2) of points along the image's edge, corners included."""
+    share = np.arange(_POINTS_PER_SIDE) / _POINTS_PER_SIDE
+    sides = [(share, 0 * share), (1 + 0 * share, share), (1 - share, 1 + 0 * share), (0 * share, 1 - share)]
+    return np.concatenate([np.stack(side, axis=-1) for side in sides]) * [camera.width_px, camera.height_px]
+
+
+def _leaving(position_m: Array, rays: Array, half_m: float) -> tuple[Array, Array, Array]:
+    """Height, x and y (N, S) at which downward rays (N, S, 3) leave the square of half side `half_m`."""
+    start = position_m[:, None, :2]
+    with np.errstate(divide="ignore"):
+        way = np.where(rays[..., :2] != 0, (half_m - np.sign(rays[..., :2]) * start) / np.abs(rays[..., :2]), np.inf)
+    way = np.minimum(way.min(axis=-1), 1e12)
+    place = start + way[..., None] * rays[..., :2]
+    return position_m[:, None, 2] + way * rays[..., 2], place[..., 0], place[..., 1]
+
+
+def _refuse(faulty: np.ndarray, poses: Poses, where: object, found, wanted) -> None:
+    """Raise UserError for the first faulty frame (N,); `found` and `wanted` make text of its place in `poses`."""
+    if faulty.any():
+        n = int(np.argmax(faulty))
+        raise UserError(where, f"frame {poses.frame_id[n]}", found(n), wanted(n))

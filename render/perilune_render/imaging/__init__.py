@@ -1,0 +1,1 @@
+"""From radiance to the image of a camera."""

@@ -1,0 +1,23 @@
+"""Warns of frames of which almost no pixel is sunlit."""
+
+from collections.abc import Sequence
+
+from perilune_render.imaging.exr import Radiance
+from perilune_shared.progress import console
+
+_LEAST_SUNLIT = 0.01
+
+
+def is_dark(radiance: Radiance) -> bool:
+    """Whether less than 1 % of a frame's pixels are sunlit."""
+    return bool(radiance.sunlit.mean() < _LEAST_SUNLIT)
+
+
+def warn_of_dark_frames(scene_id: str, dark: Sequence[str], n_frames: int, sun_elevation_deg: float) -> None:
+    """Print one line for a scene unless `dark`, the ids of the dark ones among `n_frames` new frames, is empty."""
+    if dark:
+        line = (
+            f"warning: {scene_id}: {len(dark)} of {n_frames} frames are dark (less than {_LEAST_SUNLIT:.0%} of the "
+            f"picture is sunlit), first {dark[0]}; the Sun is {sun_elevation_deg:.1f} degrees high"
+        )
+        console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,93 @@
+"""EXR files: what Blender writes, and what the dataset holds."""
+
+import errno
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import written_aside
+
+_MOST_CHANNELS = 64
+CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
+
+
+@dataclass(frozen=True, slots=True)
+class Radiance:
+    """What a renderer gives for one frame, before the sensor."""
+
+    radiance_factor: np.ndarray
+    """I/F (h, w) float32."""
+    depth_m: np.ndarray
+    """Along the camera's axis, of the ray through the pixel's centre, metres; infinite where it hits nothing (h, w)
+    float32."""
+    normal: np.ndarray
+    """Unit shading normal in O_L, 0 where nothing is hit; where EXRs are asked for that of the same ray, else the mean
+    direction over the pixel's samples (h, w, 3) float32."""
+    sunlit: np.ndarray
+    """Whether the Sun reaches the pixel (h, w) bool."""
+
+
+def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:
+    """Write a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), losslessly compressed.
+
+    Returns before the file is on the disk.
+    """
+    values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), radiance.sunlit, crater)
+    channels = {name: np.ascontiguousarray(value, np.float32) for name, value in zip(CHANNELS, values, strict=True)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with written_aside(path, durable=False) as aside:
+        try:
+            OpenEXR.File(header, channels).write(str(aside))
+        except RuntimeError as error:
+            raise OSError(errno.ENOSPC, f"cannot write ({error})", str(path)) from None
+
+
+def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
+    """Channels (h, w) by name. Raises UserError where the file is missing, damaged or not of `size_px` (width, height).
+
+    A small file may unpack to any size: its header is looked at before its pixels.
+    """
+    if not path.is_file():
+        raise UserError(path, "exr", "no such file", "an EXR frame")
+    try:
+        with OpenEXR.File(str(path), header_only=True) as header:
+            _check_header(path, header, size_px)
+        with OpenEXR.File(str(path), separate_channels=True) as image:
+            return {name: channel.pixels for name, channel in image.channels().items()}
+    except (RuntimeError, ValueError, TypeError, MemoryError) as error:
+        raise UserError(path, "exr", error, "a whole EXR file") from None
+
+
+def _check_header(path: Path, image: OpenEXR.File, size_px: tuple[int, int] | None) -> None:
+    """Raises UserError where the pixels of an EXR file should not be unpacked."""
+    if len(image.parts) != 1:
+        raise UserError(path, "parts", len(image.parts), "one")
+    header = image.parts[0].header
+    low, high = (np.asarray(corner, np.int64) for corner in header["dataWindow"])
+    width, height = (high - low + 1).tolist()
+    if width < 1 or height < 1 or width * height > LARGEST_IMAGE_PX:
+        raise UserError(path, "size", f"{width} x {height} pixels", f"at most {LARGEST_IMAGE_PX} pixels")
+    if size_px is not None and (width, height) != size_px:
+        raise UserError(path, "size", f"{width} x {height} pixels", f"{size_px[0]} x {size_px[1]}")
+    channels = header["channels"]
+    if len(channels) > _MOST_CHANNELS:
+        raise UserError(path, "channels", len(channels), f"at most {_MOST_CHANNELS}")
+    if any((channel.xSampling, channel.ySampling) != (1, 1) for channel in channels):
+        raise UserError(path, "channels", "fewer samples than pixels", "a value for each pixel")
+
+
+def read_radiance(path: Path, size_px: tuple[int, int] | None = None) -> Radiance:
+    """A frame as it was before the sensor, of an expected width and height, if given.
+
+    Raises UserError where the file is missing, damaged, of another size or lacks a channel.
+    """
+    channels = read_exr(path, size_px)
+    missing = [name for name in CHANNELS if name not in channels]
+    if missing:
+        raise UserError(path, "channels", f"no {missing[0]}", ", ".join(CHANNELS))
+    normal = np.stack([channels[name] for name in ("N.X", "N.Y", "N.Z")], axis=-1)
+    return Radiance(channels["R"], channels["Z"], normal, channels["sunlit"] > 0.5)

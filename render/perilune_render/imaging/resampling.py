@@ -1,0 +1,63 @@
+"""What one camera saw, in the pixels of another camera at the same place: lens distortion, other intrinsics."""
+
+from dataclasses import fields, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from perilune_render.imaging.exr import Radiance
+from perilune_shared.geometry.camera import Camera
+
+
+def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
+    """An image (h, w) of the camera `source` as `camera` sees it (Lanczos, 8 x 8 px); itself where they are the same.
+
+    `source` must cover `camera`. OpenCV places samples to 1/32 px. Where `source` is finer by a factor or more, the
+    rays of a pixel are averaged, so that nothing aliases.
+    """
+    if camera == source:
+        return image
+    finer = max(1, int(np.ceil(source.fx_px / camera.fx_px - 0.01)))
+    seen = cv2.remap(
+        image, *_places(refined(camera, finer), source), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
+    )
+    return seen if finer == 1 else cv2.resize(seen, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
+
+
+def resample_nearest(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
+    """An image (h, w, ...) of `source` in `camera`'s pixels, each as the pixel nearest to its centre."""
+    if camera == source:
+        return image
+    x, y = _places(camera, source)
+    column = np.clip(np.rint(x), 0, source.width_px - 1).astype(int)
+    row = np.clip(np.rint(y), 0, source.height_px - 1).astype(int)
+    return image[row, column]
+
+
+def seen_by(radiance: Radiance, camera: Camera, source: Camera) -> Radiance:
+    """All of a frame of `source` in `camera`'s pixels, nearest pixel each: to look up what is seen where."""
+    if camera == source:
+        return radiance
+    images = {field.name: getattr(radiance, field.name) for field in fields(radiance)}
+    return replace(radiance, **{name: resample_nearest(image, camera, source) for name, image in images.items()})
+
+
+def refined(camera: Camera, n: int) -> Camera:
+    """The same view with n x n pixels in place of each."""
+    return replace(
+        camera,
+        width_px=n * camera.width_px,
+        height_px=n * camera.height_px,
+        fx_px=n * camera.fx_px,
+        fy_px=n * camera.fy_px,
+        cx_px=n * camera.cx_px,
+        cy_px=n * camera.cy_px,
+    )
+
+
+@lru_cache(maxsize=4)
+def _places(camera: Camera, source: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row (h, w) float32 in `source` of each pixel centre; OpenCV counts from the first pixel's centre."""
+    place = source.project(camera.rays(camera.pixel_centres())) - 0.5
+    return place[..., 0].astype(np.float32), place[..., 1].astype(np.float32)

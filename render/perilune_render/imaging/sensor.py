@@ -1,0 +1,213 @@
+"""From radiance factor to grey values, as EMVA 1288 (release 4.0, linear) models a camera.
+
+Symbols: mu_p photons and eta mu_p electrons of a pixel in the exposure time t, here responsivity x t x I/F; mu_d and
+sigma_d mean and standard deviation of the dark signal, electrons; K grey values (DN) per electron; mu_y mean and
+sigma_y^2 variance of the grey value in time:
+
+    mu_y = K (eta mu_p + mu_d) + black level,    mu_d = dark current x t
+    sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark),    sigma_d^2 = read noise^2 + mu_d
+
+Over the pixels, eta varies by the PRNU and mu_d by the DSNU and the hot pixels: the same in every frame of a dataset.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from scipy.special import ive
+
+from perilune_render.config import SensorConfig
+from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.resampling import resample, resample_nearest
+from perilune_render.streams import stream
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+
+_STRETCH = 1.5
+"""Distortion may widen motion at the edges by about so much."""
+_LEAST_MOTION_PX = 0.05
+"""Motion during the exposure below which it is not worth the blurring."""
+_FAINT_E = 100.0
+"""Above it a rounded Gaussian stands for the Poisson law, ten times faster."""
+
+
+HOT_PIXEL_S = 0.002
+"""Exposure time of the extra signal `hot_pixel_e`, seconds. It is dark current, and grows with the exposure time."""
+
+
+@dataclass(frozen=True, slots=True)
+class FixedPattern:
+    """What is the same in all frames of one sensor."""
+
+    response: np.ndarray
+    """Relative response of each pixel, mean 1 (h, w) float32."""
+    offset_e: np.ndarray
+    """Offset of each pixel, mean 0, electrons (h, w) float32."""
+    hot_e: np.ndarray
+    """Extra dark signal of the hot pixels in an exposure of HOT_PIXEL_S, 0 elsewhere, electrons (h, w) float32."""
+
+    @classmethod
+    def draw(cls, config: SensorConfig, camera: Camera, seed: int) -> "FixedPattern":
+        """The one sensor of a dataset with this seed."""
+        rng = stream(seed, "sensor")
+        shape = camera.height_px, camera.width_px
+        response = 1 + config.gain_nonuniformity * rng.standard_normal(shape, np.float32)
+        offset = config.dark_nonuniformity_e * rng.standard_normal(shape, np.float32)
+        hot = rng.random(shape, np.float32) < config.hot_pixel_share
+        extra = config.hot_pixel_e * rng.standard_exponential(shape, np.float32)
+        return cls(np.maximum(response, 0), offset, np.where(hot, extra, np.float32(0)))
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """What falls on the sensor in one frame: no noise yet, no fixed pattern."""
+
+    light: np.ndarray
+    """Radiance factor I/F of each pixel after point spread and motion blur (h, w) float32."""
+    time_s: float
+    """Exposure time, seconds."""
+
+
+def develop(
+    radiance: Radiance,
+    config: SensorConfig,
+    camera: Camera,
+    exr_camera: Camera,
+    velocity_camera_mps: Array,
+    pattern: FixedPattern,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """The grey image (h, w) of `camera`, in DN from 0 to 2^bits - 1: `expose`, then `read_out`."""
+    return read_out(expose(radiance, config, camera, exr_camera, velocity_camera_mps), config, pattern, rng)
+
+
+def expose(
+    radiance: Radiance, config: SensorConfig, camera: Camera, exr_camera: Camera, velocity_camera_mps: Array
+) -> Exposure:
+    """What falls on the sensor of `camera`: resampling, point spread, exposure, motion blur, in this order.
+
+    `radiance` is as `exr_camera` sees it, in the middle of the exposure; the velocity (3,) of the camera is along its
+    own axes O_C.
+    """
+    light = np.maximum(resample(radiance.radiance_factor.astype(np.float32, copy=False), camera, exr_camera), 0)
+    if config.psf_sigma_px > 0:
+        kernel = psf_kernel(config.psf_sigma_px)
+        light = cv2.sepFilter2D(light, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
+    exposure_s = exposure_time_s(light, config)
+    way_m = np.asarray(velocity_camera_mps) * exposure_s
+    if config.motion_blur and _fastest_px(radiance.depth_m, camera, exr_camera, way_m) >= _LEAST_MOTION_PX:
+        depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
+        light = _blurred(light, motion_px(depth_m, camera, way_m))
+    return Exposure(light, exposure_s)
+
+
+@lru_cache(maxsize=4)
+def psf_kernel(sigma_px: float) -> np.ndarray:
+    """Weights (2 n + 1,) of the point spread along one axis: the discrete Gaussian of variance sigma_px^2.
+
+    The weight at k pixels is exp(-t) I_k(t) with t = sigma_px^2 (Lindeberg 1990, doi 10.1109/34.49051). Its variance
+    over the pixels is t for every t, while a Gaussian sampled at the pixel centres loses variance below about 0.7 px
+    (sigma 0.45 becomes 0.38). The mean over the pixel's own area is the renderer's and is not part of sigma_px.
+    """
+    half = int(np.ceil(6 * sigma_px + 4))
+    weights = ive(np.abs(np.arange(-half, half + 1)), sigma_px**2)
+    return weights / weights.sum()
+
+
+def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rng: np.random.Generator) -> np.ndarray:
+    """The grey image (h, w) of an exposure, in DN from 0 to 2^bits - 1: uint8, or uint16 above 8 bits.
+
+    In this order: electrons with PRNU, dark current and hot pixels, Poisson noise, read noise, DSNU, full well, gain,
+    black level, rounding and clipping. `rng` draws the noise in time alone.
+    """
+    electrons = exposure.light * pattern.response
+    electrons *= config.responsivity_e_per_s * exposure.time_s
+    electrons += config.dark_current_e_per_s * exposure.time_s
+    electrons += pattern.hot_e * np.float32(exposure.time_s / HOT_PIXEL_S)
+    normal = rng.standard_normal(electrons.shape, np.float32)
+    noisy = electrons + np.sqrt(electrons + np.float32(config.read_noise_e**2)) * normal
+    faint = electrons < _FAINT_E
+    noisy[faint] = rng.poisson(electrons[faint]) + config.read_noise_e * normal[faint]
+    noisy += pattern.offset_e
+    largest = 2**config.bits - 1
+    grey = np.minimum(noisy, config.full_well_e) * (config.gain * largest / config.full_well_e)
+    grey += config.black_level_share * largest
+    return np.clip(np.rint(grey), 0, largest).astype(np.uint8 if config.bits == 8 else np.uint16)
+
+
+def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (h, w) float32 of each grey value, DN, over all noise and all sensors of the kind.
+
+    sigma_y^2 as above, with PRNU and DSNU, which are noise to whoever sees one frame. Hot pixels are left out. Where
+    the sensor clips, in the brightest pixels and in shadows that a black level of 0 cuts off, the deviation is that
+    without clipping: rather more than less.
+    """
+    largest = 2**config.bits - 1
+    per_e = config.gain * largest / config.full_well_e
+    light_e = exposure.light * np.float32(config.responsivity_e_per_s * exposure.time_s)
+    dark_e = config.dark_current_e_per_s * exposure.time_s
+    mean = np.minimum(light_e + np.float32(dark_e), config.full_well_e) * per_e + config.black_level_share * largest
+    still_e2 = config.read_noise_e**2 + config.dark_nonuniformity_e**2 + dark_e
+    variance_e2 = light_e + np.square(config.gain_nonuniformity * light_e) + np.float32(still_e2)
+    return np.clip(mean, 0, largest), np.sqrt(np.float32(per_e**2) * variance_e2 + np.float32(1 / 12))
+
+
+def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
+    """Exposure time, seconds, for a radiance factor (h, w).
+
+    Automatic exposure brings the chosen percentile to its grey level, but no pixel of it over that share of the full
+    well, and takes no longer than it may.
+    """
+    if config.exposure == "fixed":
+        return config.exposure_time_s
+    bright = float(np.percentile(light, config.exposure_percentile))
+    share = min((config.exposure_level - config.black_level_share) / config.gain, config.exposure_level)
+    rate = config.responsivity_e_per_s * bright + config.dark_current_e_per_s
+    return min(share * config.full_well_e / max(rate, 1e-30), config.longest_exposure_s)
+
+
+def motion_px(depth_m: np.ndarray, camera: Camera, way_camera_m: Array) -> np.ndarray:
+    """How far the ground at a depth (h, w) along the axis moves in the image, pixels (h, w, 2), float32.
+
+    The camera moves by `way_camera_m` (3,) along its own axes O_C, without turning. To first order in way over depth;
+    0 where nothing is hit.
+    """
+    rays = _rays(camera)
+    way = np.asarray(way_camera_m, np.float32)
+    move = (rays * way[2] - way[:2]) / depth_m[..., None]
+    if not any(camera.distortion):
+        return move * np.array([camera.fx_px, camera.fy_px], np.float32)
+    moved = np.concatenate([rays + move, np.ones_like(depth_m)[..., None]], axis=-1)
+    start = np.concatenate([rays, np.ones_like(depth_m)[..., None]], axis=-1)
+    # At the very edge of what the distortion allows, the end of the way may have no image.
+    return np.nan_to_num(camera.project(moved) - camera.project(start)).astype(np.float32)
+
+
+def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, way_camera_m: Array) -> float:
+    """About the fastest motion of any pixel of `camera`, pixels, rather more than less; `pinhole` covers its view."""
+    corners = [[u, v] for u in (0, pinhole.width_px) for v in (0, pinhole.height_px)]
+    widest = np.linalg.norm(pinhole.rays(corners), axis=-1).max()
+    nearest_m = max(float(depth_m.min()), 1e-9)
+    return float(np.linalg.norm(way_camera_m) / nearest_m * widest * max(camera.fx_px, camera.fy_px) * _STRETCH)
+
+
+@lru_cache(maxsize=4)
+def _rays(camera: Camera) -> np.ndarray:
+    """Direction (h, w, 2) of each pixel centre over the axis, float32."""
+    return camera.rays(camera.pixel_centres())[..., :2].astype(np.float32)
+
+
+def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """The mean of an image over an exposure about its own time, while its content moves by `motion` (h, w, 2)."""
+    longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
+    if longest < _LEAST_MOTION_PX:
+        return light
+    # Gauss-Legendre nodes: two already give the blur of a short motion its true width.
+    times, weights = np.polynomial.legendre.leggauss(min(int(2 * longest) + 2, 128))
+    column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in light.shape[::-1]))
+    mean = np.zeros_like(light)
+    for time, weight in zip(times / 2, weights / 2, strict=True):
+        place = column - np.float32(time) * motion[..., 0], row - np.float32(time) * motion[..., 1]
+        mean += np.float32(weight) * cv2.remap(light, *place, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    return np.maximum(mean, 0)

@@ -1,0 +1,1 @@
+"""Crater labels of a frame, measured in its rendering."""

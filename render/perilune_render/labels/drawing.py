@@ -1,0 +1,40 @@
+"""Contact sheets: frames side by side, with labels drawn, for people to look at."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from perilune_render.labels.frame_labels import Labels
+from perilune_shared.storage.files import write_bytes
+
+_CHOSEN, _OTHER = (80, 220, 80), (60, 140, 255)
+
+
+def draw_labels(image: np.ndarray, labels: Labels, chosen: np.ndarray, scale: int = 2) -> np.ndarray:
+    """A colour picture (scale h, scale w, 3) with the ellipses drawn: green where `chosen` (N,), else orange."""
+    picture = cv2.cvtColor(enlarge(image, scale), cv2.COLOR_GRAY2BGR)
+    e = labels.ellipses
+    for k in range(len(labels.crater_id)):
+        box = (
+            (e.cx_px[k] * scale, e.cy_px[k] * scale),
+            (2 * e.a_px[k] * scale, 2 * e.b_px[k] * scale),
+            np.degrees(e.theta_rad[k]),
+        )
+        cv2.ellipse(picture, box, _CHOSEN if chosen[k] else _OTHER, 1, cv2.LINE_AA)
+    return picture
+
+
+def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
+    """Each pixel as a square of `scale` pixels."""
+    return np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
+
+
+def write_sheet(path: Path, pictures: list[np.ndarray], columns: int) -> None:
+    """Pictures of one size, grey or colour, row by row, with a thin gap, as one PNG."""
+    colour = [p if p.ndim == 3 else cv2.cvtColor(p, cv2.COLOR_GRAY2BGR) for p in pictures]
+    padded = [cv2.copyMakeBorder(p, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=(40, 40, 40)) for p in colour]
+    while len(padded) % columns:
+        padded.append(np.full_like(padded[0], 40))
+    rows = [np.hstack(padded[i : i + columns]) for i in range(0, len(padded), columns)]
+    write_bytes(path, cv2.imencode(".png", np.vstack(rows))[1].tobytes())

@@ -1,0 +1,217 @@
+"""Crater labels of a frame: ellipses, how much of each rim is seen, how much of each crater is lit, what it shows."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from perilune_render.imaging.exr import Radiance
+from perilune_render.labels.pixels import contrasts, smallest_crater, sunlit_fractions
+from perilune_render.terrain.scene import Scene
+from perilune_shared.dataset.masks import SLACK_PX, SLACK_RADII
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.ellipse import Ellipses, plane_basis, project_circles, rim_points
+from perilune_shared.geometry.frames import Array
+
+_N_RIM = 48
+
+
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """N labelled craters of one frame."""
+
+    crater_id: np.ndarray
+    """Place in the scene's craters (N,)."""
+    ellipses: Ellipses
+    """Images of the rims."""
+    visible_fraction: Array
+    """Share of the rim inside the image and not hidden (N,)."""
+    sunlit_fraction: Array
+    """Share of the crater's seen pixels that the Sun reaches; 0 where none is seen (N,)."""
+    contrast: Array
+    """The crater's own shading over its standard error, from noise and clutter; NaN where not measured (N,)."""
+    n_above: int | None = None
+    """Craters with their centre in the image and a radius above the largest of a label; None where not counted."""
+
+    @classmethod
+    def from_table(cls, rows: pd.DataFrame) -> "Labels":
+        """Labels of one frame from rows of the manifest's table `labels`."""
+        ellipses = Ellipses(
+            *(rows[f"ellipse_{name}"].to_numpy() for name in ("cx_px", "cy_px", "a_px", "b_px", "theta_rad"))
+        )
+        return cls(
+            rows["crater_id"].to_numpy(),
+            ellipses,
+            rows["visible_fraction"].to_numpy(),
+            rows["sunlit_fraction"].to_numpy(),
+            rows["contrast"].to_numpy(),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What the sensor shows of a frame, whatever the noise's draw (`perilune_render.imaging.sensor.expected`)."""
+
+    grey: np.ndarray
+    """Mean of each grey value, DN (h, w)."""
+    noise: np.ndarray
+    """Standard deviation of each grey value, DN (h, w)."""
+    sun: Array
+    """Unit vector (3,) towards the Sun, O_L."""
+
+
+@dataclass(frozen=True, slots=True)
+class RimCircles:
+    """The rim circles of N craters of a scene, O_L."""
+
+    crater_id: np.ndarray
+    """Unique in the scene, ascending (N,)."""
+    centre_m: Array
+    """(N, 3)."""
+    normal: Array
+    """Unit normals (N, 3)."""
+    radius_m: Array
+    """(N,)."""
+
+    @classmethod
+    def of_scene(cls, scene: Scene) -> "RimCircles":
+        """All craters of a scene that was grown."""
+        centres = np.stack([scene.craters.x_m, scene.craters.y_m, scene.rims.z_m], axis=1)
+        return cls(np.arange(len(scene.craters)), centres, scene.rims.normal, scene.craters.diameter_m / 2)
+
+    @classmethod
+    def from_table(cls, rows: pd.DataFrame) -> "RimCircles":
+        """Rows of the manifest's table `craters`, of one scene."""
+        rows = rows.sort_values("crater_id")
+        return cls(
+            rows["crater_id"].to_numpy(),
+            rows[["x_m", "y_m", "z_m"]].to_numpy(),
+            rows[["normal_x", "normal_y", "normal_z"]].to_numpy(),
+            rows["diameter_m"].to_numpy() / 2,
+        )
+
+
+def label_frame(
+    circles: RimCircles,
+    camera: Camera,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    radiance: Radiance,
+    min_radius_px: float,
+    max_radius_px: float,
+) -> Labels:
+    """Labels by the paper's rule: centre in the frame, radius within bounds; visibility from the rendered depth.
+
+    `radiance` is in the pixels of `camera` (`perilune_render.imaging.resampling.seen_by`). The contrast depends on
+    the sensor too and is NaN here: `with_contrast` measures it.
+    """
+    in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
+    rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
+    candidate = np.flatnonzero(camera.inside(camera.project(in_camera)) & (rough > 0.5 * min_radius_px))
+    ellipses = project_circles(
+        camera,
+        in_camera[candidate],
+        circles.normal[candidate] @ rotation_camera_from_site.T,
+        circles.radius_m[candidate],
+    )
+    radius = ellipses.radius_px()
+    kept = (radius >= min_radius_px) & (radius <= max_radius_px)
+    rows = candidate[kept]
+    ellipses = Ellipses(
+        ellipses.cx_px[kept],
+        ellipses.cy_px[kept],
+        ellipses.a_px[kept],
+        ellipses.b_px[kept],
+        ellipses.theta_rad[kept],
+    )
+    visible = _visible_fraction(circles, camera, position_m, rotation_camera_from_site, radiance.depth_m, rows)
+    lit = sunlit_fractions(ellipses, radiance.sunlit)
+    n_above = int((radius > max_radius_px).sum())
+    return Labels(circles.crater_id[rows], ellipses, visible, lit, np.full(len(rows), np.nan), n_above)
+
+
+def with_contrast(
+    labels: Labels,
+    circles: RimCircles,
+    camera: Camera,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    shown: Shown,
+) -> Labels:
+    """The labels of a frame with their contrast (`perilune_render.labels.pixels.contrasts`) in what `camera` shows."""
+    rows = np.searchsorted(circles.crater_id, labels.crater_id)
+    centre = np.stack([labels.ellipses.cx_px, labels.ellipses.cy_px], axis=-1)
+    matrices = _image_from_rim(circles, camera, position_m, rotation_camera_from_site, shown.sun, rows)
+    return replace(labels, contrast=contrasts(centre, matrices, shown.grey, shown.noise))
+
+
+def _image_from_rim(
+    circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, sun: Array, rows: np.ndarray
+) -> Array:
+    """Matrices (N, 2, 2) from places on the rim's plane, in radii along the Sun's direction and across, to pixels."""
+    centre, normal = circles.centre_m[rows], circles.normal[rows]
+    along = sun - (normal @ sun)[:, None] * normal
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    # With the Sun right above a crater no direction is towards it.
+    along = np.where(length > 1e-9, along / np.maximum(length, 1e-9), plane_basis(normal)[0])
+    axes = circles.radius_m[rows, None, None] * np.stack([along, np.cross(normal, along)], axis=1)
+    ends = [camera.project(camera_from_site(centre[:, None] + side * axes, position_m, rotation)) for side in (1, -1)]
+    return np.swapaxes(ends[0] - ends[1], 1, 2) / 2
+
+
+def _visible_fraction(
+    circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, depth_m: np.ndarray, rows: np.ndarray
+) -> Array:
+    """Compare the rim's depth with the rendered depth.
+
+    The label circle is a plane through a rough rim, so a rim point may lie under the ground by some of the crater's own
+    height: it counts as hidden only where the ground in front is nearer by more than a tenth of the radius and
+    two pixels' width.
+    """
+    if not len(rows):
+        return np.empty(0)
+    radii = circles.radius_m[rows]
+    rims = rim_points(circles.centre_m[rows], circles.normal[rows], radii, _N_RIM)
+    points = camera_from_site(rims, position_m, rotation)
+    pixels = camera.project(points)
+    inside = camera.inside(pixels)
+    column = np.where(inside, pixels[..., 0], 0).astype(int)
+    row = np.where(inside, pixels[..., 1], 0).astype(int)
+    slack = np.maximum(SLACK_RADII * radii, SLACK_PX * points[:, 0, 2] / camera.fx_px)
+    return (inside & (points[..., 2] <= depth_m[row, column] + slack[:, None])).mean(axis=1)
+
+
+def crater_index(
+    circles: RimCircles,
+    camera: Camera,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    depth_m: np.ndarray | None = None,
+) -> np.ndarray:
+    """Instance image (h, w) float32: the smallest crater whose visible interior holds each pixel's centre; -1 none.
+
+    The interior is the rim's disc; it is visible where the ground of `depth_m` (h, w), metres along the axis, is not
+    nearer than the disc's plane (but for a tenth of the radius and two pixels' width). Without depth all of it is.
+    Every crater of at least a pixel across counts, also those that become no labels. `camera` has no distortion.
+    """
+    in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
+    candidate = _reaching_in(camera, in_camera, circles.radius_m)
+    candidate = candidate[np.argsort(-circles.radius_m[candidate], kind="stable")]
+    centres, radii = in_camera[candidate], circles.radius_m[candidate]
+    normals = circles.normal[candidate] @ rotation_camera_from_site.T
+    boxes = project_circles(camera, centres, normals, radii).bounding_boxes()
+    return smallest_crater(circles.crater_id[candidate], centres, normals, radii, boxes, camera, depth_m)
+
+
+def _reaching_in(camera: Camera, centre_m: Array, radius_m: Array) -> np.ndarray:
+    """Rows of circles (N, 3), (N,) in O_C, in front of the camera and a pixel across, that may reach into the image."""
+    x, y, z = centre_m.T
+    rows = np.flatnonzero((z > 0) & (2 * camera.fx_px * radius_m > z))
+    x, y, z, radius = x[rows], y[rows], z[rows], radius_m[rows]
+    with np.errstate(divide="ignore"):
+        # How far a sphere of that radius reaches from its centre's image.
+        wide = np.where(z > radius, radius / np.abs(z - radius), np.inf)
+    size = np.array([camera.width_px, camera.height_px])
+    middle = np.stack([camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px], axis=-1)
+    reach = np.stack([camera.fx_px * np.hypot(1, x / z), camera.fy_px * np.hypot(1, y / z)], axis=-1) * wide[:, None]
+    return rows[((middle > -reach) & (middle < size + reach)).all(axis=1)]

@@ -1,0 +1,167 @@
+"""Loops over the pixels of labels, compiled by numba: how much is lit, what shading shows, which crater is where."""
+
+import numpy as np
+
+from perilune_render.provenance.kernels import njit
+from perilune_shared.dataset.masks import SLACK_PX, SLACK_RADII
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.ellipse import Ellipses
+from perilune_shared.geometry.frames import Array
+
+REACH = 1.5
+"""The surroundings that contrast is measured against, radii of the rim from its centre."""
+_N_FITTED = 4
+
+
+def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
+    """Share (N,) of lit pixels of `sunlit` (h, w) bool among those whose centre lies in each of N ellipses.
+
+    0 where an ellipse holds no pixel's centre.
+    """
+    shape = ellipses.a_px, ellipses.b_px, ellipses.theta_rad
+    return _lit(ellipses.cx_px, ellipses.cy_px, *shape, ellipses.bounding_boxes(), sunlit)
+
+
+@njit()
+def _lit(cx, cy, a, b, theta, boxes, sunlit):
+    height, width = sunlit.shape
+    share = np.zeros(len(cx))
+    for k in range(len(cx)):
+        cos, sin = np.cos(theta[k]), np.sin(theta[k])
+        inside = lit = 0
+        for row in range(max(int(np.floor(boxes[k, 1])), 0), min(int(np.ceil(boxes[k, 3])), height)):
+            dy = row + 0.5 - cy[k]
+            for column in range(max(int(np.floor(boxes[k, 0])), 0), min(int(np.ceil(boxes[k, 2])), width)):
+                dx = column + 0.5 - cx[k]
+                if ((dx * cos + dy * sin) / a[k]) ** 2 + ((dy * cos - dx * sin) / b[k]) ** 2 <= 1:
+                    inside += 1
+                    lit += sunlit[row, column]
+        if inside > 0:
+            share[k] = lit / inside
+    return share
+
+
+def contrasts(centre_px: Array, image_from_rim: Array, grey: np.ndarray, noise: np.ndarray) -> Array:
+    """Shading (N,) of N craters as a bowl lit from one side, over its standard error.
+
+    `centre_px` (N, 2) are the ellipses' centres; `image_from_rim` (N, 2, 2) maps a place on the crater's plane, in
+    radii along the Sun's direction and across it, to pixels from there; `grey` and `noise` (h, w) are mean and standard
+    deviation of each pixel. Within REACH radii grey is fitted by least squares as a plane plus c times the shading of
+    a bowl, -s exp(-(r / 0.8)^4) with r the distance from the centre and s its part towards the Sun: the wall that faces
+    the Sun is bright. The result is c over its standard error; a pixel's variance is that of the noise and
+    that of what the fit leaves. A bump has a negative contrast, flat ground 0. 0 also where too few pixels are in
+    the image.
+    """
+    matrices = np.ascontiguousarray(image_from_rim, np.float64)
+    return _shading(centre_px, matrices, np.asarray(grey, np.float64), np.asarray(noise, np.float64))
+
+
+@njit()
+def _shading(centre, matrices, grey, noise):
+    height, width = grey.shape
+    result = np.zeros(len(centre))
+    values = np.empty(_N_FITTED)
+    for k in range(len(centre)):
+        m00, m01, m10, m11 = matrices[k, 0, 0], matrices[k, 0, 1], matrices[k, 1, 0], matrices[k, 1, 1]
+        determinant = m00 * m11 - m01 * m10
+        if not np.isfinite(determinant) or determinant == 0:
+            continue
+        x, y = centre[k, 0], centre[k, 1]
+        half_w, half_h = REACH * np.hypot(m00, m01), REACH * np.hypot(m10, m11)
+        first, last = max(int(np.floor(x - half_w)), 0), min(int(np.ceil(x + half_w)), width)
+        normal, right = np.zeros((_N_FITTED, _N_FITTED)), np.zeros(_N_FITTED)
+        squares = variance = 0.0
+        count = 0
+        level = grey[min(max(int(y), 0), height - 1), min(max(int(x), 0), width - 1)]
+        for row in range(max(int(np.floor(y - half_h)), 0), min(int(np.ceil(y + half_h)), height)):
+            dy = row + 0.5 - y
+            for column in range(first, last):
+                dx = column + 0.5 - x
+                s, t = (m11 * dx - m01 * dy) / determinant, (m00 * dy - m10 * dx) / determinant
+                square = s * s + t * t
+                if square > REACH * REACH:
+                    continue
+                values[0], values[1], values[2] = 1.0, s, t
+                values[3] = -s * np.exp(-((square / 0.64) ** 2))
+                own = grey[row, column] - level
+                for i in range(_N_FITTED):
+                    right[i] += values[i] * own
+                    for j in range(i + 1):
+                        normal[i, j] += values[i] * values[j]
+                squares += own * own
+                variance += noise[row, column] ** 2
+                count += 1
+        if count <= _N_FITTED:
+            continue
+        result[k] = _over_its_error(normal, right, squares, variance / count, count)
+    return result
+
+
+@njit()
+def _over_its_error(normal, right, squares, variance, count):
+    """The last fitted value over its standard error, by Cholesky's L L^T = normal (lower triangle given)."""
+    for i in range(_N_FITTED):
+        for j in range(i + 1):
+            rest = normal[i, j]
+            for m in range(j):
+                rest -= normal[i, m] * normal[j, m]
+            if i > j:
+                normal[i, j] = rest / normal[j, j]
+            elif rest > 1e-9 * normal[i, i]:
+                normal[i, i] = np.sqrt(rest)
+            else:
+                return 0.0
+        for m in range(i):
+            right[i] -= normal[i, m] * right[m]
+        right[i] /= normal[i, i]
+        squares -= right[i] ** 2
+    # The last unknown is right / L with the variance 1 / L^2, both in the last place.
+    return right[-1] / np.sqrt(variance + max(squares, 0.0) / (count - _N_FITTED))
+
+
+def smallest_crater(
+    crater_id: np.ndarray,
+    centre_m: Array,
+    normal: Array,
+    radius_m: Array,
+    boxes_px: Array,
+    camera: Camera,
+    depth_m: np.ndarray | None,
+) -> np.ndarray:
+    """Index image (h, w) float32: of N craters in O_C, largest first, the last whose seen interior holds the pixel.
+
+    Centres (N, 3) and radii (N,) in metres, unit normals (N, 3), boxes of the rims' images (N, 4); `camera` has no
+    distortion; depth_m (h, w) along the axis, None where nothing hides anything. -1 where there is none.
+    """
+    image = np.full((camera.height_px, camera.width_px), -1, np.float32)
+    depth = np.full((1, 1), np.inf) if depth_m is None else depth_m
+    pinhole = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+    _fill(image, crater_id, centre_m, normal, radius_m, boxes_px, pinhole, depth)
+    return image
+
+
+@njit()
+def _fill(image, crater_id, centre, normal, radius, boxes, pinhole, depth):
+    height, width = image.shape
+    fx, fy, cx, cy = pinhole
+    seen = depth.shape == image.shape
+    for k in range(len(crater_id)):
+        if not np.isfinite(boxes[k]).all():
+            continue
+        x, y, z = centre[k]
+        n_x, n_y, n_z = normal[k]
+        distance = n_x * x + n_y * y + n_z * z
+        slack = max(SLACK_RADII * radius[k], SLACK_PX * z / fx)
+        for row in range(max(int(np.floor(boxes[k, 1])), 0), min(int(np.ceil(boxes[k, 3])), height)):
+            ray_y = (row + 0.5 - cy) / fy
+            for column in range(max(int(np.floor(boxes[k, 0])), 0), min(int(np.ceil(boxes[k, 2])), width)):
+                ray_x = (column + 0.5 - cx) / fx
+                towards = n_x * ray_x + n_y * ray_y + n_z
+                if towards == 0:
+                    continue
+                plane = distance / towards
+                if plane <= 0 or (seen and depth[row, column] < plane - slack):
+                    continue
+                square = (plane * ray_x - x) ** 2 + (plane * ray_y - y) ** 2 + (plane - z) ** 2
+                if square <= radius[k] ** 2:
+                    image[row, column] = crater_id[k]

@@ -1,0 +1,59 @@
+"""Folders for files that can be computed again."""
+
+import functools
+import os
+import shutil
+import stat
+import tempfile
+from pathlib import Path
+
+from perilune_render.provenance.fingerprint import compiled_functions, fingerprint
+
+_KEPT = 5
+"""Folders of machine code, of so many versions of the kernels."""
+
+
+def cache_home() -> Path:
+    """perilune's folder in the user's cache folder; for a user without a home, one in the temporary folder.
+
+    Others may write to the temporary folder, and numba executes what it reads: where the folder there is not the user's
+    own alone, a new one of another name takes its place.
+    """
+    if os.environ.get("XDG_CACHE_HOME"):
+        return Path(os.environ["XDG_CACHE_HOME"]) / "perilune"
+    try:
+        home = Path.home()
+        if home.is_dir():
+            return home / ".cache" / "perilune"
+    except RuntimeError:  # no HOME, and the user is in no list of users, as in containers
+        pass
+    folder = Path(tempfile.gettempdir()) / f"perilune-{os.getuid()}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        state = folder.lstat()
+        if stat.S_ISDIR(state.st_mode) and state.st_uid == os.getuid() and not state.st_mode & 0o077:
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.mkdtemp(prefix="perilune-"))
+
+
+@functools.cache
+def machine_code_folder() -> Path:
+    """The folder of machine code for the current kernels, in NUMBA_CACHE_DIR where that is set, else in `cache_home()`.
+
+    Removes the folders that were used least recently.
+    """
+    parent = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_home() / "kernels")
+    folder = parent / f"perilune-{fingerprint(*compiled_functions()).sha256[:16]}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        known = sorted(parent.glob("perilune-*"), key=lambda path: path.stat().st_mtime, reverse=True)
+        for old in known[_KEPT:]:
+            shutil.rmtree(old, ignore_errors=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.mkdtemp(prefix="perilune-"))

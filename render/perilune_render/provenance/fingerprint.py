@@ -1,0 +1,213 @@
+"""Hash of the code that a result follows from, without what changes no result.
+
+From some functions and classes, every function, class and constant of perilune that they name is followed, module by
+module. Comments, docstrings and error messages are left out, and so is the rest of each module: a docstring or a new
+command changes no hash, a constant five calls away does.
+"""
+
+import ast
+import functools
+import hashlib
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import perilune_render
+import perilune_shared
+
+_FOLDERS = {module.__name__: Path(module.__path__[0]) for module in (perilune_render, perilune_shared)}
+_SETTINGS = "perilune_render.config"
+"""Modules that begin so hold settings, whose values stand in the recipe: defaults, bounds and checks are left out."""
+_NO_EFFECT = (
+    "perilune_render.provenance.caches",
+    "perilune_render.interrupts",
+    "perilune_shared.config",
+    "perilune_shared.errors",
+    "perilune_shared.storage.files",
+)
+"""Modules that read settings, store results or report errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fingerprint:
+    """What a result follows from."""
+
+    sha256: str
+    """Of the code, in hexadecimal."""
+    modules: frozenset[str]
+    """Modules of perilune that any of it comes from."""
+    libraries: frozenset[str]
+    """Other packages that it imports, by their import names."""
+
+
+@dataclass(slots=True)
+class _Module:
+    """One source file."""
+
+    definitions: dict[str, list[ast.stmt]] = field(default_factory=dict)
+    """Statements that define each top-level name."""
+    imported: dict[str, tuple[str, str | None]] = field(default_factory=dict)
+    """Module and name behind each imported name; None for a module as a whole."""
+    others: list[ast.stmt] = field(default_factory=list)
+    """Top-level statements that define nothing, such as calls."""
+    contents: dict[str, tuple[str, frozenset[tuple[str, ...]]]] = field(default_factory=dict)
+    """What `content` has found."""
+
+    def content(self, name: str) -> tuple[str, frozenset[tuple[str, ...]]]:
+        """The code that defines a name, and the dotted names in it; of "" the statements that define nothing."""
+        if name not in self.contents:
+            statements = self.definitions[name] if name else self.others
+            names = frozenset(names for statement in statements for names in _names(statement))
+            self.contents[name] = "\n".join(map(ast.dump, statements)), names
+        return self.contents[name]
+
+
+def fingerprint(*roots: str, folders: dict[str, Path] | None = None) -> Fingerprint:
+    """The fingerprint of functions and classes, each named as `package.module:name`, or of a whole `package.module:`.
+
+    `folders` gives the folder of each package where it is not the imported one.
+    """
+    return _fingerprint(roots, tuple(sorted((folders or _FOLDERS).items())))
+
+
+@functools.cache
+def _fingerprint(roots: tuple[str, ...], folders: tuple[tuple[str, Path], ...]) -> Fingerprint:
+    walk = _Walk(dict(folders))
+    for root in roots:
+        module, _, name = root.partition(":")
+        walk.follow(module, (name,) if name else ())
+    # Without the names of modules, so that code may move from file to file.
+    code = "\n".join(sorted(f"{name}\n{text}" for (_, name), text in walk.code.items()))
+    modules = frozenset(module for module, _ in walk.code)
+    libraries = frozenset(walk.libraries - sys.stdlib_module_names)
+    return Fingerprint(hashlib.sha256(code.encode()).hexdigest(), modules, libraries)
+
+
+def compiled_functions() -> tuple[str, ...]:
+    """Every function of perilune_render that numba compiles, as `package.module:name`."""
+    found = []
+    root = _FOLDERS["perilune_render"]
+    for path in sorted(root.rglob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        if "njit" in text:
+            name = ".".join(("perilune_render", *path.relative_to(root).with_suffix("").parts))
+            for own, (*_, node) in _parsed(text).definitions.items():
+                if isinstance(node, ast.FunctionDef) and any("njit" in ast.dump(each) for each in node.decorator_list):
+                    found.append(f"{name}:{own}")
+    return tuple(found)
+
+
+class _Walk:
+    """Follows names from module to module."""
+
+    def __init__(self, folders: dict[str, Path]):
+        self.folders = folders
+        self.code: dict[tuple[str, str], str] = {}
+        self.libraries: set[str] = set()
+        self.sources: dict[str, _Module | None] = {}
+
+    def follow(self, module: str, names: tuple[str, ...]) -> None:
+        """Take in what a dotted name means in a module; names that the module does not define are local or built in."""
+        if module.startswith(_NO_EFFECT):
+            return
+        source = self._source(module)
+        if source is None:
+            self.libraries.add(module.partition(".")[0])
+            return
+        wanted = names[:1] or (*source.definitions, *source.imported)
+        for name in wanted:
+            if name in source.imported:
+                self._follow_import(*source.imported[name], names[1:])
+            elif name in source.definitions:
+                self._take(module, name, source)
+        self._take(module, "", source)
+
+    def _follow_import(self, module: str, name: str | None, rest: tuple[str, ...]) -> None:
+        if name is None:
+            self.follow(module, rest)
+        elif self._source(f"{module}.{name}") is not None:
+            self.follow(f"{module}.{name}", rest)
+        else:
+            self.follow(module, (name, *rest))
+
+    def _take(self, module: str, name: str, source: _Module) -> None:
+        if (module, name) not in self.code:
+            self.code[module, name], named = source.content(name)
+            for names in named:
+                self.follow(module, names)
+
+    def _source(self, module: str) -> _Module | None:
+        """A module of perilune, or None."""
+        if module not in self.sources:
+            package, *parts = module.split(".")
+            path = self.folders[package].joinpath(*parts) if package in self.folders else None
+            files = [path.with_suffix(".py"), path / "__init__.py"] if path is not None else []
+            text = next((file.read_text(encoding="utf-8") for file in files if file.is_file()), None)
+            self.sources[module] = None if text is None else _parsed(text, module.startswith(_SETTINGS))
+        return self.sources[module]
+
+
+@functools.cache
+def _parsed(text: str, settings: bool = False) -> _Module:
+    """A source file without docstrings and error messages; of settings also without fields and checks."""
+    module = _Module()
+    for node in _Stripped(settings).visit(ast.parse(text)).body:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                bound = alias.asname or alias.name.partition(".")[0]
+                module.imported[bound] = (alias.name if alias.asname else bound, None)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                module.imported[alias.asname or alias.name] = (node.module, alias.name)
+        elif defined := _defined(node):
+            for name in defined:
+                module.definitions.setdefault(name, []).append(node)
+        elif not isinstance(node, ast.Pass):
+            module.others.append(node)
+    return module
+
+
+class _Stripped(ast.NodeTransformer):
+    """Removes docstrings and other bare texts, and what is raised; of settings the fields and their checks."""
+
+    def __init__(self, settings: bool):
+        self.settings = settings
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> ast.AST:
+        self.generic_visit(node)
+        if self.settings:
+            plain = [each for each in node.body if isinstance(each, ast.FunctionDef) and not each.decorator_list]
+            node.body = [*plain, ast.Pass()]
+        return node
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST:
+        self.generic_visit(node)
+        bare = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return ast.Pass() if bare else node
+
+    def visit_Raise(self, node: ast.Raise) -> ast.AST:
+        return ast.Raise()
+
+
+def _defined(node: ast.stmt) -> list[str]:
+    """Names that a top-level statement defines."""
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return [node.name]
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+    return [each.id for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)]
+
+
+def _names(node: ast.AST) -> Iterator[tuple[str, ...]]:
+    """Every name in a statement with the attributes that are taken of it, as (a, b, c) for a.b.c."""
+    for each in ast.walk(node):
+        if isinstance(each, ast.Name):
+            yield (each.id,)
+        elif isinstance(each, ast.Attribute):
+            parts: list[str] = []
+            base: ast.expr = each
+            while isinstance(base, ast.Attribute):
+                parts.append(base.attr)
+                base = base.value
+            if isinstance(base, ast.Name):
+                yield (base.id, *reversed(parts))

@@ -1,0 +1,25 @@
+"""numba.njit with a cache of machine code that is keyed by the sources of all kernels.
+
+numba itself keeps a function's machine code as long as the function's own file is the same, though functions and
+constants of other files are compiled into it. Here a change in any of them makes another folder.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+from perilune_render.provenance.caches import machine_code_folder
+
+
+def njit(**options: Any) -> Callable[[Callable], Any]:
+    """`numba.njit(cache=True)` with the machine code in `machine_code_folder()`."""
+
+    def decorate(function: Callable) -> Any:
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(machine_code_folder())
+        try:
+            return numba.njit(cache=True, **options)(function)
+        finally:
+            numba.config.CACHE_DIR = before
+
+    return decorate

@@ -1,0 +1,72 @@
+"""The recipe that a dataset records, and the way back from it to a configuration."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from perilune_render.config import DatasetConfig
+from perilune_render.provenance.versions import all_versions, ground_versions
+from perilune_shared.config import resolve_over
+from perilune_shared.dataset.metadata import Recipe
+from perilune_shared.dataset.schema import Kind
+from perilune_shared.errors import UserError
+
+_FILES = ("dem", "catalogue")
+_SPEED = ("threads", "cache_gib")
+_OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
+
+
+def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
+    """The recipe of a dataset; of a plan, with the versions of its ground only."""
+    with_dem = config.terrain.dem is not None
+    versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
+    return Recipe(preset=preset, kind=kind, seed=config.seed, config=recorded_settings(config, kind), versions=versions)
+
+
+def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
+    """The settings that stand in a recipe, as plain data.
+
+    Of files only the names are kept. Left out is what changes no byte: settings of speed, and the other kind's settings
+    where the kinds share no terrain.
+    """
+    plain = json.loads(config.model_dump_json())
+    for name in _FILES:
+        if plain["terrain"][name] is not None:
+            plain["terrain"][name] = Path(plain["terrain"][name]).name
+    for name in _SPEED:
+        del plain["render"][name]
+    if not config.shared_terrain:
+        del plain[_OTHER[kind]]
+    return plain
+
+
+def settings_of(recipe: Recipe) -> dict[str, Any]:
+    """The settings of a recipe with a section for each kind, as a configuration has them."""
+    other = _OTHER[recipe.kind]
+    return {other: recipe.config[recipe.kind], **recipe.config} if recipe.kind in recipe.config else recipe.config
+
+
+def same_source(first: str, second: str) -> bool:
+    """Whether two scenes' `dem_source` are of one content, whatever the file was called."""
+    return first.rpartition("sha256:")[2] == second.rpartition("sha256:")[2]
+
+
+def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue: Path | None = None) -> DatasetConfig:
+    """The configuration of a recipe, with the user's own copies of the files that it names.
+
+    A recipe may be anybody's: the files that it names are never opened, only those given here. Raises UserError where
+    one is needed and not given, or the configuration is none of this version.
+    """
+    given = {"dem": dem, "catalogue": catalogue}
+    terrain = recipe.config.get("terrain", {})
+    if not isinstance(terrain, dict):
+        raise UserError(where, "terrain", repr(terrain), "settings")
+    terrain = dict(terrain)
+    for name in _FILES:
+        if terrain.get(name) is None and given[name] is not None:
+            raise UserError(f"--{name}", name, given[name], "no such option: the recipe is of procedural ground")
+        if terrain.get(name) is not None:
+            if given[name] is None:
+                raise UserError(where, f"terrain.{name}", terrain[name], f"--{name} with this machine's copy of it")
+            terrain[name] = str(given[name])
+    return resolve_over(DatasetConfig, "dataset", str(where), {**settings_of(recipe), "terrain": terrain})

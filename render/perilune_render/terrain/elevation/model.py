@@ -1,0 +1,254 @@
+"""A real elevation model as the base of a scene: any projection, any pixel size, holes."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import rasterio.warp
+from rasterio.errors import RasterioError
+from scipy import ndimage
+from scipy.interpolate import RectBivariateSpline
+
+from perilune_render.config_terrain import Outside
+from perilune_render.terrain.elevation.continuation import continued, distance_in_holes_m, margin_m, mean_slope
+from perilune_render.terrain.elevation.quantisation import smoothed, step_of
+from perilune_render.terrain.grid import Grid
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, selenographic_from_site
+from perilune_shared.storage.files import sha256_of
+
+_MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
+_LARGEST_PIXELS = 100_000_000
+_RESOLVED_PIXELS = 4.0
+_SWELL_M = 120.0
+"""Waves longer than about four times this keep their slope beyond the edge of a mirrored model."""
+_SEAM_M = 100.0
+"""Width of the band along the edge in which short waves keep their slope too."""
+
+
+@dataclass(frozen=True, slots=True)
+class ElevationModel:
+    """An elevation model in memory."""
+
+    height_m: Array
+    """Rows from the raster's top (rows, columns), metres, holes filled."""
+    known: np.ndarray
+    """Where the raster has a height of its own (rows, columns)."""
+    transform: rasterio.Affine
+    """Projected coordinates from (column, row), raster corners."""
+    crs: rasterio.crs.CRS
+    """The projection."""
+    latitude_deg: float
+    """Of the raster's middle, which becomes the site."""
+    longitude_deg: float
+    """Of the raster's middle."""
+    pixel_m: float
+    """Ground size of a pixel, mean of both directions, metres."""
+    pixel_sides_m: tuple[float, float]
+    """Ground size of a pixel from row to row and from column to column, metres."""
+    step_m: float
+    """Step in which the raster holds its heights, metres, where that makes terraces; 0 otherwise."""
+    hole_m: Array | None
+    """Distance of each pixel (rows, columns) from the nearest known one, metres; None without holes."""
+    source: str
+    """File name and SHA-256."""
+
+    def selenographic(self, column: Array, row: Array) -> tuple[Array, Array]:
+        """Latitude and longitude in degrees of places (N,) counted from the raster's top left corner."""
+        longitude, latitude = rasterio.warp.transform(self.crs, _MOON, *(self.transform @ (column, row)))
+        return np.array(latitude), np.array(longitude)
+
+
+def read_elevation(path: Path) -> ElevationModel:
+    """Read a GeoTIFF. Raises UserError where it is missing, no raster, without projection or pixel size, or empty.
+
+    Holes (nodata, NaN) are filled from the nearest known height. Heights may be elevations or radii: only differences
+    count, since the site is put at height 0. Heights in steps are smoothed within half a step
+    (`perilune_render.terrain.elevation.quantisation`).
+    """
+    if not path.is_file():
+        raise UserError(path, "dem", "no such file", "a GeoTIFF elevation model")
+    try:
+        with rasterio.open(path) as raster:
+            if raster.width * raster.height > _LARGEST_PIXELS:
+                raise UserError(path, "size", f"{raster.width} x {raster.height}", f"at most {_LARGEST_PIXELS} pixels")
+            height = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
+            # Some products hold integers and say what they stand for.
+            height = height * raster.scales[0] + raster.offsets[0]
+            transform, crs = raster.transform, raster.crs
+    except RasterioError as error:
+        raise UserError(path, "dem", error.__cause__ or error, "a readable GeoTIFF") from None
+    if transform.is_identity or transform.determinant == 0:
+        raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
+    if crs is None:
+        raise UserError(path, "projection", "none", "a coordinate reference system of the Moon")
+    _refuse_other_bodies(path, crs)
+    known = np.isfinite(height)
+    if known.sum() < 16:
+        raise UserError(path, "heights", f"{known.sum()} known", "an elevation model with data")
+    if not known.all():
+        nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+        height = height[tuple(nearest)]
+    middle = (height.shape[1] / 2, height.shape[0] / 2)
+    try:
+        lon, lat = rasterio.warp.transform(crs, _MOON, *([v] for v in transform @ middle))
+    except RasterioError as error:
+        raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
+    sides = _pixel_sides_m(transform, crs, middle, lat[0], lon[0])
+    hole = distance_in_holes_m(known, sides)
+    step = step_of(height[known], float(np.mean(sides)))
+    if step:
+        height = smoothed(height, step)
+    plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
+    source = f"{plain_name} sha256:{sha256_of(path)}"
+    place = float(lat[0]), float(lon[0])
+    return ElevationModel(height, known, transform, crs, *place, float(np.mean(sides)), sides, step, hole, source)
+
+
+def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
+    """Raises UserError where a coordinate system's ellipsoid is missing, or not the Moon's within one percent.
+
+    PROJ refuses to transform between bodies, with an error that says neither.
+    """
+    found = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
+    radius = float(found[2]) if found else 0.0
+    if abs(radius / MOON_RADIUS_M - 1) > 0.01:
+        name = f"{found[1]}, radius {radius / 1000:.0f} km" if found else "none on a sphere or ellipsoid"
+        raise UserError(
+            path, "projection", name, f"a coordinate reference system of the Moon ({MOON_RADIUS_M / 1000:.0f} km)"
+        )
+
+
+def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+    """Column and row, counted from the raster's top left corner, of places (...) of O_L's plane."""
+    lat, lon = selenographic_from_site(x_m, y_m, model.latitude_deg, model.longitude_deg)
+    east, north = (np.array(v) for v in rasterio.warp.transform(_MOON, model.crs, np.ravel(lon), np.ravel(lat)))
+    if model.crs.is_geographic:
+        # A raster may count longitudes from 0 or from -180, and may lie across either.
+        middle = (model.transform @ (model.height_m.shape[1] / 2, model.height_m.shape[0] / 2))[0]
+        east += 360 * np.round((middle - east) / 360)
+    column, row = ~model.transform @ (east, north)
+    return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
+
+
+def resolved_m(model: ElevationModel) -> float:
+    """Diameter in metres from which an elevation model shows a crater: four pixels. Smaller ones are added."""
+    return _RESOLVED_PIXELS * model.pixel_m
+
+
+def beyond_m(model: ElevationModel, column: Array, row: Array) -> Array:
+    """Distance in metres of raster places (...) from the model's known ground: 0 on it, more in holes and outside."""
+    rows, columns = model.height_m.shape
+    down = np.maximum(np.maximum(-row, row - rows), 0) * model.pixel_sides_m[0]
+    across = np.maximum(np.maximum(-column, column - columns), 0) * model.pixel_sides_m[1]
+    beyond = np.hypot(down, across)
+    if model.hole_m is not None:
+        beyond += ndimage.map_coordinates(model.hole_m, [row - 0.5, column - 0.5], order=1, mode="nearest")
+    return beyond
+
+
+def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
+    """Raises UserError where `outside` is "refuse" and the ground reaches beyond the model's raster."""
+    if outside != "refuse":
+        return
+    edge = grid.extent_m / 2 * np.linspace(-1, 1, 33)
+    x, y = np.concatenate([(edge, edge * 0 + side) for side in (edge[0], edge[-1])], axis=1)
+    column, row = raster_places(model, np.append(x, y), np.append(y, x))
+    rows, columns = model.height_m.shape
+    if ((row < 0) | (row > rows) | (column < 0) | (column > columns)).any():
+        down, across = rows * model.pixel_sides_m[0], columns * model.pixel_sides_m[1]
+        raise UserError(
+            model.source,
+            "dataset.terrain.elevation.outside",
+            f"a model of {across:.0f} m x {down:.0f} m for {grid.extent_m:.0f} m of ground",
+            "a larger model, a lower flight or a narrower view, or dataset.terrain.elevation.outside=procedural",
+        )
+
+
+def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
+    """What a user should know of a model before the ground is made from it, a line each."""
+    lines = []
+    name = model.source.split(" sha256:")[0]
+    if model.step_m:
+        lines.append(f"{name}: heights are in steps of {model.step_m:.3g} m; they are smoothed within half a step")
+    net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 129)
+    share = float((beyond_m(model, *raster_places(model, *np.meshgrid(net, net))) == 0).mean())
+    if share < 1:
+        rest = "procedural" if outside == "procedural" else "its mirror image"
+        side = f"{grid.extent_m:.0f} m"
+        lines.append(f"{name}: {share:.0%} of the ground, {side} x {side}, is real, the rest {rest}")
+    return lines
+
+
+def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedural") -> tuple[Array, Array]:
+    """Heights (n_vertices,) of the model on the grid in metres, site at 0, and the distance (n_vertices,) beyond it.
+
+    Bicubic inside. Beyond the model the ground continues smoothly
+    (`perilune_render.terrain.elevation.continuation`); relief and craters are added later. With `outside` "mirror" it
+    is the model's mirror image. The distance is that from known ground (`beyond_m`). Raises UserError where the ground
+    reaches beyond the model and `outside` is "refuse".
+    """
+    rows, columns = model.height_m.shape
+    # Pixel coordinates vary slowly over a site: project a coarse net and interpolate.
+    net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 65)
+    column, row = raster_places(model, *np.meshgrid(net, net))
+    x, y = grid.vertices_xy()
+    column, row = (RectBivariateSpline(net, net, place).ev(y, x) for place in (column, row))
+    beyond = beyond_m(model, column, row)
+    pixels = float(np.maximum.reduce([-row, row - rows, -column, column - columns]).max())
+    sides = rows * model.pixel_sides_m[0], columns * model.pixel_sides_m[1]
+    refuse_beyond(model, grid, outside)
+    middle = grid.n_half * (2 * grid.n_half + 2)
+    if not beyond.any():
+        height = ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="nearest")
+        return height - height[middle], beyond
+    margin = int(np.ceil(max(pixels, 0))) + 2
+    if outside == "procedural":
+        margin = min(margin, int(np.ceil(margin_m(sides) / min(model.pixel_sides_m))) + 2)
+    if (rows + 2 * margin) * (columns + 2 * margin) > _LARGEST_PIXELS:
+        ground = f"{grid.extent_m:.0f} m of ground"
+        raise UserError(model.source, "dem", f"{rows} x {columns} pixels for {ground}", "a model of similar extent")
+    places = [row - 0.5 + margin, column - 0.5 + margin]
+    if outside == "mirror":
+        padded = _mirrored(model.height_m, margin, model.pixel_m)
+        height = ndimage.map_coordinates(padded, places, order=3, mode="nearest")
+    else:
+        centres = [np.arange(n + 2 * margin) + 0.5 - margin for n in (rows, columns)]
+        far = beyond_m(model, *np.meshgrid(centres[1], centres[0]))
+        padded = continued(model.height_m, far, margin, model.pixel_sides_m)
+        height = ndimage.map_coordinates(padded, places, order=3, mode="nearest")
+        height += mean_slope(model.height_m, row - 0.5, column - 0.5, beyond, min(sides))
+    return height - height[middle], beyond
+
+
+def _mirrored(height_m: Array, margin: int, pixel_m: float) -> Array:
+    """Heights with `margin` more pixels on each side, without a crease at the old edge.
+
+    Long waves go on by point reflection, which keeps the slope across the edge; short ones by mirroring, so that
+    craters stay craters, and by point reflection too in a narrow band along the edge.
+    """
+    point_reflected = np.pad(height_m, margin, mode="reflect", reflect_type="odd")
+    swell = ndimage.gaussian_filter(point_reflected, _SWELL_M / pixel_m, mode="nearest")
+    inner = slice(margin, -margin)
+    mirrored = np.pad(height_m - swell[inner, inner], margin, mode="reflect")
+    rows, columns = (
+        np.maximum(np.maximum(margin - i, i - margin - n + 1), 0)
+        for i, n in zip(np.ogrid[: len(swell), : swell.shape[1]], height_m.shape, strict=True)
+    )
+    away = np.clip(np.maximum(rows, columns) * pixel_m / _SEAM_M, 0, 1)
+    away = away * away * (3 - 2 * away)
+    return swell + away * mirrored + (1 - away) * (point_reflected - swell)
+
+
+def _pixel_sides_m(
+    transform: rasterio.Affine, crs: rasterio.crs.CRS, middle: tuple[float, float], lat: float, lon: float
+) -> tuple[float, float]:
+    """Ground size of the middle pixel from row to row and from column to column, from great-circle distances."""
+    places = [transform @ (middle[0], middle[1] + 1), transform @ (middle[0] + 1, middle[1])]
+    lons, lats = rasterio.warp.transform(crs, _MOON, [p[0] for p in places], [p[1] for p in places])
+    to_east = np.cos(np.radians(lat)) * np.radians((np.array(lons) - lon + 180) % 360 - 180)
+    to_north = np.radians(np.array(lats) - lat)
+    down, across = MOON_RADIUS_M * np.hypot(to_east, to_north)
+    return float(down), float(across)

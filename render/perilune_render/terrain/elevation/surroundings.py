@@ -1,0 +1,121 @@
+"""Relief of procedural ground about an elevation model, with the model's own statistics.
+
+Measured is the robust deviation (median over 0.6745, so that one pit does not count) of second differences of height
+over a range of baselines, on the model and on ground with the configured craters alone. A self-affine relief is
+fitted to what the craters leave.
+"""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.config_terrain import CratersConfig, ReliefConfig
+from perilune_render.streams import derived_seed, stream
+from perilune_render.terrain.craters import draw_craters
+from perilune_render.terrain.elevation.continuation import fade
+from perilune_render.terrain.elevation.model import ElevationModel, resolved_m
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.noise import add_waves
+from perilune_render.terrain.stamp import stamp_craters
+from perilune_shared.geometry.frames import Array
+
+_NORMAL = 0.6745
+"""Median of the absolute value over the standard deviation of a normal law."""
+_HURST = np.arange(0.4, 1.01, 0.05)
+_LARGEST_TRIAL = 384
+"""Pixels along a side of the trial ground with craters alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class FittedRelief:
+    """Self-affine waves: amplitude coefficient times wavelength^hurst, in octaves."""
+
+    wavelength_m: Array
+    """Octaves that the model resolves and longer ones, metres (N,)."""
+    amplitude_m: Array
+    """Of gradient noise (`perilune_render.terrain.noise.add_waves`), metres (N,)."""
+    hurst_exponent: float
+    """Fitted."""
+
+
+def fitted_relief(model: ElevationModel, relief: ReliefConfig, craters: CratersConfig, seed: int) -> FittedRelief:
+    """Waves from what the model resolves to the configured longest one, fitted to the model."""
+    n_octaves = int(np.floor(np.log2(relief.longest_wavelength_m / resolved_m(model)))) + 1
+    wavelength = relief.longest_wavelength_m / 2.0 ** np.arange(max(n_octaves, 0))
+    baselines = 2 ** np.arange(1, max(int(np.log2(min(model.height_m.shape) / 4)), 1) + 1)
+    measured = second_differences(np.where(model.known, model.height_m, np.nan), baselines)
+    left = measured**2 - second_differences(_cratered(model, craters, seed), baselines) ** 2
+    target = np.maximum(left, 0.02 * measured**2)
+    if not len(wavelength) or not target.all():
+        return FittedRelief(wavelength, np.zeros(len(wavelength)), relief.hurst_exponent)
+    response = _response(baselines[:, None] * model.pixel_m / wavelength) ** 2
+    best = (np.inf, 0.0, 0.0)
+    for hurst in _HURST:
+        ratio = np.log(target) - np.log(response @ wavelength ** (2 * hurst))
+        best = min(best, (float(np.abs(ratio - np.median(ratio)).sum()), float(hurst), float(np.median(ratio))))
+    _, hurst, log_square = best
+    return FittedRelief(wavelength, np.exp(log_square / 2) * wavelength**hurst, hurst)
+
+
+def add_fitted_relief(
+    height_m: Array, grid: Grid, fitted: FittedRelief, beyond_m: Array, seed: int, shortest_m: float, longest_m: float
+) -> None:
+    """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
+
+    They lie beyond the model only. Each begins where the model's own relief of its wavelength fades
+    (`continuation.fade`).
+    """
+    outside = np.flatnonzero(beyond_m > 0)
+    for length, amplitude in zip(fitted.wavelength_m, fitted.amplitude_m, strict=True):
+        if shortest_m <= length < longest_m and amplitude > 0:
+            waves = np.zeros(grid.n_vertices)
+            add_waves(waves, grid, float(length), float(amplitude), stream(seed, "surroundings", length))
+            height_m[outside] += waves[outside] * (1 - fade(beyond_m[outside], float(length)) ** 2)
+
+
+def second_differences(height_m: Array, baselines: np.ndarray) -> Array:
+    """Robust deviation (B,) of h(x - b) - 2 h(x) + h(x + b) along both axes of heights (rows, columns), b in pixels.
+
+    NaN are left out; 0 where nothing is left.
+    """
+    found = []
+    for b in baselines:
+        along = [
+            np.abs(h[: -2 * b] - 2 * h[b:-b] + h[2 * b :]).ravel() for h in (height_m, height_m.T) if len(h) > 2 * b
+        ]
+        values = np.concatenate(along) if along else np.empty(0)
+        values = values[np.isfinite(values)]
+        found.append(np.median(values) / _NORMAL if len(values) else 0.0)
+    return np.array(found)
+
+
+def _cratered(model: ElevationModel, config: CratersConfig, seed: int) -> Array:
+    """Heights of flat ground with the configured craters, in the model's pixels."""
+    n_half = min(*model.height_m.shape, _LARGEST_TRIAL) // 2
+    grid = Grid.even(n_half * model.pixel_m, n_half)
+    height = np.zeros(grid.n_vertices)
+    craters = draw_craters(config, grid, derived_seed(seed, "trial craters"))
+    stamp_craters(height, np.ones(grid.n_vertices), grid, craters, np.zeros(len(craters)), config.profile)
+    return height.reshape(2 * n_half + 1, -1)
+
+
+def _response(share: Array) -> Array:
+    """Deviation of second differences of gradient noise of amplitude 1, at baselines (...) over the wavelength."""
+    baselines, deviations = _measured_response()
+    return np.interp(share, baselines, deviations)
+
+
+@functools.cache
+def _measured_response() -> tuple[Array, Array]:
+    wavelength, n_half = 32, 192
+    grid = Grid.even(float(n_half), n_half)
+    field = np.zeros(grid.n_vertices)
+    add_waves(field, grid, float(wavelength), 1.0, np.random.default_rng(1))
+    baselines = np.array([1, 2, 4, 6, 8, 11, 16, 22, 32, 45, 64])
+    deviations = second_differences(field.reshape(2 * n_half + 1, -1), baselines)
+    # Second differences of a smooth wave fall with the square of the baseline.
+    low = np.array([1 / 64, 1 / 16, 1 / 4])
+    return np.concatenate([low / wavelength, baselines / wavelength]), np.concatenate(
+        [deviations[0] * low**2, deviations]
+    )

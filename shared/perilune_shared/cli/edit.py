@@ -1,0 +1,177 @@
+"""Commands of `perilune-manifest` that make one dataset of others."""
+
+import enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.editing import attach as attaching
+from perilune_shared.editing import diff as differing
+from perilune_shared.editing import merge as merging
+from perilune_shared.editing import migrate as migrating
+from perilune_shared.editing import pack as packing
+from perilune_shared.editing.rewrite import ImageMode
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.subset import subset as choose
+from perilune_shared.errors import UserError
+from perilune_shared.progress import progress_bar
+
+EXIT_DIFFERENT = 1
+
+
+class Images(enum.StrEnum):
+    """How frames are written."""
+
+    COPY = "copy"
+    NONE = "none"
+    PLAN = "plan"
+
+
+class Unit(enum.StrEnum):
+    """What stays together in one split."""
+
+    SCENE = "scene"
+    TRAJECTORY = "trajectory"
+    FRAME = "frame"
+
+
+DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the one that holds dataset.json.")]
+OutOption = Annotated[Path, typer.Option(help="New folder for the result.")]
+ImagesOption = Annotated[
+    Images,
+    typer.Option(help="Frames: copy, none (leave them out), plan (leave out craters, boulders and labels too)."),
+]
+
+LinkOption = Annotated[
+    bool,
+    typer.Option("--link", help="Hard links instead of copies of frames: an edit in one dataset changes both."),
+]
+
+
+def _mode(images: Images, link: bool) -> ImageMode:
+    if link and images is not Images.COPY:
+        raise UserError("--link", "--images", images.value, "copy: the others leave frames out")
+    return "link" if link else images.value
+
+
+def add_to(app: typer.Typer) -> None:
+    """Add the commands to a command line."""
+    for command in (merge, subset, split, diff, migrate, pack, unpack, attach):
+        app.command()(command)
+
+
+def _tell(out: Path) -> None:
+    """What was made, and whether its splits share terrain."""
+    info = open_dataset(out).info
+    counts = info.counts
+    told = f"{counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames, {counts.labels} labels"
+    line = f"{out}: {told}, frames {info.images}, split by {info.split_by}{info.leak}"
+    Console().print(Text(line), soft_wrap=True)
+
+
+def merge(
+    datasets: Annotated[list[Path], typer.Argument(help="Folders of two datasets or more, of one kind and camera.")],
+    out: OutOption,
+    name: Annotated[str, typer.Option(help="Name of the result.")] = "merged",
+    images: ImagesOption = Images.COPY,
+    link: LinkOption = False,
+) -> None:
+    """Make one dataset of several. The same scene or frame in two of them comes once."""
+    with progress_bar() as progress:
+        merging.merge([open_dataset(path) for path in datasets], out, name, _mode(images, link), progress)
+    _tell(out)
+
+
+def subset(
+    dataset: DatasetArgument,
+    out: OutOption,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(help='Condition on columns, as "radius_px > 5" or "split == \'test\'"; may be repeated.'),
+    ] = None,
+    frames: Annotated[int | None, typer.Option(help="At most this many frames.")] = None,
+    mb: Annotated[float | None, typer.Option(help="At most this many megabytes of PNGs.")] = None,
+    images: ImagesOption = Images.COPY,
+    link: LinkOption = False,
+) -> None:
+    """Take part of a dataset: frames or labels for which conditions hold, so many frames, so many megabytes."""
+    with progress_bar() as progress:
+        choose(open_dataset(dataset), out, tuple(where or ()), frames, mb, _mode(images, link), progress)
+    _tell(out)
+
+
+def split(
+    dataset: DatasetArgument,
+    out: OutOption,
+    by: Annotated[
+        Unit, typer.Option(help="What goes together; frame is the paper's protocol, which leaks terrain.")
+    ] = Unit.SCENE,
+    val: Annotated[float, typer.Option(help="Share for validation.")] = 0.1,
+    test: Annotated[float, typer.Option(help="Share for the test.")] = 0.1,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the split.")] = 0,
+    images: ImagesOption = Images.COPY,
+    link: LinkOption = False,
+) -> None:
+    """Assign scenes, trajectories or frames to another train, val and test split."""
+    with progress_bar() as progress:
+        split_dataset(open_dataset(dataset), out, by.value, val, test, seed, _mode(images, link), progress)
+    _tell(out)
+
+
+def diff(first: DatasetArgument, second: DatasetArgument) -> None:
+    """Show what differs between two datasets. Exit code 1 where something does."""
+    found = differing.differences(open_dataset(first), open_dataset(second))
+    if not found:
+        Console().print("no difference")
+        return
+    table = Table("where", "column", "rows", "for example", "first", "second")
+    for each in found:
+        cells = (each.place, each.column, str(each.rows), each.example, each.first, each.second)
+        table.add_row(*(Text(cell, overflow="fold") for cell in cells))
+    Console().print(table)
+    raise typer.Exit(EXIT_DIFFERENT)
+
+
+def migrate(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
+    """Bring a dataset of an older schema version to the present one."""
+    with progress_bar() as progress:
+        migrating.migrate(dataset, out, progress, link=link)
+    _tell(out)
+
+
+def pack(
+    dataset: DatasetArgument,
+    out: OutOption,
+    shard_mb: Annotated[float, typer.Option(help="Size of an image shard, megabytes.")] = 1000,
+) -> None:
+    """Put frames into few large Parquet files and each table into one, to move or to stream them."""
+    with progress_bar() as progress:
+        packing.pack(open_dataset(dataset), out, shard_mb, progress)
+    _tell(out)
+
+
+def unpack(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
+    """Make files of packed frames again."""
+    with progress_bar() as progress:
+        packing.unpack(open_dataset(dataset), out, progress, link=link)
+    _tell(out)
+
+
+def attach(
+    manifest: DatasetArgument,
+    frames: Annotated[Path, typer.Option(help="Folder that `perilune-render regenerate --out` filled.")],
+    out: OutOption,
+    rehash: Annotated[
+        bool, typer.Option("--rehash", help="Take frames of other hashes, and write theirs down.")
+    ] = False,
+    link: LinkOption = False,
+) -> None:
+    """Make a dataset of a manifest without frames and the frames that were made from it."""
+    with progress_bar() as progress:
+        attaching.attach(open_dataset(manifest), frames, out, rehash, progress, link=link)
+    _tell(out)

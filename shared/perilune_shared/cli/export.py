@@ -1,0 +1,127 @@
+"""`perilune-manifest export` and `card`: a dataset for the tools of other fields, and a page about it for people."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from perilune_shared.cli.edit import DatasetArgument, LinkOption
+from perilune_shared.config_errors import nearest
+from perilune_shared.dataset.keys import check_keys
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.schema import SPLITS
+from perilune_shared.dataset.selection import SELECTIONS
+from perilune_shared.errors import UserError
+from perilune_shared.progress import progress_bar
+from perilune_shared.storage.files import check_free
+
+
+class ExportFormat(StrEnum):
+    """What a dataset can be turned into."""
+
+    COCO = "coco"
+    YOLO = "yolo"
+    TUM = "tum"
+    KITTI = "kitti"
+    CROISSANT = "croissant"
+    HUGGING_FACE = "huggingface"
+
+
+_WITH_LABELS = (ExportFormat.COCO, ExportFormat.YOLO, ExportFormat.HUGGING_FACE)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands of this file."""
+    app.command()(export)
+    app.command()(card)
+
+
+def export(
+    dataset: DatasetArgument,
+    format: Annotated[
+        ExportFormat,
+        typer.Option(
+            help="coco, yolo: boxes and ellipses; tum, kitti: camera poses; huggingface: frames with pose and labels; "
+            "croissant: metadata."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="New folder; for croissant a .json file in the dataset, croissant.json unless given."),
+    ] = None,
+    split: Annotated[str | None, typer.Option(help="train, val or test alone (not for croissant).")] = None,
+    selection: Annotated[
+        str,
+        typer.Option(
+            help="Labels to find: all, paper, visible; coco marks others as iscrowd, yolo drops them, huggingface "
+            "says which are chosen."
+        ),
+    ] = "all",
+    link: LinkOption = False,
+) -> None:
+    """Write labels, trajectories or metadata in the form of another field's tools. See docs/export.md."""
+    from perilune_shared.export.coco import export_coco
+    from perilune_shared.export.croissant import export_croissant
+    from perilune_shared.export.hugging_face import export_hugging_face
+    from perilune_shared.export.rows import by_selection
+    from perilune_shared.export.trajectory import export_kitti, export_tum
+    from perilune_shared.export.yolo import export_yolo
+
+    opened = open_dataset(dataset)
+    check_keys(opened)
+    if split is not None and split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    if selection not in SELECTIONS:
+        raise UserError("--selection", "selection", selection, nearest(selection, tuple(SELECTIONS)))
+    choose = by_selection(SELECTIONS[selection]) if selection != "all" else None
+    if choose is not None and format not in _WITH_LABELS:
+        raise UserError(
+            "--selection", "selection", selection, "--format coco, yolo or huggingface: the others hold no labels"
+        )
+    if link and format is not ExportFormat.YOLO:
+        raise UserError("--link", "--format", format.value, "yolo: the others hold no images")
+    if format is ExportFormat.CROISSANT:
+        if split is not None:
+            raise UserError("--split", "split", split, "none: Croissant describes the whole dataset")
+        with progress_bar() as progress:
+            written = export_croissant(opened, out, progress)
+        _say(f"{written}: written")
+        return
+    if out is None:
+        raise UserError("--out", "folder", "none", f"a new folder for the {format} files")
+    check_free(out)
+    with progress_bar() as progress:
+        match format:
+            case ExportFormat.COCO:
+                done = f"{export_coco(opened, out, progress, split, choose)} annotations"
+            case ExportFormat.YOLO:
+                done = f"{export_yolo(opened, out, progress, split, choose, link=link)} boxes"
+            case ExportFormat.HUGGING_FACE:
+                done = f"{export_hugging_face(opened, out, progress, split, choose)} frames"
+            case ExportFormat.TUM:
+                done = f"{export_tum(opened, out, progress, split)} descents"
+            case ExportFormat.KITTI:
+                done = f"{export_kitti(opened, out, progress, split)} descents"
+    _say(f"{out}: {done}")
+
+
+def card(
+    dataset: DatasetArgument,
+    out: Annotated[
+        Path | None, typer.Option(help="Markdown file, its picture beside it; README.md in the dataset unless given.")
+    ] = None,
+) -> None:
+    """Write a page about the dataset: counts, histograms, labelled frames, licence, how to make it again."""
+    from perilune_shared.export.card import write_card
+
+    with progress_bar() as progress:
+        page, picture = write_card(open_dataset(dataset), out, progress)
+    _say(f"{page}, {picture}: written")
+
+
+def _say(line: str) -> None:
+    # As Text, since brackets would be read as markup.
+    Console().print(Text(line), soft_wrap=True)

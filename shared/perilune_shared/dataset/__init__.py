@@ -1,0 +1,1 @@
+"""A dataset as tables: schema, metadata, reading, writing, selection."""

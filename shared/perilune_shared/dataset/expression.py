@@ -1,0 +1,255 @@
+"""Conditions on columns, as `--where` takes them: arithmetic and comparisons in Python's notation.
+
+A condition is parsed by `ast`, its types are checked against the schema, and it is compiled to an expression of
+pyarrow.compute; nothing of it is ever executed. Columns go by name, or by `table.column` where several tables have it;
+`position_m[2]` is an element of a vector. As in SQL, a comparison with a null is neither true nor false.
+"""
+
+import ast
+import difflib
+import functools
+import operator
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.errors import UserError
+
+_SEARCHED = ("frames", "labels", "scenes", "craters", "trajectories")
+"""Where a bare name is looked for, first to last."""
+_COMPARED: dict[type, Callable] = {
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
+_ARITHMETIC: dict[type, Callable] = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
+_FUNCTIONS: dict[str, Callable] = {"abs": pc.abs, "sqrt": pc.sqrt, "log10": pc.log10}
+_LONGEST = 2000
+_FORMS = "columns, numbers, text, + - * / %, abs, sqrt, log10, comparisons, in, and, or, not"
+_Kind = Literal["integer", "real", "text", "truth", "vector"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Value:
+    """A part of a condition."""
+
+    kind: _Kind
+    """Type of its values."""
+    expression: Any
+    """Its pyarrow expression."""
+    length: int = 0
+    """Number of elements of a vector."""
+
+    @property
+    def is_number(self) -> bool:
+        return self.kind in ("integer", "real")
+
+
+class Condition:
+    """A parsed condition."""
+
+    def __init__(self, text: str):
+        """Raises UserError on what is no condition, names no column or mixes types."""
+        self.text = text
+        self.columns: set[tuple[str, str]] = set()
+        self._joined = self._compiled(lambda table, name: f"{table}.{name}")
+        if not self.columns:
+            raise self._fault(text, "a condition on columns")
+
+    @property
+    def on_labels(self) -> bool:
+        """Whether it chooses labels rather than frames."""
+        return any(table in ("labels", "craters") for table, _ in self.columns)
+
+    def columns_of_only(self, table: str) -> list[str] | None:
+        """The columns that it names, where all are of one table; else None."""
+        return sorted(name for _, name in self.columns) if {table} == {own for own, _ in self.columns} else None
+
+    def within_table(self) -> Any:
+        """Its pyarrow expression on columns by their bare names, for a condition on one table."""
+        return self._compiled(lambda table, name: name)
+
+    def holds(self, rows: pa.Table) -> NDArray[np.bool_]:
+        """Where it holds (N,), given its columns as `table.column`. Raises UserError where numbers overflow."""
+        mask = np.zeros(len(rows), np.bool_)
+        try:
+            found = rows.append_column("", pa.array(np.arange(len(rows)))).filter(self._joined)
+        except pa.ArrowException as error:
+            raise self._fault(self.text, f"numbers within the range of their columns ({error})") from None
+        mask[found[""].to_numpy()] = True
+        return mask
+
+    def _compiled(self, named: Callable[[str, str], str]) -> Any:
+        try:
+            if len(self.text) > _LONGEST:
+                raise ValueError(f"{len(self.text)} characters")
+            value = self._walk(ast.parse(self.text.strip(), mode="eval").body, named)
+        except (
+            SyntaxError,
+            TypeError,
+            ValueError,
+            OverflowError,
+            RecursionError,
+            MemoryError,
+            pa.ArrowException,
+        ) as error:
+            wanted = f"a condition such as radius_px > 5 and split == 'test' ({error})"
+            raise self._fault(self.text, wanted) from None
+        if value.kind != "truth":
+            raise self._fault(self.text, "a condition that is true or false for each row")
+        return value.expression
+
+    def _walk(self, node: ast.expr, named: Callable[[str, str], str]) -> _Value:
+        def walk(child: ast.expr) -> _Value:
+            return self._walk(child, named)
+
+        match node:
+            case ast.Name() | ast.Attribute():
+                table, name = self._column(node)
+                self.columns.add((table, name))
+                return _column_value(TABLES[table].field(name).type, pc.field(named(table, name)))
+            case ast.Constant(value=bool() | int() | float() | str() as constant):
+                return _constant(constant)
+            case ast.BoolOp():
+                join = operator.and_ if isinstance(node.op, ast.And) else operator.or_
+                values = [self._truth(walk(value), value) for value in node.values]
+                return _Value("truth", functools.reduce(join, values))
+            case ast.UnaryOp(op=ast.Not()):
+                return _Value("truth", ~self._truth(walk(node.operand), node.operand))
+            case ast.UnaryOp(op=ast.USub()):
+                value = self._number(walk(node.operand), node.operand)
+                return _Value(value.kind, pc.negate_checked(value.expression))
+            case ast.BinOp():
+                left, right = (self._number(walk(side), side) for side in (node.left, node.right))
+                return self._arithmetic(node, left, right)
+            case ast.Compare():
+                return self._compare(node, walk)
+            case ast.Subscript(slice=ast.Constant(value=int() as place)) if not isinstance(place, bool):
+                value = walk(node.value)
+                if value.kind != "vector" or place >= value.length:
+                    raise self._fault(
+                        ast.unparse(node), f"an element 0 to {value.length - 1}" if value.length else _FORMS
+                    )
+                return _Value("real", pc.list_element(value.expression, place))
+            case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
+                value = self._number(walk(argument), argument)
+                if name == "abs":
+                    return _Value(value.kind, pc.abs_checked(value.expression))
+                return _Value("real", _FUNCTIONS[name](value.expression.cast(pa.float64())))
+            case ast.Call(func=ast.Name(id=name)) if name in _FUNCTIONS:
+                raise self._fault(ast.unparse(node), f"one argument of {name}, without a name")
+        raise self._fault(ast.unparse(node), _FORMS)
+
+    def _arithmetic(self, node: ast.BinOp, left: _Value, right: _Value) -> _Value:
+        a, b = left.expression, right.expression
+        whole = left.kind == right.kind == "integer"
+        kind: _Kind = "integer" if whole else "real"
+        if type(node.op) in _ARITHMETIC:
+            return _Value(kind, _ARITHMETIC[type(node.op)](a, b))
+        if isinstance(node.right, ast.Constant) and node.right.value == 0:
+            raise self._fault(ast.unparse(node), "a divisor other than 0")
+        real_a, real_b = a.cast(pa.float64()), b.cast(pa.float64())
+        if isinstance(node.op, ast.Div):
+            return _Value("real", pc.divide(real_a, real_b))
+        if isinstance(node.op, ast.Mod) and whole:
+            # Arrow's division cuts towards zero; the remainder has the divisor's sign, as in Python.
+            rest = a - b * pc.divide(a, b)
+            return _Value(kind, pc.if_else((rest != 0) & pc.xor(rest < 0, b < 0), rest + b, rest))
+        if isinstance(node.op, ast.Mod):
+            return _Value(kind, real_a - pc.floor(pc.divide(real_a, real_b)) * real_b)
+        raise self._fault(ast.unparse(node), _FORMS)
+
+    def _compare(self, node: ast.Compare, walk: Callable[[ast.expr], _Value]) -> _Value:
+        sides = [node.left, *node.comparators]
+        found = []
+        for op, left, right in zip(node.ops, sides, sides[1:], strict=False):
+            if isinstance(op, ast.In | ast.NotIn):
+                inside = self._inside(walk(left), left, right)
+                found.append(inside if isinstance(op, ast.In) else ~inside)
+            elif type(op) in _COMPARED:
+                a, b = walk(left), walk(right)
+                if not ((a.is_number and b.is_number) or a.kind == b.kind == "text"):
+                    raise self._fault(
+                        f"{ast.unparse(left)} ({a.kind}) with {ast.unparse(right)} ({b.kind})",
+                        "comparisons of numbers with numbers and text with text",
+                    )
+                found.append(_COMPARED[type(op)](a.expression, b.expression))
+            else:
+                raise self._fault(ast.unparse(node), "comparisons by == != < <= > >= in")
+        return _Value("truth", functools.reduce(operator.and_, found))
+
+    def _inside(self, value: _Value, left: ast.expr, right: ast.expr) -> Any:
+        if not isinstance(right, ast.Tuple | ast.List) or not right.elts:
+            raise self._fault(ast.unparse(right), "a list after `in`, such as split in ('val', 'test')")
+        try:
+            words = [ast.literal_eval(word) for word in right.elts]
+        except ValueError:
+            raise self._fault(ast.unparse(right), "a list of numbers or of text") from None
+        texts = all(isinstance(word, str) for word in words)
+        numbers = all(isinstance(word, int | float) and not isinstance(word, bool) for word in words)
+        if not ((texts and value.kind == "text") or (numbers and value.is_number)):
+            wanted = "comparisons of numbers with numbers and text with text"
+            raise self._fault(f"{ast.unparse(left)} ({value.kind}) in {ast.unparse(right)}", wanted)
+        if texts:
+            found = value.expression.isin(pa.array(words, pa.string()))
+        elif value.kind == "integer" and all(isinstance(word, int) for word in words):
+            found = value.expression.isin(pa.array(words, pa.int64()))
+        else:
+            found = value.expression.cast(pa.float64()).isin(pa.array([float(word) for word in words]))
+        # For pyarrow a null is in no list: `not in` would hold.
+        return pc.if_else(value.expression.is_valid(), found, pa.scalar(None, pa.bool_()))
+
+    def _number(self, value: _Value, node: ast.expr) -> _Value:
+        if not value.is_number:
+            hint = f"; {ast.unparse(node)}[0] is one" if value.kind == "vector" else ""
+            raise self._fault(f"{ast.unparse(node)} ({value.kind})", f"a number{hint}")
+        return value
+
+    def _truth(self, value: _Value, node: ast.expr) -> Any:
+        if value.kind != "truth":
+            raise self._fault(f"{ast.unparse(node)} ({value.kind})", "conditions beside and, or, not")
+        return value.expression
+
+    def _column(self, node: ast.Name | ast.Attribute) -> tuple[str, str]:
+        if isinstance(node, ast.Attribute):
+            table, name = (node.value.id, node.attr) if isinstance(node.value, ast.Name) else ("", node.attr)
+            if table in _SEARCHED and name in TABLES[table].names:
+                return table, name
+            raise self._fault(ast.unparse(node), f"table.column, with one of {', '.join(_SEARCHED)}")
+        for table in _SEARCHED:
+            if node.id in TABLES[table].names:
+                return table, node.id
+        known = sorted({name for table in _SEARCHED for name in TABLES[table].names})
+        near = difflib.get_close_matches(node.id, known, n=1)
+        raise self._fault(node.id, f"{near[0]}?" if near else "a column of " + ", ".join(_SEARCHED))
+
+    @staticmethod
+    def _fault(found: str, wanted: str) -> UserError:
+        return UserError("--where", "condition", found, wanted)
+
+
+def _column_value(kind: pa.DataType, expression: Any) -> _Value:
+    if pa.types.is_fixed_size_list(kind):
+        return _Value("vector", expression, kind.list_size)
+    return _Value(
+        "text" if pa.types.is_string(kind) else "integer" if pa.types.is_integer(kind) else "real", expression
+    )
+
+
+def _constant(value: bool | float | str) -> _Value:
+    kinds: dict[type, _Kind] = {bool: "truth", int: "integer", float: "real", str: "text"}
+    return _Value(kinds[type(value)], pc.scalar(value))
+
+
+def columns_of(conditions: Iterable[Condition]) -> set[tuple[str, str]]:
+    """All columns, as (table, name), that conditions need."""
+    return {key for condition in conditions for key in condition.columns}

@@ -1,0 +1,134 @@
+"""Keys of a dataset's rows: each key is unique, and each referenced row exists.
+
+A tool that joins tables by broken keys silently takes a wrong row. `validate` reports every such fault with its file
+and row; here the first one stops a command.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.parts import Part
+from perilune_shared.dataset.schema import KEYS
+from perilune_shared.errors import UserError
+
+FRAME_COLUMNS = ("frame_id", "scene_id", "trajectory_id")
+_HINT = "see `perilune-manifest validate`"
+
+
+def check_keys(dataset: Dataset) -> None:
+    """Raises UserError where a key is not unique, or a row names a scene, trajectory, frame or crater that is missing.
+
+    Labels are read part by part; 8 bytes of memory are kept for each.
+    """
+    check = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
+    _check_numbered(dataset, "boulders", check.scene_of)
+    for part in dataset.parts("labels"):
+        opened = Part(part, "labels")
+        for group in range(opened.n_groups):
+            check.add_labels(opened.read(KEYS["labels"], [group]))
+    check.finish()
+
+
+class KeyCheck:
+    """Checks keys of scenes, trajectories, frames and craters on creation, and of labels while a caller reads them.
+
+    Call `add_labels` with all labels of the dataset, some at a time, then `finish`. The keys of boulders, which no
+    other row names, are not checked.
+    """
+
+    def __init__(self, dataset: Dataset, frames: pa.Table):
+        """Takes the table frames with at least FRAME_COLUMNS. Raises UserError where a key is broken."""
+        self._dataset = dataset
+        scenes = dataset.table("scenes", KEYS["scenes"]).to_pandas()
+        _check_unique(dataset, "scenes", scenes)
+        self.scene_of = {name: place for place, name in enumerate(scenes["scene_id"])}
+        trajectories = dataset.table("trajectories", KEYS["trajectories"])
+        _check_unique(dataset, "trajectories", trajectories.to_pandas())
+        _check_known(dataset, "trajectories", "scene_id", trajectories["scene_id"], self.scene_of)
+        self._scene_of_frame = _check_known(dataset, "frames", "scene_id", frames["scene_id"], self.scene_of)
+        known = set(zip(*(trajectories[name].to_pylist() for name in KEYS["trajectories"]), strict=True))
+        odd = set(zip(*(frames[name].to_pylist() for name in KEYS["trajectories"]), strict=True)) - known
+        if odd:
+            raise UserError(dataset.root, "frames: trajectory_id", f"no {'/'.join(min(odd))}", f"trajectories; {_HINT}")
+        self._frame_of = {name: place for place, name in enumerate(frames["frame_id"].to_pylist())}
+        if len(self._frame_of) != len(frames):
+            _check_unique(dataset, "frames", frames.select(KEYS["frames"]).to_pandas())
+        self._numbers, self._keys = _check_numbered(dataset, "craters", self.scene_of)
+        self._seen: list[NDArray[np.int64]] = []
+
+    def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
+        """Place of each label's frame (N,) in the table frames, for labels with frame_id and crater_id.
+
+        Raises UserError where a frame or crater is missing.
+        """
+        frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
+        ids = rows["crater_id"].to_numpy()
+        number = np.searchsorted(self._numbers, ids)
+        known = number < len(self._numbers)
+        known[known] = self._numbers[number[known]] == ids[known]
+        key = self._scene_of_frame[frame] * len(self._numbers) + number
+        place = np.searchsorted(self._keys, key[known])
+        known[known] = (place < len(self._keys)) & (self._keys[np.minimum(place, len(self._keys) - 1)] == key[known])
+        if not known.all():
+            row = rows.slice(int(np.argmin(known)), 1).to_pylist()[0]
+            found = f"no crater {row['crater_id']}, which a label of {row['frame_id']} names"
+            raise UserError(self._dataset.root, "labels: crater_id", found, f"a crater of the frame's scene; {_HINT}")
+        self._seen.append(frame * len(self._numbers) + number)
+        return frame
+
+    def finish(self) -> None:
+        """Raises UserError where two labels are of the same frame and crater."""
+        both = np.concatenate(self._seen) if self._seen else np.empty(0, np.int64)
+        if not (np.diff(both) > 0).all():
+            both.sort()
+        twice = np.flatnonzero(np.diff(both) == 0)
+        if len(twice):
+            frame_place, number_place = divmod(int(both[twice[0]]), len(self._numbers))
+            frame_id = next(name for name, place in self._frame_of.items() if place == frame_place)
+            found = f"crater {self._numbers[number_place]} of {frame_id} twice"
+            raise UserError(self._dataset.root, "labels: frame_id+crater_id", found, f"unique keys; {_HINT}")
+
+
+def _places(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
+    """Place of each text (N,) of a column, -1 where it has none. Each distinct text is looked up once."""
+    found = []
+    for chunk in column.chunks:
+        words = chunk.dictionary_encode()
+        own = [*(place_of.get(word, -1) for word in words.dictionary.to_pylist()), -1]
+        found.append(np.array(own, np.int64)[words.indices.fill_null(len(own) - 1).to_numpy()])
+    return np.concatenate(found) if found else np.empty(0, np.int64)
+
+
+def _check_numbered(
+    dataset: Dataset, table: str, scene_of: Mapping[str, int]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """All numbers of craters or boulders, and their keys (the places of scene and number in one), both sorted."""
+    rows = dataset.table(table, KEYS[table])
+    scene = _check_known(dataset, table, "scene_id", rows["scene_id"], scene_of)
+    numbers, place = np.unique(rows[KEYS[table][1]].to_numpy(), return_inverse=True)
+    keys = np.sort(scene * len(numbers) + place)
+    if (np.diff(keys) == 0).any():
+        _check_unique(dataset, table, rows.to_pandas())
+    return numbers, keys
+
+
+def _check_known(
+    dataset: Dataset, table: str, name: str, column: pa.ChunkedArray, place_of: Mapping[str, int]
+) -> NDArray[np.int64]:
+    found = _places(column, place_of)
+    if (found < 0).any():
+        missing = column[int(np.argmin(found))].as_py()
+        raise UserError(dataset.root, f"{table}: {name}", f"no {missing}", f"{name.removesuffix('_id')}s; {_HINT}")
+    return found
+
+
+def _check_unique(dataset: Dataset, table: str, rows: pd.DataFrame) -> None:
+    twice = rows.duplicated(KEYS[table])
+    if twice.any():
+        found = " ".join(map(str, rows[KEYS[table]].iloc[int(np.argmax(twice))])) + " twice"
+        raise UserError(dataset.root, f"{table}: {'+'.join(KEYS[table])}", found, f"unique keys; {_HINT}")

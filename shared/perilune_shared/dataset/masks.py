@@ -1,0 +1,140 @@
+"""Masks of craters in a frame, made when asked for: the whole rim's interior (amodal), and what is seen of it.
+
+A pixel belongs to a crater where the ray through its centre passes the disc within the rim circle: exact, with and
+without lens distortion. It is visible where the ground that the frame's EXR has in that pixel (channel Z) is not nearer
+than the disc there; a crater's own floor lies behind the disc. The disc lies in rough ground, so ground hides only what
+lies more than a tenth of the radius and two pixels' width behind it, as for `visible_fraction`. Use::
+
+    depth_m = perilune_render.imaging.exr.read_exr(dataset.file(frame.exr_path))["Z"]
+    for mask in frame_masks(dataset, frame_id, depth_m=depth_m):
+        picture[mask.window][mask.visible] = 255
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.ellipse import project_circles
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+
+SLACK_RADII, SLACK_PX = 0.1, 2.0
+"""By how much nearer ground may be without hiding: share of the radius, pixels' width; the larger of the two."""
+_CRATER = ["crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
+
+
+@dataclass(frozen=True, slots=True)
+class CraterMask:
+    """One crater's masks, cut out of the image at its edge."""
+
+    crater_id: int
+    """The crater, within the frame's scene."""
+    row: int
+    """First row of the cut-out in the image, pixels from the top."""
+    column: int
+    """First column of the cut-out in the image, pixels from the left."""
+    amodal: NDArray[np.bool_]
+    """Whether each pixel's centre lies within the rim, hidden or not (h, w)."""
+    visible: NDArray[np.bool_] | None
+    """Those of `amodal` in which no nearer ground hides the crater (h, w); None where no depth was given."""
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """The cut-out in the image: rows and columns."""
+        height, width = self.amodal.shape
+        return slice(self.row, self.row + height), slice(self.column, self.column + width)
+
+
+def frame_masks(
+    dataset: Dataset,
+    frame_id: str,
+    crater_ids: Sequence[int] | None = None,
+    depth_m: NDArray[np.floating] | None = None,
+    image: Literal["png", "exr"] = "png",
+) -> list[CraterMask]:
+    """Masks of craters in a frame: of all its labels, in their order, or of `crater_ids` of its scene.
+
+    `image` "png" gives them in the pixels of `camera` of dataset.json, in which the labels are; "exr" in those of
+    `exr_camera`, which differ under lens distortion. depth_m (h, w) is the EXR's channel Z in either case, infinite
+    where nothing is hit; in the PNG's pixels it is looked up in the nearest pixel. Raises UserError on an unknown frame
+    or crater and on a depth of another size.
+    """
+    scene_id, trajectory_id = [*frame_id.split("/"), ""][:2]
+    columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz"]
+    frames = dataset.table("frames", columns, scene_id, trajectory_id).to_pandas()
+    frame = frames[frames["frame_id"] == frame_id]
+    if len(frame) != 1:
+        raise UserError(dataset.root, "frame_id", frame_id, "a frame of the dataset")
+    pose = frame.iloc[0]
+    if crater_ids is None:
+        labels = dataset.table("labels", ["frame_id", "crater_id"], scene_id, trajectory_id).to_pandas()
+        crater_ids = labels.loc[labels["frame_id"] == frame_id, "crater_id"].tolist()
+    craters = dataset.table("craters", _CRATER, scene_id=pose["scene_id"]).to_pandas().set_index("crater_id")
+    unknown = [crater for crater in crater_ids if crater not in craters.index]
+    if unknown:
+        raise UserError(dataset.root, "crater_id", unknown[0], f"a crater of {pose['scene_id']}")
+    rows = craters.loc[list(crater_ids)]
+    camera = dataset.info.camera.intrinsics()
+    exr_camera = (dataset.info.exr_camera or dataset.info.camera).intrinsics()
+    if depth_m is not None:
+        if depth_m.shape != (exr_camera.height_px, exr_camera.width_px):
+            wanted = f"{exr_camera.width_px} x {exr_camera.height_px} pixels, as dataset.json says of the EXRs"
+            raise UserError(frame_id, "depth_m", f"{depth_m.shape[::-1]}", wanted)
+        if image == "png" and camera != exr_camera:
+            depth_m = _looked_up(depth_m, camera, exr_camera)
+    rotation = matrix_from_quaternion(pose["rotation_wxyz"])
+    centres = camera_from_site(rows[["x_m", "y_m", "z_m"]].to_numpy(np.float64), pose["position_m"], rotation)
+    normals = rows[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float64) @ rotation.T
+    radii = rows["diameter_m"].to_numpy(np.float64) / 2
+    return crater_masks(camera if image == "png" else exr_camera, crater_ids, centres, normals, radii, depth_m)
+
+
+def crater_masks(
+    camera: Camera,
+    crater_ids: Sequence[int],
+    centres_camera_m: Array,
+    normals_camera: Array,
+    radii_m: Array,
+    depth_m: NDArray[np.floating] | None = None,
+) -> list[CraterMask]:
+    """Masks in `camera`'s pixels of N rim circles in O_C: centres (N, 3) and radii (N,) metres, unit normals (N, 3).
+
+    depth_m (h, w) is along the camera's axis, in its pixels. Empty masks (0, 0) where a rim has no image there or only
+    a part of it is in front of the camera.
+    """
+    rays = camera.rays(camera.pixel_centres())
+    size = np.array([camera.width_px, camera.height_px])
+    boxes = project_circles(camera, centres_camera_m, normals_camera, radii_m).bounding_boxes()
+    # Under distortion the ellipse is only the nearest to the rim's image.
+    margin = 1 if any(camera.distortion) else 0
+    none = np.isnan(boxes).any(axis=1, keepdims=True)
+    first = np.clip(np.where(none, 0, np.floor(boxes[:, :2]) - margin), 0, size).astype(int)
+    last = np.clip(np.where(none, 0, np.ceil(boxes[:, 2:]) + margin), first, size).astype(int)
+    masks = []
+    for k, crater_id in enumerate(crater_ids):
+        (x0, y0), (x1, y1) = first[k], last[k]
+        centre, normal, radius = centres_camera_m[k], normals_camera[k], radii_m[k]
+        ray = rays[y0:y1, x0:x1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            plane_m = (centre @ normal) / (ray @ normal)
+            off = ray * plane_m[..., None] - centre
+            amodal = (plane_m > 0) & (np.einsum("ijk,ijk->ij", off, off) <= radius**2)
+        visible = None
+        if depth_m is not None:
+            slack_m = max(SLACK_RADII * radius, SLACK_PX * centre[2] / camera.fx_px)
+            visible = amodal & (depth_m[y0:y1, x0:x1] >= np.where(amodal, plane_m, np.inf) - slack_m)
+        masks.append(CraterMask(int(crater_id), int(y0), int(x0), amodal, visible))
+    return masks
+
+
+def _looked_up(depth_m: NDArray[np.floating], camera: Camera, source: Camera) -> NDArray[np.floating]:
+    """What `source` has in the pixel nearest to each pixel centre of `camera`, at the same place."""
+    place = np.floor(source.project(camera.rays(camera.pixel_centres())))
+    column = np.clip(place[..., 0], 0, source.width_px - 1).astype(int)
+    row = np.clip(place[..., 1], 0, source.height_px - 1).astype(int)
+    return depth_m[row, column]

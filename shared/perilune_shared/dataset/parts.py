@@ -1,0 +1,252 @@
+"""One Parquet part of a table: written once, aside and renamed; read with limits, since it may come from anybody.
+
+A part's name says whose rows it holds: `<scene_id>` or `<scene_id>.<trajectory_id>`. A whole table is the part `all`,
+whose row groups hold a scene or a few descents each; a table above the limits continues in `all.0001` and so on.
+"""
+
+import contextlib
+import io
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+from pyarrow.fs import LocalFileSystem
+
+from perilune_shared.dataset.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
+from perilune_shared.errors import UserError
+from perilune_shared.storage import files
+from perilune_shared.storage.pages import pages_of
+
+WHOLE_TABLE = "all"
+"""Name of the part that holds all rows of its table, or the first of them."""
+MOST_ROWS_WRITTEN = 10_000_000
+"""Most rows of one written part; below every limit of the reader, for every table."""
+_MOST_ROWS = 50_000_000
+_MOST_GROUP_ROWS = 2**21
+_LONGEST_TEXT = 1000
+_MOST_BYTES = 8 * 2**30
+# Of a footer's list: a schema nested deeper than this ends the process.
+_LONGEST_LIST = 10_000
+_LONGEST_FOOTER_TEXT = 10_000_000
+# No row of any table takes less room, however well it is compressed, and none shrinks more.
+_SPARE_ROWS, _BYTES_A_ROW = 10_000, 4
+_SPARE_BYTES, _MOST_SHRUNK = 2**26, 200
+_SMALL_BYTES, _FEW_WORDS = 2**18, 200
+_ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
+ID_PATTERN = f"^{_ID}$"
+"""Scenes and descents: their names become names of files."""
+FRAME_ID_PATTERN = f"^{_ID}/{_ID}/[0-9]{{6}}$"
+PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
+_IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
+
+
+def is_whole(stem: str) -> bool:
+    """Whether a part of this name may hold rows of any scene."""
+    return stem.partition(".")[0] == WHOLE_TABLE
+
+
+class Part:
+    """An opened part, whose footer has been checked."""
+
+    def __init__(self, path: Path, table: str, schema: pa.Schema | None = None, version: str = SCHEMA_VERSION):
+        """Raises UserError where it is no Parquet file, of another table or schema version, or too large.
+
+        `schema` is that of the table's columns where it is not that of TABLES, as in older versions.
+
+        Columns that the table does not know are ignored. Columns of `OPTIONAL` that the file lacks are read as null.
+        """
+        self.path, self.schema = path, schema or TABLES[table]
+        self._optional = OPTIONAL.get(table, ()) if schema is None else ()
+        self._n_bytes = files.check_plain_file(path)
+        self._checked: set[tuple[int, str]] = set()
+        try:
+            # A small file is read once; a large one only where its columns are asked for.
+            self._content = path.read_bytes() if self._n_bytes <= _SMALL_BYTES else None
+            texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
+            self.file = self._parquet(texts)
+            self.found = self.file.metadata.schema.to_arrow_schema()
+            self._check_size()
+        except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+            raise UserError(path, "content", error, "a whole Parquet file") from None
+        metadata = self.found.metadata or {}
+        for name, wanted in (("schema_version", version), ("table", table)):
+            got = metadata.get(f"perilune.{name}".encode(), b"none").decode(errors="replace")
+            if got != wanted:
+                hint = "; see `perilune-manifest migrate`" if name == "schema_version" else ""
+                raise UserError(path, f"perilune.{name}", got, wanted + hint)
+
+    def _parquet(self, texts: Sequence[str]) -> pq.ParquetFile:
+        """The opened file; columns of `texts` are read as dictionaries.
+
+        So a short file cannot grow into gigabytes of text before its length is known.
+        """
+        source = self.path if self._content is None else pa.BufferReader(self._content)
+        options = {
+            "pre_buffer": False,
+            "thrift_string_size_limit": _LONGEST_FOOTER_TEXT,
+            "thrift_container_size_limit": _LONGEST_LIST,
+        }
+        with contextlib.suppress(KeyError):  # a text column that the file lacks
+            return pq.ParquetFile(source, read_dictionary=texts, **options)
+        with pq.ParquetFile(source, **options) as plain:
+            names = plain.metadata.schema.names
+        return pq.ParquetFile(source, read_dictionary=[name for name in texts if name in names], **options)
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the part."""
+        return self.file.metadata.num_rows
+
+    @property
+    def n_groups(self) -> int:
+        """Row groups of the part."""
+        return self.file.metadata.num_row_groups
+
+    def _check_size(self) -> None:
+        footer = self.file.metadata
+        most_rows = min(_MOST_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_A_ROW)
+        n_bytes, n_rows = 0, 0
+        for group in range(footer.num_row_groups):
+            rows = footer.row_group(group)
+            n_rows += rows.num_rows
+            if not 0 <= rows.num_rows <= min(_MOST_GROUP_ROWS, most_rows):
+                wanted = f"at most {min(_MOST_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
+                raise UserError(self.path, "rows", f"{rows.num_rows} in a row group", wanted)
+            for place in range(rows.num_columns):
+                column = rows.column(place)
+                if column.path_in_schema.split(".")[0] not in self.schema.names:
+                    continue  # never read
+                n_bytes += max(column.total_uncompressed_size, 0)
+                # The longest list is a quaternion.
+                if column.num_values > 4 * rows.num_rows:
+                    raise UserError(self.path, column.path_in_schema, f"{column.num_values} values", "4 a row at most")
+        if footer.num_rows != n_rows or n_rows > most_rows:
+            wanted = f"those of its row groups, {n_rows}, and at most {most_rows} for {self._n_bytes} bytes"
+            raise UserError(self.path, "rows", footer.num_rows, wanted)
+        most = min(_MOST_BYTES, _SPARE_BYTES + _MOST_SHRUNK * self._n_bytes)
+        if n_bytes > most:
+            raise UserError(self.path, "size", f"{n_bytes} bytes unpacked", f"at most {most} for {self._n_bytes} bytes")
+
+    def read(
+        self, columns: Sequence[str] | None = None, groups: Iterable[int] | None = None, *, any_ids: bool = False
+    ) -> pa.Table:
+        """Rows with chosen columns, of chosen row groups.
+
+        Raises UserError where that cannot be read, or names of scenes, descents and frames could not be names of files
+        (unless `any_ids`).
+        """
+        chosen = list(range(self.n_groups) if groups is None else groups)
+        names = list(columns) if columns is not None else self.schema.names
+        wanted = pa.schema([self.schema.field(name) for name in names], metadata=self.schema.metadata)
+        missing = [name for name in names if name in self._optional and name not in self.found.names]
+        present = [name for name in names if name not in missing]
+        for field in map(wanted.field, present):
+            place = self.found.get_field_index(field.name)
+            if place < 0:
+                raise UserError(self.path, "columns", f"no {field.name}", f"every column of version {SCHEMA_VERSION}")
+            if self.found.field(place).type != field.type:
+                raise UserError(self.path, field.name, self.found.field(place).type, f"{field.type}")
+        try:
+            opened: BinaryIO = self.path.open("rb") if self._content is None else io.BytesIO(self._content)
+            with opened as stream:
+                for group in chosen:
+                    self._check_pages(stream, group, present)
+            # Threads cost more than they save on a single row group.
+            rows = self.file.read_row_groups(chosen, columns=present, use_threads=len(chosen) > 1)
+            for field in map(wanted.field, present):
+                if pa.types.is_string(field.type):
+                    self._check_text(field.name, rows[field.name], None if any_ids else _IDS.get(field.name))
+            for name in missing:
+                n_rows = sum(self.file.metadata.row_group(group).num_rows for group in chosen)
+                rows = rows.append_column(name, pa.nulls(n_rows, wanted.field(name).type))
+            rows = rows.select(names).cast(wanted)
+            rows.validate(full=True)
+            return rows
+        except (pa.ArrowException, OSError, ValueError, KeyError) as error:
+            raise UserError(self.path, "content", error, "a whole Parquet file") from None
+
+    def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
+        """The footer's sizes were checked; here that the pages keep to them."""
+        metadata = self.file.metadata.row_group(group)
+        for column in map(metadata.column, range(metadata.num_columns)):
+            name = column.path_in_schema
+            if name.split(".")[0] not in names or (group, name) in self._checked:
+                continue
+            pages = pages_of(stream, column)
+            if pages.unpacked_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
+                found = f"{pages.unpacked_bytes} bytes unpacked and {pages.n_values} values"
+                wanted = f"at most {column.total_uncompressed_size} and {column.num_values}, as its footer says"
+                raise UserError(self.path, name, found, wanted)
+            # One image repeated by a dictionary would be a small file that unpacks without end.
+            if name.startswith("image.") and pages.has_dictionary:
+                raise UserError(self.path, name, "a dictionary", "plain bytes for each frame")
+            self._checked.add((group, name))
+
+    def _check_text(self, name: str, column: pa.ChunkedArray, pattern: str | None) -> None:
+        for chunk in column.chunks:
+            words = chunk.dictionary if pa.types.is_dictionary(chunk.type) else chunk
+            longest = pc.max(pc.binary_length(words)).as_py() or 0
+            if longest > _LONGEST_TEXT:
+                raise UserError(self.path, name, f"text of {longest} bytes", f"at most {_LONGEST_TEXT}")
+            odd = _first_odd(words, pattern) if pattern is not None else None
+            if odd is not None:
+                raise UserError(self.path, name, repr(odd), f"text like {pattern}")
+
+    def groups_within(self, column: str, low: str, high: str) -> list[int]:
+        """Row groups that may hold texts from `low` up to, but not including, `high`, by their statistics."""
+        footer = self.file.metadata
+        names = [footer.schema.column(i).path for i in range(footer.num_columns)]
+        place = names.index(column) if column in names else -1
+        chosen = []
+        for group in range(footer.num_row_groups):
+            known = footer.row_group(group).column(place).statistics if place >= 0 else None
+            try:
+                far = known is not None and known.has_min_max and not (str(known.min) < high and str(known.max) >= low)
+            except (pa.ArrowException, ValueError):  # of another type, or no text
+                far = False
+            if not far:
+                chosen.append(group)
+        return chosen
+
+    def groups_where(self, condition: pc.Expression) -> list[int]:
+        """Row groups that may hold rows for which a condition on the part's columns is true, by their statistics."""
+        try:
+            # The footer was checked when the part was opened.
+            whole = ds.ParquetFileFormat().make_fragment(str(self.path.absolute()), LocalFileSystem())
+            return [group.id for group in whole.subset(filter=condition, schema=self.schema).row_groups]
+        except (pa.ArrowException, ValueError, KeyError):
+            return list(range(self.n_groups))
+
+
+def _first_odd(words: pa.Array, pattern: str) -> str | None:
+    """The first text that does not match a pattern, None where all match."""
+    if len(words) <= _FEW_WORDS:  # arrow would compile the pattern each time
+        fitting = re.compile(pattern)
+        return next((word for word in words.to_pylist() if word is not None and not fitting.fullmatch(word)), None)
+    fits = pc.match_substring_regex(words, pattern)  # in RE2, $ matches the end only
+    return words.filter(pc.invert(fits))[0].as_py() if pc.all(fits).as_py() is False else None
+
+
+def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> pa.Table:
+    """One Parquet part. Raises UserError where it cannot be read or is of another table or schema version."""
+    return Part(path, table).read(columns)
+
+
+def write_part(root: Path, table: str, name: str, rows: pa.Table, rows_a_group: int | None = None) -> Path:
+    """Write one part `manifest/<table>/<name>.parquet`. A part that exists is never rewritten.
+
+    Raises UserError where the name, which may come from another dataset's rows, could not be a part's.
+    """
+    if not re.fullmatch(PART_PATTERN, name) or name.endswith("\n"):
+        raise UserError(root, "part", repr(name), f"a name like {PART_PATTERN}")
+    part = root / "manifest" / table / f"{name}.parquet"
+    if part.exists():
+        raise FileExistsError(part)
+    with files.written_aside(part) as aside:
+        pq.write_table(complete(table, rows), aside, compression="zstd", row_group_size=rows_a_group)
+    return part

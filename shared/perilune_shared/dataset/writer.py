@@ -1,0 +1,247 @@
+"""Writing a whole dataset anew, scene by scene, aside and renamed: how merge, subset, split and the others end.
+
+What can be reckoned from the rows is reckoned here and nowhere added up: rows of each table, frames of each descent,
+its split, and what the splits do not share.
+"""
+
+import contextlib
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from rich.progress import Progress
+
+from perilune_shared.content import terrain_of
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import Counts, DatasetInfo, checked_info, write_info
+from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WHOLE_TABLE, write_part
+from perilune_shared.dataset.schema import IMAGES, TABLES, SplitUnit, complete
+from perilune_shared.errors import UserError
+from perilune_shared.storage import checksums, files
+
+SceneTables = dict[str, pa.Table]
+"""Every table of one scene, by name."""
+_PER_DESCENT = ("frames", "labels")
+_IMAGES_A_GROUP, _BYTES_A_GROUP = 128, 2**28
+MOST_IMAGES_WRITTEN = 1_000_000
+"""Frames of one shard: 7,813 row groups, of which a reader accepts 10,000."""
+
+
+class DatasetWriter:
+    """Collects a dataset in a folder; see `written`."""
+
+    def __init__(
+        self, root: Path, info: DatasetInfo, *, whole_tables: bool = False, most_rows: int = MOST_ROWS_WRITTEN
+    ):
+        self.root, self.info = root, info
+        self.whole_tables, self._most_rows = whole_tables, most_rows
+        self._n_whole = dict.fromkeys(TABLES, 0)
+        self._rows = dict.fromkeys(TABLES, 0)
+        self._kept: dict[str, list[pa.Table]] = defaultdict(list)
+        self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
+        self._splits_of_descent: dict[tuple[str, int], set[str]] = defaultdict(set)
+        self._has_exr = False
+        self._recipes: set[str] = set()
+
+    def add_scene(self, tables: SceneTables) -> None:
+        """Append one scene, whose frames are not empty.
+
+        Descents get their number of frames and their split anew, frames the paths at which `add_images` puts them.
+        Raises UserError where the scene has not one row, or a frame is of a descent that has none.
+        """
+        check_scene("the dataset given", tables)
+        frames = _placed(tables["frames"])
+        splits = frames["split"].to_numpy(zero_copy_only=False)
+        scene = tables["scenes"].to_pylist()[0]
+        terrain = terrain_of(scene["dem_source"], scene["content_sha256"])
+        self._splits_of_terrain[terrain] |= set(splits)
+        for descent in tables["trajectories"].select(["trajectory_id", "seed"]).to_pylist():
+            own = np.asarray(pc.equal(frames["trajectory_id"], descent["trajectory_id"]), bool)
+            self._splits_of_descent[terrain, descent["seed"]] |= set(splits[own])
+        self._has_exr |= frames["exr_path"].null_count < len(frames)
+        self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
+        tables = {**tables, "frames": frames, "trajectories": _settled(tables["trajectories"], frames)}
+        scene_id = scene["scene_id"]
+        for name, rows in tables.items():
+            self._rows[name] += len(rows)
+            rows = complete(name, rows)
+            if self.whole_tables:
+                self._keep(name, _sorted_by(rows, "frame_id") if name in _PER_DESCENT else rows)
+            elif name in _PER_DESCENT:
+                for trajectory_id in pc.unique(frames["trajectory_id"]).to_pylist():
+                    own = pc.starts_with(rows["frame_id"], f"{scene_id}/{trajectory_id}/")
+                    write_part(self.root, name, f"{scene_id}.{trajectory_id}", rows.filter(own))
+            else:
+                write_part(self.root, name, scene_id, rows)
+
+    def _keep(self, name: str, rows: pa.Table) -> None:
+        """Collect rows of a whole table; write a part whenever another row would exceed its limit."""
+        while len(rows):
+            free = self._most_rows - sum(map(len, self._kept[name]))
+            if not free:
+                self._write_whole(name)
+                continue
+            self._kept[name].append(rows[:free])
+            rows = rows[free:]
+
+    def _write_whole(self, name: str) -> None:
+        rows = pa.concat_tables([TABLES[name].empty_table(), *self._kept.pop(name, [])])
+        stem = f"{WHOLE_TABLE}.{self._n_whole[name]:04d}" if self._n_whole[name] else WHOLE_TABLE
+        write_part(self.root, name, stem, rows, max(1000, len(rows) // 200))
+        self._n_whole[name] += 1
+
+    def add_images(self, source: Dataset, frames: pa.Table, names: dict[str, str], *, link: bool) -> None:
+        """Bring frames of another dataset as files: `frames` are its rows, `names` give the new frame_id of each.
+
+        With `link` files are linked where the disk allows it, else copied.
+        """
+        by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path"]).to_pylist()}
+        if source.info.images == "packed":
+            for frame_id, png in source.pngs(frames):
+                files.write_bytes(files.inside(self.root, frame_path(names[frame_id], "png")), png, durable=False)
+        else:
+            for row in frames.select(["frame_id", "png_path"]).to_pylist():
+                by_id[row["frame_id"]]["png_path"] = row["png_path"]
+        for frame_id, row in by_id.items():
+            for kind in ("png", "exr"):
+                if row.get(f"{kind}_path") is not None:
+                    to = files.inside(self.root, frame_path(names[frame_id], kind))
+                    files.bring(source.file(row[f"{kind}_path"]), to, link=link)
+
+    def pack_images(
+        self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int, most_images: int = MOST_IMAGES_WRITTEN
+    ) -> None:
+        """Write frames (frame_id, png_path, PNG bytes) into shards images/*.parquet of about `shard_bytes` at most."""
+        shard, size, held, n_images, writer = 0, 0, 0, 0, None
+        waiting: list[tuple[str, str, bytes]] = []
+        self.root.joinpath("images").mkdir(parents=True, exist_ok=True)
+
+        def flush() -> None:
+            nonlocal writer, waiting, held
+            if not waiting:
+                return
+            if writer is None:
+                path = self.root / "images" / f"{shard:05d}.parquet"
+                # PNG is compressed already, and no two frames are alike.
+                writer = pq.ParquetWriter(path, IMAGES, compression="none", use_dictionary=["frame_id"])
+            rows = [{"frame_id": name, "image": {"bytes": png, "path": path}} for name, path, png in waiting]
+            writer.write_table(pa.Table.from_pylist(rows, schema=IMAGES))
+            waiting, held = [], 0
+
+        for name, path, png in images:
+            if size and (size + len(png) > shard_bytes or n_images == most_images):
+                flush()
+                if writer is not None:
+                    writer.close()
+                shard, size, n_images, writer = shard + 1, 0, 0, None
+            waiting.append((name, path, png))
+            n_images += 1
+            size += len(png)
+            held += len(png)
+            if len(waiting) == _IMAGES_A_GROUP or held > _BYTES_A_GROUP:
+                flush()
+        flush()
+        if writer is not None:
+            writer.close()
+
+    def finish(self, out: Path, progress: Progress | None = None) -> None:
+        """Write what remains, dataset.json and the checksums. Raises UserError about `out` where no frame came."""
+        if not self._rows["frames"]:
+            raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
+        for name in TABLES if self.whole_tables else ():
+            if self._kept[name] or not self._n_whole[name]:
+                self._write_whole(name)
+        # A descent may come twice: rendered, and developed again with another sensor.
+        torn = any(len(splits) > 1 for splits in self._splits_of_descent.values())
+        shared = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
+        unit: SplitUnit = "frame" if torn else "trajectory" if shared else "scene"
+        exr_camera = self.info.exr_camera if self._has_exr else None
+        recipes = {key: recipe for key, recipe in self.info.recipes.items() if key in self._recipes}
+        info = self.info.model_copy(
+            update={"split_by": unit, "recipes": recipes, "exr_camera": exr_camera, "counts": Counts(**self._rows)}
+        )
+        write_info(self.root, info)
+        checksums.seal(self.root, progress)
+
+
+@contextlib.contextmanager
+def written(
+    out: Path,
+    info: DatasetInfo,
+    *,
+    whole_tables: bool = False,
+    most_rows: int = MOST_ROWS_WRITTEN,
+    progress: Progress | None = None,
+) -> Iterator[DatasetWriter]:
+    """A writer for a new dataset in `out`, which appears whole or not at all.
+
+    With `whole_tables` each table is one part, or several of at most `most_rows` rows. `info` gives all that does not
+    follow from the rows. Raises UserError where there are no frames or `out` holds something.
+    """
+    with files.new_folder(out) as aside:
+        # A copy of an info with fields replaced was never checked.
+        checked_info(json.loads(info.model_dump_json()), out)
+        writer = DatasetWriter(aside, info, whole_tables=whole_tables, most_rows=most_rows)
+        yield writer
+        writer.finish(out, progress)
+
+
+def check_scene(where: object, tables: SceneTables) -> None:
+    """Raises UserError about a dataset (`where`) where a scene has not one row, or a descent with frames has none."""
+    scenes, frames = tables["scenes"]["scene_id"], tables["frames"]
+    if len(scenes) != 1:
+        found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"
+        raise UserError(where, "scenes", found, "one row each; see `perilune-manifest validate`")
+    odd = set(frames["trajectory_id"].to_pylist()) - set(tables["trajectories"]["trajectory_id"].to_pylist())
+    if odd:
+        found = f"no {scenes[0].as_py()}/{min(odd)}"
+        raise UserError(where, "trajectories", found, "the descent of every frame; see `perilune-manifest validate`")
+
+
+def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
+    """A table with one column replaced."""
+    place = table.schema.get_field_index(name)
+    field = table.schema.field(place)
+    array = values if isinstance(values, pa.Array | pa.ChunkedArray) else pa.array(values, field.type)
+    return table.set_column(place, field, array)
+
+
+def frame_path(frame_id: str, kind: str) -> str:
+    """Where the PNG or EXR of a frame lies in every dataset that is written here."""
+    return f"frames/{frame_id}.{kind}"
+
+
+def _placed(frames: pa.Table) -> pa.Table:
+    """Frames with the paths of their files here; another's dataset may keep them elsewhere."""
+    ids = frames["frame_id"].to_pylist()
+    for kind in ("png", "exr"):
+        name = f"{kind}_path"
+        known = frames[name].to_pylist()
+        paths = [None if path is None else frame_path(key, kind) for key, path in zip(ids, known, strict=True)]
+        frames = with_column(frames, name, paths)
+    return frames
+
+
+def _settled(trajectories: pa.Table, frames: pa.Table) -> pa.Table:
+    """The descents that have frames, with the number and the common split of these."""
+    counted = frames.group_by("trajectory_id").aggregate(
+        [("frame_id", "count"), ("split", "count_distinct"), ("split", "min")]
+    )
+    rows = {row["trajectory_id"]: row for row in counted.to_pylist()}
+    ids = trajectories["trajectory_id"].to_pylist()
+    trajectories = trajectories.filter(pa.array(name in rows for name in ids))
+    own = [rows[name] for name in ids if name in rows]
+    n_frames = [row["frame_id_count"] for row in own]
+    splits = [row["split_min"] if row["split_count_distinct"] == 1 else None for row in own]
+    trajectories = with_column(trajectories, "n_frames", n_frames)
+    return with_column(trajectories, "split", splits)
+
+
+def _sorted_by(table: pa.Table, column: str) -> pa.Table:
+    order = np.argsort(table[column].to_numpy(zero_copy_only=False), kind="stable")
+    return table.take(pa.array(order))

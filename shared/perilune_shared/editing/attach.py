@@ -1,0 +1,84 @@
+"""A manifest and the frames that were made from it, joined to a dataset."""
+
+from pathlib import Path
+
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.writer import with_column, written
+from perilune_shared.editing.rewrite import check_source
+from perilune_shared.errors import UserError
+from perilune_shared.storage import files
+from perilune_shared.storage.png import png_header
+
+
+def attach(
+    manifest: Dataset,
+    frames_root: Path,
+    out: Path,
+    rehash: bool = False,
+    progress: Progress | None = None,
+    *,
+    link: bool = False,
+) -> None:
+    """Write a dataset of a manifest without frames and the frames under `frames_root`, at the manifest's own paths.
+
+    Frames are copied, or linked with `link`. Every PNG must have the hash that the manifest states. With `rehash`
+    frames are taken as they are and their own hashes written down, as for those of another kind of machine. EXRs come
+    along where all of a scene's are there. Raises UserError where a frame is missing or another, and on a plan, which
+    has no labels.
+    """
+    check_source(manifest, out, progress)
+    if manifest.info.images != "absent":
+        wanted = "absent: a manifest with labels and without frames"
+        raise UserError(manifest.root, "images", manifest.info.images, wanted)
+    source = Dataset(frames_root, manifest.info.model_copy(update={"images": "files"}))
+    line = "frames attached" + (", hashed anew" if rehash else "")
+    info = manifest.info.changed(line, images="files")
+    scene_ids = manifest.scene_ids()
+    task = (
+        progress.add_task("attaching", total=manifest.info.counts.frames, unit="frames", note="") if progress else None
+    )
+    with written(out, info, progress=progress) as writer:
+        for scene_id in scene_ids:
+            tables = manifest.scene(scene_id)
+            frames = _checked(source, tables["frames"], rehash)
+            writer.add_scene({**tables, "frames": frames})
+            writer.add_images(source, frames, {name: name for name in frames["frame_id"].to_pylist()}, link=link)
+            if progress is not None and task is not None:
+                progress.advance(task, len(frames))
+
+
+def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
+    """A scene's rows of `frames` with the hashes of the files that are there."""
+    camera = source.info.camera
+    rows = frames.select(["frame_id", "png_path", "png_sha256", "exr_path", "exr_sha256"]).to_pylist()
+    found: dict[str, list] = {f"{kind}_{name}": [] for kind in ("png", "exr") for name in ("sha256", "bytes", "path")}
+    for row in rows:
+        for kind in ("png", "exr"):
+            path = source.file(row[f"{kind}_path"]) if row[f"{kind}_path"] is not None else None
+            there = path is not None and path.is_file()
+            if kind == "png" and not there:
+                raise UserError(source.root, "frame", f"no {row['png_path']}", "every frame of the manifest")
+            sha256 = files.sha256_of(path) if there and path is not None else None
+            if there and not rehash and sha256 != row[f"{kind}_sha256"]:
+                wanted = f"the file with SHA-256 {row[f'{kind}_sha256']}, or --rehash"
+                raise UserError(path, f"{kind}_sha256", sha256, wanted)
+            found[f"{kind}_sha256"].append(sha256)
+            found[f"{kind}_bytes"].append(path.stat().st_size if there and path is not None else None)
+            found[f"{kind}_path"].append(row[f"{kind}_path"] if there else None)
+        with source.file(row["png_path"]).open("rb") as stream:
+            head = stream.read(64)
+        try:
+            header = png_header(head)
+        except ValueError as error:
+            raise UserError(source.root / row["png_path"], "frame", error, "a grey PNG") from None
+        if (header.width_px, header.height_px) != (camera.width_px, camera.height_px):
+            size = f"{header.width_px} x {header.height_px}"
+            raise UserError(row["png_path"], "size", size, f"{camera.width_px} x {camera.height_px} pixels")
+    if None in found["exr_path"]:
+        found |= {name: [None] * len(rows) for name in found if name.startswith("exr")}
+    for name, values in found.items():
+        frames = with_column(frames, name, values)
+    return frames

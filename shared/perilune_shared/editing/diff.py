@@ -1,0 +1,107 @@
+"""What differs between two datasets, row by row and column by column."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.schema import KEYS, TABLES
+from perilune_shared.errors import one_line, shortened
+
+_NUMBER = "copy"
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One column in which rows differ, or rows that only one dataset has."""
+
+    place: str
+    """Table, or dataset.json."""
+    column: str
+    """Column or field; empty where whole rows are missing."""
+    rows: int
+    """How many rows differ."""
+    example: str
+    """Key of the first such row."""
+    first: str
+    """Its value in the first dataset."""
+    second: str
+    """Its value in the second dataset."""
+
+
+def differences(first: Dataset, second: Dataset) -> list[Difference]:
+    """All differences; none means that both hold the same, however their parts and frames are stored."""
+    found = list(_info(_plain(first), _plain(second), ""))
+    one, two = set(first.scene_ids()), set(second.scene_ids())
+    for there, other, only in ((one, two, True), (two, one, False)):
+        alone = sorted(there - other)
+        if alone:
+            present = ("present", "-") if only else ("-", "present")
+            found.append(Difference("scenes", "", len(alone), alone[0], *present))
+    gathered: dict[tuple[str, str], Difference] = {}
+    for scene_id in sorted(one & two):
+        for name in TABLES:
+            pair = (dataset.table(name, scene_id=scene_id).to_pandas() for dataset in (first, second))
+            for each in _rows(name, *pair):
+                key = (each.place, each.column + (each.first if not each.column else ""))
+                before = gathered.get(key)
+                total = each.rows + (before.rows if before else 0)
+                kept = before or each
+                gathered[key] = Difference(kept.place, kept.column, total, kept.example, kept.first, kept.second)
+    return found + list(gathered.values())
+
+
+def _plain(dataset: Dataset) -> dict:
+    return dataset.info.model_dump(mode="json", exclude={"images", "counts"})
+
+
+def _info(one: object, two: object, path: str) -> Iterator[Difference]:
+    if one == two:
+        return
+    if isinstance(one, dict) and isinstance(two, dict):
+        for key in sorted({*one, *two}):
+            yield from _info(one.get(key), two.get(key), f"{path}.{key}".lstrip("."))
+        return
+    yield Difference("dataset.json", path, 1, "", _text(one), _text(two))
+
+
+def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Difference]:
+    """Differences of one table of one scene."""
+    keys = KEYS[table]
+    if any(frame.duplicated(keys).any() for frame in (one, two)):
+        # Rows of one key are told apart by a number, in an order that does not depend on how they are stored.
+        one, two = (_numbered(frame, keys) for frame in (one, two))
+        keys = [*keys, _NUMBER]
+    one, two = (frame.set_index(keys).sort_index() for frame in (one, two))
+    for there, other, present in ((one, two, ("present", "-")), (two, one, ("-", "present"))):
+        alone = there.index.difference(other.index)
+        if len(alone):
+            yield Difference(table, "", len(alone), _text(alone[0]), *present)
+    common = one.index.intersection(two.index)
+    one, two = one.loc[common], two.loc[common]
+    for column in one.columns:
+        a, b = one[column], two[column]
+        if a.map(np.ndim).gt(0).any() if a.dtype == object else False:
+            apart = np.array([not np.array_equal(x, y, equal_nan=True) for x, y in zip(a, b, strict=True)], bool)
+        else:
+            apart = ~((a == b) | (a.isna() & b.isna())).fillna(False).to_numpy(bool)
+        if apart.any():
+            row = int(np.argmax(apart))
+            yield Difference(
+                table, column, int(apart.sum()), _text(common[row]), _text(a.iloc[row]), _text(b.iloc[row])
+            )
+
+
+def _numbered(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
+    """Rows with a column that numbers those of one key, from 0."""
+    plain = [name for name in rows.columns if not (rows[name].dtype == object and rows[name].map(np.ndim).gt(0).any())]
+    rows = rows.sort_values(plain, kind="stable", ignore_index=True)
+    return rows.assign(**{_NUMBER: rows.groupby(keys).cumcount()})
+
+
+def _text(value: object) -> str:
+    if isinstance(value, tuple):
+        value = " ".join(map(str, value))
+    return shortened(one_line(value), 60)

@@ -1,0 +1,55 @@
+"""Which trajectories are one flight: the same terrain seen from the same poses, whatever their names."""
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_shared.content import terrain_of
+from perilune_shared.dataset.manifest import Dataset
+
+
+def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
+    """Every frame, by frame_id, with what it must not share with another split: `terrain`, `flight` and `pose`.
+
+    Terrain is the ground's content (`terrain_of`), pose a position and rotation over a terrain. Trajectories over one
+    terrain are one flight where they have the same random seed or a pose in common: a flight that was rendered and
+    developed again, or rendered under another Sun, is one.
+    """
+    columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
+    rows = dataset.table("frames", columns).sort_by("frame_id")
+    frames = rows.select(columns[:3]).to_pandas()
+    scenes = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pandas()
+    terrain = {row.scene_id: terrain_of(row.dem_source, row.content_sha256) for row in scenes.itertuples()}
+    frames["terrain"] = frames["scene_id"].map(terrain)
+    seeds = dataset.table("trajectories", ["scene_id", "trajectory_id", "seed"]).to_pandas()
+    frames["seed"] = frames.merge(seeds, on=["scene_id", "trajectory_id"], how="left")["seed"].to_numpy()
+    numbers = [
+        rows[name].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(len(rows), -1)
+        for name in columns[3:]
+    ]
+    # Negative zero is zero.
+    poses = pd.DataFrame(np.hstack(numbers) + 0.0).assign(terrain=frames["terrain"].to_numpy())
+    frames["pose"] = poses.groupby(list(poses.columns), dropna=False).ngroup().to_numpy()
+    trajectory = frames.groupby(["scene_id", "trajectory_id"], sort=False).ngroup().to_numpy()
+    by_seed = frames.groupby(["terrain", "seed"], dropna=False).ngroup().to_numpy()
+    frames["flight"] = _joined(trajectory, [by_seed, frames["pose"].to_numpy()])
+    return frames[["frame_id", "terrain", "flight", "pose"]]
+
+
+def _joined(unit: NDArray[np.int64], keys: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """A number (N,) for each row, equal where units (N,) are connected by equal values of any key (N,)."""
+    root = np.arange(unit.max(initial=-1) + 1)
+
+    def find(one: int) -> int:
+        while root[one] != one:
+            root[one] = root[root[one]]
+            one = root[one]
+        return one
+
+    for key in keys:
+        pairs = pd.DataFrame({"key": key, "unit": unit}).drop_duplicates()
+        first = pairs.groupby("key")["unit"].transform("first").to_numpy()
+        own = pairs["unit"].to_numpy()
+        for one, other in zip(first[first != own], own[first != own], strict=True):
+            root[find(int(other))] = find(int(one))
+    return np.array([find(int(one)) for one in range(len(root))], np.int64)[unit]

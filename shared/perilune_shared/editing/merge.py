@@ -1,0 +1,187 @@
+"""Several datasets as one."""
+
+from collections.abc import Container, Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.progress import Progress
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import CameraInfo, DatasetInfo
+from perilune_shared.dataset.writer import SceneTables, check_scene, with_column, written
+from perilune_shared.editing.licence import joined_licence
+from perilune_shared.editing.rewrite import ImageMode, bare, check_source, state_of
+from perilune_shared.errors import UserError
+
+_GROUND = ("scenes", "craters", "boulders")
+_CHANGING = ("scene_id", "trajectory_id", "n_frames", "split")
+"""Of a descent: what may differ though it is the same."""
+_RENDERED = ("position_m", "rotation_wxyz", "time_s", "png_sha256")
+"""Of a frame: what may not differ where it is the same."""
+
+
+def merge(
+    sources: Sequence[Dataset],
+    out: Path,
+    name: str = "merged",
+    images: ImageMode = "copy",
+    progress: Progress | None = None,
+) -> None:
+    """Write the frames of all sources, each once, as one dataset.
+
+    Scenes that are the same (recipe, seed, Sun, craters) become one; others of the same name get a new one, and so do
+    trajectories. A frame that several sources have is taken from the first, with that one's split and labels. Counts,
+    splits and what the splits share are recomputed from the rows. Raises UserError where kinds, cameras or cameras of
+    EXRs differ, a licence is no SPDX expression, or one frame was rendered in two ways.
+    """
+    if len(sources) < 2:
+        raise UserError("merge", "datasets", len(sources), "at least two")
+    for source in {source.root.resolve(): source for source in sources}.values():
+        check_source(source, out, progress)
+    info = _joined_info(sources, name, state_of(list(sources), images))
+    groups = _same_scenes(sources, planned=info.images == "planned")
+    task = progress.add_task("merging", total=len(groups), unit="scenes", note="") if progress else None
+    with written(out, info, progress=progress) as writer:
+        for scene_id, members in groups.items():
+            tables, brought = _join(scene_id, [(sources[i], own) for i, own in members])
+            writer.add_scene(bare(tables) if info.images == "planned" else tables)
+            for source, frames, names in brought:
+                if info.images == "files" and len(frames):
+                    writer.add_images(source, frames, names, link=images == "link")
+            if progress is not None and task is not None:
+                progress.advance(task)
+
+
+def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetInfo:
+    first = sources[0].info
+    for source in sources:
+        for field in ("kind", "camera"):
+            if getattr(source.info, field) != getattr(first, field):
+                raise UserError(source.root, field, "another", f"the {field} of {sources[0].root}")
+    info = first.model_copy(
+        update={
+            "name": name,
+            "images": images,
+            "exr_camera": _exr_camera(sources),
+            "recipes": {key: recipe for source in sources for key, recipe in source.info.recipes.items()},
+            "licence": joined_licence((source.root, source.info.licence) for source in sources),
+            "history": tuple(dict.fromkeys(line for source in sources for line in source.info.history)),
+        }
+    )
+    return info.changed("merge of " + ", ".join(source.info.name for source in sources))
+
+
+def _exr_camera(sources: Sequence[Dataset]) -> CameraInfo | None:
+    """The camera of all EXRs. Raises UserError where two sources have EXRs of different cameras."""
+    with_exrs = [source for source in sources if _has_exrs(source)]
+    for source in with_exrs:
+        if source.info.exr_camera != with_exrs[0].info.exr_camera:
+            wanted = f"the exr_camera of {with_exrs[0].root}; `perilune-manifest pack` leaves EXRs out"
+            raise UserError(source.root, "exr_camera", "another", wanted)
+    return with_exrs[0].info.exr_camera if with_exrs else None
+
+
+def _has_exrs(source: Dataset) -> bool:
+    paths = source.table("frames", ["exr_path"])["exr_path"]
+    return paths.null_count < len(paths)
+
+
+def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list[tuple[int, str]]]:
+    """For each scene of the result, the sources (by place) and names under which it comes.
+
+    In a plan, which has no labels, the numbers of craters do not count.
+    """
+    groups: dict[str, list[tuple[int, str]]] = {}
+    known: dict[tuple, str] = {}
+    for i, source in enumerate(sources):
+        for row in sorted(source.table("scenes").to_pylist(), key=lambda row: row["scene_id"]):
+            own = row.pop("scene_id")
+            # Ids are part of what labels say, so that they must be the same too.
+            craters = [] if planned else source.table("craters", ["crater_id"], scene_id=own)["crater_id"].to_pylist()
+            key = (*row.values(), tuple(craters))
+            if key not in known or any(place == i for place, _ in groups[known[key]]):
+                known[key] = free_name(own, groups)
+                groups[known[key]] = []
+            groups[known[key]].append((i, own))
+    return groups
+
+
+def free_name(name: str, taken: Container[str]) -> str:
+    """A name that is not taken yet: the same, or with -2, -3 and so on at its end."""
+    tried, number = name, 1
+    while tried in taken:
+        number += 1
+        tried = f"{name[:56]}-{number}"
+    return tried
+
+
+def _join(
+    scene_id: str, members: Sequence[tuple[Dataset, str]]
+) -> tuple[SceneTables, list[tuple[Dataset, pa.Table, dict[str, str]]]]:
+    """The tables of a joined scene, and of each member the frames taken (as its own rows) with their new names."""
+    joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels")}
+    brought: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
+    descents: list[tuple[dict, str]] = []
+    taken: dict[str, dict] = {}
+    first: SceneTables = {}
+    for source, own in members:
+        tables = source.scene(own)
+        check_scene(source.root, tables)
+        if not first:
+            first = {name: with_column(tables[name], "scene_id", [scene_id] * len(tables[name])) for name in _GROUND}
+        new_ids, rows = _descents(tables["trajectories"], descents)
+        rows = with_column(rows, "scene_id", [scene_id] * len(rows))
+        joined["trajectories"].append(rows)
+        frames = tables["frames"]
+        old = frames.select(["frame_id", "trajectory_id", "frame_index", *_RENDERED]).to_pylist()
+        names = {row["frame_id"]: f"{scene_id}/{new_ids[row['trajectory_id']]}/{row['frame_index']:06d}" for row in old}
+        fresh = []
+        for row in old:
+            before = taken.get(names[row["frame_id"]])
+            fresh.append(before is None)
+            if before is None:
+                taken[names[row["frame_id"]]] = row
+            else:
+                _check_same(source, row, before)
+        chosen = frames.filter(pa.array(fresh, pa.bool_()))
+        labels = tables["labels"].filter(pc.is_in(tables["labels"]["frame_id"], chosen["frame_id"].combine_chunks()))
+        joined["frames"].append(_renamed(chosen, scene_id, new_ids, names))
+        labelled = [names[frame_id] for frame_id in labels["frame_id"].to_pylist()]
+        joined["labels"].append(with_column(labels, "frame_id", labelled))
+        brought.append((source, chosen, names))
+    return first | {name: pa.concat_tables(pieces) for name, pieces in joined.items()}, brought
+
+
+def _descents(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tuple[dict[str, str], pa.Table]:
+    """New ids of a member's descents, by old; and the rows of those that were not known before, renamed.
+
+    `known` holds the descents of the members before, by content and new id; the new ones are added to it.
+    """
+    names: dict[str, str] = {}
+    new = []
+    for row in trajectories.to_pylist():
+        content = {name: value for name, value in row.items() if name not in _CHANGING}
+        same = [name for found, name in known if found == content and name not in names.values()]
+        if not same:
+            same = [free_name(row["trajectory_id"], {name for _, name in known})]
+            known.append((content, same[0]))
+            new.append(True)
+        else:
+            new.append(False)
+        names[row["trajectory_id"]] = same[0]
+    renamed = with_column(trajectories, "trajectory_id", [names[n] for n in trajectories["trajectory_id"].to_pylist()])
+    return names, renamed.filter(pa.array(new, pa.bool_()))
+
+
+def _check_same(source: Dataset, row: dict, before: dict) -> None:
+    for name in _RENDERED:
+        if None not in (row[name], before[name]) and row[name] != before[name]:
+            raise UserError(source.root, row["frame_id"], f"another {name}", "the same frame as in the other dataset")
+
+
+def _renamed(frames: pa.Table, scene_id: str, new_ids: dict[str, str], names: dict[str, str]) -> pa.Table:
+    ids = [names[frame_id] for frame_id in frames["frame_id"].to_pylist()]
+    frames = with_column(frames, "scene_id", [scene_id] * len(frames))
+    frames = with_column(frames, "trajectory_id", [new_ids[name] for name in frames["trajectory_id"].to_pylist()])
+    return with_column(frames, "frame_id", ids)

@@ -1,0 +1,133 @@
+"""Datasets of older schema versions brought to this one.
+
+Version 2 added to `craters` where a crater comes from, and made its age and fresh depth nullable. Version 3 added
+recipes and content hashes to `scenes`, `contrast` to `labels`, checksums of all files, and the state of the frames.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_shared.content import content_sha256
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import INFO_NAME, DatasetInfo, Recipe, checked_info, read_object
+from perilune_shared.dataset.parts import Part
+from perilune_shared.dataset.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
+from perilune_shared.dataset.writer import written
+from perilune_shared.errors import UserError
+
+_ADDED_IN_3 = {"scenes": ("recipe", "content_sha256"), "labels": ("contrast",)}
+_ADDED_IN_2 = {"craters": ("origin",)}
+
+
+def _without(tables: dict[str, pa.Schema], added: Mapping[str, tuple[str, ...]]) -> dict[str, pa.Schema]:
+    kept = {}
+    for name, schema in tables.items():
+        kept[name] = pa.schema([field for field in schema if field.name not in added.get(name, ())])
+    return kept
+
+
+_TABLES_2 = _without(_without(TABLES, OPTIONAL), _ADDED_IN_3)
+OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
+"""Columns of the tables in older versions."""
+
+
+def migrate(root: Path, out: Path, progress: Progress | None = None, *, link: bool = False) -> None:
+    """Write a dataset of schema version 1 or 2 as one of this version; frames are copied, or linked.
+
+    What older versions did not record becomes null: the contrast of labels. Raises UserError where there is nothing to
+    migrate, or the dataset is damaged or not complete.
+    """
+    path = root / INFO_NAME
+    content = read_object(path)
+    version = content.get("schema_version")
+    if version == SCHEMA_VERSION:
+        raise UserError(path, "schema_version", version, "an older one; there is nothing to migrate")
+    if not isinstance(version, str) or version not in OLD_TABLES:
+        raise UserError(path, "schema_version", version, f"one of {', '.join(OLD_TABLES)}")
+    if content.get("complete") is not True:
+        raise UserError(path, "complete", content.get("complete"), "a dataset that was rendered to its end")
+    info = _info(content, path)
+    source = _Old(root, info, version)
+    scene_ids = sorted(source.rows("scenes")["scene_id"].to_pylist())
+    task = progress.add_task("migrating", total=len(scene_ids), unit="scenes", note="") if progress else None
+    with written(out, info, progress=progress) as writer:
+        for scene_id in scene_ids:
+            tables = {name: source.rows(name, scene_id) for name in TABLES}
+            writer.add_scene(tables)
+            names = {name: name for name in tables["frames"]["frame_id"].to_pylist()}
+            writer.add_images(source, tables["frames"], names, link=link)
+            if progress is not None and task is not None:
+                progress.advance(task)
+
+
+def _info(content: dict[str, Any], path: Path) -> DatasetInfo:
+    """dataset.json of version 1 or 2, in which settings, seed and versions stood by themselves, as one of this."""
+    version = content["schema_version"]
+    missing = [name for name in ("preset", "kind", "seed", "config", "versions") if name not in content]
+    if missing:
+        raise UserError(path, missing[0], "nothing", f"what every dataset of version {version} has")
+    made = {name: content.pop(name) for name in ("preset", "seed", "config", "versions")}
+    origin = content.pop("developed_from", None)
+    if isinstance(origin, dict):
+        origin = {**origin, "camera_config": None}
+    try:
+        recipe = Recipe.model_validate({**made, "kind": content["kind"], "developed_from": origin})
+    except ValueError as error:
+        raise UserError(path, "config", str(error).splitlines()[0], "the settings of a dataset") from None
+    return checked_info(
+        {
+            **content,
+            "schema_version": SCHEMA_VERSION,
+            "images": "files",
+            "recipes": {recipe.key: recipe.model_dump(mode="json")},
+            "history": [f"migrated from schema version {version}"],
+        },
+        path,
+    )
+
+
+class _Old(Dataset):
+    """A dataset of an older version, read as one of this."""
+
+    def __init__(self, root: Path, info: DatasetInfo, version: str):
+        super().__init__(root, info)
+        self.version = version
+
+    def rows(self, table: str, scene_id: str | None = None) -> pa.Table:
+        """Rows of a table, of one scene or all, with the columns of this version."""
+        schema = OLD_TABLES[self.version][table]
+        pieces = [Part(part, table, schema, self.version).read() for part in self.parts(table, scene_id)]
+        rows = pa.concat_tables(pieces) if pieces else schema.empty_table()
+        if scene_id is None:
+            return rows
+        rows = self._of_scene(table, rows, scene_id)
+        columns = {
+            name: rows[name] if name in schema.names else self._added(table, name, rows, scene_id)
+            for name in TABLES[table].names
+            if name not in OPTIONAL.get(table, ())
+        }
+        return complete(table, pa.table(columns, schema=pa.schema(map(TABLES[table].field, columns))))
+
+    def _of_scene(self, table: str, rows: pa.Table, scene_id: str) -> pa.Table:
+        key = "scene_id" if "scene_id" in rows.column_names else "frame_id"
+        values = rows[key].to_pylist()
+        own = [value == scene_id if key == "scene_id" else value.startswith(f"{scene_id}/") for value in values]
+        return rows.filter(pa.array(own, pa.bool_()))
+
+    def _added(self, table: str, name: str, rows: pa.Table, scene_id: str) -> pa.Array:
+        """A column that the older version has not."""
+        n = len(rows)
+        fill: dict[tuple[str, str], Callable[[], list]] = {
+            # Before version 2 the generator drew single craters only, and knew no catalogues.
+            ("craters", "origin"): lambda: ["primary"] * n,
+            ("labels", "contrast"): lambda: [None] * n,
+            ("scenes", "recipe"): lambda: [self.info.recipe().key] * n,
+            ("scenes", "content_sha256"): lambda: (
+                [content_sha256(self.rows("craters", scene_id), self.rows("boulders", scene_id))] * n
+            ),
+        }
+        return pa.array(fill[table, name](), TABLES[table].field(name).type)

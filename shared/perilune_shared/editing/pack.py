@@ -1,0 +1,74 @@
+"""A dataset in few large files, and back: frames as PNG bytes in images/*.parquet, each table as one part."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
+from perilune_shared.dataset.writer import MOST_IMAGES_WRITTEN, frame_path, with_column, written
+from perilune_shared.editing.rewrite import check_source, rewrite
+from perilune_shared.errors import UserError
+
+_EXR = ("exr_path", "exr_sha256", "exr_bytes")
+_LARGEST_SHARD_MB = 8000
+"""Larger files are refused when they are read (perilune_shared.dataset.parts)."""
+_ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
+
+
+def pack(
+    source: Dataset,
+    out: Path,
+    shard_mb: float = 1000,
+    progress: Progress | None = None,
+    *,
+    most_rows: int = MOST_ROWS_WRITTEN,
+    most_images: int = MOST_IMAGES_WRITTEN,
+) -> None:
+    """Write a packed dataset: frames in shards of about `shard_mb` megabytes, which Hugging Face `datasets` opens too.
+
+    A table of more than `most_rows` rows becomes several parts, and a shard holds at most `most_images` frames, so that
+    no file exceeds what a reader accepts (perilune_shared.dataset.parts).
+    A dataset without frames is packed as its tables alone. EXRs stay behind: their columns become null.
+    """
+    check_source(source, out, progress)
+    if not 0 < shard_mb <= _LARGEST_SHARD_MB:
+        raise UserError("--shard-mb", "size", shard_mb, f"above 0, at most {_LARGEST_SHARD_MB}")
+    packed = source.info.images in ("files", "packed")
+    info = source.info
+    if packed:
+        info = info.changed("packed", images="packed", exr_camera=None)
+    frames = source.table("frames").sort_by(_ORDER)
+    task = progress.add_task("packing", total=len(frames), unit="frames", note="") if progress and packed else None
+    with written(out, info, whole_tables=True, most_rows=most_rows, progress=progress) as writer:
+        for scene_id in source.scene_ids():
+            tables = source.scene(scene_id)
+            writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
+        if packed:
+            writer.pack_images(_images(source, frames, progress, task), round(shard_mb * 1e6), most_images)
+
+
+def _images(source: Dataset, frames: pa.Table, progress: Progress | None, task) -> Iterator[tuple[str, str, bytes]]:
+    for frame_id, png in source.pngs(frames):
+        yield frame_id, frame_path(frame_id, "png"), png
+        if progress is not None:
+            progress.advance(task)
+
+
+def unpack(source: Dataset, out: Path, progress: Progress | None = None, *, link: bool = False) -> None:
+    """Write a dataset with a part for each scene and trajectory, and frames as files.
+
+    Frames that are files already are copied, or linked with `link`.
+    """
+    check_source(source, out, progress)
+    info: DatasetInfo = source.info.changed("unpacked")
+    rewrite(source, out, info, lambda tables: tables, "link" if link else "copy", progress)
+
+
+def _without_exr(frames: pa.Table) -> pa.Table:
+    for name in _EXR:
+        frames = with_column(frames, name, [None] * len(frames))
+    return frames

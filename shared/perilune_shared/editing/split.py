@@ -1,0 +1,57 @@
+"""A dataset with another split into train, val and test."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.writer import SceneTables, with_column
+from perilune_shared.editing.flights import terrains_and_flights
+from perilune_shared.editing.rewrite import ImageMode, check_source, rewrite
+from perilune_shared.errors import UserError
+
+SplitBy = Literal["scene", "trajectory", "frame"]
+
+
+def split_dataset(
+    source: Dataset,
+    out: Path,
+    by: SplitBy = "scene",
+    val_share: float = 0.1,
+    test_share: float = 0.1,
+    seed: int = 0,
+    images: ImageMode = "copy",
+    progress: Progress | None = None,
+) -> None:
+    """Write a dataset whose whole scenes, trajectories or single frames are assigned to train, val and test at random.
+
+    Units go by content, not by name (`perilune_shared.editing.flights`). Scenes with the same ground stay together,
+    whatever their names and Suns, as do all over one elevation model. Trajectories of one flight stay together, also
+    where the flight was rendered and developed again, and so do frames of one pose. `frame` with shares of 0.1 is the
+    paper's protocol: the same ground in all three splits, which flatters the test; `split_by` in dataset.json says so.
+    At least one unit goes to each split with a share above 0. Raises UserError where there are too few.
+    """
+    if not (0 <= val_share < 1 and 0 <= test_share < 1 and val_share + test_share < 1):
+        raise UserError("--val and --test", "shares", f"{val_share}, {test_share}", "from 0 to less than 1 in all")
+    check_source(source, out, progress)
+    frames = terrains_and_flights(source)
+    key = {"scene": "terrain", "trajectory": "flight", "frame": "pose"}[by]
+    units = frames[key].drop_duplicates().to_numpy()
+    n_val, n_test = (int(np.ceil(share * len(units))) for share in (val_share, test_share))
+    if n_val + n_test >= len(units):
+        wanted = f"more than {n_val + n_test}, for train, val and test"
+        raise UserError(source.root, "--by", f"{len(units)} of {by}", wanted)
+    names = np.array(["train"] * (len(units) - n_val - n_test) + ["val"] * n_val + ["test"] * n_test)
+    dealt = dict(zip(units, np.random.default_rng(seed).permutation(names), strict=True))
+    split_of = dict(zip(frames["frame_id"], frames[key].map(dealt), strict=True))
+
+    def change(tables: SceneTables) -> SceneTables:
+        ids = tables["frames"]["frame_id"].to_pylist()
+        splits = pa.array([str(split_of[frame_id]) for frame_id in ids], pa.string())
+        return {**tables, "frames": with_column(tables["frames"], "split", splits)}
+
+    line = f"split by {by}, val {val_share:g}, test {test_share:g}, seed {seed}"
+    rewrite(source, out, source.info.changed(line), change, images, progress)

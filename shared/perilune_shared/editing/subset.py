@@ -1,0 +1,130 @@
+"""Part of a dataset: by conditions on columns, by a number of frames, by size."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.progress import Progress
+
+from perilune_shared.dataset.expression import Condition, columns_of
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.writer import SceneTables
+from perilune_shared.editing.rewrite import ImageMode, check_source, rewrite
+from perilune_shared.errors import UserError
+
+
+def subset(
+    source: Dataset,
+    out: Path,
+    where: Sequence[str] = (),
+    n_frames: int | None = None,
+    megabytes: float | None = None,
+    images: ImageMode = "copy",
+    progress: Progress | None = None,
+) -> None:
+    """Write the frames and labels of a dataset for which all conditions hold, at most so many, at most so large.
+
+    A condition on columns of frames, trajectories and scenes chooses frames; one that names labels or craters chooses
+    labels, and frames stay. Scenes keep all their craters and boulders, since their content is what names them. A
+    number of frames or a size (of the PNGs, 10^6 bytes each megabyte) is filled with whole descents, taken in turn from
+    each scene so that the ground stays varied; the last is cut short at its end. Raises UserError where nothing is
+    left.
+    """
+    conditions = [Condition(text) for text in where]
+    on_frames = [condition for condition in conditions if not condition.on_labels]
+    on_labels = [condition for condition in conditions if condition.on_labels]
+    planned = source.info.images == "planned" or images == "plan"
+    if on_labels and planned:
+        wanted = "conditions on frames, trajectories and scenes: a plan has no labels"
+        raise UserError("--where", "condition", on_labels[0].text, wanted)
+    check_source(source, out, progress)
+    kept = None
+    if n_frames is not None or megabytes is not None:
+        kept = _first_frames(source, on_frames, n_frames, megabytes)
+
+    def change(tables: SceneTables) -> SceneTables:
+        frames = tables["frames"]
+        mask = _holds(on_frames, tables, frames)
+        if kept is not None:
+            mask = mask & np.asarray(pc.is_in(frames["frame_id"], kept), bool)
+        labels = tables["labels"].filter(pa.array(_holds(on_labels, tables, tables["labels"])))
+        return {**tables, "frames": frames.filter(pa.array(mask)), "labels": labels}
+
+    told = [*(f"where {text}" for text in where)]
+    told += [f"{n_frames} frames"] if n_frames is not None else []
+    told += [f"{megabytes:g} MB"] if megabytes is not None else []
+    told += ["no craters and labels"] if images == "plan" else []
+    info = source.info.changed("subset: " + ("; ".join(told) or "all").replace("<", " lt ").replace(">", " gt "))
+    rewrite(source, out, info, change, images, progress, _scenes_with(source, on_frames))
+
+
+def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
+    """Scenes in which a frame may be chosen; of the others, only row groups' statistics or one column are read."""
+    scene_ids = set(source.scene_ids())
+    for condition in on_frames:
+        if condition.columns_of_only("frames") is not None:
+            scene_ids &= set(source.table("frames", ["scene_id"], where=condition)["scene_id"].unique().to_pylist())
+    return sorted(scene_ids)
+
+
+def _first_frames(
+    source: Dataset, on_frames: Sequence[Condition], n_frames: int | None, megabytes: float | None
+) -> pa.Array:
+    """frame_id of whole descents, in turn from each scene, up to a number or size."""
+    if (n_frames is not None and n_frames < 1) or (megabytes is not None and not megabytes > 0):
+        raise UserError("--frames or --mb", "size", n_frames if n_frames is not None else megabytes, "above 0")
+    pieces = []
+    for scene_id in source.scene_ids():
+        tables = {name: source.table(name, scene_id=scene_id) for name in ("scenes", "trajectories", "frames")}
+        frames = tables["frames"].filter(pa.array(_holds(on_frames, tables, tables["frames"])))
+        pieces.append(frames.select(["frame_id", "scene_id", "trajectory_id", "frame_index", "png_bytes"]).to_pandas())
+    if not pieces:
+        raise UserError(source.root, "scenes", "none", "a dataset with frames")
+    table = pd.concat(pieces, ignore_index=True)
+    if megabytes is not None and table["png_bytes"].isna().any():
+        raise UserError(source.root, "png_bytes", "null", "--frames: the size of frames never rendered is not known")
+    table["descent"] = table.groupby("scene_id")["trajectory_id"].transform(lambda ids: pd.factorize(ids, sort=True)[0])
+    table = table.sort_values(["descent", "scene_id", "frame_index"], ignore_index=True)
+    if n_frames is not None:
+        table = table.iloc[:n_frames]
+    if megabytes is not None:
+        table = table[table["png_bytes"].cumsum() <= megabytes * 1e6]
+    return pa.array(table["frame_id"], pa.string())
+
+
+def _holds(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
+    """Where all conditions hold, for rows of a scene's frames or labels (N,)."""
+    mask = np.ones(len(rows), bool)
+    if not conditions or not len(rows):
+        return mask
+    columns = {f"{table}.{name}": _column(tables, rows, table, name) for table, name in columns_of(conditions)}
+    joined = pa.table(columns)
+    for condition in conditions:
+        mask &= condition.holds(joined)
+    return mask
+
+
+def _column(tables: SceneTables, rows: pa.Table, table: str, name: str) -> pa.ChunkedArray:
+    """A column of a table of one scene, joined to rows of frames or labels."""
+    values = tables[table][name]
+    if table == "scenes":
+        return values.take(np.zeros(len(rows), np.int64))
+    on_labels = "crater_id" in rows.column_names
+    if table == "labels":
+        return rows[name]
+    if table == "craters":
+        return values.take(_places(rows["crater_id"], tables["craters"]["crater_id"]))
+    frames = tables["frames"]
+    of_frame = _places(rows["frame_id"], frames["frame_id"]) if on_labels else np.arange(len(rows))
+    if table == "frames":
+        return (values if on_labels else rows[name]).take(of_frame)
+    of_trajectory = _places(frames["trajectory_id"], tables["trajectories"]["trajectory_id"])
+    return values.take(of_trajectory[of_frame])
+
+
+def _places(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
+    index = pd.Index(within.to_pandas())
+    return index.get_indexer(values.to_pandas())

@@ -1,0 +1,59 @@
+"""The YAML head of a dataset card, as Hugging Face reads it.
+
+Format: https://huggingface.co/docs/hub/datasets-cards and datasets-manual-configuration.
+"""
+
+from typing import Any
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.yaml_text import to_yaml_text
+
+_TASKS = {"detect": "object-detection", "nav": "other"}
+_HUB_LICENCES = {
+    "CC0-1.0",
+    "CC-BY-4.0",
+    "CC-BY-SA-4.0",
+    "CC-BY-NC-4.0",
+    "CC-BY-NC-SA-4.0",
+    "Apache-2.0",
+    "MIT",
+    "CDLA-Permissive-2.0",
+}
+_SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
+
+
+def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
+    """The YAML head: licence, name, tags, and which files are which split of which configuration."""
+    info = dataset.info
+    single = info.licence in _HUB_LICENCES
+    licence = {"license": info.licence.lower()} if single else {"license": "other", "license_name": info.licence}
+    head = {
+        **licence,
+        "pretty_name": info.name,
+        "task_categories": [_TASKS[info.kind]],
+        "tags": ["moon", "craters", "lunar-landing", "synthetic", "perilune"],
+        "size_categories": [next((name for most, name in _SIZES if info.counts.frames < most), "n>1M")],
+        "configs": configs,
+    }
+    return "---\n" + to_yaml_text(head) + "---"
+
+
+def table_configs(dataset: Dataset) -> list[dict[str, Any]]:
+    """A configuration for each table that has rows, and for packed images.
+
+    Without it `datasets` takes every picture of the folder for training data. A part may hold rows of all splits, so
+    that each table is one split, `mixed`; the frames' column `split` says which. The export for Hugging Face has the
+    splits as files.
+    """
+    counts = dataset.info.counts.model_dump()
+    names = ["frames", *(name for name in TABLES if name != "frames")]
+    configs = [_config(name, f"manifest/{name}/*.parquet") for name in names if counts[name]]
+    if dataset.info.images == "packed":
+        configs.append(_config("images", "images/*.parquet"))
+    return configs
+
+
+def _config(name: str, path: str) -> dict[str, Any]:
+    config: dict[str, Any] = {"config_name": name, "data_files": [{"split": "mixed", "path": path}]}
+    return {**config, "default": True} if name == "frames" else config

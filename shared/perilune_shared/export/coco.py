@@ -1,0 +1,181 @@
+"""COCO: boxes and ellipses as polygons, one file a split.
+
+Format: https://cocodataset.org/#format-data. COCO's coordinates have their origin at the outer corner of the top-left
+pixel, as ours do. After COCO's habit boxes and polygons end at the image's edge; the whole ellipse stands beside them.
+Labels that are not chosen become `iscrowd`: an evaluator then counts a detection of them neither for nor against.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from rich.progress import Progress
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_shared.export.rows import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, scenes_of, sizes
+from perilune_shared.storage import files
+
+CATEGORY = {"id": 1, "name": "crater", "supercategory": "crater"}
+_N_CORNERS = 32
+_DECIMALS = 3
+"""Of pixels in the file; more would be below any label's truth."""
+_ANGLES = 2 * np.pi * np.arange(_N_CORNERS) / _N_CORNERS
+_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+# Corners on the ellipse would enclose less than it; moved out by 0.3 %, they enclose as much.
+_CIRCLE *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
+
+
+def export_coco(
+    dataset: Dataset, out: Path, progress: Progress, split: str | None = None, choose: Choice | None = None
+) -> int:
+    """Write `out`/instances_<split>.json for each split, or for one; returns the number of annotations.
+
+    `file_name` is the frame's png_path, so that the image folder is the dataset's. Raises UserError where `out` holds
+    something, the dataset is only planned, a png_path leads out of it or no frame is of the split.
+    """
+    if dataset.info.images == "planned":
+        raise UserError(dataset.root, "images", "planned", "a rendered dataset: a plan has no labels")
+    task = progress.add_task("coco", total=len(dataset.scene_ids()), unit="scenes")
+    opened: dict[str, _SplitFile] = {}
+    with files.new_folder(out) as folder:
+        try:
+            for scene in scenes_of(dataset, split, choose):
+                annotations = _annotations(scene)
+                for name, frames in scene.frames.groupby("split"):
+                    if name not in opened:
+                        opened[str(name)] = _SplitFile(folder / f"instances_{name}.json", dataset)
+                    opened[str(name)].add(frames, annotations)
+                progress.advance(task)
+        finally:
+            for file in opened.values():
+                file.close()
+    return sum(file.n_annotations for file in opened.values())
+
+
+def polygons_of(labels: pd.DataFrame) -> NDArray[np.float64]:
+    """Polygons (N, 32, 2) about the ellipses of labels, of their area, pixels; they may leave the image."""
+    cos, sin = np.cos(labels["ellipse_theta_rad"].to_numpy()), np.sin(labels["ellipse_theta_rad"].to_numpy())
+    along = labels["ellipse_a_px"].to_numpy()[:, None] * _CIRCLE[:, 0]
+    across = labels["ellipse_b_px"].to_numpy()[:, None] * _CIRCLE[:, 1]
+    x = labels["ellipse_cx_px"].to_numpy()[:, None] + along * cos[:, None] - across * sin[:, None]
+    y = labels["ellipse_cy_px"].to_numpy()[:, None] + along * sin[:, None] + across * cos[:, None]
+    return np.stack([x, y], axis=-1)
+
+
+def cut_at_edges(polygon: NDArray[np.float64], width_px: float, height_px: float) -> NDArray[np.float64]:
+    """What of a convex polygon (M, 2) lies in the image, as a polygon; empty where nothing does.
+
+    One edge after the other (Sutherland & Hodgman 1974, doi 10.1145/360767.360802).
+    """
+    for axis, edge, sign in ((0, 0.0, 1.0), (0, width_px, -1.0), (1, 0.0, 1.0), (1, height_px, -1.0)):
+        if not len(polygon):
+            break
+        inside = sign * (polygon[:, axis] - edge)
+        kept = []
+        for here, there, d_here, d_there in zip(
+            polygon, np.roll(polygon, -1, axis=0), inside, np.roll(inside, -1), strict=True
+        ):
+            if d_here >= 0:
+                kept.append(here)
+            if d_here * d_there < 0:
+                crossing = here + (there - here) * (d_here / (d_here - d_there))
+                crossing[axis] = edge
+                kept.append(crossing)
+        polygon = np.array(kept).reshape(-1, 2)
+    return polygon
+
+
+def area_of(polygon: NDArray[np.float64]) -> float:
+    """Area of a polygon (M, 2), by the shoelace formula."""
+    x, y = polygon.T
+    return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
+
+
+def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
+    """Annotations of a scene by image_id. A label of which nothing lies in its image is left out."""
+    labels = scene.labels
+    boxes, size, polygons = clipped_boxes(labels, scene.frames), sizes(labels, scene.frames), polygons_of(labels)
+    boxes[:, 2:] -= boxes[:, :2]
+    whole = ((polygons >= 0) & (polygons <= size[:, None])).all(axis=(1, 2))
+    columns = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
+    ellipses = labels[columns].to_numpy(np.float64)
+    image_ids = scene.frames.set_index("frame_id")["image_id"].loc[labels["frame_id"]].to_list()
+    names = zip(image_ids, labels["label_id"], labels["crater_id"], labels["chosen"], strict=True)
+    measures = {name: labels[name].to_numpy(np.float64) for name in LABEL_MEASURES if name in labels}
+    found: dict[int, list[dict[str, Any]]] = {}
+    for k, (image_id, label_id, crater_id, chosen) in enumerate(names):
+        polygon = polygons[k] if whole[k] else cut_at_edges(polygons[k], *size[k])
+        area = area_of(polygon) if len(polygon) > 2 else 0.0
+        if area <= 0 or boxes[k, 2:].min() <= 0:
+            continue
+        found.setdefault(image_id, []).append(
+            {
+                "id": label_id,
+                "image_id": image_id,
+                "category_id": CATEGORY["id"],
+                "bbox": np.round(boxes[k], _DECIMALS).tolist(),
+                "segmentation": [np.round(polygon, _DECIMALS).ravel().tolist()],
+                "area": round(area, _DECIMALS),
+                "iscrowd": int(not chosen),
+                "crater_id": crater_id,
+                "ellipse": np.round(ellipses[k], 6).tolist(),
+                **{name: _number(values[k]) for name, values in measures.items()},
+            }
+        )
+    return found
+
+
+class _SplitFile:
+    """One JSON file, whose annotations are written as they come and whose images, which are few, at the end."""
+
+    def __init__(self, path: Path, dataset: Dataset):
+        info = dataset.info
+        self.n_annotations = 0
+        self._dataset = dataset
+        self._images: list[dict[str, Any]] = []
+        head = {
+            "info": {
+                "description": info.name,
+                "version": info.schema_version,
+                "ellipse": "cx_px, cy_px, a_px, b_px, theta_rad; whole, while bbox and segmentation end at the edges",
+            },
+            "licenses": [{"id": 1, "name": info.licence, "url": ""}],
+            "categories": [CATEGORY],
+        }
+        self._stream = path.open("w", encoding="utf-8")
+        self._stream.write(json.dumps(head)[:-1] + ',\n"annotations": [')
+
+    def add(self, frames: pd.DataFrame, annotations: dict[int, list[dict[str, Any]]]) -> None:
+        """Frames of this split, with the annotations of each."""
+        for row in frames.to_dict("records"):
+            # Readers join the name to a folder: it must not lead out of it.
+            self._dataset.file(row["png_path"])
+            self._images.append(
+                {
+                    "id": row["image_id"],
+                    "file_name": row["png_path"],
+                    "width": row["width_px"],
+                    "height": row["height_px"],
+                    "license": 1,
+                    "frame_id": row["frame_id"],
+                }
+            )
+            for annotation in annotations.get(row["image_id"], ()):
+                self._stream.write(",\n" if self.n_annotations else "\n")
+                self._stream.write(json.dumps(annotation, allow_nan=False))
+                self.n_annotations += 1
+
+    def close(self) -> None:
+        """Write the images and end the file."""
+        with self._stream:
+            self._stream.write(
+                '\n],\n"images": [\n' + ",\n".join(json.dumps(image) for image in self._images) + "\n]}\n"
+            )
+
+
+def _number(value: float) -> float | None:
+    return round(float(value), 6) if np.isfinite(value) else None

@@ -1,0 +1,251 @@
+"""Croissant: the dataset's files, tables and columns as JSON-LD that dataset search and ML tools read.
+
+Format: Croissant 1.1 (https://docs.mlcommons.org/croissant/docs/croissant-spec-1.1.html). The file lies in the
+dataset's own folder, since it names files by paths from there; mlcroissant then reads records from the local files::
+
+    dataset = mlcroissant.Dataset("data/small/detect/croissant.json")
+    for record in dataset.records("labels"):
+        print(record["labels/radius_px"])
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import INFO_NAME
+from perilune_shared.dataset.parts import Part
+from perilune_shared.dataset.schema import KEYS, OPTIONAL, TABLES
+from perilune_shared.errors import UserError
+from perilune_shared.export.added_files import add_files, check_sums
+from perilune_shared.storage import files
+
+CROISSANT_NAME = "croissant.json"
+# The registered name, application/vnd.apache.parquet, is one that mlcroissant does not read.
+_PARQUET = "application/x-parquet"
+_CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "arrayShape": "cr:arrayShape",
+    "citeAs": "cr:citeAs",
+    "column": "cr:column",
+    "conformsTo": "dct:conformsTo",
+    "containedIn": "cr:containedIn",
+    "cr": "http://mlcommons.org/croissant/",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "dct": "http://purl.org/dc/terms/",
+    "description": {"@container": "@language"},
+    "equivalentProperty": "cr:equivalentProperty",
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "extract": "cr:extract",
+    "field": "cr:field",
+    "fileProperty": "cr:fileProperty",
+    "fileObject": "cr:fileObject",
+    "fileSet": "cr:fileSet",
+    "format": "cr:format",
+    "includes": "cr:includes",
+    "isArray": "cr:isArray",
+    "isLiveDataset": "cr:isLiveDataset",
+    "jsonPath": "cr:jsonPath",
+    "key": "cr:key",
+    "md5": "cr:md5",
+    "name": {"@container": "@language"},
+    "parentField": "cr:parentField",
+    "path": "cr:path",
+    "recordSet": "cr:recordSet",
+    "references": "cr:references",
+    "regex": "cr:regex",
+    "repeated": "cr:repeated",
+    "replace": "cr:replace",
+    "samplingRate": "cr:samplingRate",
+    "sc": "https://schema.org/",
+    "separator": "cr:separator",
+    "source": "cr:source",
+    "subField": "cr:subField",
+    "transform": "cr:transform",
+}
+_DATA_TYPES = {pa.string(): "sc:Text", pa.int64(): "cr:Int64", pa.float64(): "cr:Float64"}
+
+
+def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progress | None = None) -> Path:
+    """Write croissant.json, or `out`, into the dataset's folder; returns its path. The checksums are kept right.
+
+    Raises UserError where `out` lies elsewhere, the dataset is not complete or its checksums are wrong.
+    """
+    out = out or dataset.root / CROISSANT_NAME
+    if out.resolve().parent != dataset.root.resolve() or out.suffix != ".json":
+        raise UserError(out, "--out", "another folder", f"a .json file in {dataset.root}, whose files it names by path")
+    if out.name == INFO_NAME:
+        raise UserError(out, "--out", INFO_NAME, "a name that is not taken")
+    if not dataset.info.complete:
+        raise UserError(dataset.root, "complete", "false", "a finished dataset")
+    known = check_sums(dataset, [out], progress)
+    text = json.dumps(metadata_of(dataset, known or {}), indent=1, allow_nan=False) + "\n"
+    add_files(dataset, {out: text.encode()}, known)
+    return out
+
+
+def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
+    """The JSON-LD object; `known` has hashes that need not be computed again.
+
+    A table of one part is a FileObject with its hash; SHA256SUMS has those of many parts.
+    """
+    info = dataset.info
+    distribution = [
+        {
+            "@type": "cr:FileObject",
+            "@id": INFO_NAME,
+            "name": INFO_NAME,
+            "description": "what the dataset is, what it was made by, what was done to it",
+            "contentUrl": INFO_NAME,
+            "encodingFormat": "application/json",
+            "sha256": files.sha256_of(dataset.root / INFO_NAME),
+        }
+    ]
+    record_sets = []
+    for table, schema in TABLES.items():
+        distribution.append(_distribution(dataset, table, known))
+        # A file may lack optional columns, which mlcroissant would then not find.
+        missing = {
+            name
+            for name in OPTIONAL.get(table, ())
+            for part in dataset.parts(table)
+            if name not in Part(part, table).found.names
+        }
+        record_sets.append(
+            {
+                "@type": "cr:RecordSet",
+                "@id": table,
+                "name": table,
+                "key": [{"@id": f"{table}/{column}"} for column in KEYS[table]],
+                "field": [_field(table, column, distribution[-1]) for column in schema if column.name not in missing],
+            }
+        )
+    if info.images in ("files", "packed"):
+        distribution.append(_images(packed=info.images == "packed"))
+        record_sets.append(_image_records(packed=info.images == "packed"))
+    return {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.1",
+        "name": info.name,
+        "description": _description(dataset),
+        "license": _licence(info.licence),
+        # A dataset has no version of its own: what was done to it since rendering counts.
+        "version": f"1.0.{len(info.history)}",
+        "citeAs": citation_of(dataset),
+        "keywords": ["Moon", "craters", "lunar landing", "synthetic images", info.kind],
+        "distribution": distribution,
+        "recordSet": record_sets,
+    }
+
+
+def citation_of(dataset: Dataset) -> str:
+    """How to name this dataset and no other, as BibTeX."""
+    sha256 = files.sha256_of(dataset.root / INFO_NAME)
+    key = "".join(c if c.isascii() and c.isalnum() else "-" for c in dataset.info.name).strip("-")
+    note = f"Rendered lunar descents. SHA-256 of {INFO_NAME}: {sha256}"
+    return f"@misc{{{key}, title = {{{dataset.info.name}}}, howpublished = {{perilune dataset}}, note = {{{note}}}}}"
+
+
+def _description(dataset: Dataset) -> str:
+    counts = dataset.info.counts
+    return (
+        f"Rendered lunar descents with exact crater ellipses and camera poses: {counts.scenes} scenes, "
+        f"{counts.trajectories} descents, {counts.frames} frames, {counts.labels} labels, made by perilune. "
+        f"Splits share no {dataset.info.split_by}."
+    )
+
+
+def _licence(expression: str) -> str:
+    """A page of SPDX for a single licence, the expression itself for several."""
+    return f"https://spdx.org/licenses/{expression}.html" if " " not in expression else expression
+
+
+def _distribution(dataset: Dataset, table: str, known: Mapping[str, str]) -> dict[str, Any]:
+    parts = dataset.parts(table)
+    common = {"name": f"{table}-parquet", "encodingFormat": _PARQUET}
+    if len(parts) == 1:
+        url = parts[0].relative_to(dataset.root).as_posix()
+        return {
+            "@type": "cr:FileObject",
+            "@id": f"{table}-parquet",
+            **common,
+            "contentUrl": url,
+            "sha256": known.get(url) or files.sha256_of(parts[0]),
+        }
+    return {
+        "@type": "cr:FileSet",
+        "@id": f"{table}-parquet",
+        **common,
+        "description": "parts, each with the rows of a scene or a descent; their hashes stand in SHA256SUMS",
+        "includes": f"manifest/{table}/*.parquet",
+    }
+
+
+def _field(table: str, column: pa.Field, distribution: dict[str, Any]) -> dict[str, Any]:
+    metadata = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
+    unit = f" [{metadata['unit']}]" if metadata.get("unit") else ""
+    is_list = pa.types.is_fixed_size_list(column.type)
+    field = {
+        "@type": "cr:Field",
+        "@id": f"{table}/{column.name}",
+        "name": column.name,
+        "description": metadata.get("meaning", "") + unit,
+        "dataType": _DATA_TYPES[column.type.value_type if is_list else column.type],
+        "source": _source(distribution, {"column": column.name}),
+    }
+    if is_list:
+        field |= {"isArray": True, "arrayShape": str(column.type.list_size)}
+    return field
+
+
+def _source(distribution: dict[str, Any], extract: dict[str, str], **more: Any) -> dict[str, Any]:
+    kind = "fileObject" if distribution["@type"] == "cr:FileObject" else "fileSet"
+    return {kind: {"@id": distribution["@id"]}, "extract": extract, **more}
+
+
+def _images(*, packed: bool) -> dict[str, Any]:
+    return {
+        "@type": "cr:FileSet",
+        "@id": "image-files",
+        "name": "image-files",
+        "description": "packed frames" if packed else "frames; their hashes stand in the table frames",
+        "encodingFormat": _PARQUET if packed else "image/png",
+        "includes": "images/*.parquet" if packed else "frames/*.png",
+    }
+
+
+def _image_records(*, packed: bool) -> dict[str, Any]:
+    """The frames: by frame_id where packed, else by png_path."""
+    source = {"@type": "cr:FileSet", "@id": "image-files"}
+    if packed:
+        key, name = "frame_id", _source(source, {"column": "frame_id"})
+        image = _source(source, {"column": "image"}, transform={"jsonPath": "bytes"})
+    else:
+        key, name = "png_path", _source(source, {"fileProperty": "fullpath"})
+        image = _source(source, {"fileProperty": "content"})
+    return {
+        "@type": "cr:RecordSet",
+        "@id": "images",
+        "name": "images",
+        "key": {"@id": f"images/{key}"},
+        "field": [
+            {"@type": "cr:Field", "@id": f"images/{key}", "name": key, "dataType": "sc:Text", "source": name},
+            {
+                "@type": "cr:Field",
+                "@id": "images/image",
+                "name": "image",
+                "description": "the grey PNG",
+                "dataType": "sc:ImageObject",
+                "source": image,
+            },
+        ],
+    }

@@ -1,0 +1,150 @@
+"""Hugging Face: one row a frame with its image, pose and labels, in Parquet files for each split.
+
+A dataset's own tables hold frames of all splits side by side, and labels apart from frames; `datasets` would read all
+as training data. Here `datasets.load_dataset(folder)` gives the splits, and `load_dataset(folder, split="test")`
+one of them. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from rich.progress import Progress
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.schema import IMAGES, SPLITS, TABLES
+from perilune_shared.export.card_head import head_of
+from perilune_shared.export.rows import Choice, SceneRows, scenes_of
+from perilune_shared.storage import files
+
+_LEFT_OUT = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
+_LABEL = pa.struct(
+    [
+        *(pa.field(field.name, field.type) for field in TABLES["labels"] if field.name != "frame_id"),
+        pa.field("chosen", pa.bool_()),
+    ]
+)
+_FRAMES_A_GROUP = 128
+_DTYPES = {pa.string(): "string", pa.int64(): "int64", pa.float64(): "float64", pa.bool_(): "bool"}
+
+
+def export_hugging_face(
+    dataset: Dataset,
+    out: Path,
+    progress: Progress,
+    split: str | None = None,
+    choose: Choice | None = None,
+    shard_mb: float = 500,
+) -> int:
+    """Write data/<split>/*.parquet and a README.md with the splits into `out`; returns the number of frames.
+
+    Each label says whether it is `chosen`. Raises UserError where `out` is not empty, an image is missing or no frame
+    is of the split.
+    """
+    task = progress.add_task("hugging face", total=dataset.info.counts.frames, unit="frames", note="")
+    writers: dict[str, _Shards] = {}
+    n_frames = 0
+    with files.new_folder(out) as folder:
+        try:
+            for scene in scenes_of(dataset, split, choose):
+                for name, rows in _tables(dataset, scene):
+                    if name not in writers:
+                        writers[name] = _Shards(folder / "data" / name, round(shard_mb * 1e6))
+                    writers[name].write(rows)
+                    n_frames += len(rows)
+                    progress.advance(task, len(rows))
+        finally:
+            for writer in writers.values():
+                writer.close()
+        splits = [{"split": name, "path": f"data/{name}/*.parquet"} for name in SPLITS if name in writers]
+        page = head_of(dataset, [{"config_name": "default", "data_files": splits}]) + _PAGE
+        files.write_text(folder / "README.md", page)
+    return n_frames
+
+
+_PAGE = """
+
+Rendered lunar descents: one row a frame, with its image, camera pose and labels (crater ellipses). Units stand in the
+names of the columns; their meaning stands in the metadata of the Parquet files.
+
+```python
+from datasets import load_dataset
+
+test = load_dataset("FOLDER", split="test")
+```
+"""
+
+
+def schema_of() -> pa.Schema:
+    """Columns of the files: the frame's, its image, and its labels as a list of structs."""
+    columns = [IMAGES.field("frame_id"), IMAGES.field("image")]
+    columns += [field for field in TABLES["frames"] if field.name not in ("frame_id", *_LEFT_OUT)]
+    columns.append(pa.field("labels", pa.list_(_LABEL), metadata={"unit": "", "meaning": "craters in the frame"}))
+    features = {field.name: {"_type": "Image"} if field.name == "image" else _feature(field.type) for field in columns}
+    return pa.schema(columns, metadata={"huggingface": json.dumps({"info": {"features": features}})})
+
+
+def _feature(kind: pa.DataType) -> dict[str, Any]:
+    """A type as `datasets` describes it."""
+    if pa.types.is_fixed_size_list(kind):
+        return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
+    if pa.types.is_list(kind):
+        return {"feature": {field.name: _feature(field.type) for field in kind.value_type}, "_type": "List"}
+    return {"dtype": _DTYPES[kind], "_type": "Value"}
+
+
+def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]]:
+    """Split and rows of a scene's frames, some at a time."""
+    schema = schema_of()
+    for split, frames in scene.frames.groupby("split"):
+        for start in range(0, len(frames), _FRAMES_A_GROUP):
+            some = frames.iloc[start : start + _FRAMES_A_GROUP]
+            pngs = dict(dataset.pngs(pa.Table.from_pandas(some[["frame_id", "png_path"]], preserve_index=False)))
+            images = [{"bytes": pngs[name], "path": f"{name}.png"} for name in some["frame_id"]]
+            columns = {
+                "image": pa.array(images, schema.field("image").type),
+                "labels": _labels(scene.labels, some["frame_id"]),
+            }
+            for field in schema:
+                if field.name not in columns:
+                    columns[field.name] = pa.array(some[field.name].tolist(), field.type, from_pandas=True)
+            yield str(split), pa.table([columns[name] for name in schema.names], schema=schema)
+
+
+def _labels(labels: pd.DataFrame, frame_ids: pd.Series) -> pa.ListArray:
+    """For each frame its labels, which are sorted by frame_id as the frames are."""
+    own = labels[labels["frame_id"].isin(frame_ids)]
+    counts = own["frame_id"].value_counts().reindex(frame_ids, fill_value=0).to_numpy()
+    offsets = pa.array(np.concatenate([[0], np.cumsum(counts)]), pa.int32())
+    values = [pa.array(own[field.name].to_numpy(), field.type, from_pandas=True) for field in _LABEL]
+    return pa.ListArray.from_arrays(offsets, pa.StructArray.from_arrays(values, fields=list(_LABEL)))
+
+
+class _Shards:
+    """Parquet files of one split, each of about `shard_bytes`."""
+
+    def __init__(self, folder: Path, shard_bytes: int):
+        self._folder, self._shard_bytes = folder, shard_bytes
+        self._shard, self._size = 0, 0
+        self._writer: pq.ParquetWriter | None = None
+        folder.mkdir(parents=True)
+
+    def write(self, rows: pa.Table) -> None:
+        if self._writer is not None and self._size + rows.nbytes > self._shard_bytes:
+            self.close()
+        if self._writer is None:
+            path = self._folder / f"{self._shard:05d}.parquet"
+            self._writer = pq.ParquetWriter(path, rows.schema, compression="zstd")
+            self._shard, self._size = self._shard + 1, 0
+        self._writer.write_table(rows)
+        self._size += rows.nbytes
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = None

@@ -1,0 +1,86 @@
+"""Trajectories: TUM and KITTI, one file a descent, as evo and the benchmarks' own tools read them.
+
+A pose is the camera's: where its centre of projection is, and rotation_site_from_camera, which turns O_C's axes (x
+right, y down, z along the view) into those of the reference.
+
+- TUM (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): `timestamp tx ty tz qx qy qz qw`, reference O_L.
+- KITTI (https://www.cvlibs.net/datasets/kitti/eval_odometry.php): the upper 3x4 of the pose, row by row; the reference
+  is the first camera of the file, so that the first line is the identity. The times stand in a second file.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.progress import Progress, TaskID
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.export.rows import scenes_of
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+from perilune_shared.storage import files
+
+_TUM_HEADER = (
+    "# camera poses of one descent: centre of projection in O_L (X west, Y south, Z up), metres;\n"
+    "# rotation_site_from_camera (camera: x right, y down, z along the view); seconds since the first frame\n"
+    "# timestamp tx ty tz qx qy qz qw\n"
+)
+
+
+def export_tum(dataset: Dataset, out: Path, progress: Progress, split: str | None = None) -> int:
+    """Write `out`/<scene_id>/<trajectory_id>.txt for each descent in TUM's form; returns their number.
+
+    With a split, only frames of it. Raises UserError where `out` holds something or no frame is of the split.
+    """
+    n_descents = 0
+    task = progress.add_task("tum", total=len(dataset.scene_ids()), unit="scenes")
+    with files.new_folder(out) as folder:
+        for scene_id, trajectory_id, frames in _descents(dataset, progress, task, split):
+            # Conjugated, since the manifest holds rotation_camera_from_site.
+            w, x, y, z = np.stack(frames["rotation_wxyz"].to_list()).T
+            rows = np.column_stack([frames["time_s"], np.stack(frames["position_m"].to_list()), -x, -y, -z, w])
+            path = files.inside(folder, f"{scene_id}/{trajectory_id}.txt")
+            files.write_text(path, _TUM_HEADER + _lines(rows))
+            n_descents += 1
+    return n_descents
+
+
+def export_kitti(dataset: Dataset, out: Path, progress: Progress, split: str | None = None) -> int:
+    """Write `out`/<scene_id>/<trajectory_id>.txt and <trajectory_id>.times.txt in KITTI's form; returns their number.
+
+    With a split, only frames of it. Raises UserError where `out` holds something or no frame is of the split.
+    """
+    n_descents = 0
+    task = progress.add_task("kitti", total=len(dataset.scene_ids()), unit="scenes")
+    with files.new_folder(out) as folder:
+        for scene_id, trajectory_id, frames in _descents(dataset, progress, task, split):
+            poses = poses_site_from_camera(frames)
+            relative = np.linalg.inv(poses[0]) @ poses
+            path = files.inside(folder, f"{scene_id}/{trajectory_id}.txt")
+            files.write_text(path, _lines(relative[:, :3].reshape(-1, 12)))
+            files.write_text(path.with_suffix(".times.txt"), _lines(frames["time_s"].to_numpy()[:, None]))
+            n_descents += 1
+    return n_descents
+
+
+def poses_site_from_camera(frames: pd.DataFrame) -> Array:
+    """Homogeneous matrices (N, 4, 4) of rows of the table frames: from O_C, metres, to O_L."""
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, :3, :3] = matrix_from_quaternion(np.stack(frames["rotation_wxyz"].to_list())).swapaxes(1, 2)
+    poses[:, :3, 3] = np.stack(frames["position_m"].to_list())
+    return poses
+
+
+def _descents(
+    dataset: Dataset, progress: Progress, task: TaskID, split: str | None
+) -> Iterator[tuple[str, str, pd.DataFrame]]:
+    """scene_id, trajectory_id and frames in the order of time, of each descent."""
+    for scene in scenes_of(dataset, split, with_labels=False):
+        for trajectory_id, frames in scene.frames.groupby("trajectory_id"):
+            yield scene.scene_id, str(trajectory_id), frames.sort_values("frame_index")
+        progress.advance(task)
+
+
+def _lines(rows: Array) -> str:
+    # The shortest text that gives the same number again; never "-0.0", which reads like a fault.
+    return "".join(" ".join(repr(float(value) + 0.0) for value in row) + "\n" for row in rows)

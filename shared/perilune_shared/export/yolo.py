@@ -1,0 +1,76 @@
+"""YOLO: one text file an image, a line `class cx cy w h` a crater, in shares of the image's width and height.
+
+Format: https://docs.ultralytics.com/datasets/detect (what stands there is read by Darknet's descendants all alike).
+A trainer finds the labels of `images/a/b.png` in `labels/a/b.txt`. Boxes end at the image's edge. The format cannot
+ignore a crater: labels that are not chosen are left out.
+"""
+
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from rich.progress import Progress
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.schema import SPLITS
+from perilune_shared.export.rows import Choice, clipped_boxes, scenes_of, sizes
+from perilune_shared.storage import files
+
+CRATER_CLASS = 0
+
+
+def export_yolo(
+    dataset: Dataset,
+    out: Path,
+    progress: Progress,
+    split: str | None = None,
+    choose: Choice | None = None,
+    *,
+    link: bool = False,
+) -> int:
+    """Write images/, labels/, <split>.txt and data.yaml into `out`; returns the number of boxes.
+
+    Images are copies, or with `link` hard links where the disk allows it. An image without craters has an empty text
+    file. Raises UserError where `out` holds something, an image is missing or no frame is of the split.
+    """
+    task = progress.add_task("yolo", total=len(dataset.scene_ids()), unit="scenes")
+    lists: dict[str, list[str]] = defaultdict(list)
+    n_boxes = 0
+    with files.new_folder(out) as folder:
+        for scene in scenes_of(dataset, split, choose):
+            labels = scene.labels[scene.labels["chosen"]]
+            boxes = clipped_boxes(labels, scene.frames) / np.tile(sizes(labels, scene.frames), 2)
+            # Three decimals below the pixel of any camera.
+            size, centre = boxes[:, 2:] - boxes[:, :2], (boxes[:, 2:] + boxes[:, :2]) / 2
+            seen = (size > 0).all(axis=1)
+            lines: dict[str, list[str]] = defaultdict(list)
+            for frame_id, (x, y), (w, h) in zip(labels["frame_id"][seen], centre[seen], size[seen], strict=True):
+                lines[frame_id].append(f"{CRATER_CLASS} {x:.8f} {y:.8f} {w:.8f} {h:.8f}\n")
+            n_boxes += int(seen.sum())
+            for frame_id, own_split in zip(scene.frames["frame_id"], scene.frames["split"], strict=True):
+                files.write_text(
+                    files.inside(folder, f"labels/{frame_id}.txt"), "".join(lines[frame_id]), durable=False
+                )
+                lists[own_split].append(f"./images/{frame_id}.png\n")
+            _bring_images(dataset, scene.frames, folder, link=link)
+            progress.advance(task)
+        for name, entries in lists.items():
+            files.write_text(folder / f"{name}.txt", "".join(entries))
+        # Without `path`, the lists are looked for beside this file, wherever it is moved to.
+        present = [f"{name}: {name}.txt\n" for name in SPLITS if name in lists]
+        files.write_text(folder / "data.yaml", "".join(present) + f"names:\n  {CRATER_CLASS}: crater\n")
+    return n_boxes
+
+
+def _bring_images(dataset: Dataset, frames: pd.DataFrame, folder: Path, *, link: bool) -> None:
+    """The PNGs of frames as images/<frame_id>.png."""
+    rows = frames[["frame_id", "png_path"]]
+    if dataset.info.images == "files":
+        for row in rows.to_dict("records"):
+            to = files.inside(folder, f"images/{row['frame_id']}.png")
+            files.bring(dataset.file(row["png_path"]), to, link=link)
+        return
+    for frame_id, png in dataset.pngs(pa.Table.from_pandas(rows, preserve_index=False)):
+        files.write_bytes(files.inside(folder, f"images/{frame_id}.png"), png, durable=False)

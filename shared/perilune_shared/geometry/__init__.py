@@ -1,0 +1,1 @@
+"""Frames of reference, camera, ellipses and the nominal descent."""

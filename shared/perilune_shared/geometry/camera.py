@@ -1,0 +1,199 @@
+"""The camera: a pinhole, with or without lens distortion.
+
+Theory: a point X in O_L goes to the camera by x_C = rotation_camera_from_site (X - position_m), and to the image by
+u = fx x' + cx, v = fy y' + cy. Without distortion x' = a = x/z and y' = b = y/z. With it, after Brown (1966) and
+Conrady (1919) in OpenCV's form, with r^2 = a^2 + b^2 and s = 1 + k1 r^2 + k2 r^4 + k3 r^6,
+x' = a s + 2 p1 a b + p2 (r^2 + 2 a^2) and y' = b s + p1 (r^2 + 2 b^2) + 2 p2 a b.
+
+Image coordinates have their origin at the outer corner of the top-left pixel, so pixel (column i, row j) covers
+[i, i+1) x [j, j+1) and its centre lies at (i + 0.5, j + 0.5); cx = width / 2 is the middle of the image.
+
+Use: `camera.project(points)` and its inverse `camera.rays(pixels) * depth`.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perilune_shared.geometry.frames import Array
+
+Distortion = tuple[float, float, float, float, float]
+NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
+_UNDISTORTED_TO = 1e-10
+"""Largest error of `rays`, in coordinates over the focal length."""
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Intrinsics of a camera."""
+
+    width_px: int
+    """Image width, pixels."""
+    height_px: int
+    """Image height, pixels."""
+    fx_px: float
+    """Focal length over the pixel's width, pixels."""
+    fy_px: float
+    """Focal length over the pixel's height, pixels."""
+    cx_px: float
+    """Principal point, pixels right of the left edge."""
+    cy_px: float
+    """Principal point, pixels below the top edge."""
+    distortion: Distortion = NO_DISTORTION
+    """k1, k2, p1, p2, k3 of Brown and Conrady, on coordinates over the focal length."""
+
+    @classmethod
+    def from_field_of_view(cls, width_px: int, height_px: int, horizontal_fov_deg: float) -> "Camera":
+        """A camera with square pixels and a centred principal point."""
+        f = width_px / 2 / np.tan(np.radians(horizontal_fov_deg) / 2)
+        return cls(width_px, height_px, float(f), float(f), width_px / 2, height_px / 2)
+
+    @property
+    def matrix(self) -> Array:
+        """Calibration matrix K (3, 3)."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
+
+    def project(self, points_camera_m: ArrayLike) -> Array:
+        """Pixels (..., 2) of points (..., 3) in O_C.
+
+        NaN where the point is not in front of the camera, or so far off the axis that the distortion folds back.
+        """
+        p = np.asarray(points_camera_m, np.float64)
+        z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
+        x, y = p[..., 0] / z, p[..., 1] / z
+        if any(self.distortion):
+            x, y = self._distorted(x, y)
+        return np.stack([self.fx_px * x + self.cx_px, self.fy_px * y + self.cy_px], axis=-1)
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Directions (..., 3) in O_C with z = 1 through pixels (..., 2): times a depth along the axis, points.
+
+        Undoes distortion to 1e-10; NaN where no ray comes to the pixel before the distortion folds back.
+        """
+        uv = np.asarray(pixels, np.float64)
+        x = (uv[..., 0] - self.cx_px) / self.fx_px
+        y = (uv[..., 1] - self.cy_px) / self.fy_px
+        if any(self.distortion):
+            x, y = self._undistorted(x, y)
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+    def pixel_centres(self) -> Array:
+        """Image coordinates (height, width, 2) of all pixel centres."""
+        u, v = np.meshgrid(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
+        return np.stack([u, v], axis=-1)
+
+    def inside(self, pixels: ArrayLike) -> np.ndarray:
+        """Whether pixels (..., 2) lie in the image; NaN does not."""
+        uv = np.asarray(pixels, np.float64)
+        return (uv[..., 0] >= 0) & (uv[..., 0] < self.width_px) & (uv[..., 1] >= 0) & (uv[..., 1] < self.height_px)
+
+    def outline(self) -> Array:
+        """Image coordinates (M, 2) along the image's outer edge, half a pixel apart."""
+        u, v = (np.linspace(0, size, 2 * size + 1) for size in (self.width_px, self.height_px))
+        sides = [(u, 0 * u), (u, 0 * u + self.height_px), (0 * v, v), (0 * v + self.width_px, v)]
+        return np.concatenate([np.stack(side, axis=-1) for side in sides])
+
+    def folds_back(self) -> bool:
+        """Whether the distortion folds back within the image, so that some pixels have no ray."""
+        return bool(np.isnan(self.rays(self.outline())).any())
+
+    def covering_pinhole(self) -> "Camera":
+        """A camera without distortion and with the same focal lengths that sees every ray of this one's pixels.
+
+        Its image is enlarged by whole pixels at each side where needed; without distortion it is this camera. Raises
+        ValueError where the distortion folds back within the image.
+        """
+        if not any(self.distortion):
+            return self
+        if self.folds_back():
+            raise ValueError("the distortion folds back within the image")
+        pinhole = replace(self, distortion=NO_DISTORTION)
+        seen = pinhole.project(self.rays(self.outline()))
+        left, top = (int(np.ceil(max(0.0, -low))) for low in seen.min(axis=0))
+        size = np.array([self.width_px, self.height_px])
+        right, bottom = (int(np.ceil(max(0.0, more))) for more in seen.max(axis=0) - size)
+        return replace(
+            pinhole,
+            width_px=self.width_px + left + right,
+            height_px=self.height_px + top + bottom,
+            cx_px=self.cx_px + left,
+            cy_px=self.cy_px + top,
+        )
+
+    def covers(self, other: "Camera") -> bool:
+        """Whether every ray of another camera's pixels comes to this one's image too."""
+        seen = self.project(other.rays(other.outline()))
+        return bool((seen >= -1e-6).all() and (seen <= np.array([self.width_px, self.height_px]) + 1e-6).all())
+
+    def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Distorted coordinates; NaN from where the radial part turns back or the mapping changes its orientation."""
+        k1, k2, p1, p2, k3 = self.distortion
+        r2 = x * x + y * y
+        scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xx, xy, yy = self._jacobian(x, y)
+        beyond = (r2 >= _fold_radius(self.distortion) ** 2) | (xx * yy <= xy * xy)
+        nan = np.where(beyond, np.nan, 0.0)
+        return (
+            x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + nan,
+            y * scale + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + nan,
+        )
+
+    def _jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Derivatives dx'/dx, dx'/dy = dy'/dx and dy'/dy of the distortion."""
+        k1, k2, p1, p2, k3 = self.distortion
+        r2 = x * x + y * y
+        scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        return (
+            scale + slope * x * x + 2 * p1 * y + 6 * p2 * x,
+            slope * x * y + 2 * p1 * x + 2 * p2 * y,
+            scale + slope * y * y + 6 * p1 * y + 2 * p2 * x,
+        )
+
+    def _undistorted(self, wanted_x: Array, wanted_y: Array) -> tuple[Array, Array]:
+        """Newton's method from the inverse of the radial part, which a table gives safely within the fold."""
+        wanted_r = np.hypot(wanted_x, wanted_y)
+        radial = self._radial_table(float(np.nanmax(wanted_r, initial=0.0)))
+        start = np.interp(wanted_r, radial[1], radial[0]) / np.maximum(wanted_r, 1e-300)
+        x, y = wanted_x * start, wanted_y * start
+        for _ in range(20):
+            got_x, got_y = self._distorted(x, y)
+            off_x, off_y = wanted_x - got_x, wanted_y - got_y
+            # A point on the fold itself has no way back; it stays NaN.
+            if not (np.maximum(np.abs(off_x), np.abs(off_y)) > 1e-2 * _UNDISTORTED_TO).any():
+                break
+            xx, xy, yy = self._jacobian(x, y)
+            determinant = xx * yy - xy * xy
+            x = x + (yy * off_x - xy * off_y) / determinant
+            y = y + (xx * off_y - xy * off_x) / determinant
+        got_x, got_y = self._distorted(x, y)
+        found = np.maximum(np.abs(wanted_x - got_x), np.abs(wanted_y - got_y)) < _UNDISTORTED_TO
+        return np.where(found, x, np.nan), np.where(found, y, np.nan)
+
+    def _radial_table(self, largest: float) -> Array:
+        """Radii before and after the radial distortion (2, 2000), ascending, to about `largest` or up to the fold."""
+        k1, k2, _, _, k3 = self.distortion
+        fold = _fold_radius(self.distortion)
+        end = min(fold, 1.0)
+        while end < fold and end * (1 + end**2 * (k1 + end**2 * (k2 + end**2 * k3))) < largest:
+            end = min(2 * end, fold)
+        r = np.linspace(0, end, 2000, endpoint=False)
+        r2 = r * r
+        return np.stack([r, r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))])
+
+
+@lru_cache
+def _fold_radius(distortion: Distortion) -> float:
+    """Least r > 0 at which the radial part r (1 + k1 r^2 + k2 r^4 + k3 r^6) turns back, or infinity."""
+    k1, k2, _, _, k3 = distortion
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+    turns = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
+    return float(np.sqrt(turns.min())) if len(turns) else np.inf
+
+
+def camera_from_site(points_site_m: ArrayLike, position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> Array:
+    """Points (..., 3) of O_L in O_C, for a camera at position_m (3,)."""
+    offset = np.asarray(points_site_m, np.float64) - np.asarray(position_m, np.float64)
+    return offset @ np.asarray(rotation_camera_from_site, np.float64).T

@@ -1,0 +1,150 @@
+"""Projection of circles in space to ellipses in the image: exact without lens distortion, fitted with it.
+
+A circle with centre c, radius r and normal n is the set c + r (cos t p + sin t q) with p, q spanning its plane. Its
+image is the conic H^-T diag(1, 1, -1) H^-1 with H = K [r p, r q, c] (Hartley & Zisserman, Multiple View Geometry,
+2nd ed., section 8.1; for craters Christian et al. 2021, doi 10.1007/s40295-021-00287-8). The image of the circle's
+centre is not the centre of the ellipse. A distorted image of a circle is no ellipse; then one is fitted to it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+
+_N_FITTED = 64
+_ANGLES = 2 * np.pi * np.arange(_N_FITTED) / _N_FITTED
+_UNIT_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipses:
+    """N ellipses in the image; NaN where the circle has no elliptical image."""
+
+    cx_px: Array
+    """Centre, pixels from the left edge (N,)."""
+    cy_px: Array
+    """Centre, pixels from the top edge (N,)."""
+    a_px: Array
+    """Semi-major axis, pixels (N,)."""
+    b_px: Array
+    """Semi-minor axis, pixels (N,)."""
+    theta_rad: Array
+    """Direction of the semi-major axis, from x towards y, in [0, pi) (N,)."""
+
+    def bounding_boxes(self) -> Array:
+        """Tight boxes (N, 4) as x0, y0, x1, y1 in pixels, of the whole ellipse also where it leaves the image."""
+        cos, sin = np.cos(self.theta_rad), np.sin(self.theta_rad)
+        half_w = np.hypot(self.a_px * cos, self.b_px * sin)
+        half_h = np.hypot(self.a_px * sin, self.b_px * cos)
+        return np.stack([self.cx_px - half_w, self.cy_px - half_h, self.cx_px + half_w, self.cy_px + half_h], axis=-1)
+
+    def radius_px(self) -> Array:
+        """Radius of the circle of equal area, sqrt(a b), pixels (N,)."""
+        return np.sqrt(self.a_px * self.b_px)
+
+
+def plane_basis(normals: ArrayLike) -> tuple[Array, Array]:
+    """Unit vectors p, q (N, 3) that span the planes of unit normals (N, 3): p, q, n right-handed."""
+    n = np.asarray(normals, np.float64)
+    helper = np.where(np.abs(n[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    p = np.cross(helper, n)
+    p /= np.linalg.norm(p, axis=-1, keepdims=True)
+    return p, np.cross(n, p)
+
+
+def rim_points(centres_m: ArrayLike, normals: ArrayLike, radii_m: ArrayLike, n_points: int) -> Array:
+    """Points (N, n_points, 3), evenly spaced on N circles with centres (N, 3), normals (N, 3), radii (N,)."""
+    p, q = plane_basis(normals)
+    angle = 2 * np.pi * np.arange(n_points) / n_points
+    round_trip = np.cos(angle)[:, None] * p[:, None, :] + np.sin(angle)[:, None] * q[:, None, :]
+    return np.asarray(centres_m)[:, None, :] + np.asarray(radii_m)[:, None, None] * round_trip
+
+
+def project_circles(
+    camera: Camera, centres_camera_m: ArrayLike, normals_camera: ArrayLike, radii_m: ArrayLike
+) -> Ellipses:
+    """Images of N circles given in O_C: centres (N, 3) metres, unit normals (N, 3), radii (N,) metres.
+
+    With distortion, the ellipse nearest to 64 points of the rim by least squares: at up to 50 px radius and 5 px of
+    distortion in the corners of 256 px the points lie within 0.05 px of it. NaN where the circle reaches behind the
+    camera or to where its distortion folds back, or is seen edge on, so that its image is no ellipse.
+    """
+    c, n = np.asarray(centres_camera_m, np.float64), np.asarray(normals_camera, np.float64)
+    r = np.asarray(radii_m, np.float64)
+    p, q = plane_basis(n)
+    # A circle whose nearest point is not in front of the camera has an open conic as image.
+    nearest = c[:, 2] - r * np.hypot(p[:, 2], q[:, 2])
+    edge_on = np.abs(np.einsum("ij,ij->i", n, c)) < 1e-9 * np.linalg.norm(c, axis=1)
+    bad = (nearest <= 0) | edge_on
+    if any(camera.distortion):
+        points = camera.project(rim_points(c, n, r, _N_FITTED))
+        bad |= np.isnan(points).any(axis=(1, 2))
+        points[bad] = _UNIT_CIRCLE
+        ellipses = fit_ellipses(points)
+    else:
+        ellipses = _exact(camera, c, np.stack([r[:, None] * p, r[:, None] * q, c], axis=-1), bad)
+    values = [ellipses.cx_px, ellipses.cy_px, ellipses.a_px, ellipses.b_px, ellipses.theta_rad]
+    return Ellipses(*(np.where(bad, np.nan, value) for value in values))
+
+
+def _exact(camera: Camera, c: Array, h: Array, bad: Array) -> Ellipses:
+    """Images of circles with centres c (N, 3) and matrices [r p, r q, c] (N, 3, 3); anything where `bad` (N,)."""
+    h[bad] = np.eye(3)
+    # The image is taken in coordinates centred on the circle's centre, else small far ellipses lose their digits.
+    u0, v0 = (
+        np.where(bad, 0, c[:, 0] / np.where(bad, 1, c[:, 2])),
+        np.where(bad, 0, c[:, 1] / np.where(bad, 1, c[:, 2])),
+    )
+    calibration = np.zeros((len(c), 3, 3))
+    calibration[:, 0, 0], calibration[:, 0, 2] = camera.fx_px, -camera.fx_px * u0
+    calibration[:, 1, 1], calibration[:, 1, 2] = camera.fy_px, -camera.fy_px * v0
+    calibration[:, 2, 2] = 1
+    inverse = np.linalg.inv(calibration @ h)
+    conic = np.swapaxes(inverse, 1, 2) @ np.diag([1.0, 1.0, -1.0]) @ inverse
+    centre, axes, theta = _ellipse_of_conic(conic)
+    x, y = camera.cx_px + camera.fx_px * u0, camera.cy_px + camera.fy_px * v0
+    return Ellipses(centre[:, 0] + x, centre[:, 1] + y, axes[:, 0], axes[:, 1], theta)
+
+
+def fit_ellipses(points_px: ArrayLike) -> Ellipses:
+    """Ellipses nearest to N sets of M points around them (N, M, 2), pixels, by direct least squares.
+
+    The points are first moved, turned and stretched so that they lie about a unit circle: there the residual of the
+    conic's equation is about twice the distance, and an ellipse of any size, place and flatness is as well conditioned.
+    """
+    points = np.asarray(points_px, np.float64)
+    middle = points.mean(axis=1)
+    offset = points - middle[:, None]
+    variance, vectors = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset * (2 / points.shape[1]))
+    whiten = vectors.swapaxes(1, 2) / np.sqrt(variance)[:, :, None]
+    x, y = np.moveaxis(offset @ whiten.swapaxes(1, 2), -1, 0)
+    terms = np.stack([x * x, x * y, y * y, x, y], axis=-1)
+    normal = terms.swapaxes(1, 2) @ terms
+    a, b, c, d, e = np.linalg.solve(normal, terms.sum(axis=1)[:, :, None])[:, :, 0].T
+    conic = np.empty((len(points), 3, 3))
+    conic[:, 0, 0], conic[:, 1, 1], conic[:, 2, 2] = a, c, -1.0
+    conic[:, 0, 1] = conic[:, 1, 0] = b / 2
+    conic[:, 0, 2] = conic[:, 2, 0] = d / 2
+    conic[:, 1, 2] = conic[:, 2, 1] = e / 2
+    back = np.zeros((len(points), 3, 3))
+    back[:, :2, :2], back[:, 2, 2] = whiten, 1.0
+    centre, axes, theta = _ellipse_of_conic(back.swapaxes(1, 2) @ conic @ back)
+    return Ellipses(centre[:, 0] + middle[:, 0], centre[:, 1] + middle[:, 1], axes[:, 0], axes[:, 1], theta)
+
+
+def _ellipse_of_conic(conic: Array) -> tuple[Array, Array, Array]:
+    """Centre (N, 2), semi-axes (N, 2) with a >= b, direction (N,) of conics (N, 3, 3)."""
+    quadratic, linear = conic[:, :2, :2], conic[:, :2, 2]
+    centre = -np.linalg.solve(quadratic, linear[:, :, None])[:, :, 0]
+    constant = conic[:, 2, 2] + np.einsum("ij,ij->i", linear, centre)
+    eigenvalues, vectors = np.linalg.eigh(quadratic)
+    # The sign of a conic is free: both eigenvalues take the sign opposite to the constant.
+    ratio = -constant[:, None] / eigenvalues
+    axes = np.sqrt(ratio)
+    swap = axes[:, 0] < axes[:, 1]
+    axes = np.where(swap[:, None], axes[:, ::-1], axes)
+    major = np.where(swap[:, None], vectors[:, :, 1], vectors[:, :, 0])
+    return centre, axes, np.mod(np.arctan2(major[:, 1], major[:, 0]), np.pi)

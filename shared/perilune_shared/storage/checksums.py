@@ -1,0 +1,95 @@
+"""SHA256SUMS: the hash of every file of a dataset but its frames, whose hashes stand in the manifest.
+
+The file has the form of `sha256sum`, so that `sha256sum -c SHA256SUMS` checks it too.
+"""
+
+import contextlib
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from rich.progress import Progress
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage import files
+
+SUMS_NAME = "SHA256SUMS"
+_LARGEST_BYTES = 20_000_000
+_LARGEST_FILE = 2**36
+_LINE = re.compile(r"([0-9a-f]{64})  (\S+)")
+_OWN_FOLDERS = ("manifest", "images")
+
+
+def seal(root: Path, progress: Progress | None = None, known: Mapping[str, str] | None = None) -> None:
+    """Write SHA256SUMS of all files of the dataset except links and odd names, which are faults.
+
+    `known` has the hashes of files that were computed in this run and have not changed since: these are not read.
+    """
+    names = [name for name in _covered(root) if files.is_plain(name) and not (root / name).is_symlink()]
+    hashes = dict(known or {})
+    with _hashing(root, [name for name in names if name not in hashes], progress) as advance:
+        for name in names:
+            if name not in hashes:
+                hashes[name] = files.sha256_of(root / name, advance)
+    files.write_text(root / SUMS_NAME, "".join(f"{hashes[name]}  {name}\n" for name in names))
+
+
+def sums_of(root: Path) -> dict[str, str]:
+    """SHA-256 of each file that SHA256SUMS lists, for a dataset without faults (`faults_of`)."""
+    lines = [_LINE.fullmatch(line) for line in (root / SUMS_NAME).read_text(encoding="utf-8").splitlines()]
+    return {line[2]: line[1] for line in lines if line is not None}
+
+
+def faults_of(root: Path, progress: Progress | None = None) -> Iterator[tuple[str, str, str]]:
+    """File, what was found and what was wanted, for all that differs from SHA256SUMS."""
+    path = root / SUMS_NAME
+    if not path.is_file() or path.is_symlink():
+        yield SUMS_NAME, "no such file", "the hashes of the dataset's files"
+        return
+    if path.stat().st_size > _LARGEST_BYTES:
+        yield SUMS_NAME, f"{path.stat().st_size} bytes", f"at most {_LARGEST_BYTES}"
+        return
+    text = path.read_bytes().decode("utf-8", errors="replace")
+    lines = [_LINE.fullmatch(line) for line in text.removesuffix("\n").split("\n")]
+    if not text.endswith("\n") or None in lines:
+        yield SUMS_NAME, "a line of another form", "64 hexadecimal digits, two blanks, a path"
+        return
+    listed = {line[2]: line[1] for line in lines if line is not None}
+    if list(listed) != sorted(listed) or len(listed) != len(lines):
+        yield SUMS_NAME, "paths twice or out of order", "each path once, in order"
+    present = set(_covered(root))
+    with _hashing(root, [name for name in listed if name in present], progress) as advance:
+        for name, sha256 in listed.items():
+            try:
+                file = files.inside(root, name)
+            except UserError as error:
+                yield SUMS_NAME, error.found, error.wanted
+                continue
+            if not file.is_file():
+                yield name, "no such file", f"the file with SHA-256 {sha256}, as {SUMS_NAME} has it"
+            elif file.stat().st_size > _LARGEST_FILE:
+                yield name, f"{file.stat().st_size} bytes", f"at most {_LARGEST_FILE}"
+            elif files.sha256_of(file, advance) != sha256:
+                yield name, "another content", f"SHA-256 {sha256}, as {SUMS_NAME} has it"
+    for name in sorted(present - set(listed)):
+        yield name, "not listed in SHA256SUMS", "only files that the dataset was written with"
+
+
+@contextlib.contextmanager
+def _hashing(root: Path, names: list[str], progress: Progress | None) -> Iterator[Callable[[int], object]]:
+    """A function to call with the number of bytes read, which advances the progress bar."""
+    if progress is None:
+        yield lambda n_bytes: None
+        return
+    total = sum((root / name).stat().st_size for name in names if (root / name).is_file())
+    task = progress.add_task("hashing", total=total / 1e6, unit="MB", note="")
+    yield lambda n_bytes: progress.advance(task, n_bytes / 1e6)
+    progress.update(task, completed=total / 1e6)
+
+
+def _covered(root: Path) -> list[str]:
+    """Files of the dataset's own folder, manifest/ and images/, sorted; hidden ones are work in progress."""
+    found = [path for path in root.iterdir() if path.is_file() and path.name != SUMS_NAME]
+    for folder in _OWN_FOLDERS:
+        found += [path for path in root.joinpath(folder).rglob("*") if path.is_file() or path.is_symlink()]
+    return sorted(p.relative_to(root).as_posix() for p in found if not p.name.startswith("."))

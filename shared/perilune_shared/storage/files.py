@@ -1,0 +1,194 @@
+"""Files and folders written to a temporary name and renamed, and relative paths that cannot leave their folder."""
+
+import contextlib
+import errno
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import stat
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path, PurePosixPath
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage.locks import lock
+
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+_LONGEST_PATH = 500
+_CHUNK_BYTES = 2**20
+_FICLONE = 0x40049409
+"""Of linux/fs.h, on all processors but PowerPC, MIPS and SPARC, where it fails and files are copied."""
+
+
+def temporary_name(path: Path) -> Path:
+    """A name beside `path` that no other process uses, with the suffix of `path`."""
+    # PIDs repeat: in a container they begin with 1.
+    return path.with_name(f".{path.stem}.{secrets.token_hex(8)}.part{path.suffix}")
+
+
+@contextlib.contextmanager
+def written_aside(path: Path, *, durable: bool = True) -> Iterator[Path]:
+    """Give a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
+
+    The temporary name keeps the suffix of `path`, since image writers choose their format by it. A durable file is on
+    the disk before it has its name, so that a power cut leaves no empty one. Callers that write
+    many files synchronise them together at the end (`sync_all`).
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = temporary_name(path)
+    try:
+        yield aside
+        if durable:
+            sync(aside)
+        aside.replace(path)
+        if durable:
+            sync(path.parent)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or the names in a folder, are on the disk."""
+    if os.name == "nt":  # folders cannot be opened there, nor files for reading alone be synchronised
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a file system without it
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def sync_all(paths: Iterable[Path]) -> None:
+    """Wait until files and the names in their folders are on the disk."""
+    paths = list(paths)
+    for path in [*paths, *sorted({path.parent for path in paths})]:
+        sync(path)
+
+
+def write_bytes(path: Path, content: bytes, *, durable: bool = True) -> None:
+    """Write a whole file, or nothing."""
+    with written_aside(path, durable=durable) as aside:
+        aside.write_bytes(content)
+
+
+def write_text(path: Path, content: str, *, durable: bool = True) -> None:
+    """Write a whole UTF-8 file, or nothing."""
+    write_bytes(path, content.encode(), durable=durable)
+
+
+def sha256_of(path: Path, advance: Callable[[int], object] = lambda n_bytes: None) -> str:
+    """SHA-256 of a file's content, in hexadecimal; `advance` is called with the bytes read since its last call."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while chunk := stream.read(_CHUNK_BYTES):
+            digest.update(chunk)
+            advance(len(chunk))
+    return digest.hexdigest()
+
+
+def is_plain(relative: object) -> bool:
+    """Whether it is a relative POSIX path of plain names, without regard to links."""
+    short = isinstance(relative, str) and len(relative) <= _LONGEST_PATH
+    parts = PurePosixPath(str(relative)).parts if short else ()
+    return bool(parts) and all(_PLAIN_NAME.fullmatch(part) for part in parts)
+
+
+def inside(root: Path, relative: str) -> Path:
+    """The file that a manifest's relative POSIX path names below `root`.
+
+    Raises UserError where the path is absolute, climbs, has an odd name, is too long or leaves `root` through a link.
+    """
+    if not is_plain(relative):
+        raise UserError(root, "path", repr(relative), "a relative POSIX path of plain names inside the dataset")
+    path = root.joinpath(*PurePosixPath(relative).parts)
+    try:
+        own = path.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError):  # links that lead to themselves
+        own = False
+    if not own:
+        raise UserError(root, "path", repr(relative), "a path that no link leads out of the dataset")
+    return path
+
+
+def check_plain_file(path: Path) -> int:
+    """The size of a file, bytes. Raises UserError where it is none: opening a pipe or a device may never end."""
+    try:
+        state = path.lstat()
+    except (OSError, ValueError):
+        raise UserError(path, "file", "no such file", "a file of the dataset's own") from None
+    if not stat.S_ISREG(state.st_mode):
+        found = "a link" if stat.S_ISLNK(state.st_mode) else "a folder, a pipe or a device"
+        raise UserError(path, "file", found, "a file of the dataset's own")
+    return state.st_size
+
+
+@contextlib.contextmanager
+def new_folder(out: Path) -> Iterator[Path]:
+    """A hidden folder beside `out`, renamed to `out` on success and removed on any failure.
+
+    Its files are on the disk before it is renamed. Folders left by killed writers of the same `out` are removed. Raises
+    UserError where `out` is not empty or another process is writing it.
+    """
+    check_free(out)
+    out = out.absolute()  # "." has no name to put another beside
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with lock(out.with_name(f".{out.name}.lock"), out):
+        left = re.compile(rf"\.{re.escape(out.name)}\.[0-9a-f]+\.part")
+        for path in out.parent.iterdir():
+            if left.fullmatch(path.name):
+                shutil.rmtree(path, ignore_errors=True)
+        aside = out.with_name(f".{out.name}.{secrets.token_hex(8)}.part")
+        try:
+            aside.mkdir()
+            yield aside
+            sync_all(path for path in aside.rglob("*") if not path.is_symlink())
+            check_free(out)
+            if out.is_dir():
+                out.rmdir()
+            aside.replace(out)
+            sync(out.parent)
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+
+
+def check_free(out: Path) -> None:
+    """Raises UserError where a folder for a new dataset is not empty."""
+    if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
+        raise UserError(out, "--out", "something that is there", "a new or empty folder")
+
+
+def bring(path: Path, to: Path, *, link: bool) -> None:
+    """Make a frame's file present at `to` too: copied, or with `link` linked where the disk allows it.
+
+    A copy shares its blocks with the original until one is changed, where the file system can (reflink). Raises
+    UserError where it is missing.
+    """
+    if not path.is_file():
+        raise UserError(path, "frame", "no such file", "the file that the manifest names")
+    to.parent.mkdir(parents=True, exist_ok=True)
+    if link:
+        with contextlib.suppress(OSError):
+            # A link to a link would lead to what need not be here.
+            os.link(path.resolve(), to)
+            return
+    if not _cloned(path, to):
+        shutil.copyfile(path, to)
+
+
+def _cloned(path: Path, to: Path) -> bool:
+    """Whether `to` is now a reflink of a file: Btrfs, XFS and others on Linux have them."""
+    if not sys.platform.startswith("linux"):
+        return False
+    import fcntl
+
+    with path.open("rb") as source, to.open("wb") as target:
+        try:
+            fcntl.ioctl(target.fileno(), _FICLONE, source.fileno())
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,1 @@
+"""Every fault of a dataset, with its file and row."""

@@ -1,0 +1,154 @@
+"""Checks of one descent: its frames against scene and camera, its labels against craters and poses."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.geometry.ellipse import Ellipses, project_circles
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion, sun_direction
+from perilune_shared.validation.faults import Fault
+
+_LABEL_TOLERANCE_PX = 1e-6
+_SUN_TOLERANCE = 1e-9
+_FARTHEST_M = 1e9
+_CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
+_BOX = ("bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px")
+
+
+def descent_faults(
+    info: DatasetInfo,
+    scene: dict,
+    craters: pa.Table,
+    descent: dict,
+    frames: pa.Table,
+    labels: pa.Table,
+    where: dict[str, str],
+) -> Iterator[Fault]:
+    """Faults of a descent: its scene's row and craters, its own row, its frames and labels, and these tables' files."""
+    yield from _frames(info, scene, descent, frames, where["frames"])
+    if len(labels):
+        yield from _labels(info, craters, frames, labels, where)
+
+
+def _frames(info: DatasetInfo, scene: dict, descent: dict, frames: pa.Table, where: str) -> Iterator[Fault]:
+    key = f"{descent['scene_id']}/{descent['trajectory_id']}"
+    if len(frames) != descent["n_frames"]:
+        wanted = f"{len(frames)}, the frames of {key} that are present"
+        yield Fault.of("manifest/trajectories", None, "n_frames", descent["n_frames"], wanted)
+    if not len(frames):
+        return
+    splits = set(frames["split"].to_pylist())
+    if descent["split"] != (splits.pop() if len(splits) == 1 else None):
+        yield Fault.of("manifest/trajectories", None, "split", descent["split"], f"that of the frames of {key}")
+    if descent["split"] is None and info.split_by != "frame":
+        yield Fault.of("dataset.json", None, "split_by", info.split_by, f"frame: {key} lies in several splits")
+    index = frames["frame_index"].to_numpy()
+    ids = frames["frame_id"].to_pylist()
+    for row, (frame_id, place) in enumerate(zip(ids, index.tolist(), strict=True)):
+        if frame_id != f"{key}/{place:06d}":
+            yield Fault.of(where, row, "frame_id", frame_id, f"{key}/{place:06d}")
+            break
+    time = frames["time_s"].to_numpy()
+    order = np.argsort(index)
+    if (np.diff(time[order]) <= 0).any():
+        yield Fault.of(where, None, "time_s", "not rising with frame_index", "later frames at later times")
+    for name in _CAMERA:
+        wrong = np.flatnonzero(frames[name].to_numpy() != getattr(info.camera, name))
+        if len(wrong):
+            found = frames[name][int(wrong[0])].as_py()
+            yield Fault.of(where, int(wrong[0]), name, found, f"{getattr(info.camera, name)}, the dataset's camera")
+    sun = sun_direction(scene["sun_azimuth_deg"], scene["sun_elevation_deg"])
+    wrong = np.flatnonzero(np.abs(_vectors(frames["sun_direction"]) - sun).max(axis=1) > _SUN_TOLERANCE)
+    if len(wrong):
+        found = frames["sun_direction"][int(wrong[0])].as_py()
+        yield Fault.of(where, int(wrong[0]), "sun_direction", found, f"{sun.tolist()}, the scene's Sun")
+    for kind in ("png", "exr"):
+        hashed = np.asarray(frames[f"{kind}_sha256"].is_valid())
+        sized = np.asarray(frames[f"{kind}_bytes"].is_valid())
+        wrong = np.flatnonzero(hashed != sized)
+        if info.images in ("files", "packed") and kind == "png":
+            wrong = np.flatnonzero(~hashed | ~sized)
+        if kind == "exr":
+            wrong = np.flatnonzero((hashed != sized) | (hashed & ~np.asarray(frames["exr_path"].is_valid())))
+        if len(wrong):
+            yield Fault.of(where, int(wrong[0]), f"{kind}_sha256", "null", "path, hash and size together")
+
+
+def _labels(
+    info: DatasetInfo, craters: pa.Table, frames: pa.Table, labels: pa.Table, places: dict[str, str]
+) -> Iterator[Fault]:
+    """Frames and craters that labels name, and their ellipses, projected again from crater and pose."""
+    where = places["labels"]
+    frame_of = _places(labels["frame_id"], frames["frame_id"])
+    crater_of = _places(labels["crater_id"], craters["crater_id"])
+    for name, found_at in (("frame_id", frame_of), ("crater_id", crater_of)):
+        unknown = np.flatnonzero(found_at < 0)
+        if len(unknown):
+            found = labels[name][int(unknown[0])].as_py()
+            yield Fault.of(where, int(unknown[0]), name, found, f"in {name.removesuffix('_id')}s")
+    known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
+    if not len(known):
+        return
+    again = _projected(info, craters, frames, crater_of[known], frame_of[known])
+    size = 1 + again["ellipse_a_px"]
+    misfit = np.zeros(len(known), bool)
+    for name, values in again.items():
+        apart = np.abs(labels[name].to_numpy()[known] - values)
+        tolerance = _LABEL_TOLERANCE_PX * size
+        if name == "ellipse_theta_rad":
+            # A circle has no direction; half a turn is none.
+            apart = np.minimum(apart, np.pi - apart) * np.minimum(1, size - 1 - again["ellipse_b_px"])
+        wrong = np.flatnonzero(~(apart < tolerance))
+        misfit[wrong] = True
+        if len(wrong):
+            row = int(known[wrong[0]])
+            wanted = f"{values[wrong[0]]}, projected from crater and pose"
+            yield Fault.of(where, row, name, labels[name][row].as_py(), wanted)
+    # One wrong label is the label's fault; where none fits, it is the pose's.
+    labelled = np.bincount(frame_of[known], minlength=len(frames))
+    lost = np.bincount(frame_of[known[misfit]], minlength=len(frames))
+    odd = np.flatnonzero((labelled > 1) & (lost == labelled))
+    if len(odd):
+        found = f"none of {labelled[odd[0]]} labels fits"
+        yield Fault.of(places["frames"], int(odd[0]), "position_m+rotation_wxyz", found, "the pose of its labels")
+
+
+def _projected(
+    info: DatasetInfo, craters: pa.Table, frames: pa.Table, crater_of: np.ndarray, frame_of: np.ndarray
+) -> dict[str, Array]:
+    """Geometric columns of labels, for places in the tables of craters and frames (M,)."""
+    rotation = matrix_from_quaternion(_vectors(frames["rotation_wxyz"]))[frame_of]
+    centre = np.stack([craters[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
+    normal = np.stack([craters[f"normal_{axis}"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
+    offset = centre - _vectors(frames["position_m"])[frame_of]
+    in_camera = np.einsum("nij,nj->ni", rotation, offset)
+    turned = np.einsum("nij,nj->ni", rotation, normal)
+    radius = craters["diameter_m"].to_numpy()[crater_of] / 2
+    sound = (np.abs(in_camera) < _FARTHEST_M).all(axis=1) & (np.abs(turned) <= 2).all(axis=1)
+    sound &= (radius > 0) & (radius < _FARTHEST_M)
+    # A circle behind the camera has no image: then the label fits nothing.
+    in_camera[~sound], turned[~sound], radius[~sound] = (0, 0, -10), (0, 0, 1), 1
+    with np.errstate(all="ignore"):
+        try:
+            ellipses = project_circles(info.camera.intrinsics(), in_camera, turned, radius)
+        except np.linalg.LinAlgError:
+            ellipses = Ellipses(*np.full((5, len(radius)), np.nan))
+    names = ("cx_px", "cy_px", "a_px", "b_px", "theta_rad")
+    columns = {f"ellipse_{name}": getattr(ellipses, name) for name in names}
+    boxes = dict(zip(_BOX, ellipses.bounding_boxes().T, strict=True))
+    return columns | boxes | {"radius_px": ellipses.radius_px()}
+
+
+def _places(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
+    """Place of each value in a column (M,), -1 where it is not there."""
+    found = pc.index_in(values, within.combine_chunks())
+    return pc.fill_null(found, -1).to_numpy().astype(np.int64)
+
+
+def _vectors(column: pa.ChunkedArray) -> Array:
+    """A column of fixed-size lists as (N, k)."""
+    flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    return flat.reshape(len(column), -1)

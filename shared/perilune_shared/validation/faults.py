@@ -1,0 +1,183 @@
+"""Faults of a dataset, and the checks that need no more than one part: names, schema, values."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, is_whole
+from perilune_shared.dataset.schema import OPTIONAL, SPLITS, TABLES
+from perilune_shared.errors import UserError, one_line, shortened
+
+_PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
+_PLAIN = r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$"
+_COLUMN = r"^[A-Za-z][A-Za-z0-9_]{0,63}$"
+_SHA256 = r"^[0-9a-f]{64}$"
+_TEXTS = {
+    "scene_id": ID_PATTERN,
+    "trajectory_id": ID_PATTERN,
+    "frame_id": FRAME_ID_PATTERN,
+    "png_path": _PATH,
+    "exr_path": _PATH,
+    "png_sha256": _SHA256,
+    "exr_sha256": _SHA256,
+    "content_sha256": _SHA256,
+    "recipe": r"^[0-9a-f]{16}$",
+    "split": "^(" + "|".join(SPLITS) + ")$",
+}
+_POSITIVE = (
+    "diameter_m",
+    "extent_m",
+    "ellipse_a_px",
+    "ellipse_b_px",
+    "radius_px",
+    "duration_s",
+    "n_frames",
+    "width_px",
+    "height_px",
+    "fx_px",
+    "fy_px",
+    "png_bytes",
+    "exr_bytes",
+)
+_NOT_NEGATIVE = ("crater_id", "boulder_id", "shape_id", "frame_index", "seed", "time_s", "n_craters_above_max_radius")
+_RANGES = {
+    "latitude_deg": (-90, 90),
+    "longitude_deg": (-180, 180),
+    "sun_azimuth_deg": (-360, 360),
+    "sun_elevation_deg": (-90, 90),
+    "visible_fraction": (0, 1),
+    "sunlit_fraction": (0, 1),
+    "real_ground_share": (0, 1),
+    "age_myr": (0, 4600),
+    "ellipse_theta_rad": (0, np.pi),
+}
+_UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
+_MOST = 1e12
+"""No length, time or size of a descent comes near."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing wrong in a dataset."""
+
+    file: str
+    """Relative to the dataset."""
+    row: int | None
+    """Row within the file or table, from 0; None where the fault is the whole file's."""
+    column: str
+    """Column or property."""
+    found: str
+    """The value."""
+    wanted: str
+    """What would be right."""
+
+    @classmethod
+    def of(cls, file: object, row: int | None, column: object, found: object, wanted: object) -> "Fault":
+        """A fault from values of any origin, made short and plain."""
+        return cls(
+            shortened(one_line(file), 300),
+            row,
+            shortened(one_line(column)),
+            shortened(one_line(found)) or "nothing",
+            shortened(one_line(wanted), 300),
+        )
+
+    @classmethod
+    def told(cls, file: object, row: int | None, error: UserError) -> "Fault":
+        """A fault that reading gave as an error."""
+        return cls.of(file, row, error.field, error.found, error.wanted)
+
+
+def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
+    """Whatever one part shows to be wrong by itself."""
+    where = path.relative_to(dataset.root).as_posix()
+    if path.is_symlink() or not path.resolve().is_relative_to(dataset.root.resolve()):
+        yield Fault.of(where, None, "part", "a link", "a file of the dataset's own")
+        return
+    if not matches(PART_PATTERN, path.stem):
+        yield Fault.of(where, None, "part", path.stem, f"a name like {PART_PATTERN}")
+        return
+    try:
+        part = dataset.open_part(path, table)
+        names, known = part.found.names, TABLES[table].names
+        missing = set(known) - set(names) - set(OPTIONAL.get(table, ()))
+        odd = sorted({name for name in names if name not in known and not matches(_COLUMN, name)} | missing)
+        # Others are ignored: a later version may have added them.
+        present = [name for name in names if name in known]
+        if odd or present != [name for name in known if name in names]:
+            yield Fault.of(where, None, "schema", odd or "another order", f"the columns of {table}")
+            return
+        for found, wanted in ((part.found.field(name), TABLES[table].field(name)) for name in present):
+            if (found.type, found.nullable) != (wanted.type, wanted.nullable) or found.metadata != wanted.metadata:
+                yield Fault.of(where, None, found.name, found.metadata, f"{wanted.type} with {wanted.metadata}")
+        first_row = 0
+        for group in range(part.n_groups):
+            rows = part.read(groups=[group], any_ids=True)
+            yield from _of_the_name(where, first_row, path.stem, rows)
+            for field in rows.schema:
+                yield from _of_values(where, first_row, field, rows[field.name].combine_chunks())
+            first_row += len(rows)
+    except UserError as error:
+        yield Fault.told(where, None, error)
+
+
+def _of_the_name(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
+    """A reader looks for a scene's rows by the parts' names, so that these must hold no others."""
+    scene, _, trajectory = stem.partition(".")
+    if is_whole(stem):
+        return
+    if "scene_id" in rows.column_names:
+        own = pc.equal(rows["scene_id"], scene)
+        if trajectory and "trajectory_id" in rows.column_names:
+            own = pc.and_(own, pc.equal(rows["trajectory_id"], trajectory))
+    else:
+        own = pc.starts_with(rows["frame_id"], f"{scene}/{trajectory}/" if trajectory else f"{scene}/")
+    others = np.flatnonzero(~np.asarray(own, bool))
+    if len(others):
+        row = first_row + int(others[0])
+        yield Fault.of(where, row, "part", "a row of another scene or descent", f"rows of {stem} alone")
+
+
+def _of_values(where: str, first_row: int, field: pa.Field, column: pa.Array) -> Iterator[Fault]:
+    """Nulls, finiteness, ranges, lengths and patterns of one column."""
+    present = ~np.asarray(column.is_null(), bool)
+    if not field.nullable and not present.all():
+        yield Fault.of(where, first_row + int(np.argmin(present)), field.name, "null", "a value")
+        return
+    checks: list[tuple[np.ndarray, str]] = []
+    if pa.types.is_string(field.type):
+        pattern = _TEXTS.get(field.name, _PLAIN)
+        fits = np.asarray(pc.fill_null(pc.match_substring_regex(column, pattern), False), bool)
+        line_breaks = np.asarray(pc.fill_null(pc.match_substring(column, "\n"), False), bool)
+        checks.append((~fits | line_breaks, f"text like {pattern}"))
+        values = None
+    elif pa.types.is_fixed_size_list(field.type):
+        values = column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), field.type.list_size)
+    else:
+        values = column.fill_null(1).to_numpy(zero_copy_only=False).astype(np.float64)[:, None]
+    if values is not None:
+        checks.append((~(np.abs(values) < _MOST).all(axis=1) & (field.name != "seed"), "a finite number"))
+        if field.name in _POSITIVE:
+            checks.append((values[:, 0] <= 0, "above 0"))
+        if field.name in _NOT_NEGATIVE:
+            checks.append((values[:, 0] < 0, "at least 0"))
+        if field.name in _RANGES:
+            low, high = _RANGES[field.name]
+            checks.append(((values[:, 0] < low) | (values[:, 0] > high), f"{low} to {high}"))
+        if field.name in _UNIT_VECTORS:
+            checks.append((np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6, "length 1"))
+    for wrong, wanted in checks:
+        rows = np.flatnonzero(wrong & present)
+        if len(rows):
+            yield Fault.of(where, first_row + int(rows[0]), field.name, column[int(rows[0])].as_py(), wanted)
+
+
+def matches(pattern: str, text: object) -> bool:
+    """Whether a text is wholly of a pattern."""
+    return isinstance(text, str) and re.fullmatch(pattern.removeprefix("^").removesuffix("$"), text) is not None

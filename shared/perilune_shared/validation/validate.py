@@ -1,0 +1,199 @@
+"""Checks of a whole dataset: every fault with file, row, column, what was found and what was wanted.
+
+Tables are read a part and then a descent at a time, so that memory does not grow with the dataset.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from rich.progress import Progress
+
+from perilune_shared.content import content_sha256, terrain_of
+from perilune_shared.dataset.manifest import Dataset, count_rows
+from perilune_shared.dataset.parts import is_whole
+from perilune_shared.dataset.schema import KEYS, TABLES
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import selenographic_from_site
+from perilune_shared.storage import checksums
+from perilune_shared.validation.descent import descent_faults
+from perilune_shared.validation.expected_files import unexpected
+from perilune_shared.validation.faults import Fault, part_faults
+from perilune_shared.validation.images import image_faults
+
+_DEGREES = 1e-9
+_NOT_PLANNED = ("craters", "boulders", "labels")
+
+
+def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
+    """All faults of a dataset; an empty list means that it can be trusted.
+
+    Faults of the same file and column are told once, at their first row. The labels' projections are all made again.
+    """
+    # What makes numbers overflow is told as a fault; numpy's warnings would come between the lines.
+    with np.errstate(all="ignore"), dataset.parts_kept_open():
+        return _faults(dataset, progress)
+
+
+def _faults(dataset: Dataset, progress: Progress | None) -> list[Fault]:
+    faults = [
+        Fault.of(file, None, "SHA-256", found, wanted)
+        for file, found, wanted in checksums.faults_of(dataset.root, progress)
+    ]
+    try:
+        wanted = "only files that a dataset is made of (docs/manifest.md)"
+        faults += [Fault.of(path, None, "file", "an unexpected file or folder", wanted) for path in unexpected(dataset)]
+    except UserError as error:
+        faults.append(Fault.told("manifest/frames", None, error))
+    if not dataset.info.complete:
+        wanted = "a finished dataset; run `make dataset` again to go on"
+        faults.append(Fault.of("dataset.json", None, "complete", "False", wanted))
+    for name in TABLES:
+        for part in dataset.parts(name):
+            faults += part_faults(dataset, part, name)
+    try:
+        faults += _tables(dataset, progress)
+    except UserError as error:
+        if not faults:
+            faults.append(Fault.told("manifest", None, error))
+    try:
+        faults += image_faults(dataset, progress)
+    except UserError as error:
+        if not faults:
+            faults.append(Fault.told("images", None, error))
+    return list({(fault.file, fault.column, fault.row is None): fault for fault in reversed(faults)}.values())[::-1]
+
+
+def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
+    """What rows of several tables must agree in."""
+    counts = count_rows(dataset).model_dump()
+    for name, present in counts.items():
+        counted = getattr(dataset.info.counts, name)
+        if counted != present:
+            yield Fault.of("dataset.json", None, f"counts.{name}", counted, f"{present}, the rows present")
+        if dataset.info.images == "planned" and name in _NOT_PLANNED and present:
+            yield Fault.of(f"manifest/{name}", None, "images", "rows", "none: the dataset says that it is only planned")
+    scene_ids = dataset.table("scenes", ["scene_id"])["scene_id"].to_pylist()
+    yield from _unique(dataset, "scenes", dataset.table("scenes", KEYS["scenes"]), "manifest/scenes")
+    used: set[str] = set()
+    told: set[tuple[str, str]] = set()
+    seen = dict.fromkeys(TABLES, 0)
+    splits_of_terrain: dict[str, set[str]] = defaultdict(set)
+    splits_of_descent: dict[tuple[str, object], set[str]] = defaultdict(set)
+    task = progress.add_task("checking", total=len(scene_ids), unit="scenes", note="") if progress else None
+    for scene_id in dict.fromkeys(scene_ids):
+        scene = dataset.table("scenes", scene_id=scene_id)
+        if not len(scene):
+            wanted = "names of parts and statistics of row groups that tell where a scene's rows are"
+            yield Fault.of("manifest/scenes", None, "part", f"{scene_id} elsewhere", wanted)
+            continue
+        used.add(scene["recipe"][0].as_py())
+        frame_splits = dataset.table("frames", ["trajectory_id", "split"], scene_id=scene_id)
+        row = scene.to_pylist()[0]
+        terrain = terrain_of(row["dem_source"], row["content_sha256"])
+        splits_of_terrain[terrain] |= set(frame_splits["split"].unique().to_pylist())
+        seeds = dataset.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pydict()
+        seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
+        for trajectory_id, split in {tuple(each.values()) for each in frame_splits.to_pylist()}:
+            splits_of_descent[terrain, seed_of.get(trajectory_id, trajectory_id)].add(split)
+        seen["scenes"] += len(scene)
+        yield from _scene(dataset, scene_id, scene, seen, told)
+        if progress is not None and task is not None:
+            progress.advance(task)
+    for name, present in counts.items():
+        if seen[name] != present:
+            wanted = f"{seen[name]}: those of the scenes and descents listed"
+            yield Fault.of(f"manifest/{name}", None, "+".join(KEYS[name][:1]), f"{present} rows", wanted)
+    if used != set(dataset.info.recipes):
+        yield Fault.of("dataset.json", None, "recipes", sorted(dataset.info.recipes), f"{sorted(used)}, as scenes name")
+    for terrain, splits in splits_of_terrain.items():
+        if len(splits) > 1 and dataset.info.split_by == "scene":
+            found = f"terrain {terrain[:12]} in {' and '.join(sorted(map(str, splits)))}"
+            yield Fault.of("manifest/frames", None, "split", found, "one split for each scene: no common terrain")
+    for (terrain, _), splits in splits_of_descent.items():
+        if len(splits) > 1 and dataset.info.split_by != "frame":
+            found = f"a descent over terrain {terrain[:12]} in {' and '.join(sorted(map(str, splits)))}"
+            yield Fault.of("manifest/frames", None, "split", found, "one split for each descent, whatever its name")
+
+
+def _scene(
+    dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int], told: set[tuple[str, str]]
+) -> Iterator[Fault]:
+    """One scene's row, craters and boulders, then each of its descents; counts what it has seen."""
+    where = {name: _place(dataset, name, scene_id) for name in TABLES}
+    craters = dataset.table("craters", scene_id=scene_id)
+    boulders = dataset.table("boulders", scene_id=scene_id)
+    trajectories = dataset.table("trajectories", scene_id=scene_id)
+    for name, rows in (("craters", craters), ("boulders", boulders), ("trajectories", trajectories)):
+        seen[name] += len(rows)
+        yield from _unique(dataset, name, rows.select(KEYS[name]), where[name])
+    row = scene.to_pylist()[0]
+    if dataset.info.images != "planned":
+        content = content_sha256(craters, boulders)
+        if row["content_sha256"] != content:
+            yield Fault.of(where["scenes"], 0, "content_sha256", row["content_sha256"], f"{content}, of its craters")
+    if len(craters):
+        yield from _in_file(dataset, _crater_places(craters, row, where["craters"]), scene_id, told)
+    for descent in trajectories.to_pylist():
+        trajectory_id = descent["trajectory_id"]
+        frames = dataset.table("frames", scene_id=scene_id, trajectory_id=trajectory_id)
+        labels = dataset.table("labels", scene_id=scene_id, trajectory_id=trajectory_id)
+        seen["frames"] += len(frames)
+        seen["labels"] += len(labels)
+        places = {name: _place(dataset, name, scene_id, trajectory_id) for name in ("frames", "labels")}
+        for name, rows in (("frames", frames), ("labels", labels)):
+            yield from _unique(dataset, name, rows.select(KEYS[name]), places[name])
+        faults = descent_faults(dataset.info, row, craters, descent, frames, labels, places)
+        yield from _in_file(dataset, faults, f"{scene_id}/{trajectory_id}/", told)
+
+
+def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, told: set[tuple[str, str]]) -> Iterator[Fault]:
+    """Faults with rows counted within a scene or a descent (`own` begins its frames' names) as rows of the file.
+
+    What was told of a file and column is not told again.
+    """
+    for fault in faults:
+        path = dataset.root / fault.file
+        if (fault.file, fault.column) in told:
+            continue
+        told.add((fault.file, fault.column))
+        if fault.row is not None and is_whole(path.stem):
+            part = dataset.open_part(path, path.parent.name)
+            key = "frame_id" if "frame_id" in part.schema.names else "scene_id"
+            keys = part.read([key])[key]
+            found = pc.starts_with(keys, own) if key == "frame_id" else pc.equal(keys, own)
+            fault = replace(fault, row=int(np.flatnonzero(found)[fault.row]))
+        yield fault
+
+
+def _crater_places(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault]:
+    """Latitude and longitude follow from x and y; normals are of length 1."""
+    normals = np.stack([craters[f"normal_{axis}"].to_numpy() for axis in "xyz"], axis=1)
+    wrong = np.flatnonzero(np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-6)
+    if len(wrong):
+        yield Fault.of(where, int(wrong[0]), "normal_x", normals[wrong[0]].tolist(), "a normal of length 1")
+    x, y = craters["x_m"].to_numpy(), craters["y_m"].to_numpy()
+    latitude, longitude = selenographic_from_site(x, y, scene["latitude_deg"], scene["longitude_deg"])
+    for name, again in (("latitude_deg", latitude), ("longitude_deg", longitude)):
+        apart = np.abs(craters[name].to_numpy() - again)
+        apart = np.minimum(apart, np.abs(apart - 360))
+        wrong = np.flatnonzero(apart > _DEGREES)
+        if len(wrong):
+            found = craters[name][int(wrong[0])].as_py()
+            yield Fault.of(where, int(wrong[0]), name, found, f"{again[wrong[0]]}, of the place x_m, y_m")
+
+
+def _place(dataset: Dataset, table: str, scene_id: str, trajectory_id: str | None = None) -> str:
+    parts = dataset.parts(table, scene_id, trajectory_id)
+    return parts[0].relative_to(dataset.root).as_posix() if len(parts) == 1 else f"manifest/{table}"
+
+
+def _unique(dataset: Dataset, table: str, keys: pa.Table, where: str) -> Iterator[Fault]:
+    counted = keys.group_by(keys.column_names).aggregate([([], "count_all")])
+    doubled = counted.filter(pc.greater(counted["count_all"], 1))
+    if len(doubled):
+        found = list(doubled.to_pylist()[0].values())[:-1]
+        yield Fault.of(where, None, "+".join(KEYS[table]), found, "unique")

@@ -1,0 +1,87 @@
+"""The order of the rooms: a file imports from its own room and from rooms before it, never from one after it."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+ROOMS = {
+    "shared/perilune_shared": (
+        "errors progress content yaml_text config_errors config storage geometry dataset validation editing export cli"
+    ),
+    "render/perilune_render": (
+        "config_values config_terrain config streams interrupts provenance terrain flight imaging labels blender "
+        "dataset cli"
+    ),
+    "train/perilune_train": "config data evaluation models training detect navigate explain cli",
+    "train/perilune_train/detect": (
+        "config run_config data evaluate inference train evaluate_run compare_runs images deploy cli"
+    ),
+}
+"""Rooms (folders) and files of each folder, in order: each may import those before it."""
+MOST_FILES = 15
+
+
+def imported_modules(path: Path) -> set[str]:
+    """Every module that a file imports anywhere, `from a import b` as a.b."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("folder", ROOMS)
+def test_imports_flow_one_way(folder):
+    root = ROOT / folder
+    order = ROOMS[folder].split()
+    package = ".".join(root.relative_to(ROOT).parts[1:]) + "."
+    here = {path.stem for path in root.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    assert here - {"__init__"} == set(order)
+    wrong = []
+    for path in root.rglob("*.py"):
+        room = path.relative_to(root).with_suffix("").parts[0]
+        for name in imported_modules(path):
+            target = name.removeprefix(package).split(".")[0]
+            known = name.startswith(package) and room in order and target in order
+            if known and order.index(target) > order.index(room):
+                wrong.append(f"{path.relative_to(ROOT)} imports {name}")
+    assert not wrong
+
+
+def test_no_folder_is_crowded():
+    counts: dict[Path, int] = {}
+    for package in ("shared/perilune_shared", "render/perilune_render", "train/perilune_train"):
+        for path in (ROOT / package).rglob("*.py"):
+            counts[path.parent] = counts.get(path.parent, 0) + 1
+    assert len(counts) > 20
+    assert {folder: count for folder, count in counts.items() if count > MOST_FILES} == {}
+
+
+BLOCKED = """
+import importlib, pkgutil, sys
+for name in {blocked!r}:
+    sys.modules[name] = None
+for module in {modules!r}:
+    importlib.import_module(module)
+    for found in pkgutil.iter_modules(getattr(sys.modules[module], "__path__", ())):
+        importlib.import_module(f"{{module}}.{{found.name}}")
+"""
+
+
+@pytest.mark.parametrize(
+    ("blocked", "modules"),
+    [
+        (["torch", "lightning", "bpy"], ["perilune_train.detect.evaluate", "perilune_train.evaluation"]),
+        (["torch", "lightning", "bpy", "typer"], ["perilune_shared.dataset", "perilune_shared.geometry"]),
+    ],
+)
+def test_a_room_needs_no_more_than_it_says(blocked, modules):
+    code = BLOCKED.format(blocked=blocked, modules=modules)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,22 @@
+"""`perilune-train detect compare`: several runs or evaluations side by side."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.progress import console
+from perilune_train.evaluation.overlap_option import AllowOverlap
+
+
+def compare(
+    folders: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs, or of evaluations.")],
+    out: Annotated[Path, typer.Option(help="Folder to write into.")] = Path("runs/detect/compare"),
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Put runs side by side: compare.md, one table with the protocol of each, and their precision-recall curves."""
+    # matplotlib and torch take seconds to load.
+    from perilune_train.detect.compare_runs import compare_folders
+
+    console.print(compare_folders(folders, out, allow_overlap), markup=False, highlight=False, soft_wrap=True)
+    console.print(f"{out}: compare.md, precision_recall.png")

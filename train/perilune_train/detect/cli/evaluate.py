@@ -1,0 +1,100 @@
+"""`perilune-train detect evaluate`: judge a finished run again, also on another dataset or other labels."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.config import parse_setting, resolve_over
+from perilune_shared.dataset.schema import SPLITS
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console
+from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.run_config import config_of_run
+from perilune_train.evaluation.overlap_option import AllowOverlap
+
+_FOR_DATASETS = ("dataset", "split", "allow_overlap")
+_FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin")
+
+
+def evaluate(
+    context: typer.Context,
+    run: Annotated[Path, typer.Option(help="Folder of a finished detect run, for example runs/detect/small.")],
+    dataset: Annotated[
+        Path | None, typer.Option(help="Folder of the dataset. [default: data/<name of the run>/detect]")
+    ] = None,
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="One setting of detect.evaluation or detect.labels in place of the run's. Repeatable."
+        ),
+    ] = None,
+    threshold: Annotated[
+        float | None, typer.Option(help="Score threshold. [default: the run's, chosen on its validation split]")
+    ] = None,
+    choose_threshold: Annotated[
+        bool,
+        typer.Option(
+            "--choose-threshold",
+            help="Choose the threshold anew, on the dataset's val: for other settings than the run was judged with.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation, with --images <run>/images]")
+    ] = None,
+    allow_overlap: AllowOverlap = False,
+    images: Annotated[
+        Path | None,
+        typer.Option(help="Real images with boxes in place of a dataset: a folder of pictures and tables, or COCO."),
+    ] = None,
+    min_size: Annotated[float, typer.Option(help="With --images: least crater wanted, sqrt(w h), pixels.")] = 8.0,
+    scale: Scales = None,
+    tile: TileSide = 256,
+    overlap: Overlap = 64,
+    box_margin: BoxMargin = 0.0,
+) -> None:
+    """Judge a run's best weights: report.md, metrics.json, detections.parquet and pictures.
+
+    The threshold is the run's own, chosen on the validation split it was trained beside, unless --threshold gives one
+    or --choose-threshold asks for a new one.
+    """
+    if split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    if threshold is not None and not 0 <= threshold <= 1:
+        raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
+    if choose_threshold and (threshold is not None or images is not None or split == "val"):
+        other = "--threshold" if threshold is not None else "--images" if images is not None else "--split val"
+        raise UserError("--choose-threshold", "beside", other, "one of both")
+    for name in _FOR_IMAGES if images is None else _FOR_DATASETS:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            option = "--" + name.replace("_", "-")
+            if images is None:
+                raise UserError(option, "beside", "no --images", f"--images, or no {option}")
+            raise UserError(option, "beside", "--images", "one of both")
+    config = config_of_run(run, tuple(set_ or ()))
+    if images is not None:
+        for text in set_ or ():
+            keys, _ = parse_setting(text)
+            if keys[1] == "labels":
+                raise UserError("--set", ".".join(keys), "beside --images", "--min-size: images have no such labels")
+        from perilune_train.detect.images.evaluate import evaluate_images
+        from perilune_train.detect.inference.tiles import Tiling
+
+        folder = out or run / "images"
+        tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
+        evaluate_images(run, config, images, folder, tiling, min_size, threshold)
+        console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png, crops.png")
+        return
+    if scale:
+        own = config.model_dump(mode="json")
+        own["evaluation"]["scales"] = scale
+        config = resolve_over(DetectConfig, "detect", "--scale", own)
+    # Torch takes seconds to load: not for a wrong key.
+    from perilune_train.detect.evaluate_run import evaluate_again
+
+    place = dataset or Path("data", run.resolve().name, "detect")
+    folder = evaluate_again(run, config, place, split, threshold, out, choose_threshold, allow_overlap)
+    console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")

@@ -1,0 +1,43 @@
+"""`perilune-train detect predict`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console
+from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
+from perilune_train.detect.run_config import config_of_run
+
+
+def predict(
+    images: Annotated[list[Path], typer.Argument(help="PNG, TIFF or JPEG of any size.")],
+    run: Annotated[Path, typer.Option(help="Folder of a detect run.")] = Path("runs/detect/small"),
+    out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("predictions"),
+    threshold: Annotated[
+        float | None, typer.Option(help="Least score. [default: the best on the run's validation split]")
+    ] = None,
+    scale: Scales = None,
+    tile: TileSide = 256,
+    overlap: Overlap = 64,
+    box_margin: BoxMargin = 0.0,
+) -> None:
+    """Find craters in images.
+
+    Leaves detections.parquet and detections.csv (one row a crater, in pixels of the image, from the outer corner of its
+    top-left pixel), <image>.overlay.png, and detections.geojson where an image has a georeference.
+    """
+    if threshold is not None and not 0 < threshold <= 1:
+        raise UserError("--threshold", "score", threshold, "above 0, at most 1")
+    config = config_of_run(run, ())
+    # Torch takes seconds to load: not for a wrong option.
+    from perilune_train.detect.images.predict import predict_images
+    from perilune_train.detect.inference.tiles import Tiling
+
+    count = predict_images(
+        images, run, config, out, threshold, Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)
+    )
+    places = ", detections.geojson" if (out / "detections.geojson").is_file() else ""
+    written = f"detections.parquet, detections.csv{places}, *.overlay.png"
+    console.print(f"{out}: {count} craters in {len(images)} images; {written}")

@@ -1,0 +1,36 @@
+"""`perilune-train detect weights`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console
+
+
+def weights(
+    checkpoint: Annotated[Path, typer.Argument(help="best.ckpt of a detect run of width 1 with 3 input channels.")],
+    out: Annotated[
+        Path, typer.Option(help="File to write: NAME.conv.74 for the backbone, NAME.weights for the whole network.")
+    ],
+) -> None:
+    """Write the weights of a run as a Darknet file, which `detect.init_from` reads too.
+
+    NAME.conv.74 holds the 52 convolutions of the backbone, NAME.weights all 75 (a network without attention, strides
+    8 16 32; its output layers have 15 filters: x, y, width, height, objectness of 3 anchors).
+    """
+    if not out.name.endswith((".conv.74", ".weights")):
+        raise UserError(out, "--out", f"the name {out.name}", "a name that ends in .conv.74 or .weights")
+    # Torch takes seconds to load: not for a wrong name.
+    from perilune_train.detect.train.run import load_detector
+    from perilune_train.detect.train.transfer import darknet_content
+    from perilune_train.models.darknet_weights import write_darknet
+    from perilune_train.training import runs
+
+    network = load_detector(checkpoint)
+    architecture = runs.load_weights(checkpoint)["architecture"]
+    content = darknet_content(network, architecture, checkpoint, whole=out.suffix == ".weights")
+    write_darknet(out, content)
+    gates = "" if architecture["attention"] == "none" else "; the attention gates have no place in it"
+    console.print(f"{out}: {len(content.values)} floats{gates}")

@@ -1,0 +1,118 @@
+"""Several evaluations in one table and one picture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import write_text
+from perilune_train.detect.evaluate.figures import draw_curves
+from perilune_train.detect.evaluate.metrics import Curve
+from perilune_train.detect.evaluate.report import CURVE_FILE, number, table
+from perilune_train.detect.evaluate_run import read_metrics
+from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.provenance import Status, TerrainCheck
+from perilune_train.evaluation.spread import read_spread
+
+_COLUMNS = {
+    "ap50_paper": "AP",
+    "edge/ap50_paper": "edge AP",
+    "strict/ap50_paper": "strict AP",
+    "ap50_95_paper": "AP 0.50:0.95",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+}
+Metrics = dict[str, float | int | str | None]
+_LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
+
+
+def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
+    """Write compare.md and precision_recall.png into `out`; returns the table.
+
+    Raises UserError where a folder lacks its metrics or its curve, or was evaluated on terrain that its network was
+    trained on, unless `allow_overlap`; then table and picture are marked.
+    """
+    rows, curves, marks = [], {}, []
+    for folder in folders:
+        metrics = read_metrics(folder)
+        name = _name(folder)
+        if any(key.rpartition("/")[2] == "ap50" for key in metrics):
+            raise UserError(
+                folder / "metrics.json",
+                "ap50",
+                "the interpolated AP of an earlier release",
+                "ap50_paper: run `perilune-train detect evaluate` again",
+            )
+        if "images/name" in metrics:
+            # An evaluation on real images, whose figures have no split before them.
+            split, figures, wanted = "images", metrics, f"from {metrics.get('min_size_px')} px"
+            told: list[object] = [metrics.get("images/name"), split, None, wanted, metrics.get("scales")]
+        else:
+            split = str(metrics.get("evaluation/split", "test"))
+            figures = {key.removeprefix(f"{split}/"): metrics[key] for key in metrics if key.startswith(f"{split}/")}
+            told = [metrics.get("dataset/name"), split, metrics.get("dataset/protocol")]
+            told += [metrics.get("labels/selection"), metrics.get("evaluation/scales", 1)]
+        status, mark = _terrain(folder, metrics, allow_overlap)
+        marks += [f"{name}: {mark}"] if mark else []
+        told.insert(3, status)
+        cells = [name, *map(_text, (*told, figures.get("frames"), figures.get("labels")))]
+        cells += [_cell(figures, key) for key in _COLUMNS]
+        rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
+        # Of the whole curve, not of the points that are kept of it.
+        label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
+        curves[label] = read_curve(folder / CURVE_FILE)
+    head = ["run", "dataset", "split", "protocol", "terrain", "wanted", "scales", "frames", "labels"]
+    head += [*_COLUMNS.values(), *_LOWEST.values()]
+    text = "\n".join(table(head, rows)) + "\n"
+    write_text(
+        out / "compare.md",
+        "# Runs side by side\n\nIn brackets: 95 % intervals; with fewer than five units the value of each.\n\n" + text,
+    )
+    draw_curves(curves, out / "precision_recall.png")
+    mark_files(out, ("compare.md", "precision_recall.png"), "; ".join(marks))
+    return text
+
+
+def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, str]:
+    """Terrain status of an evaluation, and the mark that its output must carry ("" for none)."""
+    if "images/name" in metrics:
+        return "real images", ""
+    status, mark = metrics.get("terrain/status"), metrics.get("terrain/mark")
+    if status == "overlap" and not allow_overlap:
+        wanted = "an evaluation on other terrain; --allow-overlap allows it and marks all figures"
+        raise UserError(folder / "metrics.json", "terrain/mark", mark, wanted)
+    known = status in get_args(Status) and isinstance(mark, str)
+    return (str(status), str(mark)) if known else ("unknown", TerrainCheck("unknown").mark)
+
+
+def read_curve(path: Path) -> Curve:
+    """The curve that an evaluation left. Raises UserError where it is missing or another table."""
+    if not path.is_file():
+        raise UserError(path, "curve", "no such file", "one that `perilune-train detect evaluate` writes")
+    try:
+        columns = pq.read_table(path, columns=["score", "precision", "recall"])
+    except (pa.ArrowException, OSError, KeyError) as error:
+        raise UserError(path, "curve", error, "columns score, precision and recall") from None
+    if any(not pa.types.is_float64(column.type) for column in columns.columns) or columns.num_columns != 3:
+        raise UserError(path, "curve", columns.schema.to_string(), "columns score, precision and recall, float64")
+    return Curve(*(np.asarray(columns[name]) for name in ("score", "precision", "recall")))
+
+
+def _name(folder: Path) -> str:
+    """A run by its own name, an evaluation of it as run/evaluation."""
+    parts = folder.resolve().parts
+    return "/".join(parts[-2:]) if not (folder / "checkpoints").is_dir() else parts[-1]
+
+
+def _text(value: object) -> str:
+    return "-" if value is None else " ".join(str(value).split())
+
+
+def _cell(figures: dict, key: str) -> str:
+    value = figures.get(key)
+    return read_spread(figures, key).text(value) if isinstance(value, int | float) else number(value)

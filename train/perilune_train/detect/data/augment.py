@@ -1,0 +1,91 @@
+"""Random changes of training frames, with their boxes."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_train.detect.config import AugmentSettings
+from perilune_train.detect.data.split import MARGIN
+
+Array = NDArray[np.float64]
+
+
+def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
+    """One of the eight symmetries of a frame (height, width) with its boxes (M, 4): bit 0 mirrors left and right,
+    bit 1 top and bottom, bit 2 (applied last) exchanges x and y."""
+    height, width = image.shape
+    x0, y0, x1, y1 = boxes.T
+    if kind & 1:
+        image, x0, x1 = image[:, ::-1], width - x1, width - x0
+    if kind & 2:
+        image, y0, y1 = image[::-1], height - y1, height - y0
+    if kind & 4:
+        image, x0, y0, x1, y1 = image.T, y0, x0, y1, x1
+    return image, np.stack([x0, y0, x1, y1], axis=1)
+
+
+def rescale(image: NDArray, boxes: Array, factor: float, place: tuple[float, float]) -> tuple[NDArray, Array]:
+    """A frame (height, width) and its boxes (M, 4), enlarged or shrunk to an image of the same size.
+
+    `place` in [0, 1] tells, in x and y, which part of an enlarged frame is kept, or where a shrunk one lies; around
+    that is the frame's mean grey.
+    """
+    height, width = image.shape
+    shift = np.array([width, height]) * (1 - 1 / factor) * np.array(place)
+    if factor < 1:
+        image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / factor**2 - 1))
+    # OpenCV counts from the middle of the first pixel, boxes from its edge.
+    origin = shift + 0.5 / factor - 0.5
+    matrix = np.array([[1 / factor, 0, origin[0]], [0, 1 / factor, origin[1]]])
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    scaled = cv2.warpAffine(image, matrix, (width, height), flags=how, borderValue=float(image.mean()))
+    return scaled, (boxes - np.tile(shift, 2)) * factor
+
+
+def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.random.Generator) -> NDArray[np.float32]:
+    """What each of the 256 grey levels of a frame becomes: stretched, brightened, bent, clipped at 255."""
+    level = np.arange(256) / 255
+    if settings.stretch:
+        below = np.bincount(image.ravel(), minlength=256).cumsum() / image.size
+        black, white = np.searchsorted(below, [rng.uniform(0, settings.stretch), 1 - rng.uniform(0, settings.stretch)])
+        level = np.clip((np.arange(256) - black) / max(white - black, 1), 0, 1)
+    gain = np.exp(rng.uniform(-1, 1) * np.log1p(settings.gain))
+    gamma = np.exp(rng.uniform(-1, 1) * settings.gamma)
+    return (255 * np.minimum(gain * level**gamma, 1)).astype(np.float32)
+
+
+def augment(
+    image: NDArray[np.uint8],
+    boxes: Array,
+    wanted: NDArray[np.bool_],
+    radius_px: tuple[float, float],
+    settings: AugmentSettings,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
+    """A changed frame (height, width), grey levels as float32, its boxes (M, 4), and which of them are wanted (M,).
+
+    A crater that rescaling moves out of the range `radius_px`, or its centre off the image, is wanted no more; one
+    that becomes much smaller is left out.
+    """
+    turned: NDArray = image
+    if settings.flips_and_turns:
+        square = image.shape[0] == image.shape[1]
+        turned, boxes = turn(image, boxes, int(rng.integers(8 if square else 4)))
+    low, high = settings.scale
+    if (low, high) != (1, 1):
+        factor = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        turned, boxes = rescale(np.ascontiguousarray(turned), boxes, factor, (rng.random(), rng.random()))
+        size = np.array(turned.shape[::-1])
+        centre, radius = (boxes[:, :2] + boxes[:, 2:]) / 2, np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(1)) / 2
+        seen = ((boxes[:, 2:] > 0) & (boxes[:, :2] < size)).all(1) & (radius >= radius_px[0] * MARGIN)
+        boxes, wanted, centre, radius = boxes[seen], wanted[seen], centre[seen], radius[seen]
+        inside = ((centre >= 0) & (centre < size)).all(1)
+        wanted = wanted & inside & (radius >= radius_px[0]) & (radius <= radius_px[1])
+    pixels = grey_levels(turned, settings, rng)[turned]
+    sigma_px = rng.uniform(0, settings.blur_px)
+    if sigma_px > 0.3:
+        pixels = cv2.GaussianBlur(pixels, (0, 0), sigma_px).astype(np.float32, copy=False)
+    noise = rng.uniform(0, settings.noise)
+    if noise > 0:
+        pixels = pixels + np.float32(noise) * rng.standard_normal(pixels.shape, np.float32)
+    return pixels, boxes, wanted

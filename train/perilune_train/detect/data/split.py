@@ -1,0 +1,170 @@
+"""Frames and labels for the detector: what to find, what to ignore, augmentation, batches."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.selection import label_bound_px, read_labels, selected
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.ellipse import project_circles
+from perilune_shared.geometry.frames import matrix_from_quaternion
+from perilune_train.data.frames import FrameStore, load_frames
+from perilune_train.detect.config import LabelSettings
+
+Array = NDArray[np.float64]
+_BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
+_CRATER = ["scene_id", "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
+_ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
+_SHAPE = [*_BOX, "radius_px", *_ELLIPSE]
+
+MARGIN = np.sqrt(0.5)
+"""Craters below the least radius are ignored down to this share of it: no box in range overlaps lesser ones by half."""
+
+
+@dataclass(frozen=True)
+class FrameLabels:
+    """Labels of one frame."""
+
+    boxes: Array
+    """Tight on the whole ellipse: x0, y0, x1, y1 in pixels (M, 4)."""
+    radius_px: Array
+    """Radius of the circle of equal area, pixels (M,)."""
+    ellipses: Array
+    """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5), for drawing."""
+    wanted: NDArray[np.bool_]
+    """False for a crater that is ignored: hardly visible, or not labelled (M,)."""
+    labelled: NDArray[np.bool_]
+    """False for a crater that is not in the manifest's labels: a little too small, too large, or off the image (M,)."""
+    depth_ratio: Array | None = None
+    """Depth over diameter (M,), by which a crater is fresh or worn; NaN or None where it is not known."""
+
+
+@dataclass(frozen=True)
+class DetectSplit:
+    """One split in memory."""
+
+    frames: FrameStore
+    """Pixels and poses."""
+    labels: list[FrameLabels]
+    """One entry a frame."""
+    radius_px: tuple[float, float]
+    """Radii that are labelled and judged, pixels."""
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
+def load_split(
+    dataset: Dataset, split: str, settings: LabelSettings, scale: tuple[float, float] = (1.0, 1.0)
+) -> DetectSplit:
+    """Frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take.
+
+    `scale` holds the least and the largest factor by which frames will be shrunk and enlarged: what is ignored reaches
+    up and down accordingly. For the account of the edge the largest is 1 / EDGE.
+    """
+    camera = dataset.info.camera
+    for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
+        if size % 32:
+            nearest = max(32, round(size / 32) * 32)
+            expected = f"a multiple of 32, the network's coarsest stride; render or develop the frames with {nearest}"
+            raise UserError(dataset.root, field, size, expected)
+    frames = load_frames(dataset, split)
+    labels = read_labels(dataset, [*_BOX, *_ELLIPSE], split)
+    radius_px = _judged_range(dataset, settings)
+    shapes, ids = labels[_SHAPE].to_numpy(np.float64), labels["crater_id"].to_numpy()
+    wanted, depth_ratio = selected(labels, settings), (labels["depth_m"] / labels["diameter_m"]).to_numpy(np.float64)
+    rows_of = labels.groupby("frame_id").indices
+    craters = dataset.table("craters", _CRATER).to_pandas()
+    by_scene = {str(name): (part, *_places(part)) for name, part in craters.groupby("scene_id")}
+    nowhere = (craters.iloc[:0], *_places(craters.iloc[:0]))
+    parts = []
+    for frame in frames.table.to_dict("records"):
+        rows = rows_of.get(frame["frame_id"], np.empty(0, np.intp))
+        # Of the hundred thousand craters of a scene, those of the right size first: the rest is then cheap.
+        scene, points, radius_m = by_scene.get(frame["scene_id"], nowhere)
+        near = _right_size(points, radius_m, camera.intrinsics(), frame, _ignored_range(radius_px, scale))
+        others = scene[near]
+        others = others[~others["crater_id"].isin(ids[rows])]
+        ignored = unlabelled_craters(others, camera.intrinsics(), frame, radius_px, scale)
+        shape = np.concatenate([shapes[rows], ignored[_SHAPE].to_numpy(np.float64)])
+        labelled = np.arange(len(shape)) < len(rows)
+        chosen = np.zeros(len(shape), np.bool_)
+        chosen[: len(rows)] = wanted[rows]
+        ratio = np.concatenate([depth_ratio[rows], np.full(len(ignored), np.nan)])
+        parts.append(FrameLabels(shape[:, :4], shape[:, 4], shape[:, 5:], chosen, labelled, ratio))
+    return DetectSplit(frames, parts, radius_px)
+
+
+def _places(craters: pd.DataFrame) -> tuple[Array, Array]:
+    """Centres (N, 3) and radii (N,) in metres."""
+    return craters[["x_m", "y_m", "z_m"]].to_numpy(np.float64), craters["diameter_m"].to_numpy(np.float64) / 2
+
+
+def _ignored_range(radius_px: tuple[float, float], scale: tuple[float, float]) -> tuple[float, float]:
+    return radius_px[0] * MARGIN / max(scale[1], 1.0), radius_px[1] / MARGIN / min(scale[0], 1.0)
+
+
+def _right_size(
+    points_m: Array, radius_m: Array, camera: Camera, frame: dict[Any, Any], range_px: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Craters (N,) before the camera whose radius in the frame may lie in a range, from their depth alone.
+
+    Exact for level ground under a level camera; what a tilt changes stays well within the margins.
+    """
+    forward = matrix_from_quaternion(frame["rotation_wxyz"])[2]
+    depth_m = points_m @ forward - np.asarray(frame["position_m"], np.float64) @ forward
+    scaled = camera.fx_px * radius_m
+    return (depth_m > 0) & (scaled > 0.8 * range_px[0] * depth_m) & (scaled < 2 * range_px[1] * depth_m)
+
+
+def _judged_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
+    """Least and largest radius that a selection asks for, pixels; where it is open, that of the dataset's labels."""
+    if settings.radius_px is None:
+        return _labelled_range(dataset)
+    least_px, largest_px = settings.radius_px
+    return least_px, label_bound_px(dataset.info) if largest_px is None else largest_px
+
+
+def _labelled_range(dataset: Dataset) -> tuple[float, float]:
+    """Least and largest radius of all labels of a dataset, pixels."""
+    radius_px = dataset.table("labels", ["radius_px"]).to_pandas()["radius_px"]
+    return float(radius_px.min()), float(radius_px.max())
+
+
+def unlabelled_craters(
+    craters: pd.DataFrame,
+    camera: Camera,
+    frame: dict[Any, Any],
+    radius_px: tuple[float, float],
+    scale: tuple[float, float] = (1.0, 1.0),
+) -> pd.DataFrame:
+    """Craters of the scene that a frame shows just outside what is labelled, as rows to be ignored.
+
+    A crater of 1.9 px looks like one of 2.1 px: with only the second in the table, half of what is labelled near the
+    limit would be trained away as background, and finding the first would count as false. So, as COCO does with
+    objects outside its area range, craters within a factor of sqrt(2) of the range (beyond that no box within the
+    range overlaps them by half) and those whose centre is off the image are ignored; smaller and larger ones too where
+    frames will be enlarged and shrunk (`scale`, see load_split). `frame` is a row of the table.
+    """
+    low, high = _ignored_range(radius_px, scale)
+    points, radius_m = _places(craters)
+    sized = _right_size(points, radius_m, camera, frame, (low, high))
+    craters, points, radius_m = craters[sized], points[sized], radius_m[sized]
+    rotation = matrix_from_quaternion(frame["rotation_wxyz"])
+    centre = camera_from_site(points, frame["position_m"], rotation)
+    middle, rough_px = camera.project(centre), camera.fx_px * radius_m / centre[:, 2]
+    near = (middle > -2 * rough_px[:, None]).all(1)
+    near &= (middle < np.array([camera.width_px, camera.height_px]) + 2 * rough_px[:, None]).all(1)
+    normals = craters[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float64)[near] @ rotation.T
+    shapes = project_circles(camera, centre[near], normals, radius_m[near])
+    columns = [*shapes.bounding_boxes().T, shapes.cx_px, shapes.cy_px, shapes.a_px, shapes.b_px, shapes.theta_rad]
+    rows = pd.DataFrame(dict(zip([*_BOX, *_ELLIPSE], columns, strict=True)))
+    rows["radius_px"], rows["wanted"], rows["labelled"] = shapes.radius_px(), False, False
+    box = rows[_BOX].to_numpy(np.float64)
+    seen = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
+    return rows[seen & rows["radius_px"].between(low, high).to_numpy()]

@@ -1,0 +1,1 @@
+"""Networks for flight: ONNX, OpenVINO, int8."""

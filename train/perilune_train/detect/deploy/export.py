@@ -1,0 +1,248 @@
+"""A trained detector as files for flight: ONNX and OpenVINO, compared with torch before they are left."""
+
+import json
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console
+from perilune_shared.storage.files import new_folder, sha256_of, write_text
+from perilune_train.data.frames import normalised
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.batches import network_input
+from perilune_train.detect.data.split import load_split
+from perilune_train.detect.deploy.engines import (
+    Array,
+    Engine,
+    onnxruntime_engine,
+    openvino_core,
+    openvino_engine,
+    package,
+)
+from perilune_train.detect.deploy.flight_detector import FlightDetector
+from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
+from perilune_train.detect.deploy.readme import readme
+from perilune_train.detect.run_config import config_of_run
+from perilune_train.detect.train.run import load_detector
+from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.provenance import (
+    Provenance,
+    TerrainCheck,
+    check_calibration,
+    read_provenance,
+    split_terrain,
+)
+from perilune_train.models.size import multiply_adds
+from perilune_train.models.yolo import YOLOv3
+from perilune_train.training.runs import RunFolder, load_weights
+
+FORMATS = ("onnx", "openvino")
+MOST_PX = 1e-3
+"""Largest difference of a box's coordinate from torch's in float32, of the boxes that count."""
+MOST_SCORE = 1e-3
+"""Largest difference of a score, of all predictors."""
+_OPSET = 17
+_CHECKED_FRAMES = 8
+_CHECKED_BOXES = 100
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A finished detection run."""
+
+    network: YOLOv3
+    """Its best weights, in evaluation mode, on the CPU."""
+    config: DetectConfig
+    """Its settings."""
+    threshold: float
+    """The score at which F1 was highest on its validation split."""
+    checkpoint: Path
+    """The file of the weights."""
+
+
+def load_trained(root: Path) -> Trained:
+    """A finished run's network, settings and threshold. Raises UserError where it is none."""
+    run = RunFolder(root)
+    config = config_of_run(root)
+    if not run.finished:
+        raise UserError(root, "run", "no metrics.json", "a finished run; resume it with the command that started it")
+    try:
+        threshold = float(json.loads(run.metrics.read_text(encoding="utf-8"))["test/threshold"])
+    except (ValueError, KeyError, TypeError):
+        raise UserError(run.metrics, "test/threshold", "no number", "the metrics of a finished run") from None
+    return Trained(load_detector(run.best), config, threshold, run.best)
+
+
+def facts(trained: Trained, size_px: int) -> dict[str, Any]:
+    """All that is needed to use the exported files without this code, as plain data."""
+    network, settings = trained.network, trained.config.evaluation
+    return {
+        "input": {
+            "name": "images",
+            "shape": ["n", trained.config.in_channels, size_px, size_px],
+            "type": "float32",
+            "normalisation": "grey levels minus their mean over the image, divided by the larger of 1 and their "
+            "standard deviation (levels of 0 to 255); every channel holds the same grey image",
+        },
+        "outputs": {
+            "boxes": "(n, K, 4) float32: x0, y0, x1, y1 in pixels; 0, 0 is the image's upper left corner",
+            "scores": "(n, K) float32 in 0..1",
+        },
+        "score_threshold": trained.threshold,
+        "min_score": settings.min_score,
+        "nms_iou": settings.nms_iou,
+        "max_detections": settings.max_detections,
+        "scales": list(settings.scales),
+        "anchors_px": network.anchors.tolist(),
+        "strides": list(network.strides),
+        "width": trained.config.width,
+        "attention": trained.config.attention,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "multiply_adds": multiply_adds(network, (1, trained.config.in_channels, size_px, size_px)),
+        "checkpoint_sha256": sha256_of(trained.checkpoint),
+    }
+
+
+def write_onnx(detector: FlightDetector, path: Path, told: dict[str, Any], in_channels: int, size_px: int) -> None:
+    """The graph with any number of images; `told` goes into its metadata, each entry as JSON."""
+    onnx = package("onnx")
+    names = {"images": {0: "n"}, "boxes": {0: "n"}, "scores": {0: "n"}}
+    with warnings.catch_warnings(), torch.no_grad():
+        warnings.simplefilter("ignore")
+        # The tracing exporter: the newer one needs two packages more and gives the same graph.
+        torch.onnx.export(
+            detector,
+            (torch.zeros(1, in_channels, size_px, size_px),),
+            str(path),
+            input_names=["images"],
+            output_names=["boxes", "scores"],
+            dynamic_axes=names,
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+    model = onnx.load(str(path))
+    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in told.items()})
+    onnx.checker.check_model(model)
+    onnx.save(model, str(path))
+
+
+def write_openvino(onnx_path: Path, path: Path) -> None:
+    """OpenVINO's own form of an ONNX file: `path` (.xml) and, beside it, the weights (.bin) in float32."""
+    openvino = package("openvino")
+    # Read by the runtime, not by the converter, which reports its use over the network.
+    openvino.save_model(openvino_core().read_model(str(onnx_path)), str(path), compress_to_fp16=False)
+
+
+@torch.no_grad()
+def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float) -> tuple[float, float]:
+    """Largest differences from torch's float32: of box coordinates in pixels, and of scores.
+
+    Compared are all scores, and the boxes of at least `min_score` or among the best 100 of their image.
+    """
+    boxes, scores = (part.numpy() for part in network.detect(torch.as_tensor(images)))
+    found_boxes, found_scores = engine(images)
+    if found_boxes.shape != boxes.shape or found_scores.shape != scores.shape:
+        return float("inf"), float("inf")
+    # A check on frames in which the network sees nothing would check nothing.
+    best = np.sort(scores, axis=1)[:, -_CHECKED_BOXES:, None].min(axis=1)
+    counts = scores >= np.minimum(best, min_score)
+    apart = np.abs(found_boxes - boxes)[counts]
+    return float(apart.max(initial=0.0)), float(np.abs(found_scores - scores).max())
+
+
+def check(path: Path, name: str, trained: Trained, engine: Engine, images: Array) -> dict[str, float]:
+    """The differences of a written file, seen over all images at once. Raises UserError on too large a one."""
+    px, score = difference(trained.network, engine, images, trained.config.evaluation.min_score)
+    if not (px <= MOST_PX and score <= MOST_SCORE):
+        raise UserError(
+            path.name, name, f"boxes {px:.2g} px and scores {score:.2g} from torch's", f"{MOST_PX} px, {MOST_SCORE}"
+        )
+    return {"frames": len(images), "largest_px": px, "largest_score": score}
+
+
+def noise_frames(count: int, size_px: int) -> np.ndarray:
+    """Grey frames (count, size_px, size_px) of seeded noise, where there are no real ones to compare on."""
+    return np.random.default_rng(0).integers(0, 256, (count, size_px, size_px)).astype(np.uint8)
+
+
+def _terrain(
+    checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
+) -> tuple[Provenance, TerrainCheck | None]:
+    """The record of the exported network, with what int8 is calibrated and chosen on, and its check."""
+    provenance = read_provenance(load_weights(checkpoint), checkpoint)
+    if calibration is None:
+        return provenance, None
+    own = split_terrain(calibration, "train", "calibrated") | split_terrain(calibration, "val", "calibrated")
+    check = check_calibration(provenance, own, calibration, allow_overlap)
+    return Provenance(provenance.uses | own, provenance.known), check
+
+
+def export_run(
+    root: Path,
+    out: Path,
+    formats: tuple[str, ...] = FORMATS,
+    size_px: int = 256,
+    dataset: Path | None = None,
+    int8: bool = False,
+    allow_overlap: bool = False,
+) -> Int8Verdict | None:
+    """Write a run's detector into the new folder `out`, checked; with `int8` also quantised, if that is worth it.
+
+    Leaves detector.onnx, detector.xml and .bin (as asked for), detector-int8.onnx (if kept), detector.json (the
+    facts) and README.md. Compares on frames of the dataset's validation split, without one on noise.
+
+    Raises UserError, and leaves nothing, where a file differs from torch, the dataset has frames of another size, or
+    int8 is calibrated on terrain that the run was tested on, or that the dataset's own test split shares with what the
+    network was fitted to, unless `allow_overlap`; then facts and README say so.
+    """
+    for name in ("onnx", "onnxruntime", *formats, *(("openvino", "onnxruntime.quantization") if int8 else ())):
+        package(name)
+    trained = load_trained(root)
+    channels = trained.config.in_channels
+    opened = None if dataset is None else open_dataset(dataset)
+    if opened is not None:
+        camera = opened.info.camera
+        if (camera.width_px, camera.height_px) != (size_px, size_px):
+            found = f"{camera.width_px} x {camera.height_px}"
+            raise UserError(opened.root, "frames", found, f"{size_px} x {size_px} pixels; --size-px gives another")
+    told = facts(trained, size_px)
+    terrain, terrain_check = _terrain(trained.checkpoint, opened if int8 else None, allow_overlap)
+    told["terrain"] = {**terrain.plain(), **(terrain_check.metrics() if terrain_check is not None else {})}
+    verdict = None
+    with new_folder(out) as folder:
+        if opened is None:
+            frames = noise_frames(_CHECKED_FRAMES, size_px)
+        else:
+            val = load_split(opened, "val", trained.config.labels)
+            frames = val.frames.images[np.linspace(0, len(val) - 1, min(_CHECKED_FRAMES, len(val))).astype(int)]
+        told["compared_on"] = "noise" if opened is None else "validation frames"
+        images = network_input(normalised(frames), channels).contiguous().numpy()
+        onnx_path, xml_path = folder / "detector.onnx", folder / "detector.xml"
+        write_onnx(FlightDetector(trained.network, size_px), onnx_path, told, channels, size_px)
+        engines = [(onnx_path, "onnxruntime", onnxruntime_engine(onnx_path))]
+        if "openvino" in formats:
+            write_openvino(onnx_path, xml_path)
+            engines.append((xml_path, "openvino", openvino_engine(xml_path)))
+        told["differences_from_torch"] = {name: check(p, name, trained, engine, images) for p, name, engine in engines}
+        for name, found in told["differences_from_torch"].items():
+            console.print(
+                f"{name}: boxes within {found['largest_px']:.2g} px of torch's, scores {found['largest_score']:.2g}"
+            )
+        if int8 and opened is not None:
+            verdict = try_int8(onnx_path, folder / "detector-int8.onnx", opened, val, trained.config)
+            told["int8"] = verdict.as_facts()
+            console.print(verdict.words())
+        if "onnx" not in formats:
+            onnx_path.unlink()
+        told["files"] = {p.name: sha256_of(p) for p in sorted(folder.iterdir())}
+        write_text(folder / "detector.json", json.dumps(told, indent=2) + "\n")
+        write_text(folder / "README.md", readme(told))
+        if terrain_check is not None:
+            mark_files(folder, ("README.md",), terrain_check.mark)
+    return verdict

@@ -1,0 +1,150 @@
+"""The detector in 8-bit integers: made after training, measured, and kept only where it is worth it."""
+
+import dataclasses
+import logging
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.progress import progress_bar
+from perilune_train.data.frames import load_frames, normalised
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.batches import network_input
+from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.deploy.engines import Array, Engine, Precision, has_bf16, openvino_engine, package
+from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.detect.train.run import judge
+
+MOST_LOSS = 0.005
+"""Average precision on the validation split that int8 may lose: half a point."""
+_CALIBRATION_FRAMES = 64
+_TIMED = 30
+_KEPT_FLOAT = ("/squeeze", "/excite", "/spatial", "/heads.")
+"""Parts of the graph that stay in floating point: the gates, which are cheap, and the layers that the boxes are."""
+
+
+@dataclass(frozen=True)
+class Int8Verdict:
+    """What quantisation cost and gave, by OpenVINO on this machine."""
+
+    ap50_paper_float: float
+    """AP on the validation split in float32, frames as they are, whatever the run's scales."""
+    ap50_paper_int8: float
+    """... in int8, the rest in `precision`."""
+    float_s: float
+    """Median time of one image before quantisation, in `precision`."""
+    int8_s: float
+    """... in int8."""
+    precision: Precision
+    """What is not int8: bf16 where the processor has it."""
+
+    @property
+    def kept(self) -> bool:
+        """At most half a point of AP lost, and faster."""
+        return self.ap50_paper_float - self.ap50_paper_int8 <= MOST_LOSS and self.int8_s < self.float_s
+
+    def as_facts(self) -> dict[str, Any]:
+        """As plain data."""
+        return {**dataclasses.asdict(self), "kept": self.kept}
+
+    def words(self) -> str:
+        """In one line."""
+        told = (
+            f"AP {self.ap50_paper_int8:.4f} (float32 {self.ap50_paper_float:.4f}) on the validation split, "
+            f"{1000 * self.int8_s:.1f} ms an image ({self.precision} {1000 * self.float_s:.1f} ms)"
+        )
+        return f"int8 {'kept' if self.kept else 'not kept'}: {told}"
+
+
+def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config: DetectConfig) -> Int8Verdict:
+    """Quantise the ONNX file `source` into `out`, judge both on `val`; `out` is left only if that is worth it.
+
+    Calibrated on 64 frames spread over the training split.
+    """
+    frames = load_frames(dataset, "train").images
+    some = frames[np.linspace(0, len(frames) - 1, min(_CALIBRATION_FRAMES, len(frames))).astype(int)]
+    quantise(source, out, network_input(normalised(some), config.in_channels).contiguous().numpy())
+    precision: Precision = "bf16" if has_bf16() else "f32"
+    quick = {"float": openvino_engine(source, precision, batch=1), "int8": openvino_engine(out, precision, batch=1)}
+    image = network_input(normalised(val.frames.images[:1]), config.in_channels).contiguous().numpy()
+    times = interleaved(quick, image, _TIMED)
+    ap_float = average_precision(openvino_engine(source, "f32", batch=1), val, config, "judge float32")
+    ap_int8 = average_precision(quick["int8"], val, config, "judge int8")
+    verdict = Int8Verdict(
+        ap_float, ap_int8, statistics.median(times["float"]), statistics.median(times["int8"]), precision
+    )
+    if not verdict.kept:
+        out.unlink()
+    return verdict
+
+
+def quantise(source: Path, out: Path, images: Array) -> None:
+    """Static quantisation of an ONNX file (ONNX Runtime's): weights by channel, activations at convolutions' inputs.
+
+    `images` (N, C, H, W) are run through the network to see how large each activation gets.
+    """
+    onnx, quantization = package("onnx"), package("onnxruntime.quantization")
+
+    class Frames(quantization.CalibrationDataReader):  # type: ignore[name-defined]
+        def __init__(self) -> None:
+            self.left: Iterator[Array] = iter(images)
+
+        def get_next(self) -> dict[str, Array] | None:
+            image = next(self.left, None)
+            return None if image is None else {"images": image[None]}
+
+    graph = onnx.load(str(source), load_external_data=False).graph
+    level = logging.root.level
+    logging.root.setLevel(logging.ERROR)
+    try:
+        quantization.quantize_static(
+            str(source),
+            str(out),
+            Frames(),
+            quant_format=quantization.QuantFormat.QDQ,
+            op_types_to_quantize=["Conv"],
+            per_channel=True,
+            activation_type=quantization.QuantType.QUInt8,
+            weight_type=quantization.QuantType.QInt8,
+            nodes_to_exclude=[node.name for node in graph.node if any(part in node.name for part in _KEPT_FLOAT)],
+            # So that engines can join a convolution with what follows it before they round.
+            extra_options={"OpTypesToExcludeOutputQuantization": ["Conv"]},
+        )
+    finally:
+        logging.root.setLevel(level)
+
+
+def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, label: str) -> float:
+    """The paper's AP, at the run's IoU, of an engine on a split: image by image, at scale 1 alone as in flight."""
+    import torch
+
+    found = []
+    with progress_bar() as bar:
+        task = bar.add_task(label, total=len(split), unit="frames", note="")
+        for frame in split.frames.images:
+            image = network_input(normalised(frame[None]), config.in_channels).contiguous().numpy()
+            boxes, scores = (torch.as_tensor(part) for part in engine(image))
+            found += detections_of(boxes, scores, config.evaluation)
+            bar.advance(task)
+    return curve(judge(split, found, config)).ap_paper()
+
+
+def interleaved(engines: dict[str, Engine], images: Array, rounds: int, warm_up: int = 5) -> dict[str, list[float]]:
+    """Seconds of each call of each engine, taken in turn, so that whatever else runs here slows all alike."""
+    for engine in engines.values():
+        for _ in range(warm_up):
+            engine(images)
+    seconds: dict[str, list[float]] = {name: [] for name in engines}
+    for _ in range(rounds):
+        for name, engine in engines.items():
+            start = time.perf_counter()
+            engine(images)
+            seconds[name].append(time.perf_counter() - start)
+    return seconds

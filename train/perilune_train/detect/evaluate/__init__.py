@@ -1,0 +1,1 @@
+"""Evaluation over plain data, without torch."""

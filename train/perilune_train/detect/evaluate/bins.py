@@ -1,0 +1,174 @@
+"""Figures by the size of craters, altitude, Sun and freshness.
+
+Altitude and Sun are of a frame: a bin holds whole frames. The radius is of a label: a bin follows COCO's rule for
+areas, so it is matched anew with the labels of other bins ignored, and detections that find nothing are ignored where
+their own radius is outside the bin. Freshness, depth over diameter, is of a label too, but a false detection has
+none: there only recall is defined.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_train.detect.data.frame_facts import FrameFacts
+from perilune_train.detect.evaluate.bootstrap import at_threshold_resampled, average_precisions
+from perilune_train.detect.evaluate.matching import Matches, Overlaps
+from perilune_train.detect.evaluate.metrics import at_threshold, curve
+from perilune_train.evaluation.spread import Resamples, Spread, spreads
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+RADIUS_BINS_PX = (2.0, 3.0, 5.0, 10.0, 20.0, 50.0, float("inf"))
+"""Up to 50 px the paper's range; above it one open bin, for the larger labels of wider images."""
+_PAPERS_LARGEST_PX = 50.0
+ALTITUDE_BINS_M = (200.0, 500.0, 1000.0, 1500.0)
+SUN_BINS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
+DEPTH_RATIO_BINS = (0.0, 0.04, 0.06, 0.08, 0.1, 0.15, 1.0)
+_ALTITUDE_MARGIN = 0.1
+
+
+@dataclass(frozen=True)
+class BinFigures:
+    """Figures of one bin, at the run's threshold; NaN where not defined."""
+
+    by: str
+    """radius, altitude, sun or depth_ratio."""
+    unit: str
+    """px, m, deg or nothing."""
+    low: float
+    """Least value."""
+    high: float
+    """Values below this, in the last bin up to it."""
+    frames: int
+    """Frames with a wanted label in the bin."""
+    labels: int
+    """Wanted labels."""
+    ap50_paper: float
+    """AP as in the paper (metrics.py)."""
+    ap50_paper_spread: Spread
+    """Over the units that have wanted labels in the bin."""
+    precision: float
+    """In the usual account."""
+    recall: float
+    """Share of the wanted labels found."""
+    recall_spread: Spread
+    """Over the same units."""
+    f1: float
+    """Of precision and recall."""
+
+    @property
+    def key(self) -> str:
+        """Under which metrics.json has its figures, for example radius_2_3_px."""
+        return "_".join([self.by, f"{self.low:g}", f"{self.high:g}"] + [self.unit] * bool(self.unit))
+
+    @property
+    def label(self) -> str:
+        """The bin's range as text, for example 2 to 3 px."""
+        reach = f"{self.low:g} to {self.high:g}" if self.high < float("inf") else f"above {self.low:g}"
+        return f"{reach} {self.unit}".rstrip()
+
+
+def within(values: Array, low: float, high: float, last: bool) -> Flags:
+    """Whether values lie in a bin; NaN lies in none."""
+    return (values >= low) & ((values <= high) if last else (values < high))
+
+
+def figures_by_bin(
+    overlaps: Overlaps,
+    matches: Matches,
+    facts: FrameFacts,
+    match_iou: float,
+    radius_px: tuple[float, float],
+    threshold: float,
+    resamples: Resamples,
+) -> list[BinFigures]:
+    """Figures of every bin that holds wanted labels. `matches` are at `match_iou` with the judged `radius_px`.
+
+    Frames up to a tenth beyond the first and the last altitude count in the outer bins: descents end near the
+    nominal altitude, not at it.
+    """
+    made = []
+    for low, high in pairwise(RADIUS_BINS_PX):
+        # A radius of exactly 50 px belongs to the paper's largest bin.
+        own = within(overlaps.label_radius_px, low, high, high == _PAPERS_LARGEST_PX)
+        own &= (low < _PAPERS_LARGEST_PX) | (overlaps.label_radius_px > low)
+        judged = max(low, radius_px[0]), min(high, radius_px[1])
+        part = overlaps.match(match_iou, judged, overlaps.label_wanted & own)
+        made.append(_of_matches("radius", "px", low, high, part, threshold, resamples))
+    margins = {ALTITUDE_BINS_M[0]: 1 - _ALTITUDE_MARGIN, ALTITUDE_BINS_M[-1]: 1 + _ALTITUDE_MARGIN}
+    for low, high in pairwise(ALTITUDE_BINS_M):
+        chosen = within(facts.altitude_m, low * margins.get(low, 1), high * margins.get(high, 1), high in margins)
+        made.append(_of_matches("altitude", "m", low, high, matches.of_frames(chosen), threshold, resamples))
+    for low, high in pairwise(SUN_BINS_DEG):
+        chosen = within(facts.sun_elevation_deg, low, high, high == SUN_BINS_DEG[-1])
+        made.append(_of_matches("sun", "deg", low, high, matches.of_frames(chosen), threshold, resamples))
+    for low, high in pairwise(DEPTH_RATIO_BINS):
+        own = within(overlaps.label_depth_ratio, low, high, high == DEPTH_RATIO_BINS[-1]) & overlaps.label_wanted
+        made.append(_of_labels(low, high, own, overlaps, matches, threshold, resamples))
+    return [one for one in made if one.labels]
+
+
+def _of_matches(
+    by: str, unit: str, low: float, high: float, matches: Matches, threshold: float, resamples: Resamples
+) -> BinFigures:
+    precision, recall, f1 = at_threshold(matches, threshold)
+    spread = spreads(
+        lambda drawn: {
+            "ap50_paper": average_precisions(matches, drawn),
+            "recall": at_threshold_resampled(matches, threshold, drawn)["recall"],
+        },
+        matches.wanted_frame,
+        resamples,
+    )
+    return BinFigures(
+        by,
+        unit,
+        low,
+        high,
+        len(np.unique(matches.wanted_frame)),
+        len(matches.wanted_frame),
+        curve(matches).ap_paper(),
+        spread["ap50_paper"],
+        precision,
+        recall,
+        spread["recall"],
+        f1,
+    )
+
+
+def _of_labels(
+    low: float,
+    high: float,
+    own: Flags,
+    overlaps: Overlaps,
+    matches: Matches,
+    threshold: float,
+    resamples: Resamples,
+) -> BinFigures:
+    """Recall of the labels `own` (L,) as they were matched among all."""
+    hit = np.zeros(len(own), np.bool_)
+    hit[matches.label[(matches.label >= 0) & (matches.scores >= threshold)]] = True
+    frames = overlaps.label_frame[own]
+
+    def recalls(drawn: Resamples) -> dict[str, Array]:
+        found, wanted = drawn.totals(overlaps.label_frame[own & hit]), drawn.totals(frames)
+        return {"recall": np.divide(found, wanted, out=np.full(len(wanted), np.nan), where=wanted > 0)}
+
+    nan = float("nan")
+    recall = float(hit[own].mean()) if own.any() else nan
+    return BinFigures(
+        "depth_ratio",
+        "",
+        low,
+        high,
+        len(np.unique(frames)),
+        len(frames),
+        nan,
+        Spread(resamples.unit, None),
+        nan,
+        recall,
+        spreads(recalls, frames, resamples)["recall"],
+        nan,
+    )

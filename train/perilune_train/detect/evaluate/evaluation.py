@@ -1,0 +1,181 @@
+"""Judging detections: everything that is computed, over plain data.
+
+For rendered datasets and real images alike::
+
+    evaluation = evaluate_detections(found, labels, facts, threshold, radius_px=(2.0, 50.0))
+    figures = evaluation.figures()                       # flat keys, for metrics.json
+    write_evaluation(folder, evaluation, images, about)  # report.py: report.md, pictures
+
+with `found` a list of Detections, `labels` a list of FrameLabels (real images: all wanted and labelled, ellipses of the
+boxes), `facts` a FrameFacts (`unknown_facts` where nothing is known), one entry a frame each.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_train.detect.data.frame_facts import FrameFacts
+from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.evaluate.bins import BinFigures, figures_by_bin
+from perilune_train.detect.evaluate.bootstrap import at_threshold_resampled, average_precisions
+from perilune_train.detect.evaluate.matching import (
+    COCO_IOUS,
+    FALSE,
+    FOUND,
+    Detections,
+    Matches,
+    Overlaps,
+    edge_range,
+    find_overlaps,
+)
+from perilune_train.detect.evaluate.metrics import figures, figures_of_account, figures_over_ious
+from perilune_train.evaluation.spread import Resamples, Spread, draw_resamples, spreads
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Detections judged, with all that a report tells."""
+
+    found: list[Detections]
+    """One entry a frame."""
+    labels: list[FrameLabels]
+    """One entry a frame."""
+    facts: FrameFacts
+    """Of the frames."""
+    threshold: float
+    """Score from which a detection counts in precision, recall and F1."""
+    match_iou: float
+    """Least IoU of a find, in everything that is not over several."""
+    overlaps: Overlaps
+    """Which detection may be which label."""
+    matches: Matches
+    """At match_iou."""
+    at_edge: Matches
+    """The same in the account of the edge (matching.py)."""
+    by_iou: list[Matches]
+    """At COCO_IOUS."""
+    bins: list[BinFigures]
+    """By radius, altitude, Sun, freshness; only bins that hold labels."""
+    spreads: dict[str, Spread]
+    """Of ap50_paper, ap50_95_paper, precision, recall, f1, and of ap50_paper at the edge and strict."""
+    resamples: Resamples
+    """What the intervals are drawn from."""
+
+    @cached_property
+    def errors(self) -> dict[str, float]:
+        """Centre and radius errors of what was found, see `errors_of_found`."""
+        return errors_of_found(self.overlaps, self.matches, self.threshold)
+
+    def figures(self) -> dict[str, float | int | str | None]:
+        """Flat keys: those of `metrics.figures` and `figures_over_ious`, `Spread.keys` of the spreads,
+        <bin>/ap50_paper and others, recall_radius_..., errors. What is not defined is NaN."""
+        result: dict[str, float | int | str | None] = {
+            **figures(self.matches, self.threshold),
+            **figures_of_account(self.at_edge, self.threshold, "edge/"),
+            **figures_over_ious(self.by_iou),
+            "threshold": self.threshold,
+            "match_iou": self.match_iou,
+            "frames": len(self.facts),
+            "labels": len(self.matches.wanted_frame),
+            "intervals_over": self.resamples.unit,
+            "intervals_units": self.resamples.count,
+            **self.errors,
+        }
+        for name, spread in self.spreads.items():
+            result |= spread.keys(name)
+        for part in self.bins:
+            result |= {f"{part.key}/recall": part.recall, f"{part.key}/labels": part.labels}
+            if part.by != "depth_ratio":
+                result |= {f"{part.key}/{name}": getattr(part, name) for name in ("ap50_paper", "precision", "f1")}
+                result |= part.ap50_paper_spread.keys(f"{part.key}/ap50_paper")
+            if part.by == "radius":
+                result[f"recall_{part.key}"] = part.recall
+        for by in ("radius", "altitude", "sun"):
+            aps = [part.ap50_paper for part in self.bins if part.by == by]
+            result[f"lowest_ap50_paper_by_{by}"] = min(aps, default=None)
+        return result
+
+    def frame_f1(self) -> Array:
+        """F1 of every frame (N,) at the threshold; NaN without wanted labels."""
+        n_frames = len(self.facts)
+        strong = self.matches.scores >= self.threshold
+        hits, false = (
+            np.bincount(self.matches.frame[strong & (self.matches.outcome == kind)], minlength=n_frames)
+            for kind in (FOUND, FALSE)
+        )
+        wanted = np.bincount(self.matches.wanted_frame, minlength=n_frames)
+        return np.divide(2 * hits, hits + false + wanted, out=np.full(n_frames, np.nan), where=wanted > 0)
+
+
+def evaluate_detections(
+    found: list[Detections],
+    labels: list[FrameLabels],
+    facts: FrameFacts,
+    threshold: float,
+    *,
+    radius_px: tuple[float, float],
+    match_iou: float = 0.5,
+    seed: int = 0,
+) -> Evaluation:
+    """Judge the detections of all frames; `radius_px` is the range of radii that is labelled.
+
+    The account of the edge is fair only where `labels` hold craters, ignored ones, well below that range.
+    `threshold` must come from other frames (validation). `seed` is of the bootstrap alone.
+    """
+    overlaps = find_overlaps(found, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
+    matches = overlaps.match(match_iou, radius_px)
+    at_edge = overlaps.match(match_iou, edge_range(radius_px))
+    by_iou = [overlaps.match(iou, radius_px) for iou in COCO_IOUS]
+    resamples = draw_resamples(facts.scene, facts.descent, facts.name, np.random.default_rng(seed))
+
+    def statistics(drawn: Resamples) -> dict[str, Array]:
+        return {
+            "ap50_paper": average_precisions(matches, drawn),
+            "edge/ap50_paper": average_precisions(at_edge, drawn),
+            "strict/ap50_paper": average_precisions(matches.strict(), drawn),
+            "ap50_95_paper": np.mean([average_precisions(part, drawn) for part in by_iou], axis=0),
+            **at_threshold_resampled(matches, threshold, drawn),
+        }
+
+    return Evaluation(
+        found,
+        labels,
+        facts,
+        threshold,
+        match_iou,
+        overlaps,
+        matches,
+        at_edge,
+        by_iou,
+        figures_by_bin(overlaps, matches, facts, match_iou, radius_px, threshold, resamples),
+        spreads(statistics, matches.wanted_frame, resamples),
+        resamples,
+    )
+
+
+def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> dict[str, float]:
+    """Errors of found craters, in pixels and (`_relative`) over the label's radius; NaN where none was found.
+
+    The centre is that of the box, the radius sqrt(w h) / 2 of the detection's box against the same of the label's box:
+    for an ellipse that lies askew a little more than its sqrt(a b), which no box tells. Bias is mean found minus true.
+    """
+    own = (matches.label >= 0) & (matches.scores >= threshold)
+    ours, truth = overlaps.boxes[own], overlaps.label_boxes[matches.label[own]]
+    radius, true_radius = (np.sqrt(np.prod(box[:, 2:] - box[:, :2], axis=1)) / 2 for box in (ours, truth))
+    centre_error = np.linalg.norm((ours[:, :2] + ours[:, 2:] - truth[:, :2] - truth[:, 2:]) / 2, axis=1)
+    difference = radius - true_radius
+    result: dict[str, float] = {}
+    for ending, scale in (("px", np.ones_like(true_radius)), ("relative", true_radius)):
+        for name, values in (("centre", centre_error / scale), ("radius", np.abs(difference) / scale)):
+            result[f"{name}_error_{ending}_median"] = _or_nan(values, np.median)
+            result[f"{name}_error_{ending}_p95"] = _or_nan(values, lambda known: np.percentile(known, 95))
+        result[f"radius_bias_{ending}"] = _or_nan(difference / scale, np.mean)
+    return result
+
+
+def _or_nan(values: Array, statistic) -> float:
+    return float(statistic(values)) if len(values) else float("nan")

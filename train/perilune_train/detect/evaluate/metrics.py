@@ -1,0 +1,124 @@
+"""Precision, recall, F1 and average precision of judged detections (matching.py)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_train.detect.evaluate.matching import COCO_IOUS, FALSE, FOUND, IGNORED, Matches
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Precision and recall as the score threshold falls."""
+
+    scores: Array
+    """Thresholds, falling (K,)."""
+    precision: Array
+    """(K,)."""
+    recall: Array
+    """(K,)."""
+
+    def ap_paper(self) -> float:
+        """The paper's AP and the headline: sum of (R_n - R_(n-1)) P_n over all thresholds, with raw precision.
+
+        One threshold per distinct score, as in scikit-learn's average_precision_score: equal scores count together.
+        Never above `ap_envelope`.
+        """
+        ends = self._thresholds()
+        return float(np.sum(np.diff(self.recall[ends], prepend=0.0) * self.precision[ends]))
+
+    def ap_envelope(self) -> float:
+        """All-point interpolated AP: P_n is replaced by the best precision at that recall or a higher one.
+
+        Equal scores count one by one, in the order of the detections, as in COCO's tools.
+        """
+        envelope = np.maximum.accumulate(self.precision[::-1])[::-1]
+        return float(np.sum(np.diff(self.recall, prepend=0.0) * envelope))
+
+    def ap_coco101(self) -> float:
+        """COCO's AP: mean of the interpolated precision at recalls 0, 0.01 .. 1."""
+        envelope = np.append(np.maximum.accumulate(self.precision[::-1])[::-1], 0.0)
+        return float(envelope[np.searchsorted(self.recall, np.linspace(0, 1, 101), side="left")].mean())
+
+    def _thresholds(self) -> NDArray[np.bool_]:
+        """Which points are possible thresholds (K,): of equal scores the last, since a threshold keeps all of them."""
+        return np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
+
+    def best_threshold(self) -> float:
+        """The score at which F1 is highest, 1 without detections."""
+        if not len(self.scores):
+            return 1.0
+        return float(self.scores[int(f1_score(self.precision, self.recall).argmax())])
+
+    def operating_threshold(self, min_precision: float | None) -> tuple[float, str]:
+        """A score (0 to 1) as threshold and its name: of best F1, or of most recall at a precision of min_precision.
+
+        Where no threshold has that precision, best F1 decides again, and the words say so.
+        """
+        if min_precision is None:
+            return self.best_threshold(), "of best F1"
+        precise = np.flatnonzero(self._thresholds() & (self.precision >= min_precision))
+        if not len(precise):
+            return self.best_threshold(), f"of best F1, since none has a precision of {min_precision:g},"
+        return float(self.scores[precise[-1]]), f"of most recall at a precision of {min_precision:g}"
+
+
+def f1_score(precision: Array, recall: Array) -> Array:
+    """2 P R / (P + R), 0 where both are 0."""
+    total = np.asarray(precision + recall, np.float64)
+    return np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
+
+
+def curve(matches: Matches) -> Curve:
+    """The precision-recall curve of all counted detections. Without wanted labels recall is 0."""
+    counted = matches.outcome != IGNORED
+    order = np.argsort(-matches.scores[counted], kind="stable")
+    hits = np.cumsum(matches.outcome[counted][order] == FOUND)
+    wanted = max(len(matches.wanted_frame), 1)
+    return Curve(matches.scores[counted][order], hits / np.arange(1, len(hits) + 1), hits / wanted)
+
+
+def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, float]:
+    """Precision, recall and F1 of the detections with a score of at least `threshold`; 0 where undefined."""
+    strong = matches.scores >= threshold
+    hits, false = (int((matches.outcome[strong] == kind).sum()) for kind in (FOUND, FALSE))
+    precision = hits / max(hits + false, 1)
+    recall = hits / max(len(matches.wanted_frame), 1)
+    return precision, recall, float(f1_score(np.array(precision), np.array(recall)))
+
+
+def figures(matches: Matches, threshold: float) -> dict[str, float]:
+    """ap50_paper, ap50_envelope, ap50_coco101, precision, recall and f1 by key, and the same under "strict/"."""
+    return figures_of_account(matches, threshold, "") | figures_of_account(matches.strict(), threshold, "strict/")
+
+
+def figures_of_account(matches: Matches, threshold: float, prefix: str) -> dict[str, float]:
+    """The six figures of one account by key, with a prefix."""
+    points = curve(matches)
+    precision, recall, f1 = at_threshold(matches, threshold)
+    return {
+        f"{prefix}ap50_paper": points.ap_paper(),
+        f"{prefix}ap50_envelope": points.ap_envelope(),
+        f"{prefix}ap50_coco101": points.ap_coco101(),
+        f"{prefix}precision": precision,
+        f"{prefix}recall": recall,
+        f"{prefix}f1": f1,
+    }
+
+
+def figures_over_ious(by_iou: Sequence[Matches]) -> dict[str, float]:
+    """ap50_95_... (mean over COCO_IOUS) and ap75_..., each as paper, envelope and coco101."""
+    curves = [curve(matches) for matches in by_iou]
+    at_75 = curves[COCO_IOUS.index(0.75)]
+    return {
+        "ap50_95_paper": float(np.mean([points.ap_paper() for points in curves])),
+        "ap50_95_envelope": float(np.mean([points.ap_envelope() for points in curves])),
+        "ap50_95_coco101": float(np.mean([points.ap_coco101() for points in curves])),
+        "ap75_paper": at_75.ap_paper(),
+        "ap75_envelope": at_75.ap_envelope(),
+        "ap75_coco101": at_75.ap_coco101(),
+    }

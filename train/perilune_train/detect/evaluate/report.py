@@ -1,0 +1,176 @@
+"""What an evaluation leaves in a folder: report.md, pictures, and the curve as a table. Needs no dataset."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from perilune_shared.storage.files import write_text, written_aside
+from perilune_train.detect.evaluate.bins import BinFigures
+from perilune_train.detect.evaluate.evaluation import Evaluation
+from perilune_train.detect.evaluate.figures import draw_bins, draw_curves, draw_frames
+from perilune_train.detect.evaluate.matching import COCO_IOUS, EDGE
+from perilune_train.detect.evaluate.metrics import Curve, curve
+from perilune_train.evaluation.spread import LEAST_UNITS, RESAMPLES, Resamples, Spread
+
+CURVE_FILE = "precision_recall.parquet"
+_CURVE_POINTS = 1000
+_ROWS = {
+    "ap50_paper": "AP (the paper's sum)",
+    "ap50_envelope": "AP, interpolated at all points",
+    "ap50_coco101": "AP, COCO's 101 points",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+}
+
+
+def write_evaluation(
+    folder: Path, evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], about: Sequence[str]
+) -> None:
+    """Write report.md, precision_recall.png and .parquet, bins.png (where there are bins) and detections.png.
+
+    `images` are the frames (height, width), grey; `about` are lines of Markdown that say what was judged and how.
+    """
+    write_text(folder / "report.md", markdown(evaluation, about))
+    curves = {f"IoU {COCO_IOUS[k]:.1f}": curve(evaluation.by_iou[k]) for k in (0, 2, 4, 6, 8)}
+    others = {"edge": evaluation.at_edge, "strict": evaluation.matches.strict()}
+    dashed = {f"IoU {evaluation.match_iou:g}, {name}": curve(matches) for name, matches in others.items()}
+    draw_curves(_with_ap(curves), folder / "precision_recall.png", dashed=_with_ap(dashed))
+    write_curve(folder / CURVE_FILE, curve(evaluation.matches))
+    draw_bins(evaluation.bins, folder / "bins.png")
+    draw_frames(evaluation, images, folder / "detections.png")
+
+
+def _with_ap(curves: dict[str, Curve]) -> dict[str, Curve]:
+    return {f"{name}: AP {points.ap_paper():.3f}": points for name, points in curves.items()}
+
+
+def write_curve(path: Path, points: Curve) -> None:
+    """Table score, precision, recall: at most 1000 points, evenly along the curve, by which runs are compared."""
+    count = len(points.scores)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _CURVE_POINTS)).astype(int)) if count else np.empty(0, int)
+    columns = {name: pa.array(getattr(points, f)[chosen]) for name, f in _CURVE_COLUMNS.items()}
+    with written_aside(path) as aside:
+        pq.write_table(pa.table(columns), aside, compression="zstd")
+
+
+_CURVE_COLUMNS = {"score": "scores", "precision": "precision", "recall": "recall"}
+
+
+def number(value: object) -> str:
+    """A figure with three digits behind the point; a dash where it is not defined."""
+    return f"{value:.3f}" if isinstance(value, int | float) and math.isfinite(value) else "-"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table; an upright bar within a cell is escaped."""
+    lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
+    lines.insert(1, ["---"] * len(head))
+    return ["| " + " | ".join(row) + " |" for row in lines]
+
+
+def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
+    """The whole report."""
+    figures, spreads = evaluation.figures(), evaluation.spreads
+    fullest = max((len(part.scores) for part in evaluation.found), default=0)
+    lines = ["# Crater detection, judged", "", *[f"- {line}" for line in about]]
+    lines += [
+        f"- {figures['frames']} frames, {figures['labels']} wanted labels; most detections in a frame: {fullest}",
+        f"- match at IoU {evaluation.match_iou:g}; precision, recall and F1 at a score of {evaluation.threshold:.4f}",
+        f"- {_of_brackets(evaluation.resamples)}",
+        "- usual account: finds on ignored craters, outside the range of radii or centred off the image do not count; "
+        f"edge: from {EDGE:g} of the least radius on, those on no crater at all are false; strict: all are false",
+        "",
+        "## All frames",
+        "",
+    ]
+    rows = [
+        [title, *(_cell(figures, spreads, f"{account}{key}") for account in ("", "edge/", "strict/"))]
+        for key, title in _ROWS.items()
+    ]
+    rows += [
+        ["AP over IoU 0.50:0.95", _cell(figures, spreads, "ap50_95_paper"), "", ""],
+        ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_coco101"]), "", ""],
+        ["AP at IoU 0.75", number(figures["ap75_paper"]), "", ""],
+    ]
+    lines += [*table(["", "usual", "edge", "strict"], rows), ""]
+    lines += ["AP alone means the paper's AP: the sum of (R_n - R_(n-1)) P_n over all thresholds.", ""]
+    for by, title in (("radius", "Radius"), ("altitude", "Altitude"), ("sun", "Sun elevation")):
+        lines += _bins(title, [part for part in evaluation.bins if part.by == by])
+    lines += _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
+    lines += ["## Errors of found craters", ""]
+    errors = evaluation.errors
+    rows = [
+        [name, *(number(errors[f"{key}_{ending}{which}"]) for ending in ("px", "relative"))]
+        for name, key, which in (
+            ("centre, median", "centre_error", "_median"),
+            ("centre, 95th percentile", "centre_error", "_p95"),
+            ("radius, median", "radius_error", "_median"),
+            ("radius, 95th percentile", "radius_error", "_p95"),
+            ("radius, bias (found less true)", "radius_bias", ""),
+        )
+    ]
+    lines += [*table(["", "px", "over the radius"], rows), ""]
+    return "\n".join(lines)
+
+
+def _cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], key: str) -> str:
+    value = figures[key]
+    known = key in spreads and isinstance(value, int | float)
+    return spreads[key].text(value) if known else number(value)  # type: ignore[arg-type]
+
+
+def _of_brackets(resamples: Resamples) -> str:
+    """Explains the brackets after a figure."""
+    count, unit = resamples.count, resamples.unit
+    if count < LEAST_UNITS:
+        return f"in brackets: the value of each {unit}; {count} of them are too few for an interval"
+    return (
+        f"in brackets: 95 % intervals, {RESAMPLES} resamples of {count} {unit}s; the value of each {unit} where fewer "
+        f"than {LEAST_UNITS} have labels"
+    )
+
+
+def _bins(title: str, parts: list[BinFigures]) -> list[str]:
+    if not parts:
+        return []
+    rows = [
+        [
+            part.label,
+            str(part.frames),
+            str(part.labels),
+            part.ap50_paper_spread.text(part.ap50_paper),
+            number(part.precision),
+            part.recall_spread.text(part.recall),
+            number(part.f1),
+        ]
+        for part in parts
+    ]
+    least = min(parts, key=lambda part: part.ap50_paper)
+    return [
+        f"## {title}",
+        "",
+        f"Lowest AP: {number(least.ap50_paper)} at {least.label}.",
+        "",
+        *table([title.lower(), "frames", "labels", "AP", "precision", "recall", "F1"], rows),
+        "",
+    ]
+
+
+def _freshness(parts: list[BinFigures]) -> list[str]:
+    if not parts:
+        return []
+    rows = [[part.label, str(part.labels), part.recall_spread.text(part.recall)] for part in parts]
+    return [
+        "## Freshness",
+        "",
+        "Depth over diameter. A false detection has none, so only recall is defined.",
+        "",
+        *table(["depth over diameter", "labels", "recall"], rows),
+        "",
+    ]

@@ -1,0 +1,163 @@
+"""A run judged on real images, with what people marked there: the same report as for a dataset.
+
+Wanted are boxes of at least `min_size_px` (sqrt(w h)) that are centred in their image; smaller ones, others off the
+image and those a COCO file ignores are neither wanted nor false when found, nor are detections below that size. The
+threshold is the run's own, from its validation split. The best threshold on the images themselves is told beside it, as
+an oracle: nobody who has no labels can know it.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_shared.progress import progress_bar
+from perilune_shared.storage.files import written_aside
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.frame_facts import unknown_facts
+from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
+from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections
+from perilune_train.detect.evaluate.metrics import at_threshold, curve
+from perilune_train.detect.evaluate.report import write_evaluation
+from perilune_train.detect.evaluate_run import check_folder, read_metrics, threshold_of
+from perilune_train.detect.images.labelled import ImageSet, LabelledImage, read_images
+from perilune_train.detect.images.predict import draw_boxes, open_detector, table_of
+from perilune_train.detect.images.read import read_grey
+from perilune_train.detect.inference.tiles import Detector, Tiling, count_tiles, detect_image
+from perilune_train.training import runs
+
+_CROP_PX = 200
+_PAIRS_A_ROW, _MOST_PAIRS = 3, 12
+_LABEL, _SMALL = (64, 64, 255), (48, 192, 224)
+_COLOURS = {FOUND: (224, 211, 25), FALSE: (255, 64, 255)}
+
+
+def evaluate_images(
+    run: Path,
+    config: DetectConfig,
+    place: Path,
+    out: Path,
+    tiling: Tiling,
+    min_size_px: float = 8.0,
+    threshold: float | None = None,
+) -> dict[str, float | int | str | None]:
+    """Judge a run on labelled images (a folder or a COCO file); the figures, as written to `out`/metrics.json.
+
+    Leaves report.md, detections.parquet, precision_recall.png, bins.png, detections.png and crops.png in `out` too.
+    Raises UserError where anything of it cannot be read; then nothing is written.
+    """
+    check_folder(out, run)
+    tiling.check()
+    if not 0 < min_size_px < np.inf:
+        raise UserError("--min-size", "pixels", min_size_px, "above 0")
+    given = read_images(place)
+    if not any(image.wanted(min_size_px).any() for image in given.images):
+        raise UserError(place, "boxes", f"none of {min_size_px:g} px or more", "at least one to be found")
+    chosen_on = "chosen on the run's validation split" if threshold is None else "given by hand"
+    threshold = threshold_of(read_metrics(run), run / "metrics.json") if threshold is None else threshold
+    images = [read_grey(image.path) for image in given.images]
+    found = _detect(open_detector(run, config), images, tiling)
+    evaluation = judge_images(given, found, threshold, min_size_px, config.evaluation.match_iou)
+    best = curve(evaluation.matches).best_threshold()
+    oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
+    about = [
+        f"run `{run.resolve().name}`, best weights; {len(images)} images of `{place.name}`",
+        f"wanted: boxes of {min_size_px:g} px or more (sqrt(w h)), centred in the image",
+        f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
+        + ("" if tiling.box_margin_px == 0 else f"; boxes enlarged by {tiling.box_margin_px:g} px at every side"),
+        f"threshold {chosen_on}",
+        f"oracle, with the threshold ({best:.4f}) of best F1 on these very images, which nobody knows beforehand: "
+        + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
+    ]
+    about += [given.categories] * bool(given.categories)
+    write_evaluation(out, evaluation, images, about)
+    table = pd.concat(table_of(image.name, part) for image, part in zip(given.images, found, strict=True))
+    with written_aside(out / "detections.parquet") as aside:
+        table.to_parquet(aside, index=False)
+    write_crops(out / "crops.png", images, evaluation)
+    figures = {"images/name": place.resolve().name, "images/categories": given.categories} | evaluation.figures()
+    figures |= {f"oracle/{name}": value for name, value in oracle.items()}
+    figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}
+    figures |= {
+        "overlap_px": tiling.overlap_px,
+        "box_margin_px": tiling.box_margin_px,
+        "scales": " ".join(map(str, tiling.scales)),
+    }
+    runs.write_metrics(runs.RunFolder(out), figures)
+    return figures
+
+
+def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
+    """An image's boxes as labels that can be judged; its craters are the ellipses in them."""
+    centre, half = (image.boxes[:, :2] + image.boxes[:, 2:]) / 2, (image.boxes[:, 2:] - image.boxes[:, :2]) / 2
+    ellipses = np.column_stack([centre, half, np.zeros(len(half))])
+    every = np.ones(len(half), bool)
+    return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, image.wanted(min_size_px), every)
+
+
+def judge_images(
+    given: ImageSet, found: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
+) -> Evaluation:
+    """The detections of all images against their boxes; where boxes end at the images' edges, detections do too."""
+    sizes = np.array([[image.width_px, image.height_px] for image in given.images])
+    if given.ends_at_edges:
+        limits = np.tile(sizes, 2).astype(np.float64)
+        found = [
+            Detections(np.clip(part.boxes, 0, limit), part.scores) for part, limit in zip(found, limits, strict=True)
+        ]
+    return evaluate_detections(
+        found,
+        [frame_labels(image, min_size_px) for image in given.images],
+        unknown_facts([image.name for image in given.images], sizes),
+        threshold,
+        radius_px=(min_size_px / 2, np.inf),
+        match_iou=match_iou,
+    )
+
+
+def _detect(detector: Detector, images: list[NDArray[np.uint8]], tiling: Tiling) -> list[Detections]:
+    found = []
+    with progress_bar() as progress:
+        total = sum(count_tiles(image.shape[0], image.shape[1], tiling) for image in images)
+        bar = progress.add_task("detect", total=total, unit="tiles", note="")
+        for image in images:
+            found.append(detect_image(detector, image, tiling, lambda n: progress.advance(bar, n)))
+    return found
+
+
+def write_crops(path: Path, images: list[NDArray[np.uint8]], evaluation: Evaluation) -> None:
+    """Middles of at most 12 images, enlarged twice: left the labels (wanted red, others orange), right the detections
+    above the threshold (found cyan, false magenta; what does not count is left out)."""
+    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), _MOST_PAIRS)).round().astype(int))
+    pairs = [_crop_pair(images[index], evaluation, int(index)) for index in chosen]
+    pairs += [np.zeros_like(pairs[0])] * (-len(pairs) % min(_PAIRS_A_ROW, len(pairs)))
+    columns = min(_PAIRS_A_ROW, len(pairs))
+    rows = [np.concatenate(pairs[k : k + columns], axis=1) for k in range(0, len(pairs), columns)]
+    with written_aside(path) as aside:
+        if not cv2.imwrite(str(aside), np.concatenate(rows)):
+            raise OSError(f"{path}: not written")
+
+
+def _crop_pair(image: NDArray[np.uint8], evaluation: Evaluation, index: int) -> NDArray[np.uint8]:
+    corner = np.maximum((np.array(image.shape) - _CROP_PX) // 2, 0)
+    crop = image[corner[0] :, corner[1] :][:_CROP_PX, :_CROP_PX]
+    square = np.zeros((_CROP_PX, _CROP_PX), np.uint8)
+    square[: crop.shape[0], : crop.shape[1]] = crop
+    large = cv2.cvtColor(cv2.resize(square, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), cv2.COLOR_GRAY2BGR)
+    left, right = np.array(large, np.uint8), np.array(large, np.uint8)
+    shift = np.tile(corner[::-1], 2)
+    truth, matches = evaluation.labels[index], evaluation.matches
+    draw_boxes(left, 2 * (truth.boxes[~truth.wanted] - shift), _SMALL)
+    draw_boxes(left, 2 * (truth.boxes[truth.wanted] - shift), _LABEL)
+    strong = (matches.frame == index) & (matches.scores >= evaluation.threshold)
+    for outcome, colour in _COLOURS.items():
+        boxes = evaluation.overlaps.boxes[strong & (matches.outcome == outcome)]
+        draw_boxes(right, 2 * (boxes - shift), colour)
+    pair = np.concatenate([left, right], axis=1)
+    pair[[0, -1]] = pair[:, [0, -1]] = 255
+    cv2.putText(pair, evaluation.facts.name[index][:40], (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1)
+    return pair

@@ -1,0 +1,159 @@
+"""Where on the Moon an image lies, and detections as GeoJSON.
+
+A georeference is a GeoTIFF's own, or a world file (.pgw, .tfw, .jgw) with the projection's .prj beside the image. It
+is read by rasterio, which is wanted only for this (the extra `geo`).
+"""
+
+import importlib.util
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import MOON_RADIUS_M
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.images.read import picture_format
+
+Array = NDArray[np.float64]
+_MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
+MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
+"""Longitude and latitude, degrees, on the sphere of the Moon's mean radius."""
+_CORNERS = 32
+_GRID = 17
+"""Pixels a side that tell whether an image lies on its map at all: a disc may leave its corners empty."""
+_DECIMALS = 8
+"""Of degrees: 0.3 mm on the ground."""
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """From pixels to the Moon."""
+
+    transform: tuple[float, float, float, float, float, float]
+    """a, b, c, d, e, f: map x = a column + b row + c, map y = d column + e row + f, pixels from the outer corner."""
+    projection: str
+    """The map's coordinate reference system, WKT."""
+    path: Path
+    """The image, for faults to name."""
+
+    def lon_lat_deg(self, pixels: Array) -> Array:
+        """East longitude and latitude (N, 2), degrees, of pixel coordinates (N, 2); infinite off the map.
+
+        Raises UserError where the projection is not one of the Moon.
+        """
+        from rasterio._err import CPLE_AppDefinedError, CPLE_BaseError
+        from rasterio.errors import RasterioError
+        from rasterio.warp import transform
+
+        a, b, c, d, e, f = self.transform
+        x, y = a * pixels[:, 0] + b * pixels[:, 1] + c, d * pixels[:, 0] + e * pixels[:, 1] + f
+        try:
+            return np.stack(transform(self.projection, _MOON, x, y)[:2], axis=1)
+        except CPLE_AppDefinedError:
+            # One point off the projection's domain fails them all: halved until it is alone.
+            half = len(pixels) // 2
+            if half == 0:
+                return np.full((1, 2), np.inf)
+            return np.concatenate([self.lon_lat_deg(part) for part in (pixels[:half], pixels[half:])])
+        except (RasterioError, CPLE_BaseError, ValueError) as error:
+            raise UserError(self.path, "projection", error, "a coordinate reference system of the Moon") from None
+
+
+def read_georeference(path: Path) -> Georeference | None:
+    """The georeference of an image, None where it has none, or only half of one. Needs rasterio."""
+    import rasterio
+    from rasterio.crs import CRS
+    from rasterio.errors import RasterioError
+
+    beside = path.with_suffix(".prj")
+    # Left to itself, GDAL would open a text that calls itself .tif and names other files; PAM files may do so too.
+    driver = {"TIFF": "GTiff"}.get(kind := picture_format(path), kind)
+    with warnings.catch_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO"):
+        warnings.simplefilter("ignore")
+        try:
+            with rasterio.open(path.resolve(), driver=driver) as image:
+                transform, projection, size = image.transform, image.crs, (image.width, image.height)
+            if projection is None and beside.is_file():
+                projection = CRS.from_wkt(beside.read_text(encoding="utf-8"), morph_from_esri_dialect=True)
+        except (RasterioError, ValueError) as error:
+            where = beside if beside.is_file() else path
+            raise UserError(where, "georeference", error, "a GeoTIFF, or a world file and a .prj") from None
+    if transform.is_identity or transform.determinant == 0 or projection is None:
+        return None
+    found = Georeference(tuple(transform)[:6], projection.to_wkt(), path)
+    grid = np.stack(np.meshgrid(*(np.linspace(0, side, _GRID) for side in size)), axis=-1).reshape(-1, 2)
+    if not np.isfinite(found.lon_lat_deg(grid)).all(axis=1).any():
+        raise UserError(path, "projection", "none of its pixels on the map", "an image of a place on the Moon")
+    return found
+
+
+def has_rasterio() -> bool:
+    """Whether georeferences can be read."""
+    return importlib.util.find_spec("rasterio") is not None
+
+
+def features(name: str, found: Detections, reference: Georeference) -> list[dict[str, Any]]:
+    """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with diameter_m.
+
+    Longitudes go on past 180 degrees where a polygon crosses it. A polygon around a pole is not one in longitude and
+    latitude: such a crater's corners are right, its filling is not. Detections that reach off the map are left out.
+    """
+    if not len(found.boxes):
+        return []
+    centre, half = (found.boxes[:, :2] + found.boxes[:, 2:]) / 2, (found.boxes[:, 2:] - found.boxes[:, :2]) / 2
+    angle = 2 * np.pi * np.arange(_CORNERS) / _CORNERS
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    pixels = np.concatenate([centre[:, None], centre[:, None] + half[:, None] * ring], axis=1)
+    places = reference.lon_lat_deg(pixels.reshape(-1, 2)).reshape(pixels.shape)
+    on_map = np.isfinite(places).all(axis=(1, 2))
+    places, centre, half, scores = places[on_map], centre[on_map], half[on_map], found.scores[on_map]
+    places[:, 1:, 0] -= 360 * np.round((places[:, 1:, 0] - places[:, :1, 0]) / 360)
+    quarter = _CORNERS // 4
+    along, across = (great_circle_m(places[:, 1 + k], places[:, 1 + k + 2 * quarter]) for k in (0, quarter))
+    rows = zip(places, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), scores, centre, strict=True)
+    return [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Polygon", "coordinates": [_ring(place[1:])]},
+            "properties": {
+                "image": name,
+                "score": round(float(score), 6),
+                "longitude_deg": round(float(place[0, 0]), _DECIMALS),
+                "latitude_deg": round(float(place[0, 1]), _DECIMALS),
+                "diameter_m": round(float(diameter_m), 3),
+                "diameter_px": round(float(diameter_px), 3),
+                "centre_x_px": round(float(middle[0]), 3),
+                "centre_y_px": round(float(middle[1]), 3),
+            },
+        }
+        for place, diameter_m, diameter_px, score, middle in rows
+    ]
+
+
+def collection(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """A GeoJSON FeatureCollection in the Moon's longitude and latitude.
+
+    Deviation from RFC 7946, which knows the Earth's WGS 84 alone: the member `crs` of GeoJSON 2008 names the Moon's
+    system; GDAL and QGIS heed it, others pass it over.
+    """
+    crs = {"type": "name", "properties": {"name": MOON_CRS}}
+    return {"type": "FeatureCollection", "name": "craters", "crs": crs, "features": parts}
+
+
+def great_circle_m(first: Array, second: Array) -> Array:
+    """Distances (N,) on the Moon's sphere, metres, of longitudes and latitudes (N, 2) in degrees (haversine)."""
+    (lon0, lat0), (lon1, lat1) = np.radians(first).T, np.radians(second).T
+    h = np.sin((lat1 - lat0) / 2) ** 2 + np.cos(lat0) * np.cos(lat1) * np.sin((lon1 - lon0) / 2) ** 2
+    return 2 * MOON_RADIUS_M * np.arcsin(np.sqrt(np.clip(h, 0, 1)))
+
+
+def _ring(corners: Array) -> list[list[float]]:
+    """A closed ring, counter-clockwise as RFC 7946 asks."""
+    x, y = corners.T - corners[0][:, None]
+    if x @ np.roll(y, -1) - y @ np.roll(x, -1) < 0:
+        corners = corners[::-1]
+    return np.round(np.concatenate([corners, corners[:1]]), _DECIMALS).tolist()

@@ -1,0 +1,139 @@
+"""Craters in images of any size: tables, overlays and, where an image has a georeference, GeoJSON."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console, progress_bar
+from perilune_shared.storage.files import new_folder
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate_run import read_metrics, threshold_of
+from perilune_train.detect.images.georeference import (
+    Georeference,
+    collection,
+    features,
+    has_rasterio,
+    read_georeference,
+)
+from perilune_train.detect.images.read import picture_size, read_grey
+from perilune_train.detect.inference.tiles import Detector, Tiling, count_tiles, detect_image
+from perilune_train.detect.train.run import load_detector
+from perilune_train.training import runs
+
+_DETECTED = (227, 211, 25)
+"""Cyan, in OpenCV's order blue, green, red."""
+_LARGEST_OVERLAY_PX = 4096
+_SMALLEST_OVERLAY_PX = 1600
+
+
+def open_detector(root: Path, config: DetectConfig) -> Detector:
+    """The best network of a run's folder. Raises UserError where it has none."""
+    device = runs.choose_device(config.device)
+    network = load_detector(runs.RunFolder(root).best).to(device)
+    return Detector(network, config, device, runs.choose_bf16(config.precision, device))
+
+
+def predict_images(
+    paths: list[Path], run: Path, config: DetectConfig, out: Path, threshold: float | None, tiling: Tiling
+) -> int:
+    """Find craters in images; returns their number. Everything is in the new folder `out`, or nothing.
+
+    Raises UserError on the first image that cannot be read, before any is searched.
+    """
+    tiling.check()
+    with new_folder(out) as folder, progress_bar() as progress:
+        check = progress.add_task("check", total=len(paths), unit="images", note="")
+        references: list[Georeference | None] = []
+        n_tiles = 0
+        names: set[str] = set()
+        for path in paths:
+            if path.name in names:
+                raise UserError(path, "name", "a second image of this name", "names that tell the images apart")
+            names.add(path.name)
+            width, height = picture_size(path)
+            read_grey(path)
+            references.append(_reference(path))
+            n_tiles += count_tiles(height, width, tiling)
+            progress.advance(check)
+        threshold = threshold_of(read_metrics(run), run / "metrics.json") if threshold is None else threshold
+        detector = open_detector(run, config)
+        bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
+        tables, shapes = [], []
+        for path, reference in zip(paths, references, strict=True):
+            progress.update(bar, note=path.name)
+            image = read_grey(path)
+            found = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
+            found = above(found, threshold)
+            tables.append(table_of(path.name, found))
+            write_overlay(folder / f"{path.name}.overlay.png", image, found)
+            if reference is not None:
+                own = features(path.name, found, reference)
+                shapes += own
+                if len(own) < len(found.boxes):
+                    left_out = len(found.boxes) - len(own)
+                    told = f"{path.name}: {left_out} craters lie off its map: not in detections.geojson"
+                    console.print(told, markup=False)
+        table = pd.concat(tables, ignore_index=True)
+        table.to_parquet(folder / "detections.parquet", index=False)
+        table.round(4).to_csv(folder / "detections.csv", index=False)
+        if any(reference is not None for reference in references):
+            (folder / "detections.geojson").write_text(json.dumps(collection(shapes)) + "\n", encoding="utf-8")
+    return len(table)
+
+
+def _reference(path: Path) -> Georeference | None:
+    if has_rasterio():
+        return read_georeference(path)
+    if path.suffix.lower() in (".tif", ".tiff") or path.with_suffix(".prj").is_file():
+        console.print(f"{path.name}: no georeference is read without rasterio (pip install 'perilune-train[geo]')")
+    return None
+
+
+def above(found: Detections, threshold: float) -> Detections:
+    """The detections with at least this score."""
+    strong = found.scores >= threshold
+    return Detections(found.boxes[strong], found.scores[strong])
+
+
+def table_of(name: str, found: Detections) -> pd.DataFrame:
+    """Detections as rows: image, box, centre and radius in pixels (sqrt(w h) / 2), score."""
+    x0, y0, x1, y1 = found.boxes.T
+    columns: dict[str, Any] = {
+        "image": pd.Series([name] * len(found.scores), dtype="str"),
+        "x0_px": x0,
+        "y0_px": y0,
+        "x1_px": x1,
+        "y1_px": y1,
+        "centre_x_px": (x0 + x1) / 2,
+        "centre_y_px": (y0 + y1) / 2,
+        "radius_px": np.sqrt((x1 - x0) * (y1 - y0)) / 2,
+        "score": found.scores,
+    }
+    return pd.DataFrame(columns)
+
+
+def write_overlay(path: Path, image: NDArray[np.uint8], found: Detections) -> None:
+    """Draw the detections as ellipses over the image; small ones are enlarged, large ones reduced."""
+    side = max(image.shape)
+    factor = min(max(_SMALLEST_OVERLAY_PX // side, 1), 4) if side < _LARGEST_OVERLAY_PX else _LARGEST_OVERLAY_PX / side
+    size = tuple(max(round(length * factor), 1) for length in image.shape[::-1])
+    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=how), cv2.COLOR_GRAY2BGR)
+    draw_boxes(canvas, found.boxes * factor, _DETECTED)
+    if not cv2.imwrite(str(path), canvas):
+        raise OSError(f"{path}: not written")
+
+
+def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
+    """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3) in blue, green, red."""
+    # OpenCV takes whole numbers, here of sixteenths of a pixel, and puts 0 at a pixel's centre.
+    sixteenths = np.rint(16 * np.column_stack([boxes[:, :2] + boxes[:, 2:] - 1, boxes[:, 2:] - boxes[:, :2]]) / 2)
+    for x, y, a, b in sixteenths.astype(int).tolist():
+        cv2.ellipse(canvas, (x, y), (a, b), 0, 0, 360, colour, 1, cv2.LINE_AA, 4)

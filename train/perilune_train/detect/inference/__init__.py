@@ -1,0 +1,1 @@
+"""From the network's output to detections: scales, tiles, suppression."""

@@ -1,0 +1,96 @@
+"""Detections of whole batches: score floor, aspect, non-maximum suppression."""
+
+import torch
+from torch import Tensor
+
+from perilune_train.detect.config import EvaluationSettings
+from perilune_train.detect.evaluate.boxes import suppress
+from perilune_train.detect.evaluate.matching import Detections
+
+_BLOCK = 256
+"""Boxes that are decided at once: more cost more overlaps, fewer cost more steps."""
+
+
+def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> list[Detections]:
+    """Detections of each frame from all predictors' boxes (N, K, 4) and scores (N, K).
+
+    On a GPU the whole batch is suppressed there; on a CPU frame by frame by OpenCV, which is faster on it
+    (`make bench-suppress`). Both keep the same boxes in the same order.
+    """
+    strong = scores >= settings.min_score
+    if settings.max_aspect is not None:
+        sides = boxes[..., 2:] - boxes[..., :2]
+        strong &= sides.amax(-1) <= settings.max_aspect * sides.amin(-1)
+    if boxes.device.type == "cpu":
+        return [_of_frame(*frame, settings) for frame in zip(boxes, scores, strong, strict=True)]
+    kept = suppress_batch(boxes, scores, strong, settings.nms_iou)
+    # One transfer for the batch.
+    found_boxes, found_scores, kept = (part.cpu() for part in (boxes, scores, kept))
+    found = []
+    for some_boxes, some_scores, chosen in zip(found_boxes, found_scores, kept, strict=True):
+        best = chosen[chosen >= 0][: settings.max_detections]
+        found.append(Detections(some_boxes[best].double().numpy(), some_scores[best].double().numpy()))
+    return found
+
+
+def _of_frame(boxes: Tensor, scores: Tensor, strong: Tensor, settings: EvaluationSettings) -> Detections:
+    some_boxes, some_scores = boxes[strong].double().numpy(), scores[strong].double().numpy()
+    kept = suppress(some_boxes, some_scores, settings.nms_iou, settings.max_detections)
+    return Detections(some_boxes[kept], some_scores[kept])
+
+
+@torch.no_grad()
+def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou: float) -> Tensor:
+    """Non-maximum suppression of N frames at once, on the tensors' device: the same boxes as `suppress` keeps.
+
+    Takes boxes (N, K, 4), scores (N, K) and which boxes take part (N, K). Returns indices (N, M) of the kept boxes of
+    each frame, best first, padded with -1.
+
+    Boxes are decided in blocks from the best down. Within a block the greedy rule is a fixed point: a box is kept
+    unless a kept better one overlaps it. The overlaps are a strict triangle, so iterating reaches it. The kept boxes
+    of a block then remove others, and those that are left move up, so that later blocks hold no decided box.
+    """
+    rows = torch.arange(len(boxes), device=boxes.device)[:, None]
+    # Scores as OpenCV's float32; equal scores keep their order.
+    order = torch.where(allowed, scores.float(), -1.0).sort(dim=1, descending=True, stable=True).indices
+    order = order[:, : int(allowed.sum(1).amax())] if allowed.any() else order[:, :0]
+    alive, corners = allowed.gather(1, order), boxes.double()[rows, order]
+    # OpenCV's rectangles hold a corner and a size.
+    corners = torch.cat([corners[..., :2], corners[..., :2] + (corners[..., 2:] - corners[..., :2])], dim=-1)
+    kept = []
+    while alive.shape[1]:
+        block, own = corners[:, :_BLOCK], alive[:, :_BLOCK]
+        beaten = (_overlap(block, block) > threshold_iou).triu(1)
+        chosen = own
+        while True:
+            again = own & ~(beaten & chosen[:, :, None]).any(1)
+            if torch.equal(again, chosen):
+                break
+            chosen = again
+        kept.append(torch.where(chosen, order[:, :_BLOCK], -1))
+        # Kept boxes first, so that overlaps are only computed for these.
+        first = chosen.byte().argsort(dim=1, descending=True, stable=True)[:, : int(chosen.sum(1).amax())]
+        removed = (_overlap(block[rows, first], corners[:, _BLOCK:]) > threshold_iou) & chosen.gather(1, first)[
+            ..., None
+        ]
+        alive = alive[:, _BLOCK:] & ~removed.any(1)
+        left = alive.byte().argsort(dim=1, descending=True, stable=True)[
+            :, : int(alive.sum(1).amax()) if alive.numel() else 0
+        ]
+        order, corners, alive = order[:, _BLOCK:][rows, left], corners[:, _BLOCK:][rows, left], alive.gather(1, left)
+    if not kept:
+        return order
+    merged = torch.cat(kept, dim=1)
+    count = int((merged >= 0).sum(1).amax())
+    return merged.gather(1, (merged >= 0).byte().argsort(dim=1, descending=True, stable=True)[:, :count])
+
+
+def _overlap(first: Tensor, second: Tensor) -> Tensor:
+    """Intersection over union (N, A, B) of boxes (N, A, 4) and (N, B, 4), rounded as OpenCV does; 1 for two points."""
+    a, b = first[:, :, None], second[:, None]
+    size = (torch.minimum(a[..., 2:], b[..., 2:]) - torch.maximum(a[..., :2], b[..., :2])).clamp(min=0)
+    shared = size[..., 0] * size[..., 1]
+    area_a, area_b = ((part[..., 2] - part[..., 0]) * (part[..., 3] - part[..., 1]) for part in (a, b))
+    both = area_a + area_b
+    distance = torch.where(both <= torch.finfo(torch.float64).eps, 0.0, 1.0 - shared / (both - shared))
+    return 1.0 - distance.float()

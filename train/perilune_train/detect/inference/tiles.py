@@ -1,0 +1,183 @@
+"""Detection in images of any size: overlapping tiles, several scales, one list of boxes.
+
+The network was trained on frames of one size, normalised each by its own mean and deviation; so an image is cut into
+tiles of that size, each normalised for itself. Where tiles overlap, a box is taken from the tile whose borders are
+farthest from it: near a border the network guesses what lies beyond, and both tiles' boxes together would hold more
+false ones than the rest of the image does.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_train.data.frames import normalised
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.batches import network_input
+from perilune_train.detect.evaluate.boxes import suppress
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.inference.scales import resized
+from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.models.yolo import YOLOv3
+
+Array = NDArray[np.float64]
+_STEP = 32
+"""The network's coarsest stride, of which the sides of its input are multiples."""
+_AT_ONCE = 5_000
+"""Boxes that are suppressed together; above that, block by block."""
+_TOLERANCE_PX = 2.0
+"""Two tiles place one crater a little differently: so far may each leave it to the other before it is lost."""
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How an image is cut, and how large the boxes are drawn."""
+
+    tile_px: int = 256
+    """Side of a tile: that of the training frames, pixels."""
+    overlap_px: int = 64
+    """Least overlap of two neighbours, pixels: craters up to this size are whole in at least one tile."""
+    scales: tuple[float, ...] = (1.0,)
+    """Factors by which the image is enlarged or shrunk before it is cut. Above 1 for smaller craters than those
+    trained on, below 1 for larger ones; what several scales find is merged."""
+    box_margin_px: float = 0.0
+    """Added to the boxes found at every side. Ours end at the crest of the rim, to fractions of a pixel; the smallest
+    box of whole pixels around a crater is half a pixel larger at every side on average."""
+
+    def check(self) -> None:
+        """Raise UserError on what cannot be cut."""
+        if self.tile_px < _STEP or self.tile_px % _STEP:
+            raise UserError("--tile", "pixels", self.tile_px, f"a multiple of {_STEP}")
+        if not 0 <= self.overlap_px < self.tile_px:
+            raise UserError("--overlap", "pixels", self.overlap_px, f"0 to {self.tile_px - 1}, less than a tile")
+        if not self.scales or not all(0.05 <= scale <= 8 for scale in self.scales):
+            raise UserError("--scale", "factor", list(self.scales), "0.05 to 8")
+        if not 0 <= self.box_margin_px <= 10:
+            raise UserError("--box-margin", "pixels", self.box_margin_px, "0 to 10")
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A trained network and how it is run."""
+
+    network: YOLOv3
+    """The network, in evaluation mode, on the device."""
+    config: DetectConfig
+    """The run's settings."""
+    device: str
+    """cpu or cuda."""
+    bf16: bool
+    """Whether it computes in bfloat16."""
+
+
+def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
+    """Where tiles begin along a side: evenly, the first at 0, the last ending at the side's end."""
+    if length_px <= tile_px:
+        return np.zeros(1, np.intp)
+    count = -(-(length_px - overlap_px) // (tile_px - overlap_px))
+    return np.rint(np.linspace(0, length_px - tile_px, count)).astype(np.intp)
+
+
+def padded(image: NDArray[np.uint8], tile_px: int) -> NDArray[np.uint8]:
+    """The image with reflected pixels at right and bottom where a side is shorter than a tile and no multiple of 32."""
+    more = [max(0, min(tile_px, -(-side // _STEP) * _STEP) - side) for side in image.shape]
+    return np.pad(image, [(0, more[0]), (0, more[1])], mode="reflect") if any(more) else image
+
+
+def count_tiles(height_px: int, width_px: int, tiling: Tiling) -> int:
+    """Number of tiles of an image at all scales."""
+    return sum(
+        len(tile_starts(round(height_px * s), tiling.tile_px, tiling.overlap_px))
+        * len(tile_starts(round(width_px * s), tiling.tile_px, tiling.overlap_px))
+        for s in tiling.scales
+    )
+
+
+def detect_image(
+    detector: Detector, image: NDArray[np.uint8], tiling: Tiling, advance: Callable[[int], object] = lambda n: None
+) -> Detections:
+    """Craters of an image (height, width) of any size, best first; `advance(n)` is called after n more tiles.
+
+    An image of the size of one tile gets what `detect_at_scales` finds at scale 1.
+    """
+    height, width = image.shape
+    boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
+    for scale in tiling.scales:
+        size = max(round(width * scale), 1), max(round(height * scale), 1)
+        scaled = resized(image, *size)
+        whole = padded(scaled, tiling.tile_px)
+        for found in _detect_tiles(detector, whole, tiling, advance):
+            own = np.ones(len(found.scores), bool)
+            if whole.shape != scaled.shape:
+                # Craters of the reflection are none.
+                own = ((found.boxes[:, :2] + found.boxes[:, 2:]) / 2 < size).all(axis=1)
+            boxes.append(found.boxes[own] / np.tile([size[0] / width, size[1] / height], 2))
+            scores.append(found.scores[own])
+    all_boxes, all_scores = np.concatenate(boxes), np.concatenate(scores)
+    kept = suppress_in_blocks(all_boxes, all_scores, detector.config.evaluation.nms_iou)
+    margin = tiling.box_margin_px * np.array([-1, -1, 1, 1])
+    return Detections(all_boxes[kept] + margin, all_scores[kept])
+
+
+def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:
+    """Non-maximum suppression of any number of boxes (N, 4): indices of the kept ones, best first.
+
+    The time of `suppress` grows with the square of the number. Where there are many, each block of an image is dealt
+    with among the boxes centred within a margin of it: half a block, or half the largest box (centres farther apart do
+    not overlap by half). Only long chains of boxes that suppress each other could come out otherwise.
+    """
+    if len(boxes) <= _AT_ONCE:
+        return suppress(boxes, scores, threshold_iou, len(boxes))
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    margin = max(block_px / 2, float((boxes[:, 2:] - boxes[:, :2]).max()) / 2)
+    kept = []
+    for block in np.unique(np.floor(centre / block_px), axis=0):
+        low, high = block * block_px, (block + 1) * block_px
+        near = np.flatnonzero(((centre >= low - margin) & (centre < high + margin)).all(axis=1))
+        chosen = near[suppress(boxes[near], scores[near], threshold_iou, len(near))]
+        kept.append(chosen[((centre[chosen] >= low) & (centre[chosen] < high)).all(axis=1)])
+    every = np.concatenate(kept)
+    return every[np.argsort(-scores[every], kind="stable")]
+
+
+def _detect_tiles(
+    detector: Detector, image: NDArray[np.uint8], tiling: Tiling, advance: Callable[[int], object]
+) -> Iterator[Detections]:
+    """What each tile of an image finds, in pixels of the image, without what another tile sees better."""
+    tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)
+    places = [(int(top), int(left)) for top in tops for left in lefts]
+    tile_h, tile_w = (min(tiling.tile_px, side) for side in image.shape)
+    for first in range(0, len(places), detector.config.batch_size):
+        batch = places[first : first + detector.config.batch_size]
+        tiles = np.stack([image[top : top + tile_h, left : left + tile_w] for top, left in batch])
+        for place, found in zip(batch, detect_batch(detector, tiles), strict=True):
+            boxes = found.boxes + np.tile(place[::-1], 2)
+            clear = [
+                _clearance(boxes[:, [axis, axis + 2]], starts, length, image.shape[1 - axis])
+                for axis, starts, length in ((0, lefts, tile_w), (1, tops, tile_h))
+            ]
+            column, row = int(np.searchsorted(lefts, place[1])), int(np.searchsorted(tops, place[0]))
+            own = np.minimum(clear[0][:, column], clear[1][:, row])
+            best = np.minimum(clear[0].max(axis=1), clear[1].max(axis=1))
+            kept = own >= best - _TOLERANCE_PX
+            yield Detections(boxes[kept], found.scores[kept])
+        advance(len(batch))
+
+
+def _clearance(spans: Array, starts: NDArray[np.intp], tile_px: int, length_px: int) -> Array:
+    """Least distance (D, T) of spans (D, 2) from the borders of tiles along a side; the image's own edges are none."""
+    low = np.where(starts > 0, spans[:, :1] - starts, np.inf)
+    high = np.where(starts + tile_px < length_px, starts + tile_px - spans[:, 1:], np.inf)
+    return np.minimum(low, high)
+
+
+@torch.no_grad()
+def detect_batch(detector: Detector, tiles: NDArray[np.uint8]) -> list[Detections]:
+    """Detections of tiles (N, height, width), one entry a tile."""
+    images = network_input(normalised(tiles), detector.config.in_channels).to(detector.device)
+    with torch.autocast(detector.device, torch.bfloat16, enabled=detector.bf16):
+        boxes, scores = detector.network.detect(images)
+    return detections_of(boxes, scores, detector.config.evaluation)

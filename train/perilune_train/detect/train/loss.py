@@ -1,0 +1,98 @@
+"""Complete IoU with the paper's circular prior, and the detection loss."""
+
+import math
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from perilune_train.detect.config import LossSettings
+from perilune_train.detect.data.assign import Targets, assign
+from perilune_train.models.yolo import decode
+
+_TINY = 1e-7
+
+
+def iou(first: Tensor, second: Tensor) -> Tensor:
+    """Intersection over union (N,) of pairs of boxes (N, 4), x0 y0 x1 y1; 0 where neither has an area."""
+    area = (first[:, 2:] - first[:, :2]).clamp(min=0).prod(1) + (second[:, 2:] - second[:, :2]).clamp(min=0).prod(1)
+    shared = torch.minimum(first[:, 2:], second[:, 2:]) - torch.maximum(first[:, :2], second[:, :2])
+    intersection = shared.clamp(min=0).prod(1)
+    return intersection / (area - intersection + _TINY)
+
+
+def ciou_loss(predicted: Tensor, label: Tensor, aspect: Literal["circular", "standard"] = "circular") -> Tensor:
+    """1 - IoU + rho^2 / c^2 + alpha v of pairs of boxes (N, 4), x0 y0 x1 y1 in pixels: losses (N,) in float32.
+
+    rho is the distance of the centres and c the diagonal of the box around both. v = 4 / pi^2 (arctan(r) -
+    arctan(w / h))^2 with r the label's w / h (`standard`, Zheng et al. 2020, doi 10.1609/aaai.v34i07.6999) or 1
+    (`circular`, the paper's prior). alpha = v / (1 - IoU + v) carries no gradient. Boxes without area are allowed.
+    """
+    predicted, label = predicted.float(), label.float()
+    size = (predicted[:, 2:] - predicted[:, :2]).clamp(min=0)
+    size_label = (label[:, 2:] - label[:, :2]).clamp(min=0)
+    overlap = iou(predicted, label)
+    around = torch.maximum(predicted[:, 2:], label[:, 2:]) - torch.minimum(predicted[:, :2], label[:, :2])
+    shift = (predicted[:, :2] + predicted[:, 2:] - label[:, :2] - label[:, 2:]) / 2
+    distance = shift.square().sum(1) / (around.square().sum(1) + _TINY)
+    angle = torch.atan2(size[:, 0] + _TINY, size[:, 1] + _TINY)
+    if aspect == "circular":
+        angle_label = torch.full_like(angle, math.pi / 4)
+    else:
+        angle_label = torch.atan2(size_label[:, 0] + _TINY, size_label[:, 1] + _TINY)
+    v = 4 / math.pi**2 * (angle_label - angle).square()
+    with torch.no_grad():
+        alpha = v / (1 - overlap + v + _TINY)
+    return 1 - overlap + distance + alpha * v
+
+
+def detection_loss(
+    outputs: list[Tensor],
+    targets: Targets,
+    anchors: Tensor,
+    strides: tuple[int, ...],
+    ratio: float,
+    settings: LossSettings,
+) -> tuple[Tensor, Tensor]:
+    """L_ciou and L_obj of raw outputs (N, 3, h, w, 5) per scale; the loss is their weighted sum.
+
+    Of each scale, L_ciou is the mean over its positive predictors, 0 without any, and L_obj the sum of the binary
+    cross-entropy of the objectness over positive and (times lambda_noobj) negative predictors, over the number of all
+    its predictors; the scales are averaged with weights 1 / stride. Deviation: the paper writes plain sums over all
+    scales. With means its weights 0.05 and 1 let both parts train, and with the weights the coarse scales, whose
+    craters are a hundred times rarer, do.
+
+    A positive predictor's objectness is to become 1 (`hard`, YOLOv3) or the IoU of its box with the label it answers
+    for (`iou`): then the score says how well a box sits, and suppression keeps the best of those on one crater.
+    """
+    shapes = [(raw.shape[0], raw.shape[2], raw.shape[3]) for raw in outputs]
+    box, confidence = outputs[0].new_zeros(()), outputs[0].new_zeros(())
+    total = sum(1 / stride for stride in strides)
+    for raw, prior, stride, found in zip(
+        outputs, anchors, strides, assign(targets, anchors, strides, shapes, ratio), strict=True
+    ):
+        place = (found.frame, found.anchor, found.row, found.column)
+        chosen = raw[place].float()
+        cells = torch.stack([found.column, found.row], 1)
+        boxes, labels = decode(chosen, cells, prior[found.anchor], stride), targets.boxes[found.label]
+        share = 1 / stride / total
+        # The sum over nothing keeps the graph, so that a batch of empty frames can still be differentiated.
+        box = box + share * ciou_loss(boxes, labels, settings.aspect).sum() / max(len(labels), 1)
+        positive = found.positive
+        weight = torch.where(positive, 1.0, settings.lambda_noobj * (~found.free))
+        goal = positive.float()
+        if settings.objectness == "iou":
+            # Where two labels share a predictor, the one that it fits better counts.
+            _, anchors_here, height, width = goal.shape
+            flat = ((found.frame * anchors_here + found.anchor) * height + found.row) * width + found.column
+            goal = (
+                torch.zeros_like(goal)
+                .view(-1)
+                .scatter_reduce(0, flat, iou(boxes.detach(), labels), "amax")
+                .view_as(goal)
+            )
+        logits = raw[..., 4].float()
+        entropy = F.binary_cross_entropy_with_logits(logits, goal, weight, reduction="sum")
+        confidence = confidence + share * entropy / logits.numel()
+    return box, confidence

@@ -1,0 +1,204 @@
+"""Training of the detector as a Lightning module."""
+
+import copy
+import math
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.batches import Batch, EvaluationFrames, Share, TrainingFrames, loader
+from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.evaluate.matching import Detections, match_split
+from perilune_train.detect.evaluate.metrics import at_threshold, curve
+from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.detect.train.distill import Teacher, distill_loss
+from perilune_train.detect.train.loss import detection_loss
+from perilune_train.evaluation.provenance import RECORD
+from perilune_train.models.yolo import YOLOv3
+
+_FINAL_RATE = 0.01
+_EVERY_STEP_UNTIL = 100
+_STEPS_BETWEEN_AVERAGES = 4
+"""Reading and writing all weights takes a twentieth of a small network's step; four at a time change nothing."""
+
+
+def learning_rate_factor(step: int, warmup_steps: int, total_steps: int) -> float:
+    """Linear from nearly 0 to 1 over the warm-up, then half a cosine to a hundredth at the last step."""
+    warmup = min(warmup_steps, total_steps // 2)
+    if step < warmup:
+        return (step + 1) / warmup
+    progress = (step - warmup) / max(total_steps - warmup, 1)
+    return _FINAL_RATE + (1 - _FINAL_RATE) * (1 + math.cos(math.pi * min(progress, 1.0))) / 2
+
+
+Pairs = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]
+
+
+def pairs(average: nn.Module, network: nn.Module) -> Pairs:
+    """Tensors of an average and of its network: floats of both, then counters of both."""
+    old, new = list(average.state_dict().values()), list(network.state_dict().values())
+    floats = [value.is_floating_point() for value in old]
+    return (
+        [value for value, is_float in zip(old, floats, strict=True) if is_float],
+        [value for value, is_float in zip(new, floats, strict=True) if is_float],
+        [value for value, is_float in zip(old, floats, strict=True) if not is_float],
+        [value for value, is_float in zip(new, floats, strict=True) if not is_float],
+    )
+
+
+@torch.no_grad()
+def update_average(tensors: Pairs, decay: float) -> None:
+    """Move an average of weights and batch statistics towards the network by 1 - decay; counters are copied."""
+    old, new, old_counters, new_counters = tensors
+    torch._foreach_lerp_(old, new, 1 - decay)
+    torch._foreach_copy_(old_counters, new_counters)
+
+
+class DetectTask(lightning.LightningModule):
+    """AdamW, warm-up and cosine, a moving average of the weights that is judged instead of them.
+
+    While frozen, the backbone keeps its weights and batch statistics, and only its attention gates learn.
+    """
+
+    def __init__(
+        self,
+        network: YOLOv3,
+        config: DetectConfig,
+        train: DetectSplit,
+        val: DetectSplit,
+        frozen_epochs: int,
+        teacher: Teacher | None = None,
+    ):
+        super().__init__()
+        self.config, self.frozen_epochs, self.teacher = config, frozen_epochs, teacher
+        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.evaluated = copy.deepcopy(self.network).eval().requires_grad_(False)
+        self.architecture = {
+            "in_channels": config.in_channels,
+            "width": config.width,
+            "attention": config.attention,
+            "strides": list(config.strides),
+        }
+        self.splits = {"train": train, "val": val}
+        self.judged: list[Detections] = []
+        self.images_seen = 0
+        self.terrain: dict[str, Any] | None = None
+        self.resumed = (0, 0)
+
+    @property
+    def process(self) -> tuple[int, int]:
+        """This process among all that train together."""
+        return (self._trainer.global_rank, self._trainer.world_size) if self._trainer else (0, 1)
+
+    def train_dataloader(self) -> Any:
+        frames = TrainingFrames(self.splits["train"], self.config.augment, self.config.seed, self.current_epoch)
+        epoch, batches = self.resumed
+        start = batches if epoch == self.current_epoch else 0
+        return loader(frames, self.config, Share(len(frames), self.config.batch_size, *self.process, start))
+
+    def val_dataloader(self) -> Any:
+        return loader(EvaluationFrames(self.splits["val"], *self.process), self.config)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["epoch_and_batches"] = [
+            self.current_epoch,
+            self.trainer.fit_loop.epoch_loop.batch_progress.current.processed,
+        ]
+        checkpoint["images_seen"] = self.images_seen
+        if self.terrain is not None:
+            checkpoint[RECORD] = self.terrain
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        epoch, batches = checkpoint["epoch_and_batches"]
+        self.resumed = (epoch, batches)
+        self.images_seen = checkpoint.get("images_seen", 0)
+
+    def configure_optimizers(self) -> Any:
+        decayed = [p for p in self.network.parameters() if p.ndim > 1]
+        plain = [p for p in self.network.parameters() if p.ndim <= 1]
+        optimizer = torch.optim.AdamW(
+            [{"params": decayed, "weight_decay": self.config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
+            lr=self.config.learning_rate,
+            fused=True,
+        )
+        # Lightning's own count would ask for the batches of an epoch before it knows where a resumed run stands.
+        total = self.config.epochs * len(Share(len(self.splits["train"]), self.config.batch_size, *self.process))
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda step: learning_rate_factor(step, self.config.warmup_steps, total)
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_train_epoch_start(self) -> None:
+        frozen = self.current_epoch < self.frozen_epochs
+        self.evaluated.eval()
+        backbone = self.network.backbone
+        for part in (backbone.stem, backbone.downs, backbone.units):
+            part.requires_grad_(not frozen)
+            part.train(not frozen)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        images, targets = batch
+        self.images_seen += len(images) * self.process[1]
+        outputs = self.network(images)
+        settings = self.config.loss
+        box, confidence = detection_loss(
+            outputs, targets, self.network.anchors, self.network.strides, self.config.anchor_ratio, settings
+        )
+        self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(images))
+        loss = settings.lambda_iou * box + settings.lambda_obj * confidence
+        if self.teacher is not None:
+            told = self.teacher(images)
+            box, confidence = distill_loss(outputs, told, self.network.anchors, self.network.strides)
+            self.log_dict({"train/teacher_ciou": box, "train/teacher_objectness": confidence}, batch_size=len(images))
+            loss = loss + settings.lambda_teacher * (settings.lambda_iou * box + settings.lambda_obj * confidence)
+        return loss
+
+    def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
+        # Lightning's own refuses fused optimisers, for fear of float16's scaled gradients, which are not in use here.
+        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
+        norm = nn.utils.get_total_norm(gradients, foreach=True)
+        # On a CPU the look is free, and most steps need no second pass over all gradients.
+        if norm.is_cuda or norm > self.config.gradient_clip:
+            nn.utils.clip_grads_with_norm_(self.network.parameters(), self.config.gradient_clip, norm, foreach=True)
+
+    def on_train_start(self) -> None:
+        self.tensors = pairs(self.evaluated, self.network)
+
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        super().optimizer_step(*args, **kwargs)
+        # Here, not after the batch: a checkpoint in between would lack it. Early on the average forgets faster, or
+        # it would carry the random start through a short training.
+        steps = self.global_step + 1
+        every = 1 if steps <= _EVERY_STEP_UNTIL else _STEPS_BETWEEN_AVERAGES
+        if steps % every == 0:
+            update_average(self.tensors, min(self.config.ema_decay, (1 + steps) / (10 + steps)) ** every)
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        return batch[0].to(device), batch[1].to(device)
+
+    def on_validation_epoch_start(self) -> None:
+        self.judged = []
+        if self.process[1] > 1:
+            # Weights are equal in all processes; batch statistics are each one's own, and the first one's count.
+            for value in self.evaluated.buffers():
+                torch.distributed.broadcast(value, 0)
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        boxes, scores = self.evaluated.detect(batch[0])
+        self.judged += detections_of(boxes, scores, self.config.evaluation)
+
+    def on_validation_epoch_end(self) -> None:
+        split, judged = self.splits["val"], self.judged
+        processes = self.process[1]
+        if processes > 1:
+            parts: list[Any] = [None] * processes
+            torch.distributed.all_gather_object(parts, judged)
+            judged = [parts[i % processes][i // processes] for i in range(len(split))]
+        height, width = split.frames.images.shape[1:]
+        matches = match_split(judged, split.labels, (width, height), self.config.evaluation.match_iou, split.radius_px)
+        points = curve(matches)
+        _, recall, f1 = at_threshold(matches, points.best_threshold())
+        self.log_dict({"val/ap50_paper": points.ap_paper(), "val/f1": f1, "val/recall": recall})

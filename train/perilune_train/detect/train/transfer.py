@@ -1,0 +1,141 @@
+"""What a detector takes from an earlier run or from Darknet's weight files, and gives back as one of these."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from perilune_shared.errors import UserError
+from perilune_train.detect.config import DetectConfig
+from perilune_train.evaluation.provenance import Provenance, read_provenance
+from perilune_train.models.darknet import AttentionDarknet53
+from perilune_train.models.darknet_weights import (
+    COCO_FILTERS,
+    DarknetFile,
+    backbone_slots,
+    content_of,
+    count_floats,
+    fill,
+    is_darknet,
+    network_slots,
+    read_darknet,
+)
+from perilune_train.models.yolo import YOLOv3
+from perilune_train.training import runs
+
+_GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
+"""Of photographs on Darknet's scale of 0 to 1, about. A power of two scales without rounding."""
+_GATES = "backbone.attentions."
+DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}
+
+
+@torch.no_grad()
+def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"]) -> None:
+    """Change the stem of a backbone so that it sees the same in another scale of its input.
+
+    Darknet's files were trained on grey values from 0 to 1 (`grey`), our networks see frames with their mean taken
+    off and their deviation divided out (`normalised`). Without this a frozen backbone would get an input some four
+    times stronger than its batch statistics are made for. grey = 0.25 normalised + 0.45, folded into the stem's
+    weights and its batch norm's mean: exact but for rounding and for the border, where zero padding then means grey.
+    """
+    stem: Any = backbone.stem
+    weight, mean = stem.conv.weight, stem.norm.running_mean
+    shift = _GREY_MEAN * weight.double().sum((1, 2, 3))
+    if to == "normalised":
+        weight *= _GREY_DEVIATION
+        mean.copy_(mean.double() - shift)
+    else:
+        weight /= _GREY_DEVIATION
+        mean.copy_(mean.double() + shift / _GREY_DEVIATION)
+
+
+def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
+    """Give the network what an earlier detect run, or a Darknet file, has for it.
+
+    A run of the same strides gives everything, its anchors too; one of other strides gives the backbone. Where their
+    attention differs the gates stay as they are. Raises UserError where width or in_channels are not the same, and
+    where the backbone is to be frozen behind new plain gates.
+    """
+    if is_darknet(path):
+        check_gates(path, config)
+        start_from_darknet(network, path, config)
+        return
+    content = runs.load_weights(path)
+    architecture = content["architecture"]
+    runs.check_architecture(path, architecture, {"in_channels": config.in_channels, "width": config.width})
+    whole = architecture.get("strides") == list(config.strides)
+    gates = architecture.get("attention") == config.attention
+    if not gates:
+        check_gates(path, config)
+
+    def taken(key: str) -> bool:
+        return (whole or key.startswith("backbone.")) and (gates or not key.startswith(_GATES))
+
+    kept = {key: value for key, value in network.state_dict().items() if not taken(key)}
+    runs.fill(network, kept | {key: value for key, value in content["state_dict"].items() if taken(key)}, path)
+
+
+def check_gates(path: Path, config: DetectConfig) -> None:
+    """Raises UserError where a frozen backbone would sit behind plain gates that start at random.
+
+    Each such gate scales its input by about 0.25, so that the frozen layers get features that they were not trained on:
+    the cosine to those of the plain backbone falls to about 0.5 (`make bench-transfer`).
+    """
+    if config.frozen_epochs and config.attention == "cbam":
+        wanted = (
+            "cbam_identity, whose gates start at 1 and keep the features of the frozen backbone, or frozen_epochs=0"
+        )
+        raise UserError(path, "detect.attention", "cbam with frozen_epochs and no gates in this file", wanted)
+
+
+def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenance]:
+    """Terrain records of the networks that a run starts or learns from.
+
+    A resumed run has them in its last state, `last`. Darknet's files were trained on photographs of the Earth. Raises
+    UserError where a checkpoint is missing or damaged.
+    """
+    if last is not None:
+        content = runs.read_saved(last, "last state", {"state_dict"}, "the state of an interrupted run")
+        return [read_provenance(content, last)]
+    given = [Path(path) for path in (config.init_from, config.teacher) if path is not None]
+    return [read_provenance(runs.load_weights(path), path) for path in given if not is_darknet(path)]
+
+
+def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> None:
+    """Fill a network with all that a Darknet file holds for it; the rest stays as it is.
+
+    A darknet53.conv.74 fills the backbone. A yolov3.weights fills the neck and the heads' 3 x 3 convolutions too if
+    the strides are 8, 16, 32, else the backbone alone. Its output layers are left out: they tell COCO's 80 classes
+    by COCO's anchors, and would undo the prior that a cell is empty. Those of a file of our own (15 filters) count.
+
+    Raises UserError where width is not 1 or in_channels not 3, and on a file of another size; then nothing changed.
+    """
+    for key, value in DARKNET_SHAPE.items():
+        if getattr(config, key) != value:
+            raise UserError(path, f"detect.{key}", getattr(config, key), f"{value:g}, as Darknet's files have it")
+    backbone = backbone_slots(network.backbone)
+    with torch.device("meta"):
+        whole = YOLOv3()
+    n_backbone, n_ours, n_coco = (
+        count_floats(slots) for slots in (backbone, network_slots(whole), network_slots(whole, COCO_FILTERS))
+    )
+    content = read_darknet(path, (n_backbone, n_ours, n_coco))
+    n = len(content.values)
+    if n == n_backbone or network.strides != whole.strides:
+        fill(backbone, content, path)
+    else:
+        fill(network_slots(network, COCO_FILTERS) if n == n_coco else network_slots(network), content, path)
+    rescale_input(network.backbone, "normalised")
+
+
+def darknet_content(network: YOLOv3, architecture: dict[str, Any], checkpoint: Path, whole: bool) -> DarknetFile:
+    """The Darknet file of a trained network, which is changed: its backbone, or the whole with 15 output filters.
+
+    Attention gates have no place in these files. Raises UserError where the network has not the file's shape.
+    """
+    wanted: dict[str, Any] = dict(DARKNET_SHAPE)
+    if whole:
+        wanted |= {"strides": [8, 16, 32], "attention": "none"}
+    runs.check_architecture(checkpoint, architecture, wanted)
+    rescale_input(network.backbone, "grey")
+    return content_of(network_slots(network) if whole else backbone_slots(network.backbone))

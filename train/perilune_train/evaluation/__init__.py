@@ -1,0 +1,1 @@
+"""What evaluations of all networks share: terrain records, marks, intervals."""

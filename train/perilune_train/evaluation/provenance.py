@@ -1,0 +1,214 @@
+"""Which terrain a network was fitted to, and whether a test split shares it.
+
+Every checkpoint carries a record of the ground that the network was trained, selected or calibrated on, by content hash
+(`perilune_shared.content`), with that of the networks it starts or learns from. A test figure on such ground measures
+memory, not generalisation, so the trainer refuses it unless the dataset's own protocol shares terrain or the user
+allows it. With the user's permission all output is marked.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from perilune_shared.content import terrain_of
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console
+
+RECORD = "terrain"
+"""Key of the record in a checkpoint."""
+Use = Literal["trained", "selected", "calibrated", "tested"]
+Status = Literal["disjoint", "by protocol", "overlap", "unknown"]
+_USE_OF_SPLIT: dict[str, Use] = {"train": "trained", "val": "selected", "test": "tested"}
+_MOST_USES = 1_000_000
+_MOST_NAMED = 4
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}")
+_PROTOCOLS = {
+    "scene": "held-out scenes",
+    "trajectory": "held-out descents, shared terrain",
+    "frame": "paper (random frames, shared terrain)",
+}
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class TerrainUse:
+    """One scene's ground and what it was used for."""
+
+    dataset: str
+    """Name of the dataset."""
+    scene_id: str
+    """The scene in it."""
+    use: str
+    """trained, selected (validation: best epoch, threshold), calibrated (threshold, int8), or tested."""
+    sha256: str
+    """Of the ground, see `terrain_of`."""
+    group: str
+    """What datasets that share terrain by their protocol have in common; otherwise the dataset's name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """All ground that a network was fitted to."""
+
+    uses: frozenset[TerrainUse] = frozenset()
+    """Also the test scenes of its own dataset (`tested`), which later calibration must avoid."""
+    known: bool = True
+    """False where a network that it starts or learns from has no record."""
+
+    def joined(self, parents: Iterable["Provenance"]) -> "Provenance":
+        """With the record of the networks that it starts or learns from, without what those were tested on."""
+        parents = list(parents)
+        inherited = {use for parent in parents for use in parent.uses if use.use != "tested"}
+        return Provenance(self.uses | inherited, self.known and all(parent.known for parent in parents))
+
+    def plain(self) -> dict[str, Any]:
+        """As lists and text, for a checkpoint or a JSON file."""
+        rows = [[use.dataset, use.scene_id, use.use, use.sha256, use.group] for use in sorted(self.uses)]
+        return {"known": self.known, "uses": rows}
+
+
+UNKNOWN = Provenance(known=False)
+
+
+def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
+    """The record in a checkpoint's content; `UNKNOWN` where it has none. Raises UserError on a malformed one."""
+    if RECORD not in content:
+        return UNKNOWN
+    record, wanted = content[RECORD], "a record of scenes, as training writes it"
+    if not isinstance(record, dict) or set(record) != {"known", "uses"} or not isinstance(record["known"], bool):
+        raise UserError(path, RECORD, type(record).__name__, wanted)
+    rows = record["uses"]
+    if not isinstance(rows, list) or len(rows) > _MOST_USES:
+        raise UserError(path, f"{RECORD}.uses", type(rows).__name__, wanted)
+    for number, row in enumerate(rows):
+        sound = isinstance(row, list) and len(row) == 5 and all(isinstance(cell, str) for cell in row)
+        if not sound or row[2] not in get_args(Use) or not _SHA256.fullmatch(row[3]):
+            raise UserError(path, f"{RECORD}.uses.{number}", "another form", wanted)
+        if not all(_PLAIN.fullmatch(row[k]) for k in (0, 1, 4)):
+            raise UserError(path, f"{RECORD}.uses.{number}", "odd characters", "plain names of dataset and scene")
+    return Provenance(frozenset(TerrainUse(*row) for row in rows), record["known"])
+
+
+def split_terrain(dataset: Dataset, split: str, use: Use) -> frozenset[TerrainUse]:
+    """The ground under the frames of a split; empty where it has none. Raises UserError on an odd scene_id."""
+    scene_ids = set(dataset.table("frames", ["scene_id"], split=split)["scene_id"].to_pylist())
+    rows = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pylist()
+    for row in rows:
+        if not _PLAIN.fullmatch(row["scene_id"]):
+            raise UserError(dataset.root, "scene_id", repr(row["scene_id"]), "letters, digits and plain marks")
+    name, group = dataset.info.name, _group(dataset.info)
+    return frozenset(
+        TerrainUse(name, row["scene_id"], use, terrain_of(row["dem_source"], row["content_sha256"]), group)
+        for row in rows
+        if row["scene_id"] in scene_ids
+    )
+
+
+def training_provenance(dataset: Dataset) -> Provenance:
+    """The record of a network that is trained, selected and tested on a dataset's splits."""
+    return Provenance(frozenset().union(*(split_terrain(dataset, *part) for part in _USE_OF_SPLIT.items())))
+
+
+def _group(info: DatasetInfo) -> str:
+    """The two datasets of a configuration with `shared_terrain` are one landing area by protocol, as the paper's."""
+    names = {
+        str(recipe.config.get("name")) if recipe.config.get("shared_terrain") is True else ""
+        for recipe in info.recipes.values()
+    }
+    (name,) = names if len(names) == 1 else ("",)
+    # Recipes are untrusted input: a name that a record cannot hold is no name.
+    return f"landing area of {name}" if name and _PLAIN.fullmatch(f"landing area of {name}") else info.name
+
+
+def protocol_of(info: DatasetInfo) -> str:
+    """Name of a dataset's protocol: what its test split holds out and what its splits share."""
+    return _PROTOCOLS[info.split_by] + info.leak
+
+
+@dataclass(frozen=True, slots=True)
+class TerrainCheck:
+    """Result of comparing the ground of a test split with a network's record."""
+
+    status: Status
+    """disjoint; by protocol: shared with other splits of the dataset by its protocol; overlap: any other shared ground,
+    allowed by the user; unknown: the record is missing or incomplete."""
+    scenes: tuple[str, ...] = field(default=())
+    """Overlapping scenes, each with the scene and use in the record; only the first few are named."""
+
+    @property
+    def mark(self) -> str:
+        """Text that all output must carry; empty for disjoint ground and for ground shared by protocol."""
+        if self.status == "overlap":
+            return f"TERRAIN OVERLAP, no test of unseen terrain: {', '.join(self.scenes)}"
+        return "TRAINING TERRAIN UNKNOWN: the checkpoint has no record of it" if self.status == "unknown" else ""
+
+    def metrics(self) -> dict[str, float | int | str | None]:
+        """For metrics.json."""
+        return {"terrain/status": self.status, "terrain/mark": self.mark}
+
+
+def check_terrain(
+    provenance: Provenance, dataset: Dataset, split: str = "test", allow_overlap: bool = False
+) -> TerrainCheck:
+    """Compare a record with the ground of a split.
+
+    Ground that splits of the same dataset share is by design where its protocol splits by frame or trajectory. Raises
+    UserError naming the scenes of any other overlap with a test split, unless `allow_overlap`.
+    """
+    fitted = frozenset(use for use in provenance.uses if use.use != "tested")
+    # Evaluating training or validation frames is no overlap: the report names the split.
+    by_design = dataset.info.split_by != "scene" or split != "test"
+    tested = split_terrain(dataset, split, "tested")
+    return _compared(fitted, tested, dataset, by_design, provenance.known, allow_overlap or split != "test")
+
+
+def check_calibration(
+    provenance: Provenance, calibrated: frozenset[TerrainUse], dataset: Dataset, allow_overlap: bool = False
+) -> TerrainCheck:
+    """Compare the ground of a calibration on `dataset` with the test ground of the dataset and of the run itself.
+
+    Raises UserError naming the scenes where they overlap, as `check_terrain` does, unless `allow_overlap`.
+    """
+    tested = frozenset(use for use in provenance.uses if use.use == "tested") | split_terrain(dataset, "test", "tested")
+    by_design = dataset.info.split_by != "scene"
+    return _compared(calibrated, tested, dataset, by_design, provenance.known, allow_overlap)
+
+
+def _compared(
+    fitted: frozenset[TerrainUse],
+    tested: frozenset[TerrainUse],
+    dataset: Dataset,
+    by_design: bool,
+    known: bool,
+    allow_overlap: bool,
+) -> TerrainCheck:
+    """The check of two sets of ground; `by_design`: scenes of one protocol may be in both."""
+    used: dict[str, list[TerrainUse]] = {}
+    for use in sorted(fitted):
+        used.setdefault(use.sha256, []).append(use)
+    overlapping, by_protocol = [], False
+    for scene in sorted(tested):
+        for use in used.get(scene.sha256, ()):
+            if by_design and use.group == scene.group:
+                by_protocol = True
+            else:
+                overlapping.append(f"{scene.dataset}/{scene.scene_id} = {use.dataset}/{use.scene_id} ({use.use})")
+    if overlapping:
+        more = len(overlapping) - _MOST_NAMED
+        named = (*overlapping[:_MOST_NAMED], *([f"{more} more"] if more > 0 else []))
+        if not allow_overlap:
+            wanted = "test terrain that nothing was fitted to; --allow-overlap allows it and marks all figures"
+            raise UserError(dataset.root, "test terrain", ", ".join(named), wanted)
+        return _reported(TerrainCheck("overlap", named))
+    if not known:
+        return _reported(TerrainCheck("unknown"))
+    return TerrainCheck("by protocol" if by_protocol else "disjoint")
+
+
+def _reported(check: TerrainCheck) -> TerrainCheck:
+    console.print(check.mark, markup=False, soft_wrap=True)
+    return check

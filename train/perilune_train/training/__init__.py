@@ -1,0 +1,1 @@
+"""Runs: folders, fitting with Lightning, resume."""

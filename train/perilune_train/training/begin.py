@@ -1,0 +1,159 @@
+"""Resume, keep, replace or refuse a run of the same name that exists already."""
+
+import functools
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from perilune_shared.config import Section, read_config_file, to_yaml
+from perilune_shared.errors import UserError
+from perilune_shared.progress import console
+from perilune_shared.storage.checksums import SUMS_NAME
+from perilune_shared.storage.files import sha256_of, write_text
+from perilune_train.training.runs import RunFolder, is_first_process
+
+State = Literal["new", "resume", "finished"]
+Hashes = Mapping[str, str | None]
+"""SHA-256 of each input of a run; None where it is missing."""
+
+_NO_RESULT = {"detect.workers", "detect.checkpoint_minutes"}
+"""Settings that change how a run proceeds, but not its result."""
+_REPLACE = "; --overwrite replaces the run"
+_AGREEMENT = "perilune/run"
+
+
+def hashes_of(inputs: Mapping[str, Path | None]) -> dict[str, str | None]:
+    """Hash of each input: of a dataset (a folder) that of its SHA256SUMS, of a file its own."""
+    files = {name: path / SUMS_NAME if path is not None and path.is_dir() else path for name, path in inputs.items()}
+    return {name: sha256_of(file) if file is not None and file.is_file() else None for name, file in files.items()}
+
+
+def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrite: bool = False) -> State:
+    """What to do with a run's folder, the same in all processes.
+
+    new: start from the beginning, since no state is there or `overwrite` is given. resume: continue from last.ckpt.
+    finished: leave it as it is; a message says so.
+
+    Raises UserError where the run began with other settings or other inputs, where the folder holds no run of this
+    task, and where the first process resumes but this one has no last.ckpt (several machines, no shared folder).
+    """
+    if is_first_process():
+        state = _decide(run, task, config, inputs, overwrite)
+        if torch.distributed.is_torchelastic_launched():
+            _store().set(_AGREEMENT, state)
+    elif torch.distributed.is_torchelastic_launched():
+        state = _store().get(_AGREEMENT).decode()
+    else:
+        # Lightning starts these processes on the first one's machine, after that has prepared the folder.
+        state = "resume" if run.last.is_file() else "new"
+    if state == "resume" and not run.last.is_file():
+        wanted = "that of the first process: share the runs folder between the machines, or copy it"
+        raise UserError(run.last, "last state", "no such file", wanted)
+    if state == "finished":
+        console.print(f"{run.root}: finished, left as it is; --overwrite replaces it", soft_wrap=True)
+    elif state == "resume":
+        console.print(f"{run.root}: resume", soft_wrap=True)
+    return state
+
+
+def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state: State) -> None:
+    """Prepare the folder of a run: with `new` remove an older run and write config.yaml and inputs.json.
+
+    Of several processes only the first touches the folder. Raises UserError on a folder that is no run of this task.
+    """
+    if not is_first_process() or state != "new":
+        return
+    if _is_used(run):
+        _check_own(run, task)
+        shutil.rmtree(run.root)
+    write_text(run.inputs, json.dumps(dict(inputs), indent=2) + "\n")
+    write_text(run.config, to_yaml(task, config))
+
+
+@functools.cache
+def _store() -> Any:
+    """The key-value store of torchrun, to which every process connects; it works before training connects them."""
+    return next(torch.distributed.rendezvous("env://"))[0]
+
+
+def _decide(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrite: bool) -> State:
+    if not _is_used(run):
+        return "new"
+    _check_own(run, task)
+    # A run that was stopped before it kept a state holds nothing to lose, whatever its settings were.
+    if overwrite or not (run.finished or run.last.is_file()):
+        return "new"
+    check_settings(run, task, config)
+    _check_inputs(run, inputs, missing_is_fine=run.finished)
+    return "finished" if run.finished else "resume"
+
+
+def _is_used(run: RunFolder) -> bool:
+    # A killed start may leave a temporary file, whose name begins with a dot.
+    return run.root.is_dir() and any(not path.name.startswith(".") for path in run.root.iterdir())
+
+
+def _check_own(run: RunFolder, task: str) -> None:
+    """Raise UserError unless the folder is a run of this task: its config.yaml has this section and no other."""
+    wanted = f"another name: only a {task} run is resumed or replaced"
+    if not run.config.is_file():
+        # inputs.json alone is a run that was killed before it wrote its configuration.
+        if [path.name for path in run.root.iterdir() if not path.name.startswith(".")] == [run.inputs.name]:
+            return
+        raise UserError(run.root, "--name", "a folder that is no run (no config.yaml)", wanted)
+    sections = list(read_config_file(run.config))
+    if sections != [task]:
+        raise UserError(run.config, "--name", f"the sections {', '.join(sections) or 'none'}", wanted)
+
+
+def check_settings(run: RunFolder, task: str, config: Section) -> None:
+    """Raise UserError naming the first setting in which an older run, if there is one, differs from `config`.
+
+    A setting that config.yaml lacks, since it is newer than the run, has its default.
+    """
+    if not run.config.is_file():
+        return
+    for key, old, new in _differences(task, read_config_file(run.config).get(task, {}), config):
+        if key not in _NO_RESULT:
+            raise UserError(run.config, key, new, f"{old}, with which the run began{_REPLACE}")
+
+
+def _check_inputs(run: RunFolder, inputs: Hashes, missing_is_fine: bool) -> None:
+    """Raise UserError naming the first input that is not the one the run began with.
+
+    With `missing_is_fine` an input that is missing now, or was missing then, is not compared.
+    """
+    if not run.inputs.is_file():
+        return
+    try:
+        began = json.loads(run.inputs.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        began = None
+    if not isinstance(began, dict):
+        raise UserError(run.inputs, "content", "no JSON object of hashes", f"the file as written{_REPLACE}")
+    for name, hash_now in inputs.items():
+        hash_then = began.get(name, hash_now)
+        if hash_now == hash_then or (missing_is_fine and None in (hash_now, hash_then)):
+            continue
+        got = "nothing" if hash_now is None else f"SHA-256 {hash_now[:12]}"
+        then = "nothing" if hash_then is None else str(hash_then)[:12]
+        raise UserError(run.inputs, name, got, f"{then}, with which the run began{_REPLACE}")
+
+
+def _differences(where: str, old: Mapping[str, Any], config: Section) -> Iterator[tuple[str, object, object]]:
+    """Key, old and new value of what differs between plain settings and a section."""
+    plain = config.model_dump(mode="json")
+    for name, field in type(config).model_fields.items():
+        key, value = f"{where}.{name}", getattr(config, name)
+        if isinstance(value, Section) and isinstance(old.get(name), dict):
+            yield from _differences(key, old[name], value)
+        elif name in old and old[name] != plain[name]:
+            yield key, old[name], plain[name]
+        elif name not in old and value != field.get_default(call_default_factory=True):
+            yield key, "nothing", plain[name]
+    for name in sorted(old.keys() - plain.keys()):
+        yield f"{where}.{name}", old[name], "no such setting"

@@ -1,0 +1,221 @@
+"""The training loop that all tasks share, by Lightning: best weights, last state, progress bar, several processes."""
+
+import logging
+import math
+import os
+import time
+import warnings
+from typing import Any, Literal
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from perilune_shared.errors import UserError
+from perilune_shared.progress import progress_bar
+from perilune_train.config import Precision
+from perilune_train.training.runs import (
+    RunFolder,
+    check_tensors,
+    choose_bf16,
+    choose_device,
+    is_first_process,
+    read_saved,
+    save_weights,
+)
+
+_STEPS_BETWEEN_LOOKS = 20
+_PROCESSES = "processes"
+"""Key of the number of processes in last.ckpt: position in the epoch and schedule are in steps of all of them."""
+_STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
+
+
+class KeepBest(Callback):
+    """Saves the weights whenever the validation figure `monitor` improves (NaN never does).
+
+    The task has `architecture` (plain settings) and `evaluated` (the network whose weights are judged), and may have
+    `terrain` (the plain record of the ground that it is fitted to).
+    """
+
+    def __init__(self, run: RunFolder, monitor: str, mode: Literal["min", "max"]):
+        self.run, self.monitor = run, monitor
+        self.sign = 1.0 if mode == "max" else -1.0
+        self.best = -math.inf
+
+    def state_dict(self) -> dict[str, float]:
+        return {"best": self.best}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        self.best = state_dict["best"]
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: Any) -> None:
+        value = self.sign * float(trainer.callback_metrics[self.monitor])
+        if value > self.best or not self.run.best.is_file():
+            self.best = value if math.isfinite(value) else self.best
+            if is_first_process():
+                save_weights(
+                    self.run.best, pl_module.architecture, pl_module.evaluated, getattr(pl_module, "terrain", None)
+                )
+
+
+class KeepLast(Callback):
+    """Saves the whole state after every epoch and, with `minutes`, within an epoch at this interval.
+
+    A run that begins again within an epoch has its `on_train_epoch_start` called, which Lightning leaves out.
+    """
+
+    def __init__(self, run: RunFolder, minutes: float | None):
+        self.run, self.minutes = run, minutes
+        self.earlier_s, self.began = 0.0, time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """What the training took until now, with the earlier sittings up to the state from which it was resumed."""
+        return self.earlier_s + time.monotonic() - self.began
+
+    def state_dict(self) -> dict[str, float]:
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        self.earlier_s = state_dict["seconds"]
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self.saved = time.monotonic()
+        if trainer.fit_loop.restarted_mid_epoch:
+            pl_module.on_train_epoch_start()
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
+        # At the last batch the validation is still to come, and the epoch's own checkpoint after it.
+        if self.minutes is None or trainer.is_last_batch:
+            return
+        # Several processes agree on the time by asking the first, which costs a wait.
+        if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_LOOKS == 0:
+            due = time.monotonic() - self.saved >= 60 * self.minutes
+            if trainer.strategy.broadcast(due):
+                self.save(trainer)
+
+    def on_train_epoch_end(self, trainer, pl_module) -> None:
+        self.save(trainer)
+
+    def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
+        checkpoint[_PROCESSES] = trainer.world_size
+
+    def save(self, trainer: lightning.Trainer) -> None:
+        """Write last.ckpt; an older one stays whole until the new one is."""
+        trainer.save_checkpoint(self.run.last)
+        self.saved = time.monotonic()
+
+
+class Bar(Callback):
+    """The workspace's own progress bar: steps done and to do, rate, time left, loss."""
+
+    def __init__(self, label: str):
+        self.label = label
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        self.progress = progress_bar()
+        total = int(trainer.estimated_stepping_batches)
+        self.task = self.progress.add_task(
+            self.label, total=total, completed=trainer.global_step, unit="steps", note=""
+        )
+        self.progress.start()
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
+        self.progress.advance(self.task)
+        # A look at the loss makes a GPU wait.
+        if batch_idx % _STEPS_BETWEEN_LOOKS == 0:
+            note = f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, loss {float(outputs['loss']):.3f}"
+            self.progress.update(self.task, note=note)
+
+    def on_train_end(self, trainer, pl_module) -> None:
+        self.progress.stop()
+
+    def on_exception(self, trainer, pl_module, exception) -> None:
+        if hasattr(self, "progress"):
+            self.progress.stop()
+
+
+def machines(devices: int, num_nodes: int) -> tuple[int, int]:
+    """Processes on each machine and machines: what torchrun says in the environment, or else what is asked for."""
+    if torch.distributed.is_torchelastic_launched():
+        local = int(os.environ["LOCAL_WORLD_SIZE"])
+        return local, int(os.environ["WORLD_SIZE"]) // local
+    return devices, num_nodes
+
+
+def fit(
+    run: RunFolder,
+    task: lightning.LightningModule,
+    *,
+    label: str,
+    epochs: int,
+    monitor: str,
+    mode: Literal["min", "max"],
+    resume: bool = False,
+    gradient_clip: float = 10.0,
+    precision: Precision = "auto",
+    device: str = "auto",
+    devices: int = 1,
+    num_nodes: int = 1,
+    strategy: str = "auto",
+    checkpoint_minutes: float | None = None,
+) -> float:
+    """Train `task` for a fixed number of epochs, keeping the best weights and the last state in the run's folder.
+
+    Returns the seconds that it took; of a resumed run those of all its sittings.
+
+    The task gives its own loaders, asked for anew before every epoch (so that order and augmentation can follow
+    from seed and epoch alone; with several processes each gives its share), logs `monitor` in validation, and has
+    `architecture` and `evaluated` (see KeepBest). With `resume` training goes on from last.ckpt, if the run has one,
+    and repeats exactly what an uninterrupted run does. That is kept after every epoch, and with `checkpoint_minutes`
+    within epochs too; then the task's training batches must go on where the checkpoint was made. Raises UserError
+    where last.ckpt is damaged, of another network or of another number of processes.
+    """
+    devices, num_nodes = machines(devices, num_nodes)
+    resume_from = run.last if resume and run.last.is_file() else None
+    if resume_from is not None:
+        wanted = "the state of an interrupted run; --overwrite replaces it"
+        state = read_saved(resume_from, "last state", _STATE, wanted)
+        check_tensors(resume_from, state["state_dict"], task)
+        began = state.get(_PROCESSES, 1)
+        if began != devices * num_nodes:
+            wanted = f"{began}, with which the run began; --overwrite replaces the run"
+            raise UserError(resume_from, "processes", devices * num_nodes, wanted)
+    keep_last = KeepLast(run, checkpoint_minutes)
+    device = choose_device(device)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        trainer = lightning.Trainer(
+            default_root_dir=run.root,
+            max_epochs=epochs,
+            accelerator="gpu" if device == "cuda" else "cpu",
+            devices=devices,
+            num_nodes=num_nodes,
+            strategy=strategy if devices * num_nodes > 1 else "auto",
+            use_distributed_sampler=False,
+            precision="bf16-mixed" if choose_bf16(precision, device) else "32-true",
+            deterministic="warn",
+            gradient_clip_val=gradient_clip,
+            reload_dataloaders_every_n_epochs=1,
+            num_sanity_val_steps=0,
+            logger=TensorBoardLogger(run.root, name="", version=""),
+            log_every_n_steps=10,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            enable_checkpointing=False,
+            callbacks=[
+                *([Bar(label)] if is_first_process() else []),
+                LearningRateMonitor("step"),
+                KeepBest(run, monitor, mode),
+                keep_last,
+            ],
+        )
+        try:
+            trainer.fit(task, ckpt_path=resume_from, weights_only=True)
+        except SystemExit:
+            # Lightning answers Ctrl-C with a bare exit; the command line has words for it.
+            raise KeyboardInterrupt from None
+    return keep_last.seconds

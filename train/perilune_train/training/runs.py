@@ -1,0 +1,152 @@
+"""A run's folder, its weights and figures; where and how precisely to compute."""
+
+import io
+import json
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch.utilities import rank_zero_only
+from torch import nn
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import write_bytes, write_text
+from perilune_train.config import Precision
+from perilune_train.evaluation.provenance import RECORD
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """`<runs>/<task>/<name>/`: everything that one run leaves behind."""
+
+    root: Path
+    """The folder."""
+
+    @property
+    def config(self) -> Path:
+        """The resolved configuration."""
+        return self.root / "config.yaml"
+
+    @property
+    def inputs(self) -> Path:
+        """Hashes of the dataset and of the checkpoints that the run reads."""
+        return self.root / "inputs.json"
+
+    @property
+    def metrics(self) -> Path:
+        """The figures, written last: a run that has them is finished."""
+        return self.root / "metrics.json"
+
+    @property
+    def best(self) -> Path:
+        """Weights with the best validation figure, as `save_weights` writes them."""
+        return self.root / "checkpoints" / "best.ckpt"
+
+    @property
+    def last(self) -> Path:
+        """The whole state when it was last kept, from which a run is resumed."""
+        return self.root / "checkpoints" / "last.ckpt"
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run came to its end."""
+        return self.metrics.is_file()
+
+
+def is_first_process() -> bool:
+    """Whether this process writes files and says things: the only one, or of several that train together the first.
+
+    It is known from the start: Lightning reads it from what torchrun, or it itself, gives the processes they start.
+    """
+    return int(rank_zero_only.rank) == 0
+
+
+def write_metrics(run: RunFolder, metrics: Mapping[str, float | int | str | None]) -> None:
+    """Write metrics.json: flat keys; what is not finite becomes null."""
+    plain = {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in metrics.items()
+    }
+    write_text(run.metrics, json.dumps(plain, indent=2, allow_nan=False) + "\n")
+
+
+def save_weights(
+    path: Path, architecture: Mapping[str, Any], network: nn.Module, terrain: Mapping[str, Any] | None = None
+) -> None:
+    """Write a network's weights beside the plain settings (`architecture`) that build it again.
+
+    `terrain` is the plain record of the ground that it was fitted to (provenance.py); None leaves it unknown.
+    """
+    # Through memory: torch's own writer hides a full disk behind a RuntimeError.
+    content = io.BytesIO()
+    record = {} if terrain is None else {RECORD: dict(terrain)}
+    torch.save({"architecture": dict(architecture), "state_dict": network.state_dict(), **record}, content)
+    write_bytes(path, content.getvalue())
+
+
+def load_weights(path: Path) -> dict[str, Any]:
+    """`{"architecture": settings, "state_dict": tensors}` of a file that `save_weights` wrote, on the CPU.
+
+    Raises UserError where the file is missing, damaged, or anything but plain weights.
+    """
+    if not path.is_file():
+        raise UserError(path, "checkpoint", "no such file", "checkpoints/best.ckpt of a finished run")
+    return read_saved(path, "checkpoint", {"architecture", "state_dict"}, "checkpoints/best.ckpt of a run")
+
+
+def read_saved(path: Path, field: str, keys: set[str], wanted: str) -> dict[str, Any]:
+    """The dictionary that torch saved in a file, on the CPU. Raises UserError where it is damaged or lacks `keys`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = torch.load(path, map_location="cpu", weights_only=True)
+    # Torch names no kinds of error; damaged bytes raise a dozen.
+    except Exception as error:
+        raise UserError(path, field, str(error) or type(error).__name__, wanted) from None
+    missing = keys - content.keys() if isinstance(content, dict) else keys
+    if missing:
+        raise UserError(path, field, f"no {', '.join(sorted(missing))}", wanted)
+    return content
+
+
+def check_architecture(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raise UserError naming the first setting of `wanted` in which a checkpoint's architecture differs."""
+    for key, value in wanted.items():
+        if found.get(key) != value:
+            raise UserError(path, key, found.get(key), f"{value}; the checkpoint is of another architecture")
+
+
+def fill(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
+    """Load all weights into a network. Raises UserError as `check_tensors`."""
+    check_tensors(path, state, network)
+    network.load_state_dict(dict(state))
+
+
+def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Module) -> None:
+    """Raise UserError naming the first tensor of a checkpoint that is missing, extra or misshapen for a network."""
+    own = network.state_dict()
+    for key in sorted(own.keys() | state.keys()):
+        found = tuple(state[key].shape) if key in state else "nothing"
+        wanted = str(tuple(own[key].shape)) if key in own else "no such tensor"
+        if str(found) != wanted:
+            raise UserError(path, key, found, f"{wanted}; the checkpoint is of another architecture")
+
+
+def choose_device(device: str) -> str:
+    """`auto` is the GPU where there is one. Raises UserError where `cuda` is asked for in vain."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise UserError("settings", "device", "cuda", "cpu or auto: torch finds no GPU")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+
+
+def choose_bf16(precision: Precision, device: str) -> bool:
+    """Whether to compute in bfloat16: as asked, and with `auto` where the hardware has it."""
+    if precision != "auto":
+        return precision == "bf16"
+    if device == "cuda":
+        # Emulated bfloat16 is slower than float32.
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return bool(getattr(torch.cpu, "_is_avx512_bf16_supported", lambda: False)())
