@@ -32,7 +32,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import TrainingFrames, loader
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.run import build_network, label_sizes
+from perilune_train.detect.train.network import build_network, label_sizes
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs

@@ -31,7 +31,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import Batch, EvaluationFrames, TrainingFrames, loader
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.run import build_network, label_sizes
+from perilune_train.detect.train.network import build_network, label_sizes
 from perilune_train.detect.train.task import learning_rate_factor
 from perilune_train.models.yolo import YOLOv3
 

@@ -7,7 +7,7 @@ import numpy as np
 from perilune_shared.config import resolve
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.run_config import config_of_run
-from perilune_train.detect.train.run import build_network
+from perilune_train.detect.train.network import build_network
 from perilune_train.training import runs
 from perilune_train.training.begin import start_run
 

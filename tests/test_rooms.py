@@ -79,6 +79,8 @@ for module in {modules!r}:
     [
         (["torch", "lightning", "bpy"], ["perilune_train.detect.evaluate", "perilune_train.evaluation"]),
         (["torch", "lightning", "bpy", "typer"], ["perilune_shared.dataset", "perilune_shared.geometry"]),
+        (["lightning", "bpy"], ["perilune_train.detect.images", "perilune_train.detect.deploy"]),
+        (["bpy"], ["perilune_render.flight", "perilune_render.imaging", "perilune_render.labels"]),
     ],
 )
 def test_a_room_needs_no_more_than_it_says(blocked, modules):

@@ -18,7 +18,8 @@ from perilune_train.cli import app
 from perilune_train.detect.compare_runs import compare_folders
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.deploy.export import export_run
-from perilune_train.detect.train.run import WRITTEN, run_detect
+from perilune_train.detect.evaluate.split_evaluation import WRITTEN
+from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.transfer import inherited_terrain
 from perilune_train.evaluation.provenance import (
     UNKNOWN,

@@ -12,8 +12,10 @@ from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import EvaluationFrames, loader
 from perilune_train.detect.data.split import load_split
+from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.train.distill import Teacher, distill_loss
-from perilune_train.detect.train.run import build_network, label_sizes, load_detector, load_teacher, run_detect
+from perilune_train.detect.train.network import build_network, label_sizes, load_teacher
+from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3

@@ -13,9 +13,11 @@ from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_shared.yaml_text import parse_yaml
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.run_config import config_of_run
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.run import build_network, load_detector, run_detect
+from perilune_train.detect.train.network import build_network
+from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.transfer import start_from
 from perilune_train.training import runs

@@ -12,9 +12,10 @@ from perilune_train.detect.config import AugmentSettings, DetectConfig, Evaluati
 from perilune_train.detect.data.batches import EvaluationFrames, loader
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.evaluate.split_evaluation import match_detections
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.run import build_network, judge, label_sizes
+from perilune_train.detect.train.network import build_network, label_sizes
 from perilune_train.detect.train.task import DetectTask, learning_rate_factor, pairs, update_average
 
 
@@ -98,7 +99,7 @@ def test_a_few_frames_can_be_learned_by_heart(split, tmp_path):
     # Batch statistics of the very batch, since the running ones lag behind after so few steps.
     boxes, scores = network.detect(images)
     found = detections_of(boxes, scores, config.evaluation)
-    assert curve(judge(few, found, config)).ap_paper() > 0.6
+    assert curve(match_detections(few, found, config)).ap_paper() > 0.6
 
 
 def test_augmentation_settings_reach_the_task(split, tmp_path):

@@ -14,7 +14,7 @@ from perilune_shared.dataset.selection import read_labels
 from perilune_shared.errors import UserError
 from perilune_train.data.frames import load_frames
 from perilune_train.detect.cli.evaluate import config_of_run
-from perilune_train.detect.train.run import load_detector
+from perilune_train.detect.inference.detector import load_detector
 from perilune_train.evaluation.provenance import training_provenance
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.masks import caption, detector_masks, draw_masks, navigator_masks

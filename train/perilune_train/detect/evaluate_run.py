@@ -1,4 +1,4 @@
-"""Judging a finished run once more."""
+"""Evaluate a finished run on a split of any dataset."""
 
 import json
 import math
@@ -11,17 +11,16 @@ from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.report import write_evaluation
-from perilune_train.detect.train.run import (
+from perilune_train.detect.evaluate.split_evaluation import (
     WRITTEN,
-    about,
-    detect_split,
-    judge,
-    judge_in_full,
-    load_detector,
-    selection_used,
-    told_of,
+    dataset_entries,
+    evaluate_split,
+    match_detections,
+    report_head,
+    selection_entries,
     write_detections,
 )
+from perilune_train.detect.inference.detector import detect_split, load_detector
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
 from perilune_train.training import runs
@@ -66,7 +65,7 @@ def evaluate_again(
     choose_threshold: bool = False,
     allow_overlap: bool = False,
 ) -> Path:
-    """Judge a run's best weights on a split of a dataset; everything it leaves is in the returned folder.
+    """Evaluate a run's best weights on a split of a dataset; everything it leaves is in the returned folder.
 
     The threshold is the one given, else the run's own; with `choose_threshold` one chosen on the dataset's val.
     """
@@ -94,15 +93,17 @@ def evaluate_again(
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
         seen, _ = detect_split(network, val, "val", config, device, bf16)
-        points = curve(judge(val, seen, config))
+        points = curve(match_detections(val, seen, config))
         chosen, chosen_as = points.operating_threshold(config.evaluation.min_precision)
         chosen_on = f"{chosen_as} on the dataset's val"
     found, rate = detect_split(network, frames, split, config, device, bf16)
-    evaluation = judge_in_full(frames, found, config, chosen)
+    evaluation = evaluate_split(frames, found, config, chosen)
     write_detections(folder / "detections.parquet", frames, found)
-    told = about(dataset, split, config, protocol, run.resolve().name, chosen_on)
+    told = report_head(dataset, split, config, protocol, run.resolve().name, chosen_on)
     write_evaluation(folder, evaluation, list(frames.frames.images), told)
-    metrics = selection_used(config, frames) | told_of(dataset, split, config) | {"dataset/protocol": protocol}
+    metrics = (
+        selection_entries(config, frames) | dataset_entries(dataset, split, config) | {"dataset/protocol": protocol}
+    )
     metrics |= {f"{split}/{key}": value for key, value in evaluation.figures().items()}
     metrics[f"{split}/images_per_s"] = round(rate, 2)
     mark_files(folder, WRITTEN, terrain_check.mark)

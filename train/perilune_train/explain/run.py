@@ -16,8 +16,9 @@ from perilune_shared.progress import console, progress_bar
 from perilune_shared.storage.files import written_aside
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.split_evaluation import selection_entries
+from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.run_config import config_of_run
-from perilune_train.detect.train.run import load_detector, selection_used
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
 from perilune_train.explain.config import ExplainConfig
@@ -168,7 +169,7 @@ def detect_frames(
     for own in (split.labels[i] for i in chosen):
         centres, radii = own.ellipses[own.wanted, :2], own.radius_px[own.wanted]
         masks.append(ground_truth_mask(width, height, centres, radii, settings.ring_factors).astype(np.float32))
-    return split.frames.images[chosen], np.stack(masks), selection_used(detector, split)
+    return split.frames.images[chosen], np.stack(masks), selection_entries(detector, split)
 
 
 def _navigator_rows(masks: Masks, pairs: list[tuple[Descent, int]]) -> list[dict]:

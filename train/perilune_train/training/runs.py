@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
 from perilune_shared.errors import UserError
@@ -62,6 +61,9 @@ def is_first_process() -> bool:
 
     It is known from the start: Lightning reads it from what torchrun, or it itself, gives the processes they start.
     """
+    # Here, so that commands that do not train need not import Lightning.
+    from lightning.pytorch.utilities import rank_zero_only
+
     return int(rank_zero_only.rank) == 0
 
 

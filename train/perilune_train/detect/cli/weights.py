@@ -23,7 +23,7 @@ def weights(
     if not out.name.endswith((".conv.74", ".weights")):
         raise UserError(out, "--out", f"the name {out.name}", "a name that ends in .conv.74 or .weights")
     # Torch takes seconds to load: not for a wrong name.
-    from perilune_train.detect.train.run import load_detector
+    from perilune_train.detect.inference.detector import load_detector
     from perilune_train.detect.train.transfer import darknet_content
     from perilune_train.models.darknet_weights import write_darknet
     from perilune_train.training import runs

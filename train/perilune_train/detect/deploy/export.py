@@ -28,8 +28,8 @@ from perilune_train.detect.deploy.engines import (
 from perilune_train.detect.deploy.flight_detector import FlightDetector
 from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
 from perilune_train.detect.deploy.readme import readme
+from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.run_config import config_of_run
-from perilune_train.detect.train.run import load_detector
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import (
     Provenance,

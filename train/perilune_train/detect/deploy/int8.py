@@ -19,8 +19,8 @@ from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.deploy.engines import Array, Engine, Precision, has_bf16, openvino_engine, package
 from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.evaluate.split_evaluation import match_detections
 from perilune_train.detect.inference.suppression import detections_of
-from perilune_train.detect.train.run import judge
 
 MOST_LOSS = 0.005
 """Average precision on the validation split that int8 may lose: half a point."""
@@ -133,7 +133,7 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
             boxes, scores = (torch.as_tensor(part) for part in engine(image))
             found += detections_of(boxes, scores, config.evaluation)
             bar.advance(task)
-    return curve(judge(split, found, config)).ap_paper()
+    return curve(match_detections(split, found, config)).ap_paper()
 
 
 def interleaved(engines: dict[str, Engine], images: Array, rounds: int, warm_up: int = 5) -> dict[str, list[float]]:

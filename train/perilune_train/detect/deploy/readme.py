@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from perilune_train.detect.inference.scales import at_scales
+from perilune_train.detect.evaluate.split_evaluation import at_scales
 
 _PROGRAM = '''\
 import json

@@ -23,8 +23,8 @@ from perilune_train.detect.images.georeference import (
     read_georeference,
 )
 from perilune_train.detect.images.read import picture_size, read_grey
+from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.inference.tiles import Detector, Tiling, count_tiles, detect_image
-from perilune_train.detect.train.run import load_detector
 from perilune_train.training import runs
 
 _DETECTED = (227, 211, 25)

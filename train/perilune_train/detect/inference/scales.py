@@ -40,11 +40,6 @@ def multiply_adds_of_a_frame(network: YOLOv3, config: DetectConfig, height_px: i
     return sum(multiply_adds(network, (1, config.in_channels, *size)) for size in sizes)
 
 
-def at_scales(scales: tuple[float, ...]) -> str:
-    """In words, for a report."""
-    return "as they are" if scales == (1.0,) else "at scale " + " and ".join(f"{factor:g}" for factor in scales)
-
-
 @torch.no_grad()
 def detect_at_scales(
     network: YOLOv3, frames: NDArray[np.uint8], config: DetectConfig, device: str, bf16: bool

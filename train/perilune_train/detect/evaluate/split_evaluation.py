@@ -1,0 +1,93 @@
+"""Detections of a split against its labels: matches, figures, and the files of an evaluation."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.storage.files import written_aside
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.frame_facts import facts_of
+from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
+from perilune_train.detect.evaluate.matching import Detections, Matches, match_split
+from perilune_train.evaluation.provenance import protocol_of
+
+WRITTEN = (
+    "report.md",
+    "detections.png",
+    "precision_recall.png",
+    "bins.png",
+    "detections.parquet",
+    "precision_recall.parquet",
+)
+"""Files that an evaluation writes in addition to metrics.json."""
+
+
+def match_detections(split: DetectSplit, found: list[Detections], config: DetectConfig) -> Matches:
+    """Match the detections of a split to its labels."""
+    height, width = split.frames.images.shape[1:]
+    return match_split(found, split.labels, (width, height), config.evaluation.match_iou, split.radius_px)
+
+
+def evaluate_split(split: DetectSplit, found: list[Detections], config: DetectConfig, threshold: float) -> Evaluation:
+    """Every figure of a split's detections."""
+    return evaluate_detections(
+        found,
+        split.labels,
+        facts_of(split.frames),
+        threshold,
+        radius_px=split.radius_px,
+        match_iou=config.evaluation.match_iou,
+        seed=config.seed,
+    )
+
+
+def selection_entries(config: DetectConfig, split: DetectSplit) -> dict[str, float | int | str | None]:
+    """What was wanted, for metrics.json: the selection's name and its thresholds; null asks for nothing."""
+    used = {f"labels/{key}": value for key, value in config.labels.model_dump(exclude={"radius_px"}).items()}
+    return used | {"labels/min_radius_px": split.radius_px[0], "labels/max_radius_px": split.radius_px[1]}
+
+
+def dataset_entries(dataset: Dataset, split: str, config: DetectConfig) -> dict[str, float | int | str | None]:
+    """What was evaluated and how, for metrics.json."""
+    return {
+        "dataset/name": dataset.info.name,
+        "dataset/split_by": dataset.info.split_by,
+        "dataset/protocol": protocol_of(dataset.info),
+        "evaluation/split": split,
+        "evaluation/scales": " ".join(f"{factor:g}" for factor in config.evaluation.scales),
+    }
+
+
+def report_head(
+    dataset: Dataset, split: str, config: DetectConfig, protocol: str, run: str, chosen_on: str
+) -> list[str]:
+    """What was evaluated and how, for the head of a report."""
+    settings = config.evaluation
+    thresholds = config.labels.model_dump(exclude={"selection"}, exclude_none=True)
+    return [
+        f"run `{run}`, best weights; dataset `{dataset.info.name}`, split {split}; protocol: {protocol}",
+        f"wanted: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
+        f"threshold {chosen_on}",
+        f"detections below a score of {settings.min_score:g} are dropped, suppression at IoU {settings.nms_iou:g}, "
+        f"at most {settings.max_detections} are kept in a frame; frames looked at {at_scales(settings.scales)}",
+    ]
+
+
+def at_scales(scales: tuple[float, ...]) -> str:
+    """Scales in words, for a report."""
+    return "as they are" if scales == (1.0,) else "at scale " + " and ".join(f"{factor:g}" for factor in scales)
+
+
+def write_detections(path: Path, split: DetectSplit, found: list[Detections]) -> None:
+    """Table frame_id, x0_px, y0_px, x1_px, y1_px, score, one row a detection."""
+    boxes = np.concatenate([part.boxes for part in found])
+    names = np.repeat(split.frames.table["frame_id"].to_numpy(), [len(part.scores) for part in found])
+    columns = {"frame_id": pa.array(names, pa.string())}
+    columns |= {name: pa.array(boxes[:, k]) for k, name in enumerate(("x0_px", "y0_px", "x1_px", "y1_px"))}
+    columns["score"] = pa.array(np.concatenate([part.scores for part in found]))
+    with written_aside(path) as aside:
+        pq.write_table(pa.table(columns), aside, compression="zstd")

@@ -1,0 +1,57 @@
+"""A new network with anchors of the training labels, and a teacher."""
+
+from pathlib import Path
+
+import lightning
+import numpy as np
+import torch
+
+from perilune_shared.errors import UserError
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.inference.detector import load_detector
+from perilune_train.detect.train.anchors import best_possible_recall, kmeans_anchors
+from perilune_train.detect.train.distill import Teacher
+from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
+from perilune_train.training import runs
+
+_ANCHOR_STREAM = 1
+
+
+def label_sizes(split: DetectSplit) -> np.ndarray:
+    """Widths and heights (N, 2) in pixels of all wanted labels of a split."""
+    boxes = np.concatenate([part.boxes[part.wanted] for part in split.labels])
+    return boxes[:, 2:] - boxes[:, :2]
+
+
+def build_network(config: DetectConfig, sizes_px: np.ndarray, where: Path) -> YOLOv3:
+    """The network with anchors of these label sizes (N, 2). Raises UserError where there are no labels."""
+    if len(sizes_px) == 0:
+        raise UserError(where, "labels", "no visible crater in the training split", "at least one")
+    count = len(config.strides) * ANCHORS_PER_SCALE
+    anchors = kmeans_anchors(sizes_px, count, np.random.default_rng([config.seed, _ANCHOR_STREAM]))
+    lightning.seed_everything(config.seed, verbose=False)
+    shaped = torch.as_tensor(anchors).view(len(config.strides), ANCHORS_PER_SCALE, 2)
+    return YOLOv3(shaped, config.in_channels, config.width, config.attention, config.strides)
+
+
+def load_teacher(path: Path, config: DetectConfig) -> Teacher:
+    """The network to learn from. Raises UserError where its input channels or strides are not the student's."""
+    network = load_detector(path)
+    wanted = {"in_channels": config.in_channels, "strides": list(config.strides)}
+    runs.check_architecture(path, runs.load_weights(path)["architecture"], wanted)
+    return Teacher(network.requires_grad_(False))
+
+
+def anchor_sizes(network: YOLOv3) -> np.ndarray:
+    """Widths and heights (N, 2) in pixels of a network's anchors."""
+    return network.anchors.flatten(0, 1).double().cpu().numpy()
+
+
+def anchor_report(network: YOLOv3, sizes_px: np.ndarray, ratio: float) -> str:
+    """How well a network's anchors suit labels of these sizes (N, 2): recall that training can reach at best."""
+    recall = best_possible_recall(sizes_px, anchor_sizes(network), ratio)
+    return (
+        f"anchors: best possible recall {recall:.4f}, the share of the training labels that have one within a factor "
+        f"of {ratio:g} in width and height"
+    )
