@@ -3,17 +3,21 @@
 Parts are written once, aside and renamed, and never rewritten. Use::
 
     dataset = open_dataset("data/small/detect")
-    labels = dataset.table("labels", ["frame_id", "radius_px"], split="test").to_pandas()
+    dataset.labels, dataset[0].image                                                    # pandas, NumPy
+    dataset.table("labels", ["frame_id", "radius_px"], split="test")                    # Arrow, only what is needed
 """
 
 import contextlib
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.expression import Condition
+from perilune_shared.dataset.frame import Frame
 from perilune_shared.dataset.metadata import Counts, DatasetInfo, read_info
 from perilune_shared.dataset.parts import Part, is_whole
 from perilune_shared.dataset.schema import IMAGES, SPLITS, TABLES
@@ -56,6 +60,53 @@ class Dataset:
                 del self._opened[next(iter(self._opened))]
             self._opened[path] = part
         return self._opened[path]
+
+    @functools.cached_property
+    def scenes(self) -> pd.DataFrame:
+        """The table scenes, read once."""
+        return self.table("scenes").to_pandas()
+
+    @functools.cached_property
+    def trajectories(self) -> pd.DataFrame:
+        """The table trajectories, read once."""
+        return self.table("trajectories").to_pandas()
+
+    @functools.cached_property
+    def frames(self) -> pd.DataFrame:
+        """The table frames, read once; row i is frame `dataset[i]`."""
+        return self.table("frames").to_pandas()
+
+    @functools.cached_property
+    def labels(self) -> pd.DataFrame:
+        """The table labels, read once: about 200 bytes of memory a label. `table` reads columns and splits of it."""
+        return self.table("labels").to_pandas()
+
+    @functools.cached_property
+    def craters(self) -> pd.DataFrame:
+        """The table craters, read once."""
+        return self.table("craters").to_pandas()
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return self.info.counts.frames
+
+    def __getitem__(self, place: int | str) -> Frame:
+        """A frame by its row number in `frames` or by its frame_id.
+
+        Raises IndexError or KeyError where there is none, UserError where its image or labels cannot be read.
+        """
+        if isinstance(place, str):
+            found = self.frames.index[self.frames["frame_id"] == place]
+            if len(found) == 0:
+                raise KeyError(place)
+            place = int(found[0])
+        if not -len(self.frames) <= place < len(self.frames):
+            raise IndexError(place)
+        row = {str(name): value for name, value in self.frames.iloc[place].items()}
+        labels = self.table("labels", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
+        labels = labels.filter(pc.equal(labels["frame_id"], row["frame_id"]))
+        ((_, png),) = self.pngs(pa.table({name: [row[name]] for name in ("frame_id", "png_path")}))
+        return Frame(row, labels.to_pandas(), png)
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[Path]:
         """The table's part files, sorted by name; only those that may hold rows of a scene or a descent."""
