@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+import perilune_render
+import perilune_shared
+import perilune_train
+
 ROOT = Path(__file__).parent.parent
 MAY_IMPORT = {
     "shared": {"perilune_shared"},
@@ -93,6 +97,18 @@ def test_licences_are_as_promised():
         assert content["project"]["license-files"] == ["LICENSE"]
         assert content["build-system"]["requires"] == ["setuptools>=77"]
         assert (ROOT / house / "LICENSE").is_file()
+
+
+def test_the_distributions_have_one_version():
+    """Each is built from its own `__version__`, and requires the sibling of the same."""
+    versions = {package.__version__ for package in (perilune_shared, perilune_render, perilune_train)}
+    assert len(versions) == 1
+    (version,) = versions
+    for house in ("render", "train"):
+        project = tomllib.loads((ROOT / house / "pyproject.toml").read_text())["project"]
+        assert f"perilune-shared=={version}" in project["dependencies"]
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {version}\n" in citation
 
 
 OWN_MODULES = ["perilune_shared.config", "perilune_render.cli", "perilune_train.detect.train.run", "tests.test_house"]
