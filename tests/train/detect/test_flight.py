@@ -1,6 +1,7 @@
 """The folded network, the exported files, and the command that writes them."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -112,6 +113,19 @@ def test_files_give_torchs_boxes_for_any_number_of_images(exported, images):
             np.testing.assert_allclose(found_boxes[counts], boxes[:n][counts], atol=1e-3, rtol=1e-5)
     one = openvino_engine(exported / "detector.xml", threads=1, batch=1)
     np.testing.assert_allclose(one(images[1:2])[1], scores[1:2], atol=1e-4)
+
+
+def test_no_engine_leaves_an_identity_or_sends_telemetry(exported, tmp_path):
+    """The builds of ONNX Runtime send events to their maker, and keep an identity below the home folder for it."""
+    code = (
+        "import sys; from pathlib import Path; from perilune_train.detect.deploy import engines\n"
+        "engines.package('onnxruntime.quantization'); engines.onnxruntime_engine(Path(sys.argv[1]), 1)\n"
+    )
+    command = [sys.executable, "-c", code, str(exported / "detector.onnx")]
+    names = ("CI", "ORT_DISABLE_TELEMETRY", "ORT_TELEMETRY_DISABLED", "XDG_CACHE_HOME", "PYTEST_CURRENT_TEST")
+    alone = {name: value for name, value in os.environ.items() if name not in names}
+    subprocess.run(command, check=True, env={**alone, "HOME": str(tmp_path)})
+    assert not [path for path in tmp_path.rglob("*") if "onnxruntime" in path.name]
 
 
 INTERRUPTED = """

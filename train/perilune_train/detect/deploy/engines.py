@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +23,8 @@ Precision = Literal["f32", "bf16"]
 
 def package(name: str) -> Any:
     """A module of the extra `export`. Raises UserError where it is not installed."""
+    # Official builds of ONNX Runtime send events to their maker unless this is set before the import.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
         return importlib.import_module(name)
     except ImportError:
