@@ -10,11 +10,12 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
-        "errors progress content yaml_text config_errors config storage geometry dataset validation editing export cli"
+        "errors progress content yaml_text config_errors config config_page storage geometry dataset validation "
+        "editing export cli"
     ),
     "render/perilune_render": (
         "config_values config_terrain config streams interrupts provenance terrain flight imaging labels blender "
-        "dataset cli"
+        "dataset cli_options cli"
     ),
     "train/perilune_train": "config data evaluation models training detect navigate explain cli",
     "train/perilune_train/detect": (

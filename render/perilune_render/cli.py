@@ -1,6 +1,5 @@
 """`perilune-render`: datasets, previews and meshes from a configuration."""
 
-import enum
 import tempfile
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -8,9 +7,11 @@ from typing import Annotated, Literal, get_args
 import typer
 from rich.console import Console
 
+from perilune_render.cli_options import Catalogue, Config, Dem, Kind, Preset, Setting, first_kind, one_kind
 from perilune_render.config import DatasetConfig
 from perilune_render.flight.plan import make_plan
-from perilune_shared.config import resolve
+from perilune_shared.config import resolve, to_yaml
+from perilune_shared.config_page import annotated_yaml
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import EXIT_USER_ERROR, UserError, run_command_line
 from perilune_shared.progress import progress_bar
@@ -21,46 +22,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-
-
-class Kind(enum.StrEnum):
-    """Which of a preset's datasets."""
-
-    DETECT = "detect"
-    NAV = "nav"
-    BOTH = "both"
-
-
-Preset = Annotated[
-    str,
-    typer.Option(
-        help="tiny (seconds, for tests), small (minutes), paper (the paper's protocol), large (343 terrains)."
-    ),
-]
-Config = Annotated[Path | None, typer.Option(help="YAML file whose section `dataset` overrides the preset.")]
-Setting = Annotated[
-    list[str] | None, typer.Option("--set", help="One setting, as dataset.key.key=value; may be repeated.")
-]
-Dem = Annotated[
-    Path | None,
-    typer.Option(help="GeoTIFF elevation model as the base; craters below its resolution are added."),
-]
-
-
-Catalogue = Annotated[
-    Path | None,
-    typer.Option(help="CSV of the elevation model's own craters (longitude_deg, latitude_deg, diameter_m)."),
-]
-
-
-def _first(kind: Kind) -> Literal["detect", "nav"]:
-    return "nav" if kind is Kind.NAV else "detect"
-
-
-def _one(kind: Kind) -> Literal["detect", "nav"]:
-    if kind is Kind.BOTH:
-        raise UserError("--kind", "kind", "both", "detect or nav: one dataset")
-    return _first(kind)
 
 
 def _warn_of_size(config: DatasetConfig) -> None:
@@ -83,6 +44,20 @@ def _resolve(
     if terrain.catalogue is not None and terrain.dem is None:
         raise UserError("--catalogue", "catalogue", terrain.catalogue, "--dem with the elevation model that it is of")
     return resolved.model_copy(update={"terrain": terrain})
+
+
+@app.command()
+def config(
+    preset: Preset = "small",
+    config: Config = None,
+    settings: Setting = None,
+    show: Annotated[
+        bool, typer.Option("--show/--plain", help="With meaning, unit and default; or values alone.")
+    ] = True,
+) -> None:
+    """Print every setting as a configuration file to start from."""
+    resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(settings or ()))
+    typer.echo(annotated_yaml("dataset", resolved) if show else to_yaml("dataset", resolved), nl=False)
 
 
 @app.command()
@@ -117,7 +92,7 @@ def dataset(
     )  # Blender is loaded only once the settings are known to be right.
 
     names: tuple[Literal["detect", "nav"], ...] = ("detect", "nav")
-    for name in names if kind is Kind.BOTH else (_first(kind),):
+    for name in names if kind is Kind.BOTH else (first_kind(kind),):
         with progress_bar() as progress:
             made = make_dataset(resolved, name, preset, folder / name, progress)
         counts = made.info.counts
@@ -190,7 +165,7 @@ def plan(
     from perilune_render.dataset.write_plan import write_plan
 
     with progress_bar() as progress:
-        write_plan(resolved, _one(kind), preset, out, progress)
+        write_plan(resolved, one_kind(kind), preset, out, progress)
     counts = open_dataset(out).info.counts
     Console().print(f"{out}: {counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames planned")
 
@@ -249,7 +224,7 @@ def preview(
     resolved = _resolve(preset, config, setting, dem, catalogue)
     from perilune_render.dataset.preview import write_preview
 
-    write_preview(resolved, _first(kind), out)
+    write_preview(resolved, first_kind(kind), out)
     Console().print(f"look at {out}")
 
 
@@ -274,7 +249,7 @@ def export(
 
     if out.suffix not in MESH_SUFFIXES + RASTER_SUFFIXES:
         raise UserError(out, "format", out.suffix or "none", "one of " + ", ".join(MESH_SUFFIXES + RASTER_SUFFIXES))
-    name = _first(kind)
+    name = first_kind(kind)
     plan = make_plan(resolved, name)
     scene = cached_scene(resolved, plan.exr_camera, resolved.ground_flight(name), plan.scenes[0].seed)
     if out.suffix in RASTER_SUFFIXES:

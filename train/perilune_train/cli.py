@@ -1,12 +1,21 @@
 """`perilune-train`: train the detector and the navigators, and explain them."""
 
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
+from perilune_shared.config import Section, resolve, to_yaml
+from perilune_shared.config_page import annotated_yaml
 from perilune_shared.errors import run_command_line
 from perilune_train.detect.cli.main import app as detect
+from perilune_train.detect.config import DetectConfig
 from perilune_train.explain.command import explain
+from perilune_train.explain.config import ExplainConfig
 from perilune_train.navigate.command import navigate
+from perilune_train.navigate.config import NavigateConfig
 
+SECTIONS: dict[str, type[Section]] = {"detect": DetectConfig, "navigate": NavigateConfig, "explain": ExplainConfig}
 app = typer.Typer(
     help="Crater detection, landing navigation and their explanation, from perilune datasets (see `perilune-render`).",
     no_args_is_help=True,
@@ -16,6 +25,23 @@ app = typer.Typer(
 app.add_typer(detect, name="detect")
 app.command("navigate")(navigate)
 app.command("explain")(explain)
+
+
+@app.command()
+def config(
+    preset: Annotated[str, typer.Option(help="tiny, small, paper or large.")] = "small",
+    config: Annotated[Path | None, typer.Option(help="YAML file whose sections override the preset.")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting, as detect.key.key=value; may be repeated.")
+    ] = None,
+    show: Annotated[
+        bool, typer.Option("--show/--plain", help="With meaning, unit and default; or values alone.")
+    ] = True,
+) -> None:
+    """Print every setting of detection, navigation and explanation as a configuration file to start from."""
+    for section, model in SECTIONS.items():
+        resolved = resolve(model, section, "perilune_train", preset, config, tuple(settings or ()))
+        typer.echo(annotated_yaml(section, resolved) if show else to_yaml(section, resolved), nl=False)
 
 
 def main() -> None:

@@ -1,0 +1,72 @@
+"""A resolved configuration as YAML with a comment on each key: meaning, unit, choices and default."""
+
+import json
+import textwrap
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+from pydantic.fields import FieldInfo
+
+from perilune_shared.config import Section
+
+_WIDTH = 118
+
+
+def annotated_yaml(section: str, config: Section) -> str:
+    """The section as a configuration file that `resolve` reads again.
+
+    The unit of a key is in its name or in its meaning.
+    """
+    return "\n".join([f"{section}:", *_lines(config, 1)]) + "\n"
+
+
+def _lines(config: Section, depth: int) -> Iterator[str]:
+    indent = "  " * depth
+    plain = config.model_dump(mode="json")
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        nested = isinstance(value, Section) and not _is_span(value)
+        comment = _meaning(field) if nested else f"{_meaning(field)}{_choices(field)} Default: {_default(field)}."
+        yield from textwrap.wrap(comment, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
+        if nested:
+            yield f"{indent}{name}:"
+            yield from _lines(value, depth + 1)
+        else:
+            yield f"{indent}{name}: {_flow(plain[name])}"
+
+
+def _meaning(field: FieldInfo) -> str:
+    return " ".join((field.description or "").split())
+
+
+def _choices(field: FieldInfo) -> str:
+    """The values of a Literal, which may stand beside other types."""
+    kinds = [field.annotation, *typing.get_args(field.annotation)]
+    values = [
+        str(value) for kind in kinds if typing.get_origin(kind) is typing.Literal for value in typing.get_args(kind)
+    ]
+    return f" One of: {', '.join(values)}." if values else ""
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "none, it must be given"
+    value: Any = field.get_default(call_default_factory=True)
+    return _flow(value.model_dump(mode="json") if isinstance(value, Section) else value)
+
+
+def _flow(value: Any) -> str:
+    """A value on one line of YAML: what JSON has, with plain keys, and plain text where it is a word."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_flow, value)) + "]"
+    if isinstance(value, str) and value.isidentifier() and value.lower() not in ("null", "true", "false"):
+        return value
+    return json.dumps(value)
+
+
+def _is_span(value: Section) -> bool:
+    """Whether a section is a pair of bounds, which is one value to a user."""
+    return set(type(value).model_fields) == {"low", "high"}
