@@ -1,4 +1,4 @@
-"""Kinds of value that the sections `detect`, `navigate` and `explain` share."""
+"""Types that the sections `detect`, `navigate` and `explain` share."""
 
 from typing import Annotated, Literal
 
@@ -7,11 +7,12 @@ from pydantic import Field
 Attention = Literal["none", "cbam", "cbam_identity"]
 """none: plain Darknet53; cbam: the paper's gates; cbam_identity: gates that are exactly 1 at initialisation."""
 Precision = Literal["auto", "bf16", "float32"]
-"""auto: bfloat16 where the hardware has it."""
+"""auto: bfloat16 if the hardware supports it."""
 Device = Literal["auto", "cpu", "cuda"]
-"""auto: the GPU where there is one."""
+"""auto: the GPU if there is one."""
 Strategy = Literal["auto", "ddp", "ddp_find_unused_parameters_true"]
-"""auto: one process as it is, several by ddp, where some weights are frozen with unused parameters looked for."""
+"""auto: no strategy for one process; ddp for several, with a search for unused parameters if some weights are
+frozen."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]

@@ -11,9 +11,9 @@ from perilune_train.config import Attention, Count, Device, Positive, Precision,
 
 
 class LabelSettings(Selection):
-    """Which labels are craters to find. The others are ignored: neither wanted nor counted as false.
+    """Selection of the craters to find. All other labels are ignored: neither ground truth nor false positives.
 
-    A name gives all thresholds; single ones given beside it replace its own. What is resolved is what a run stores.
+    A selection's name sets all thresholds; thresholds given beside it override it. A run stores the resolved values.
     """
 
     selection: str = "visible"
@@ -28,7 +28,7 @@ class LabelSettings(Selection):
         if not isinstance(name, str):
             return given
         if name not in SELECTIONS:
-            # As a fault of the name alone: the field's own check tells it.
+            # Keep only the name, so that its own validator reports the error.
             return {"selection": name}
         limits = given.get("radius_px")
         if isinstance(limits, list):
@@ -44,24 +44,24 @@ class LabelSettings(Selection):
 
 
 class AugmentSettings(Section):
-    """Random changes of training frames; 0 turns one off."""
+    """Random augmentation of training frames; 0 disables a setting."""
 
     flips_and_turns: bool = True
-    """The eight flips and quarter turns of a square frame, each as likely."""
+    """Apply one of the eight flips and quarter turns of a square frame, each equally likely."""
     scale: tuple[Annotated[float, Field(ge=0.25, le=4)], Annotated[float, Field(ge=0.25, le=4)]] = (1.0, 1.0)
-    """Least and largest factor by which a frame is shrunk or enlarged, even in logarithm."""
+    """Least and largest zoom factor of a frame; its logarithm is uniform."""
     gain: Share = 0.3
-    """Contrast and brightness change by up to this factor, up or down."""
+    """Largest change of brightness: the factor is between 1 / (1 + gain) and 1 + gain, uniform in logarithm."""
     gamma: Share = 0.3
-    """Exponent of the grey values, up to this far from 1 in logarithm."""
+    """Largest absolute logarithm of the exponent of the grey values."""
     stretch: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
-    """Largest share of a frame's darkest, and of its brightest, pixels that become black and white: published images
-    are often stretched so."""
+    """Largest fraction of the darkest pixels, and of the brightest, that become black and white. Published images are
+    often stretched in this way."""
     blur_px: Annotated[float, Field(ge=0, le=5)] = 0.2
-    """Largest standard deviation of a Gaussian blur, pixels. Rendered frames have the sensor's own: more than a little
-    hides the smallest craters."""
+    """Largest standard deviation of a Gaussian blur, pixels. Rendered frames already contain the sensor's blur; much
+    more hides the smallest craters."""
     noise: Annotated[float, Field(ge=0, le=100)] = 1.0
-    """Largest standard deviation of Gaussian noise, grey levels of 255, beside the sensor's own."""
+    """Largest standard deviation of Gaussian noise, grey levels of 255, in addition to the sensor's noise."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "AugmentSettings":
@@ -74,102 +74,104 @@ class LossSettings(Section):
     """L = lambda_iou L_ciou + lambda_obj L_obj (paper, eq. "loss")."""
 
     aspect: Literal["circular", "standard"] = "circular"
-    """Aspect term of CIoU: against a circle (the paper's), or against the label's own aspect ratio."""
+    """Reference of the aspect term of CIoU: a circle (the paper), or the aspect ratio of the label."""
     objectness: Literal["hard", "iou"] = "iou"
-    """What the objectness of a predictor that answers for a label is to become: 1, or the IoU of its box with it."""
+    """Objectness target of a positive predictor: 1, or the IoU of its box with its label."""
     lambda_iou: Positive = 0.05
     """Weight of L_ciou."""
     lambda_obj: Positive = 1.0
     """Weight of L_obj."""
     lambda_noobj: Positive = 1.0
-    """Weight of empty predictors within L_obj."""
+    """Weight of negative predictors within L_obj."""
     lambda_teacher: Positive = 1.0
-    """Weight of what the `teacher` says, in which box and objectness have the weights above."""
+    """Weight of the distillation loss from `teacher`; its box and objectness terms have the weights above."""
 
 
 class EvaluationSettings(Section):
-    """How detections are made of outputs, and judged."""
+    """Detection from the network's outputs, and its evaluation."""
 
     scales: Annotated[tuple[Annotated[float, Field(ge=0.25, le=4)], ...], Field(min_length=1, max_length=4)] = (1.0,)
-    """Factors by which frames are enlarged or shrunk before the network looks; what it sees at all of them is merged.
-    2 beside 1 finds more of the smallest craters at five times the cost. Validation during training looks at 1
-    alone."""
+    """Factors by which frames are resized before inference; detections at all scales are merged. 1 with 2 finds more of
+    the smallest craters at five times the cost. Validation during training uses scale 1 only."""
     match_iou: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    """Least IoU of a detection with the label that it finds."""
+    """Least IoU of a detection with the label that it matches."""
     nms_iou: Annotated[float, Field(gt=0, lt=1)] = 0.45
-    """Of two detections that overlap more than this, the weaker goes."""
+    """Of two detections with a larger IoU, non-maximum suppression removes the one with the lower score."""
     min_score: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """Detections below this score are dropped before anything else (the floor of the precision-recall curve)."""
+    """Detections below this score are dropped first. The precision-recall curve ends at this score."""
     max_aspect: Annotated[float, Field(gt=1)] | None = None
-    """Boxes whose longer side is more than this many times the shorter go before suppression: a box about two craters
-    is longer than a crater seen from above. None keeps all."""
+    """Largest ratio of a box's longer to its shorter side; others are dropped before suppression. A box around two
+    craters is longer than a crater seen from above. None keeps all."""
     max_detections: Count = 2000
-    """Most detections kept in a frame; the usual 100 would truncate crowded frames."""
+    """Largest number of detections in a frame; the usual 100 would truncate crowded frames."""
     min_precision: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """The score threshold is that of most recall at this precision on the validation split. None: of best F1."""
+    """Choose the score threshold with the highest recall at this precision on the validation split. None: highest
+    F1."""
 
 
 class DetectConfig(Section):
     """The section `detect`."""
 
     seed: Annotated[int, Field(ge=0)] = 0
-    """Of weights, anchors, order and augmentation."""
+    """Random seed of weights, anchors, order of frames and augmentation."""
     width: Annotated[float, Field(ge=0.125, le=2)] = 1.0
     """Factor on all channel counts; 1 is the paper's network."""
     attention: Attention = "cbam"
     """none (the baseline), cbam (the paper's), or cbam_identity (gates that start at exactly 1)."""
     in_channels: Literal[1, 3] = 3
-    """3: the grey frame three times over, as the paper's RGB network takes it."""
+    """Input channels. 3: the grey frame three times, as in the paper's RGB network."""
     strides: tuple[int, int, int] = (8, 16, 32)
-    """Strides with heads: 8 16 32 (the paper's) or 4 8 16 (better for tiny craters)."""
+    """Strides of the detection heads: 8 16 32 (the paper) or 4 8 16 (better for tiny craters)."""
     epochs: Count = 20
     """Passes over the training frames."""
     frozen_epochs: Annotated[int, Field(ge=0)] = 0
-    """First epochs with the backbone frozen, its attention gates excepted. They count only with `init_from`: a
-    backbone of random weights, frozen, teaches nothing, so without it training starts unfrozen."""
+    """First epochs, in which the backbone is frozen except its attention gates. Used only with `init_from`: freezing
+    random weights does not help, so without it training starts unfrozen."""
     init_from: str | None = None
-    """best.ckpt of an earlier detect run of equal width and in_channels, to go on from: all of it where the strides
-    are equal, else its backbone. Or a Darknet file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads
-    too); these need width 1 and in_channels 3."""
+    """Weights to start from. best.ckpt of a detect run of equal width and in_channels: all weights if the strides are
+    equal, else the backbone. Or a Darknet file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads
+    too); Darknet files need width 1 and in_channels 3."""
     teacher: str | None = None
-    """best.ckpt of a detect run, usually wider, to learn from beside the labels; its strides, channels and anchors."""
+    """best.ckpt of a detect run, usually wider, to distil from in addition to the labels. The strides and in_channels
+    must be the same; its anchors are used."""
     batch_size: Count = 8
-    """Frames in a step."""
+    """Frames in a training step."""
     learning_rate: Positive = 1e-3
-    """Peak of AdamW's learning rate: linear warm-up, then a cosine down to a hundredth."""
+    """Peak learning rate of AdamW: linear warm-up, then a cosine down to a hundredth."""
     warmup_steps: Annotated[int, Field(ge=0)] = 100
-    """Steps in which the learning rate rises."""
+    """Number of steps of the warm-up."""
     weight_decay: Annotated[float, Field(ge=0)] = 0.01
-    """AdamW's, per step and learning rate."""
+    """Weight decay of AdamW, per step, times the learning rate."""
     gradient_clip: Positive = 10.0
-    """Largest norm of all gradients together; longer ones are shortened to it."""
+    """Largest norm of all gradients together; larger gradients are scaled down to it."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
-    """Moving average of the weights, per step; the average is what is judged and kept. At step s it is at most
-    (1 + s) / (10 + s), so that 0.998 holds from step 4490 on."""
+    """Decay per step of the moving average of the weights; the average is evaluated and saved. At step s the decay is
+    at most (1 + s) / (10 + s), so that 0.998 holds from step 4490 on."""
     anchor_ratio: Annotated[float, Field(gt=1)] = 2.0
-    """An anchor takes part in a label whose width and height are within this factor of its own."""
+    """An anchor is assigned to a label if width and height are both within this factor."""
     labels: LabelSettings = LabelSettings()
-    """What is to be found."""
+    """Craters to find."""
     augment: AugmentSettings = AugmentSettings()
-    """Random changes in training."""
+    """Random augmentation in training."""
     loss: LossSettings = LossSettings()
-    """What training minimises."""
+    """Training loss."""
     evaluation: EvaluationSettings = EvaluationSettings()
-    """How detections are judged."""
+    """Detection and evaluation."""
     precision: Precision = "auto"
-    """Of the arithmetic."""
+    """Arithmetic: auto (bfloat16 if the hardware supports it), bf16 or float32."""
     device: Device = "auto"
-    """Where it runs."""
+    """Where to compute: auto (the GPU if there is one), cpu or cuda."""
     devices: Count = 1
-    """Processes on each machine, each with its own GPU or share of the CPU; `torchrun --nproc-per-node` wins."""
+    """Processes on each machine, each with its own GPU or part of the CPU; `torchrun --nproc-per-node` overrides it."""
     num_nodes: Count = 1
-    """Machines; `torchrun --nnodes` wins."""
+    """Number of machines; `torchrun --nnodes` overrides it."""
     strategy: Strategy = "auto"
-    """How several processes train together, by Lightning's names: auto takes what the settings need."""
+    """Lightning's strategy for several processes; auto selects what the settings need."""
     checkpoint_minutes: Annotated[float, Field(ge=0)] = 10.0
-    """Within an epoch the state is kept this often; 0: after every step. It always is after an epoch."""
+    """Minutes between saves of the training state within an epoch; 0: after every step. It is always saved after an
+    epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0
-    """Processes that augment frames beside the training; 0 does it in between, best on few cores."""
+    """Worker processes that augment frames; 0 augments in the training process, best on few cores."""
 
     @model_validator(mode="after")
     def _check(self) -> "DetectConfig":

@@ -13,47 +13,50 @@ class FusionConfig(Section):
     """One network and its training."""
 
     size_px: Annotated[int, Field(ge=32, le=4096, multiple_of=32)]
-    """Width to which frames are shrunk before the network sees them."""
+    """Width to which frames are shrunk for the network, pixels."""
     width: Positive
-    """Factor on the backbone's channels; 1 is the paper's."""
+    """Factor on the backbone's channel counts; 1 is the paper's network."""
     attention: Attention = "cbam_identity"
     """Attention after every residual unit."""
     hidden: Count
-    """States of each of the two LSTM layers; the paper has 1000."""
+    """Hidden size of each of the two LSTM layers; the paper uses 1000."""
     sequence_pairs: Count = 16
-    """Pairs in a training sequence, as the paper."""
+    """Pairs of frames in a training sequence; the paper's value."""
     batch_sequences: Count = 8
-    """Sequences in a batch, as the paper."""
+    """Sequences in a batch; the paper's value."""
     coarse_epochs: Annotated[int, Field(ge=0)]
-    """Epochs with the loss L^(S1) and, where a detector gave it, a frozen backbone."""
+    """Epochs with the loss L^(S1). A backbone from a detector is frozen in them."""
     fine_epochs: Annotated[int, Field(ge=0)]
-    """Epochs with the loss L^(S2), everything trained."""
+    """Epochs with the loss L^(S2), all weights trained."""
     learning_rate: Positive
-    """Highest learning rate; the paper has 1e-4."""
+    """Peak learning rate; the paper uses 1e-4."""
     jitter: Annotated[float, Field(ge=0)] = 0.0
-    """Extra motion drawn for each pair in training, times the spread of the residuals in the training set."""
+    """Standard deviation of a random extra motion of each training pair, over the spread of the residuals in the
+    training set."""
 
 
 class NavigateConfig(Section):
     """The section `navigate`."""
 
     seed: Annotated[int, Field(ge=0)] = 0
-    """Seed of weights, order and augmentation."""
+    """Random seed of weights, order and augmentation."""
     fusion: Literal["both", "warp", "stack"] = "both"
     """Which networks to train."""
     kappa: Positive = 1.0
-    """Weight of the orientation in the coarse loss; both errors are over their spread, so 1 is even."""
+    """Weight of the orientation in the coarse loss. Both errors are divided by their spread, so 1 weighs them
+    equally."""
     flow_weight: Annotated[float, Field(ge=0)] = 3.0
-    """Weight of the flow's error (pixels) in the loss of warp."""
+    """Weight of the optical flow error (pixels) in the loss of warp."""
     in_channels: Literal[1, 3] = 1
-    """Channels of the stack network's first layer; grey is repeated. A detector's weights need its own number."""
+    """Input channels of the stack network; the grey frame is repeated. Must be equal to that of `detector`."""
     detector: Path | None = None
-    """best.ckpt of a detector whose backbone the stack network starts from; none: the default run, if there is one."""
+    """best.ckpt of the detector whose backbone initialises the stack network. None: the default run, if there is
+    one."""
     precision: Precision = "auto"
-    """bfloat16 where the hardware has it, or as said."""
+    """Arithmetic: auto (bfloat16 if the hardware supports it), bf16 or float32."""
     device: Device = "auto"
-    """Where to compute."""
+    """Where to compute: auto (the GPU if there is one), cpu or cuda."""
     warp: FusionConfig
-    """The second frame warped by the nominal motion, stacked in channels: it flies."""
+    """Network with the second frame warped by the nominal motion and stacked in channels; the default navigator."""
     stack: FusionConfig
-    """The paper's form, stacked in height: it is explained."""
+    """The paper's network, with the pair stacked in height; the explanations use it."""
