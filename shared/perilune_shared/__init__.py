@@ -1,4 +1,4 @@
-"""Datasets of labelled descents: geometry, manifest, validation, editing, export. Use::
+"""Read, validate, edit and export datasets of labelled lunar descents. Use::
 
 import perilune_shared as ps
 
@@ -18,7 +18,7 @@ __all__ = ["Dataset", "open_dataset"]
 
 
 def __getattr__(name: str) -> Any:
-    """The names of `__all__`, imported on first use, so that a command line's --help need not read pandas."""
+    """Import the names of `__all__` on first use, so that `--help` starts without importing pandas."""
     if name in __all__:
         from perilune_shared.dataset import manifest
 

@@ -1,1 +1,1 @@
-"""A dataset as tables: schema, metadata, reading, writing, selection."""
+"""Dataset tables: schema, metadata, reading, writing, selection."""

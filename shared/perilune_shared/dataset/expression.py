@@ -1,8 +1,8 @@
-"""Conditions on columns, as `--where` takes them: arithmetic and comparisons in Python's notation.
+"""Conditions on columns, for `--where`: arithmetic and comparisons in Python syntax.
 
-A condition is parsed by `ast`, its types are checked against the schema, and it is compiled to an expression of
-pyarrow.compute; nothing of it is ever executed. Columns go by name, or by `table.column` where several tables have it;
-`position_m[2]` is an element of a vector. As in SQL, a comparison with a null is neither true nor false.
+A condition is parsed with `ast`, type-checked against the schema, and compiled to an expression of pyarrow.compute. It
+is never executed as Python code. A column is given by its name, or by `table.column` if several tables have it;
+`position_m[2]` is an element of a vector. As in SQL, a comparison with null is neither true nor false.
 """
 
 import ast
@@ -22,7 +22,7 @@ from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 
 _SEARCHED = ("frames", "labels", "scenes", "craters", "trajectories")
-"""Where a bare name is looked for, first to last."""
+"""Tables in which a column name without a table is looked up, in this order."""
 _COMPARED: dict[type, Callable] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
@@ -40,12 +40,12 @@ _Kind = Literal["integer", "real", "text", "truth", "vector"]
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """A part of a condition."""
+    """A subexpression of a condition."""
 
     kind: _Kind
     """Type of its values."""
     expression: Any
-    """Its pyarrow expression."""
+    """The pyarrow expression."""
     length: int = 0
     """Number of elements of a vector."""
 
@@ -58,7 +58,7 @@ class Condition:
     """A parsed condition."""
 
     def __init__(self, text: str):
-        """Raises UserError on what is no condition, names no column or mixes types."""
+        """Parse `text`. Raises UserError on invalid syntax, unknown columns or mismatched types."""
         self.text = text
         self.columns: set[tuple[str, str]] = set()
         self._joined = self._compiled(lambda table, name: f"{table}.{name}")
@@ -67,19 +67,19 @@ class Condition:
 
     @property
     def on_labels(self) -> bool:
-        """Whether it chooses labels rather than frames."""
+        """Whether the condition selects labels rather than frames."""
         return any(table in ("labels", "craters") for table, _ in self.columns)
 
     def columns_of_only(self, table: str) -> list[str] | None:
-        """The columns that it names, where all are of one table; else None."""
+        """Return the columns used if all belong to `table`, otherwise None."""
         return sorted(name for _, name in self.columns) if {table} == {own for own, _ in self.columns} else None
 
     def within_table(self) -> Any:
-        """Its pyarrow expression on columns by their bare names, for a condition on one table."""
+        """Return the pyarrow expression with plain column names, for a condition on one table."""
         return self._compiled(lambda table, name: name)
 
     def holds(self, rows: pa.Table) -> NDArray[np.bool_]:
-        """Where it holds (N,), given its columns as `table.column`. Raises UserError where numbers overflow."""
+        """Evaluate the condition (N,) on columns named `table.column`. Raises UserError if numbers overflow."""
         mask = np.zeros(len(rows), np.bool_)
         try:
             found = rows.append_column("", pa.array(np.arange(len(rows)))).filter(self._joined)
@@ -161,7 +161,7 @@ class Condition:
         if isinstance(node.op, ast.Div):
             return _Value("real", pc.divide(real_a, real_b))
         if isinstance(node.op, ast.Mod) and whole:
-            # Arrow's division cuts towards zero; the remainder has the divisor's sign, as in Python.
+            # Arrow's division truncates towards zero; give the remainder the divisor's sign, as in Python.
             rest = a - b * pc.divide(a, b)
             return _Value(kind, pc.if_else((rest != 0) & pc.xor(rest < 0, b < 0), rest + b, rest))
         if isinstance(node.op, ast.Mod):
@@ -205,7 +205,7 @@ class Condition:
             found = value.expression.isin(pa.array(words, pa.int64()))
         else:
             found = value.expression.cast(pa.float64()).isin(pa.array([float(word) for word in words]))
-        # For pyarrow a null is in no list: `not in` would hold.
+        # pyarrow evaluates `null in list` as false, so `null not in list` would be true; return null.
         return pc.if_else(value.expression.is_valid(), found, pa.scalar(None, pa.bool_()))
 
     def _number(self, value: _Value, node: ast.expr) -> _Value:
@@ -251,5 +251,5 @@ def _constant(value: bool | float | str) -> _Value:
 
 
 def columns_of(conditions: Iterable[Condition]) -> set[tuple[str, str]]:
-    """All columns, as (table, name), that conditions need."""
+    """Return all columns, as (table, name), that the conditions use."""
     return {key for condition in conditions for key in condition.columns}

@@ -16,23 +16,23 @@ _MOST_PIXELS = 2**27
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame as `dataset[i]` gives it."""
+    """A frame, as returned by `dataset[i]`."""
 
     row: dict[str, Any]
-    """Columns of the table frames: pose, time, split, ... with their units in the names."""
+    """The frame's row of the table frames: pose, time, split, ... with units in the column names."""
     labels: pd.DataFrame
-    """Its rows of the table labels, one crater a row."""
+    """The frame's rows of the table labels, one row per crater."""
     png: bytes
-    """The image file."""
+    """Content of the PNG file."""
 
     @property
     def frame_id(self) -> str:
-        """The key in every table: scene, trajectory and number."""
+        """Key of the frame in all tables: scene_id/trajectory_id/frame_index."""
         return str(self.row["frame_id"])
 
     @property
     def image(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Grey levels (height, width), 8 or 16 bits. Raises UserError where the file is not such a PNG."""
+        """Grey levels (height, width), 8 or 16 bits. Raises UserError if the file is not such a PNG."""
         from PIL import Image
 
         try:

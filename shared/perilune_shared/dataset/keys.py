@@ -1,7 +1,7 @@
-"""Keys of a dataset's rows: each key is unique, and each referenced row exists.
+"""Check a dataset's keys: each key is unique, and each referenced row exists.
 
-A tool that joins tables by broken keys silently takes a wrong row. `validate` reports every such fault with its file
-and row; here the first one stops a command.
+A join on broken keys silently returns wrong rows. `validate` reports every such fault with its file and row. The checks
+here raise an error at the first fault.
 """
 
 from collections.abc import Mapping
@@ -21,9 +21,9 @@ _HINT = "see `perilune-manifest validate`"
 
 
 def check_keys(dataset: Dataset) -> None:
-    """Raises UserError where a key is not unique, or a row names a scene, trajectory, frame or crater that is missing.
+    """Raise UserError if a key is not unique, or if a row refers to a missing scene, trajectory, frame or crater.
 
-    Labels are read part by part; 8 bytes of memory are kept for each.
+    Reads labels one row group at a time and keeps 8 bytes of memory per label.
     """
     check = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
     _check_numbered(dataset, "boulders", check.scene_of)
@@ -35,14 +35,14 @@ def check_keys(dataset: Dataset) -> None:
 
 
 class KeyCheck:
-    """Checks keys of scenes, trajectories, frames and craters on creation, and of labels while a caller reads them.
+    """Check the keys of scenes, trajectories, frames and craters on creation, and of labels while a caller reads them.
 
-    Call `add_labels` with all labels of the dataset, some at a time, then `finish`. The keys of boulders, which no
-    other row names, are not checked.
+    Pass all labels of the dataset to `add_labels`, in batches, then call `finish`. Keys of boulders are not checked,
+    since no other row refers to them.
     """
 
     def __init__(self, dataset: Dataset, frames: pa.Table):
-        """Takes the table frames with at least FRAME_COLUMNS. Raises UserError where a key is broken."""
+        """`frames` is the table frames with at least FRAME_COLUMNS. Raises UserError if a key is broken."""
         self._dataset = dataset
         scenes = dataset.table("scenes", KEYS["scenes"]).to_pandas()
         _check_unique(dataset, "scenes", scenes)
@@ -62,9 +62,9 @@ class KeyCheck:
         self._seen: list[NDArray[np.int64]] = []
 
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
-        """Place of each label's frame (N,) in the table frames, for labels with frame_id and crater_id.
+        """Return the row number (N,) of each label's frame in the table frames; `rows` has frame_id and crater_id.
 
-        Raises UserError where a frame or crater is missing.
+        Raises UserError if a frame or crater is missing.
         """
         frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
         ids = rows["crater_id"].to_numpy()
@@ -82,7 +82,7 @@ class KeyCheck:
         return frame
 
     def finish(self) -> None:
-        """Raises UserError where two labels are of the same frame and crater."""
+        """Raise UserError if two labels have the same frame and crater."""
         both = np.concatenate(self._seen) if self._seen else np.empty(0, np.int64)
         if not (np.diff(both) > 0).all():
             both.sort()
@@ -95,7 +95,7 @@ class KeyCheck:
 
 
 def _places(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
-    """Place of each text (N,) of a column, -1 where it has none. Each distinct text is looked up once."""
+    """Look up each text of a column (N,) in `place_of`; -1 if it is missing. Each distinct text is looked up once."""
     found = []
     for chunk in column.chunks:
         words = chunk.dictionary_encode()
@@ -107,7 +107,7 @@ def _places(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.
 def _check_numbered(
     dataset: Dataset, table: str, scene_of: Mapping[str, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """All numbers of craters or boulders, and their keys (the places of scene and number in one), both sorted."""
+    """Return all ids of craters or boulders, and all keys (scene and id combined in one integer), both sorted."""
     rows = dataset.table(table, KEYS[table])
     scene = _check_known(dataset, table, "scene_id", rows["scene_id"], scene_of)
     numbers, place = np.unique(rows[KEYS[table][1]].to_numpy(), return_inverse=True)

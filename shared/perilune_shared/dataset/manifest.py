@@ -1,10 +1,10 @@
-"""A dataset on disk: dataset.json, Parquet parts under manifest/, frames under frames/ or packed in images/.
+"""Read a dataset: dataset.json, Parquet parts under manifest/, frames under frames/ or packed in images/.
 
-Parts are written once, aside and renamed, and never rewritten. Use::
+Parts are written atomically and never rewritten. Use::
 
     dataset = open_dataset("data/small/detect")
     dataset.labels, dataset[0].image                                                    # pandas, NumPy
-    dataset.table("labels", ["frame_id", "radius_px"], split="test")                    # Arrow, only what is needed
+    dataset.table("labels", ["frame_id", "radius_px"], split="test")                    # Arrow, reads only these
 """
 
 import contextlib
@@ -25,12 +25,12 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 
 LARGEST_FRAME_BYTES = 2**30
-"""Of a PNG or an EXR."""
+"""Maximum size of a PNG or EXR, bytes."""
 _MOST_KEPT_OPEN = 32
 
 
 class Dataset:
-    """A dataset opened for reading."""
+    """A dataset, open for reading."""
 
     _opened: dict[Path, Part] | None = None
 
@@ -40,9 +40,9 @@ class Dataset:
 
     @contextlib.contextmanager
     def parts_kept_open(self) -> Iterator[None]:
-        """Open and check each part's footer once within the block, for callers that read scene by scene.
+        """Open each part and check its footer only once within the block, for callers that read scene by scene.
 
-        Only while nobody writes to the dataset: a part that changes is not read again.
+        Use it only while no process writes to the dataset: changed parts are not reread.
         """
         self._opened = {}
         try:
@@ -51,7 +51,7 @@ class Dataset:
             self._opened = None
 
     def open_part(self, path: Path, table: str) -> Part:
-        """A part of a table, opened. Raises UserError as `Part` does."""
+        """Open a part of a table. Raises UserError as `Part` does."""
         if self._opened is None:
             return Part(path, table)
         if path not in self._opened:
@@ -63,27 +63,27 @@ class Dataset:
 
     @functools.cached_property
     def scenes(self) -> pd.DataFrame:
-        """The table scenes, read once."""
+        """The table scenes; cached."""
         return self.table("scenes").to_pandas()
 
     @functools.cached_property
     def trajectories(self) -> pd.DataFrame:
-        """The table trajectories, read once."""
+        """The table trajectories; cached."""
         return self.table("trajectories").to_pandas()
 
     @functools.cached_property
     def frames(self) -> pd.DataFrame:
-        """The table frames, read once; row i is frame `dataset[i]`."""
+        """The table frames; cached. Row i is frame `dataset[i]`."""
         return self.table("frames").to_pandas()
 
     @functools.cached_property
     def labels(self) -> pd.DataFrame:
-        """The table labels, read once: about 200 bytes of memory a label. `table` reads columns and splits of it."""
+        """The table labels; cached, about 200 bytes of memory per label. `table` can read single columns or a split."""
         return self.table("labels").to_pandas()
 
     @functools.cached_property
     def craters(self) -> pd.DataFrame:
-        """The table craters, read once."""
+        """The table craters; cached."""
         return self.table("craters").to_pandas()
 
     def __len__(self) -> int:
@@ -91,9 +91,9 @@ class Dataset:
         return self.info.counts.frames
 
     def __getitem__(self, place: int | str) -> Frame:
-        """A frame by its row number in `frames` or by its frame_id.
+        """Return a frame by its row number in `frames` or by its frame_id.
 
-        Raises IndexError or KeyError where there is none, UserError where its image or labels cannot be read.
+        Raises IndexError or KeyError if there is no such frame, UserError if its image or labels cannot be read.
         """
         if isinstance(place, str):
             found = self.frames.index[self.frames["frame_id"] == place]
@@ -109,7 +109,7 @@ class Dataset:
         return Frame(row, labels.to_pandas(), png)
 
     def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[Path]:
-        """The table's part files, sorted by name; only those that may hold rows of a scene or a descent."""
+        """Return a table's part files, sorted by name; with ids, those that may contain matching rows."""
         files = self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet")
         found = sorted(files, key=lambda part: part.stem)
         return [part for part in found if _may_hold(part.stem, scene_id, trajectory_id)]
@@ -123,13 +123,12 @@ class Dataset:
         split: str | None = None,
         where: Condition | None = None,
     ) -> pa.Table:
-        """One table as Arrow, whole or with chosen columns, of one scene, one descent (with its scene), one split.
+        """Read a table as Arrow: all or some columns; all rows or those of a scene, a trajectory, a split.
 
-        `where` chooses rows by a condition on the table's own columns; row groups whose statistics exclude it are not
-        read.
-        Only parts, row groups and columns that are asked for are read. Labels are of the split of their frame, craters
-        and boulders are of none. Raises UserError where a part is truncated or of another schema, or the table or a
-        column is not known.
+        A trajectory_id needs its scene_id. `where` selects rows by a condition on columns of this table; row groups
+        whose statistics exclude it are skipped. Only the parts, row groups and columns needed are read. Labels belong
+        to the split of their frame; craters and boulders belong to no split. Raises UserError if a part is truncated or
+        of another schema, or if the table or a column is unknown.
         """
         _check_names(table, columns)
         if split is not None and split not in SPLITS:
@@ -156,22 +155,22 @@ class Dataset:
         return self.table("frames", ["frame_id"], scene_id, trajectory_id, split)["frame_id"].combine_chunks()
 
     def scene_ids(self) -> list[str]:
-        """All scenes, in order."""
+        """Return all scene_ids, sorted."""
         return sorted(self.table("scenes", ["scene_id"])["scene_id"].to_pylist())
 
     def scene(self, scene_id: str) -> dict[str, pa.Table]:
-        """Every table of one scene."""
+        """Read all tables of one scene."""
         return {name: self.table(name, scene_id=scene_id) for name in TABLES}
 
     def file(self, relative: str) -> Path:
-        """A frame's file, checked to lie inside the dataset."""
+        """Return the path of a frame's file. Raises UserError if it is outside the dataset."""
         return files.inside(self.root, relative)
 
     def pngs(self, frames: pa.Table) -> Iterator[tuple[str, bytes]]:
-        """frame_id and PNG bytes of frames given by rows with frame_id and png_path, from files or packed.
+        """Yield frame_id and PNG bytes of the frames in `frames`, which has frame_id and png_path.
 
-        Files come in the order of the rows, packed frames in the order in which they lie. Raises UserError where one
-        is missing.
+        Frames stored as files come in the order of the rows, packed frames in the order in which they are stored.
+        Raises UserError if a frame is missing.
         """
         if self.info.images in ("absent", "planned"):
             made = "regenerate" if self.info.images == "absent" else "dataset --manifest"
@@ -209,17 +208,17 @@ class Dataset:
             raise UserError(self.root / "images", "frame_id", f"no {min(missing)}", "every frame of the manifest")
 
     def shards(self) -> list[Path]:
-        """The Parquet files with packed frames."""
+        """Return the Parquet files that contain packed frames."""
         return sorted(self.root.joinpath("images").glob("[A-Za-z0-9]*.parquet"))
 
 
 def open_dataset(root: str | Path) -> Dataset:
-    """Open a dataset. Raises UserError where it is missing, damaged or of another schema version."""
+    """Open a dataset. Raises UserError if it is missing, damaged or of another schema version."""
     return Dataset(Path(root), read_info(Path(root)))
 
 
 def count_rows(dataset: Dataset) -> Counts:
-    """Rows present in each table, read from the parts' footers."""
+    """Count the rows of each table, from the footers of its parts."""
     counts = {name: sum(dataset.open_part(part, name).n_rows for part in dataset.parts(name)) for name in TABLES}
     return Counts(**counts)
 
@@ -233,7 +232,7 @@ def _check_names(table: str, columns: Sequence[str] | None) -> None:
 
 
 def _may_hold(stem: str, scene_id: str | None, trajectory_id: str | None) -> bool:
-    """Whether a part of this name may hold rows of a scene, and of a descent in it."""
+    """Whether a part of this name may contain rows of a scene, and of a trajectory in it."""
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem) or scene_id is None:
         return True
@@ -248,7 +247,7 @@ def _chosen(
     split: str | None,
     where: Condition | None,
 ) -> pa.Table:
-    """Rows of a part of one scene, descent and split, where its table has such columns; labels go by their frame_id."""
+    """Read the rows of a part that belong to a scene, a trajectory and a split; labels are matched by frame_id."""
     columns = part.schema.names
     equal = {"scene_id": scene_id, "trajectory_id": trajectory_id, "split": split}
     equal = {name: value for name, value in equal.items() if value is not None and name in columns}
@@ -256,7 +255,7 @@ def _chosen(
     prefix = f"{scene_id}/{trajectory_id}/" if trajectory_id is not None else f"{scene_id}/"
     groups = None
     if is_whole(part.path.stem) and scene_id is not None:
-        # Among frame ids all with a prefix come from it on and before the same with "0", which follows "/", at its end.
+        # In sorted order the frame ids "S/..." are in ["S/", "S0"), since "0" is the character after "/".
         if "frame_id" in columns:
             groups = part.groups_within("frame_id", prefix, prefix[:-1] + "0")
         else:

@@ -1,9 +1,10 @@
-"""Masks of craters in a frame, made when asked for: the whole rim's interior (amodal), and what is seen of it.
+"""Crater masks of a frame, computed on demand: the whole interior of the rim (amodal) and its visible part.
 
-A pixel belongs to a crater where the ray through its centre passes the disc within the rim circle: exact, with and
-without lens distortion. It is visible where the ground that the frame's EXR has in that pixel (channel Z) is not nearer
-than the disc there; a crater's own floor lies behind the disc. The disc lies in rough ground, so ground hides only what
-lies more than a tenth of the radius and two pixels' width behind it, as for `visible_fraction`. Use::
+A pixel belongs to a crater if the ray through the pixel's centre intersects the disc inside the rim circle. This is
+exact, with and without lens distortion. The pixel is visible unless the terrain in the frame's EXR (depth, channel Z)
+is nearer than the disc; the crater's own floor lies behind the disc. Since the terrain around the disc is rough, it
+hides a pixel only if it is nearer by more than a tenth of the radius and by more than two pixel widths, as for
+`visible_fraction`. Use::
 
     depth_m = perilune_render.imaging.exr.read_exr(dataset.file(frame.exr_path))["Z"]
     for mask in frame_masks(dataset, frame_id, depth_m=depth_m):
@@ -24,28 +25,28 @@ from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 SLACK_RADII, SLACK_PX = 0.1, 2.0
-"""By how much nearer ground may be without hiding: share of the radius, pixels' width; the larger of the two."""
+"""Tolerance of the depth test: in crater radii and in pixel widths at the crater; the larger one counts."""
 _CRATER = ["crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
 
 
 @dataclass(frozen=True, slots=True)
 class CraterMask:
-    """One crater's masks, cut out of the image at its edge."""
+    """Masks of one crater in a window of the image; the window ends at the image edge."""
 
     crater_id: int
-    """The crater, within the frame's scene."""
+    """Id of the crater in the frame's scene."""
     row: int
-    """First row of the cut-out in the image, pixels from the top."""
+    """First row of the window, pixels from the top of the image."""
     column: int
-    """First column of the cut-out in the image, pixels from the left."""
+    """First column of the window, pixels from the left of the image."""
     amodal: NDArray[np.bool_]
-    """Whether each pixel's centre lies within the rim, hidden or not (h, w)."""
+    """Whether each pixel's centre is inside the rim, hidden or not (h, w)."""
     visible: NDArray[np.bool_] | None
-    """Those of `amodal` in which no nearer ground hides the crater (h, w); None where no depth was given."""
+    """Pixels of `amodal` in which no nearer terrain hides the crater (h, w); None if no depth was given."""
 
     @property
     def window(self) -> tuple[slice, slice]:
-        """The cut-out in the image: rows and columns."""
+        """Rows and columns of the window, to index the image."""
         height, width = self.amodal.shape
         return slice(self.row, self.row + height), slice(self.column, self.column + width)
 
@@ -57,12 +58,12 @@ def frame_masks(
     depth_m: NDArray[np.floating] | None = None,
     image: Literal["png", "exr"] = "png",
 ) -> list[CraterMask]:
-    """Masks of craters in a frame: of all its labels, in their order, or of `crater_ids` of its scene.
+    """Compute the masks of all labelled craters of a frame, in the order of the labels, or of `crater_ids`.
 
-    `image` "png" gives them in the pixels of `camera` of dataset.json, in which the labels are; "exr" in those of
-    `exr_camera`, which differ under lens distortion. depth_m (h, w) is the EXR's channel Z in either case, infinite
-    where nothing is hit; in the PNG's pixels it is looked up in the nearest pixel. Raises UserError on an unknown frame
-    or crater and on a depth of another size.
+    With `image` "png" the masks are in pixels of `camera` of dataset.json, as the labels are; with "exr", in pixels of
+    `exr_camera`, which differ under lens distortion. depth_m (h, w) is always the EXR's channel Z, infinite where no
+    terrain is hit; for "png" it is sampled at the nearest pixel. Raises UserError on an unknown frame or crater and on
+    a depth of another size.
     """
     scene_id, trajectory_id = [*frame_id.split("/"), ""][:2]
     columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz"]
@@ -102,15 +103,15 @@ def crater_masks(
     radii_m: Array,
     depth_m: NDArray[np.floating] | None = None,
 ) -> list[CraterMask]:
-    """Masks in `camera`'s pixels of N rim circles in O_C: centres (N, 3) and radii (N,) metres, unit normals (N, 3).
+    """Compute the masks of N rim circles in O_C: centres (N, 3) and radii (N,) in metres, unit normals (N, 3).
 
-    depth_m (h, w) is along the camera's axis, in its pixels. Empty masks (0, 0) where a rim has no image there or only
-    a part of it is in front of the camera.
+    Masks and depth_m (h, w) are in the pixels of `camera`; depth is along its optical axis. A mask is empty (0, 0) if
+    the rim is outside the image or not wholly in front of the camera.
     """
     rays = camera.rays(camera.pixel_centres())
     size = np.array([camera.width_px, camera.height_px])
     boxes = project_circles(camera, centres_camera_m, normals_camera, radii_m).bounding_boxes()
-    # Under distortion the ellipse is only the nearest to the rim's image.
+    # Under distortion the ellipse is a fit and may differ from the rim's image.
     margin = 1 if any(camera.distortion) else 0
     none = np.isnan(boxes).any(axis=1, keepdims=True)
     first = np.clip(np.where(none, 0, np.floor(boxes[:, :2]) - margin), 0, size).astype(int)
@@ -133,7 +134,7 @@ def crater_masks(
 
 
 def _looked_up(depth_m: NDArray[np.floating], camera: Camera, source: Camera) -> NDArray[np.floating]:
-    """What `source` has in the pixel nearest to each pixel centre of `camera`, at the same place."""
+    """Sample the depth image of `source` at the pixel nearest to each pixel centre of `camera`; both share one pose."""
     place = np.floor(source.project(camera.rays(camera.pixel_centres())))
     column = np.clip(place[..., 0], 0, source.width_px - 1).astype(int)
     row = np.clip(place[..., 1], 0, source.height_px - 1).astype(int)

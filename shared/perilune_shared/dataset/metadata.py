@@ -1,4 +1,4 @@
-"""dataset.json: what a dataset is, what it was made by, what was done to it."""
+"""dataset.json: what a dataset contains, how it was rendered, and how it was edited since."""
 
 import hashlib
 import json
@@ -19,18 +19,18 @@ from perilune_shared.storage import files
 
 INFO_NAME = "dataset.json"
 LARGEST_IMAGE_PX = 2**27
-"""Pixels of an image that is unpacked at all."""
+"""Largest image that is decompressed, pixels."""
 _FAR = 1e9
 _ROTATION = 1e-6
 _LARGEST_INFO_BYTES = 10_000_000
-# Names reach tables, pages and shells: they are letters, digits and a few marks that mean nothing there.
+# Names appear in tables, pages and shell commands: only letters, digits and characters without a meaning there.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$")]
 _Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _Row = tuple[float, float, float]
 
 
 def _printable(text: str) -> str:
-    """As it is. Raises ValueError at what would steer a terminal, turn the line round or break it."""
+    """Return `text` unchanged. Raises ValueError on control characters, bidirectional marks and line breaks."""
     if not text.isprintable():
         raise ValueError("text should be printable")
     return text
@@ -44,24 +44,24 @@ class _Info(BaseModel):
 
 
 class CameraInfo(_Info):
-    """The camera of all frames; pixels, metres and O_B."""
+    """The camera of all frames: intrinsics in pixels, mounting in O_B in metres."""
 
     width_px: Annotated[int, Field(gt=0, le=100_000)]
     """Image width, pixels."""
     height_px: Annotated[int, Field(gt=0, le=100_000)]
     """Image height, pixels."""
     fx_px: Annotated[float, Field(gt=0, le=_FAR)]
-    """Focal length over the pixel's width, pixels."""
+    """Focal length divided by the pixel width, pixels."""
     fy_px: Annotated[float, Field(gt=0, le=_FAR)]
-    """Focal length over the pixel's height, pixels."""
+    """Focal length divided by the pixel height, pixels."""
     cx_px: Annotated[float, Field(ge=-_FAR, le=_FAR)]
     """Principal point, pixels right of the left edge."""
     cy_px: Annotated[float, Field(ge=-_FAR, le=_FAR)]
     """Principal point, pixels below the top edge."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """Brown-Conrady k1, k2, p1, p2, k3, on coordinates over the focal length."""
+    """Brown-Conrady k1, k2, p1, p2, k3, for coordinates divided by the focal length."""
     rotation_camera_from_body: tuple[_Row, _Row, _Row]
-    """Rows of the matrix (3, 3)."""
+    """Rotation matrix (3, 3), row by row."""
     position_in_body_m: _Row
     """Centre of projection in O_B, metres."""
 
@@ -76,63 +76,63 @@ class CameraInfo(_Info):
 
     @classmethod
     def of(cls, camera: Camera) -> "CameraInfo":
-        """A camera at the body's origin that looks down on a level flight."""
+        """A camera at the body's origin that looks straight down while the body is level."""
         x, y, z = ROTATION_CAMERA_FROM_BODY.tolist()
         rows = tuple(x), tuple(y), tuple(z)
         return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=(0.0, 0.0, 0.0))
 
     def intrinsics(self) -> Camera:
-        """The camera that projects, with its distortion."""
+        """The camera model, including distortion."""
         return Camera(self.width_px, self.height_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.distortion)
 
 
 class Counts(_Info):
-    """Rows in each table."""
+    """Number of rows of each table."""
 
     scenes: Annotated[int, Field(ge=0)] = 0
-    """Terrains."""
+    """Number of scenes (terrains)."""
     craters: Annotated[int, Field(ge=0)] = 0
-    """Craters of all scenes."""
+    """Number of craters in all scenes."""
     boulders: Annotated[int, Field(ge=0)] = 0
-    """Boulders of all scenes."""
+    """Number of boulders in all scenes."""
     trajectories: Annotated[int, Field(ge=0)] = 0
-    """Descents."""
+    """Number of trajectories."""
     frames: Annotated[int, Field(ge=0)] = 0
-    """Images."""
+    """Number of frames."""
     labels: Annotated[int, Field(ge=0)] = 0
-    """Craters in images."""
+    """Number of labels, one per crater and frame."""
 
 
 class Origin(_Info):
-    """The dataset from whose EXRs another was developed."""
+    """The dataset whose EXRs another dataset was developed from."""
 
     name: Name
-    """Its name."""
+    """Name of that dataset."""
     sha256: _Sha256
-    """Of its dataset.json."""
+    """SHA-256 of its dataset.json."""
     camera_config: dict[str, Any] | None
-    """Its section `dataset.camera`, which the ground and the EXRs were made for; null where that is not known."""
+    """Its section `dataset.camera`, for which terrain and EXRs were made; null if not known."""
 
 
 class Recipe(_Info):
-    """All that scenes and frames follow from, beside their seeds: enough to make them again."""
+    """Everything besides their seeds that determines scenes and frames: enough to reproduce them."""
 
     preset: Name
-    """Where the settings began."""
+    """Preset on which the settings are based."""
     kind: Kind
-    """Which of the preset's datasets."""
+    """Which of the preset's datasets: detect or nav."""
     seed: Annotated[int, Field(ge=0)]
-    """From which every random stream is derived."""
+    """Random seed from which every random stream is derived."""
     config: dict[str, Any]
-    """The resolved `dataset` section."""
+    """The resolved section `dataset` of the configuration."""
     versions: dict[Name, Name]
-    """Packages and Blender."""
+    """Versions of the packages and of Blender, by name."""
     developed_from: Origin | None = None
-    """Where the frames were developed again from; null where they were rendered."""
+    """Dataset from whose EXRs the frames were developed; null if they were rendered."""
 
     @property
     def key(self) -> str:
-        """Names the recipe by its content."""
+        """Key of the recipe, computed from its content."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -141,53 +141,53 @@ class DatasetInfo(_Info):
     """Content of dataset.json."""
 
     name: Name
-    """For people."""
+    """Name of the dataset, for display."""
     kind: Kind
-    """What it is for."""
+    """Purpose of the dataset: detect or nav."""
     schema_version: str
-    """Of tables and files."""
+    """Schema version of tables and files."""
     complete: bool
-    """False while the renderer is still at work, or was stopped."""
+    """False while rendering is in progress or was interrupted."""
     images: ImageState
-    """files under frames/, packed in images/*.parquet, absent (elsewhere), or planned (not even labels are here)."""
+    """Where the frames are: files (under frames/), packed (images/*.parquet), absent, or planned (no labels either)."""
     split_by: SplitUnit
-    """What no two splits share. Less than a scene means that splits share terrain."""
+    """Unit of the split; no unit is in two splits. If it is not scene, splits may share terrain."""
     camera: CameraInfo
-    """Of all frames."""
+    """Camera of all frames (PNG)."""
     exr_camera: CameraInfo | None = None
-    """Of the EXRs: a camera without distortion that sees all that `camera` sees; null where there are none."""
+    """Camera of the EXRs: without distortion, covering the whole view of `camera`; null if there are no EXRs."""
     recipes: dict[str, Recipe]
-    """By key; each scene names its own."""
+    """Recipes by key; each scene refers to one."""
     history: tuple[_Line, ...] = ()
-    """What was done since rendering, a line each."""
+    """Edits since rendering, one line each."""
     counts: Counts
-    """Rows in each table, once complete."""
+    """Number of rows of each table; set when the dataset is complete."""
     licence: Annotated[str, Field(pattern=r"^[A-Za-z0-9(][A-Za-z0-9 ._+:()-]{0,499}$")]
-    """SPDX expression."""
+    """Licence of the dataset, as an SPDX expression."""
 
     @property
     def leak(self) -> str:
-        """What to say behind the split's unit where the splits share terrain; else nothing."""
+        """Warning to append to the split unit if splits share terrain; otherwise empty."""
         return "" if self.split_by == "scene" else ": splits share terrain, so that test figures flatter"
 
     def recipe(self) -> Recipe:
-        """The only recipe of a dataset that was rendered at one go. Raises ValueError where there are more."""
+        """The recipe of a dataset with exactly one. Raises ValueError if there are more."""
         (recipe,) = self.recipes.values()
         return recipe
 
     def changed(self, line: str, **fields: Any) -> "DatasetInfo":
-        """A copy with fields replaced and a line of history."""
+        """Return a copy with fields replaced and a line added to the history."""
         plain = "".join(c if c.isprintable() and c not in "<>&`$" else "?" for c in line)[:500]
         return self.model_copy(update={"history": (*self.history, plain), **fields})
 
 
 def recipes_of(*recipes: Recipe) -> dict[str, Recipe]:
-    """Recipes by their keys."""
+    """Return the recipes by their keys."""
     return {recipe.key: recipe for recipe in recipes}
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file. Raises UserError where it is missing, too large or no JSON object."""
+    """Read the JSON object in a file. Raises UserError if the file is missing, too large or not a JSON object."""
     if not path.exists() and not path.is_symlink():
         raise UserError(path.parent, path.name, "no such file", "the folder of a dataset (see `make dataset`)")
     n_bytes = files.check_plain_file(path)
@@ -205,7 +205,7 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object's members; of two of the same name, two readers may take one each."""
+    """Build a dict from members; duplicate names are refused, since readers differ in which one they use."""
     members: dict[str, Any] = {}
     for name, value in pairs:
         if name in members:
@@ -221,7 +221,7 @@ def _finite(number: str) -> float:
 
 
 def read_info(root: Path) -> DatasetInfo:
-    """The dataset.json of a folder. Raises UserError where it is missing, damaged or of another schema version."""
+    """Read a folder's dataset.json. Raises UserError if it is missing, damaged or of another schema version."""
     path = root / INFO_NAME
     content = read_object(path)
     for folder in (root / "manifest", root / "images", *(root / "manifest" / table for table in TABLES)):
@@ -234,7 +234,7 @@ def read_info(root: Path) -> DatasetInfo:
 
 
 def checked_info(content: dict[str, Any], path: Path) -> DatasetInfo:
-    """Plain data as a DatasetInfo. Raises UserError with the first field that is wrong."""
+    """Validate plain data as a DatasetInfo. Raises UserError about the first wrong field."""
     try:
         info = DatasetInfo.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -251,7 +251,7 @@ def checked_info(content: dict[str, Any], path: Path) -> DatasetInfo:
 
 
 def _check_texts(info: DatasetInfo, path: Path) -> None:
-    """Settings are anybody's; pages and terminals show them."""
+    """Check the texts of recipes, since settings are untrusted and are shown on pages and terminals."""
     for recipe in info.recipes.values():
         odd = _odd_text([recipe.config, recipe.developed_from.camera_config if recipe.developed_from else None])
         if odd is not None:
@@ -259,7 +259,7 @@ def _check_texts(info: DatasetInfo, path: Path) -> None:
 
 
 def _odd_text(tree: object) -> str | None:
-    """A text in plain data, names of members too, that would steer a terminal or a page."""
+    """Return the first text or member name in plain data that contains unsafe characters; None if there is none."""
     if isinstance(tree, str):
         return None if tree.isprintable() and not set(tree) & set("<>&`$") else tree
     if isinstance(tree, dict):
@@ -270,6 +270,6 @@ def _odd_text(tree: object) -> str | None:
 
 
 def write_info(root: Path, info: DatasetInfo) -> None:
-    """Write dataset.json, whole or not at all. Raises UserError where its recipe names things by odd characters."""
+    """Write dataset.json atomically. Raises UserError if texts of its recipes contain unsafe characters."""
     _check_texts(info, root / INFO_NAME)
     files.write_text(root / INFO_NAME, info.model_dump_json(indent=2) + "\n")

@@ -1,7 +1,8 @@
-"""One Parquet part of a table: written once, aside and renamed; read with limits, since it may come from anybody.
+"""One Parquet part of a table: written once and atomically, and read with limits, since parts are untrusted input.
 
-A part's name says whose rows it holds: `<scene_id>` or `<scene_id>.<trajectory_id>`. A whole table is the part `all`,
-whose row groups hold a scene or a few descents each; a table above the limits continues in `all.0001` and so on.
+The name of a part says which rows it contains: `<scene_id>` or `<scene_id>.<trajectory_id>`. A table in one file is the
+part `all`, whose row groups contain one scene or a few trajectories each. A table above the limits continues in
+`all.0001` and so on.
 """
 
 import contextlib
@@ -23,49 +24,48 @@ from perilune_shared.storage import files
 from perilune_shared.storage.pages import pages_of
 
 WHOLE_TABLE = "all"
-"""Name of the part that holds all rows of its table, or the first of them."""
+"""Name of the part that contains all rows of its table, or the first rows."""
 MOST_ROWS_WRITTEN = 10_000_000
-"""Most rows of one written part; below every limit of the reader, for every table."""
+"""Maximum number of rows of a written part; below the reader's limits for every table."""
 _MOST_ROWS = 50_000_000
 _MOST_GROUP_ROWS = 2**21
 _LONGEST_TEXT = 1000
 _MOST_BYTES = 8 * 2**30
-# Of a footer's list: a schema nested deeper than this ends the process.
+# Limit of the lists in a footer: a schema nested much deeper crashes the process.
 _LONGEST_LIST = 10_000
 _LONGEST_FOOTER_TEXT = 10_000_000
-# No row of any table takes less room, however well it is compressed, and none shrinks more.
+# Bounds on compression: no row of any table takes fewer bytes, and no data compresses by a larger factor.
 _SPARE_ROWS, _BYTES_A_ROW = 10_000, 4
 _SPARE_BYTES, _MOST_SHRUNK = 2**26, 200
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
 _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
-"""Scenes and descents: their names become names of files."""
+"""Pattern of scene_id and trajectory_id, which become file names."""
 FRAME_ID_PATTERN = f"^{_ID}/{_ID}/[0-9]{{6}}$"
 PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
 _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
 
 
 def is_whole(stem: str) -> bool:
-    """Whether a part of this name may hold rows of any scene."""
+    """Whether a part of this name may contain rows of any scene."""
     return stem.partition(".")[0] == WHOLE_TABLE
 
 
 class Part:
-    """An opened part, whose footer has been checked."""
+    """An open part whose footer has been checked."""
 
     def __init__(self, path: Path, table: str, schema: pa.Schema | None = None, version: str = SCHEMA_VERSION):
-        """Raises UserError where it is no Parquet file, of another table or schema version, or too large.
+        """Open a part. Raises UserError if it is no Parquet file, of another table or schema version, or too large.
 
-        `schema` is that of the table's columns where it is not that of TABLES, as in older versions.
-
-        Columns that the table does not know are ignored. Columns of `OPTIONAL` that the file lacks are read as null.
+        `schema` replaces the table's schema in TABLES, for older versions. Unknown columns are ignored. Missing columns
+        of `OPTIONAL` are read as null.
         """
         self.path, self.schema = path, schema or TABLES[table]
         self._optional = OPTIONAL.get(table, ()) if schema is None else ()
         self._n_bytes = files.check_plain_file(path)
         self._checked: set[tuple[int, str]] = set()
         try:
-            # A small file is read once; a large one only where its columns are asked for.
+            # Read a small file at once; of a large file read only the requested columns.
             self._content = path.read_bytes() if self._n_bytes <= _SMALL_BYTES else None
             texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
             self.file = self._parquet(texts)
@@ -81,9 +81,9 @@ class Part:
                 raise UserError(path, f"perilune.{name}", got, wanted + hint)
 
     def _parquet(self, texts: Sequence[str]) -> pq.ParquetFile:
-        """The opened file; columns of `texts` are read as dictionaries.
+        """Open the file; the columns `texts` are read as dictionaries.
 
-        So a short file cannot grow into gigabytes of text before its length is known.
+        Otherwise a short file could decompress to gigabytes of text before the text's length is checked.
         """
         source = self.path if self._content is None else pa.BufferReader(self._content)
         options = {
@@ -99,12 +99,12 @@ class Part:
 
     @property
     def n_rows(self) -> int:
-        """Rows of the part."""
+        """Number of rows."""
         return self.file.metadata.num_rows
 
     @property
     def n_groups(self) -> int:
-        """Row groups of the part."""
+        """Number of row groups."""
         return self.file.metadata.num_row_groups
 
     def _check_size(self) -> None:
@@ -135,9 +135,9 @@ class Part:
     def read(
         self, columns: Sequence[str] | None = None, groups: Iterable[int] | None = None, *, any_ids: bool = False
     ) -> pa.Table:
-        """Rows with chosen columns, of chosen row groups.
+        """Read the given columns of the given row groups; by default all.
 
-        Raises UserError where that cannot be read, or names of scenes, descents and frames could not be names of files
+        Raises UserError if they cannot be read, or if ids of scenes, trajectories or frames are not safe file names
         (unless `any_ids`).
         """
         chosen = list(range(self.n_groups) if groups is None else groups)
@@ -156,7 +156,7 @@ class Part:
             with opened as stream:
                 for group in chosen:
                     self._check_pages(stream, group, present)
-            # Threads cost more than they save on a single row group.
+            # Threads slow down the reading of a single row group.
             rows = self.file.read_row_groups(chosen, columns=present, use_threads=len(chosen) > 1)
             for field in map(wanted.field, present):
                 if pa.types.is_string(field.type):
@@ -171,7 +171,7 @@ class Part:
             raise UserError(self.path, "content", error, "a whole Parquet file") from None
 
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
-        """The footer's sizes were checked; here that the pages keep to them."""
+        """Check that the pages do not exceed the sizes in the footer, which have been checked."""
         metadata = self.file.metadata.row_group(group)
         for column in map(metadata.column, range(metadata.num_columns)):
             name = column.path_in_schema
@@ -182,7 +182,7 @@ class Part:
                 found = f"{pages.unpacked_bytes} bytes unpacked and {pages.n_values} values"
                 wanted = f"at most {column.total_uncompressed_size} and {column.num_values}, as its footer says"
                 raise UserError(self.path, name, found, wanted)
-            # One image repeated by a dictionary would be a small file that unpacks without end.
+            # With a dictionary, a small file could repeat one image and decompress to any size.
             if name.startswith("image.") and pages.has_dictionary:
                 raise UserError(self.path, name, "a dictionary", "plain bytes for each frame")
             self._checked.add((group, name))
@@ -198,7 +198,7 @@ class Part:
                 raise UserError(self.path, name, repr(odd), f"text like {pattern}")
 
     def groups_within(self, column: str, low: str, high: str) -> list[int]:
-        """Row groups that may hold texts from `low` up to, but not including, `high`, by their statistics."""
+        """Return the row groups that may contain texts in [low, high), by their statistics."""
         footer = self.file.metadata
         names = [footer.schema.column(i).path for i in range(footer.num_columns)]
         place = names.index(column) if column in names else -1
@@ -207,14 +207,14 @@ class Part:
             known = footer.row_group(group).column(place).statistics if place >= 0 else None
             try:
                 far = known is not None and known.has_min_max and not (str(known.min) < high and str(known.max) >= low)
-            except (pa.ArrowException, ValueError):  # of another type, or no text
+            except (pa.ArrowException, ValueError):  # statistics of another type, or not UTF-8
                 far = False
             if not far:
                 chosen.append(group)
         return chosen
 
     def groups_where(self, condition: pc.Expression) -> list[int]:
-        """Row groups that may hold rows for which a condition on the part's columns is true, by their statistics."""
+        """Return the row groups that may contain rows that fulfil a condition, by their statistics."""
         try:
             # The footer was checked when the part was opened.
             whole = ds.ParquetFileFormat().make_fragment(str(self.path.absolute()), LocalFileSystem())
@@ -224,23 +224,23 @@ class Part:
 
 
 def _first_odd(words: pa.Array, pattern: str) -> str | None:
-    """The first text that does not match a pattern, None where all match."""
-    if len(words) <= _FEW_WORDS:  # arrow would compile the pattern each time
+    """Return the first text that does not match a pattern, or None if all match."""
+    if len(words) <= _FEW_WORDS:  # faster for few texts: Arrow compiles the pattern in every call
         fitting = re.compile(pattern)
         return next((word for word in words.to_pylist() if word is not None and not fitting.fullmatch(word)), None)
-    fits = pc.match_substring_regex(words, pattern)  # in RE2, $ matches the end only
+    fits = pc.match_substring_regex(words, pattern)  # in RE2, $ matches only at the end of the text
     return words.filter(pc.invert(fits))[0].as_py() if pc.all(fits).as_py() is False else None
 
 
 def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> pa.Table:
-    """One Parquet part. Raises UserError where it cannot be read or is of another table or schema version."""
+    """Read one part. Raises UserError if it cannot be read or is of another table or schema version."""
     return Part(path, table).read(columns)
 
 
 def write_part(root: Path, table: str, name: str, rows: pa.Table, rows_a_group: int | None = None) -> Path:
-    """Write one part `manifest/<table>/<name>.parquet`. A part that exists is never rewritten.
+    """Write the part `manifest/<table>/<name>.parquet`. Raises FileExistsError if it exists.
 
-    Raises UserError where the name, which may come from another dataset's rows, could not be a part's.
+    Raises UserError if the name, which may come from the rows of an untrusted dataset, is not a valid part name.
     """
     if not re.fullmatch(PART_PATTERN, name) or name.endswith("\n"):
         raise UserError(root, "part", repr(name), f"a name like {PART_PATTERN}")

@@ -1,6 +1,6 @@
 """The tables of a dataset: every column with its type, unit and frame of reference (schema version 3).
 
-The same text stands in the metadata of every Parquet file, so that a file found alone still says what it holds.
+Every Parquet file contains these units and meanings as metadata, so a single file documents itself.
 """
 
 from typing import Literal
@@ -12,9 +12,9 @@ _TEXT, _REAL, _INTEGER = pa.string(), pa.float64(), pa.int64()
 
 
 def complete(table: str, rows: pa.Table) -> pa.Table:
-    """Rows with exactly the table's columns, in order and of their types: optional ones that are missing become null.
+    """Return `rows` with exactly the table's columns, in order and with their types; missing optional ones become null.
 
-    Raises pyarrow's error where another column is missing or of another type.
+    Raises pyarrow's error if a required column is missing or a column cannot be cast to its type.
     """
     for name in OPTIONAL.get(table, ()):
         if name not in rows.column_names:
@@ -162,8 +162,8 @@ TABLES: dict[str, pa.Schema] = {
     ),
 }
 OPTIONAL: dict[str, tuple[str, ...]] = {"frames": ("real_ground_share", "n_craters_above_max_radius")}
-"""Columns that a file may lack, by table: they came after the schema version. A reader fills them with nulls, a writer
-writes them. To add one: a column with `optional=True` at the end of its table, and its name here."""
+"""Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
+writers always write them. To add one, append a column with `optional=True` to its table and add its name here."""
 KEYS: dict[str, list[str]] = {
     "scenes": ["scene_id"],
     "craters": ["scene_id", "crater_id"],
@@ -172,7 +172,7 @@ KEYS: dict[str, list[str]] = {
     "frames": ["frame_id"],
     "labels": ["frame_id", "crater_id"],
 }
-"""What names one row of each table."""
+"""Columns that identify a row, by table."""
 
 IMAGES = pa.schema(
     [
@@ -186,12 +186,12 @@ IMAGES = pa.schema(
     metadata={
         "perilune.table": "images",
         "perilune.schema_version": SCHEMA_VERSION,
-        # Hugging Face `datasets` decodes the column as an image by this.
+        # Tells Hugging Face `datasets` to decode the column as an image.
         "huggingface": '{"info": {"features": {"frame_id": {"dtype": "string", "_type": "Value"}, '
         '"image": {"_type": "Image"}}}}',
     },
 )
-"""The frames of a packed dataset: images/*.parquet."""
+"""Schema of the packed frames, images/*.parquet."""
 
 Kind = Literal["detect", "nav"]
 SplitUnit = Literal["scene", "trajectory", "frame"]

@@ -1,4 +1,4 @@
-"""Which labels count: named selections of craters, from all that lie in the frame to those that a picture shows.
+"""Select labels by named sets of thresholds: from all craters in the frame to those visible in the image.
 
 Use::
 
@@ -24,18 +24,18 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Selection(Section):
-    """Thresholds that a label must all reach; null asks for nothing."""
+    """Thresholds; a selected label fulfils all of them. null sets no threshold."""
 
     radius_px: tuple[Positive, Positive | None] | None = None
-    """Least and largest sqrt(a b), pixels; null as the largest asks for none."""
+    """Minimum and maximum radius sqrt(a b), pixels; null as the maximum sets no upper limit."""
     min_visible_fraction: Share | None = None
-    """Least share of the rim that lies inside the image and is not hidden."""
+    """Minimum fraction of the rim that is inside the image and not hidden."""
     min_sunlit_fraction: Share | None = None
-    """Least share of the crater's pixels that the Sun reaches."""
+    """Minimum fraction of the crater's visible pixels that are in sunlight."""
     min_depth_ratio: Share | None = None
-    """Least depth over diameter, on the finished terrain: below it a crater is worn away."""
+    """Minimum ratio of depth to diameter on the finished terrain; lower ratios mean an eroded crater."""
     min_contrast: float | None = None
-    """Least contrast: the crater's own shading in the frame over its standard error, from noise and clutter."""
+    """Minimum contrast: the crater's own shading in the frame divided by its standard error, from noise and clutter."""
 
 
 SELECTIONS: dict[str, Selection] = {
@@ -49,16 +49,18 @@ SELECTIONS: dict[str, Selection] = {
         min_contrast=4.0,
     ),
 }
-"""Every label of a dataset; the paper's rule, 2 to 50 px with the centre in the frame (as is that of every label); and
-what somebody who looks at the frame could find, for training and scoring."""
+"""`all`: every label. `paper`: the paper's rule, radius 2 to 50 px and centre in the frame (true of every label).
+`visible`: craters that a person can see in the frame, for training and evaluation."""
 _JUDGED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
 _CRATER = ["scene_id", "crater_id", "depth_m", "diameter_m"]
 
 
 def selected(labels: pd.DataFrame, selection: Selection) -> NDArray[np.bool_]:
-    """Whether each label (N,) is selected, from radius_px, visible_fraction, sunlit_fraction, contrast, depth_m and
-    diameter_m (see `read_labels`). A contrast that is not known (NaN: migrated datasets) is not asked for; any other
-    value that is not known reaches no threshold."""
+    """Return whether each label (N,) is selected.
+
+    Needs the columns radius_px, visible_fraction, sunlit_fraction, contrast, depth_m and diameter_m (see
+    `read_labels`). An unknown contrast (NaN, in migrated datasets) passes; any other unknown value fails its threshold.
+    """
     chosen = np.ones(len(labels), np.bool_)
     if selection.radius_px is not None:
         least_px, largest_px = selection.radius_px
@@ -74,12 +76,12 @@ def selected(labels: pd.DataFrame, selection: Selection) -> NDArray[np.bool_]:
 
 
 def default_label_bound_px(width_px: int) -> float:
-    """Largest radius that becomes a label by default, pixels: 50, and in images wider than 256 px in proportion."""
+    """Default maximum radius of a label, pixels: 50, and proportional to the width in images wider than 256 px."""
     return max(50.0, width_px * 50 / 256)
 
 
 def label_bound_px(info: DatasetInfo) -> float:
-    """Largest radius that became a label in a dataset, pixels, by its recipes; the default where they do not say."""
+    """Maximum radius of a label in a dataset, pixels, from its recipes; the default if they do not state it."""
     stated = [recipe.config.get("labels") for recipe in info.recipes.values()]
     bounds = [labels.get("max_radius_px") for labels in stated if isinstance(labels, dict)]
     numbers = [float(bound) for bound in bounds if isinstance(bound, int | float) and bound > 0]
@@ -87,10 +89,10 @@ def label_bound_px(info: DatasetInfo) -> float:
 
 
 def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None = None) -> pd.DataFrame:
-    """Labels of a dataset or of one split with all that `selected` asks for, and further `columns` of the table.
+    """Read the labels of a dataset or of one split, with the columns that `selected` needs and further `columns`.
 
-    In the table's order. Depth and diameter (metres) are those of the table craters, joined by scene_id and crater_id.
-    Raises UserError where a part cannot be read or keys are broken.
+    Rows are in the order of the table labels. Depth and diameter (metres) come from the table craters, joined by
+    scene_id and crater_id. Raises UserError if a part cannot be read or keys are broken.
     """
     wanted = list(dict.fromkeys(["frame_id", "crater_id", *_JUDGED, *columns]))
     frames = dataset.table("frames", ["frame_id", "scene_id"], split=split).to_pandas()

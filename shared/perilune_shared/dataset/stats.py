@@ -1,4 +1,4 @@
-"""What a dataset holds, in numbers. Read a part at a time, so that memory does not grow with the dataset."""
+"""Statistics of a dataset. Labels are read one row group at a time to limit memory."""
 
 import numpy as np
 import pandas as pd
@@ -10,12 +10,12 @@ from perilune_shared.errors import UserError
 
 
 def summary(dataset: Dataset) -> pd.DataFrame:
-    """Counts and quantiles, one row a split.
+    """Compute counts and quantiles, one row per split.
 
-    Scenes, trajectories, frames, labels, labels per frame, quantiles of the radius in pixels, mean visible fraction,
-    craters in view that are too large for a label (None where not known) and megabytes of PNGs.
+    Columns: scenes, trajectories, frames, labels, labels per frame, quantiles of the radius in pixels, mean visible
+    fraction, craters in view that are too large for a label (None if not known) and size of the PNGs (10^6 bytes).
 
-    Raises UserError where there are no frames or keys are broken.
+    Raises UserError if there are no frames or keys are broken.
     """
     frames = dataset.table("frames", [*FRAME_COLUMNS, "split", "png_bytes", "n_craters_above_max_radius"])
     keys = KeyCheck(dataset, frames)
@@ -41,7 +41,7 @@ def summary(dataset: Dataset) -> pd.DataFrame:
 
 
 class _Gathered:
-    """Of the labels of one split."""
+    """Values collected from the labels of one split."""
 
     def __init__(self) -> None:
         self.radius_px: list[np.ndarray] = []

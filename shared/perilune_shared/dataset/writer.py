@@ -1,7 +1,6 @@
-"""Writing a whole dataset anew, scene by scene, aside and renamed: how merge, subset, split and the others end.
+"""Write a new dataset atomically, scene by scene; used by merge, subset, split and the other editing commands.
 
-What can be reckoned from the rows is reckoned here and nowhere added up: rows of each table, frames of each descent,
-its split, and what the splits do not share.
+The row counts, the number of frames and split of each trajectory, and the split unit are recomputed from the rows.
 """
 
 import contextlib
@@ -25,15 +24,15 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage import checksums, files
 
 SceneTables = dict[str, pa.Table]
-"""Every table of one scene, by name."""
+"""All tables of one scene, by name."""
 _PER_DESCENT = ("frames", "labels")
 _IMAGES_A_GROUP, _BYTES_A_GROUP = 128, 2**28
 MOST_IMAGES_WRITTEN = 1_000_000
-"""Frames of one shard: 7,813 row groups, of which a reader accepts 10,000."""
+"""Maximum number of frames of a shard: 7,813 row groups; readers accept 10,000."""
 
 
 class DatasetWriter:
-    """Collects a dataset in a folder; see `written`."""
+    """Write a dataset into a folder; create it with `written`."""
 
     def __init__(
         self, root: Path, info: DatasetInfo, *, whole_tables: bool = False, most_rows: int = MOST_ROWS_WRITTEN
@@ -49,10 +48,11 @@ class DatasetWriter:
         self._recipes: set[str] = set()
 
     def add_scene(self, tables: SceneTables) -> None:
-        """Append one scene, whose frames are not empty.
+        """Append one scene that has frames.
 
-        Descents get their number of frames and their split anew, frames the paths at which `add_images` puts them.
-        Raises UserError where the scene has not one row, or a frame is of a descent that has none.
+        Recomputes the number of frames and the split of each trajectory, and sets the paths at which `add_images`
+        stores the frames. Raises UserError if the table scenes has not exactly one row, or if a frame's trajectory is
+        missing.
         """
         check_scene("the dataset given", tables)
         frames = _placed(tables["frames"])
@@ -80,7 +80,7 @@ class DatasetWriter:
                 write_part(self.root, name, scene_id, rows)
 
     def _keep(self, name: str, rows: pa.Table) -> None:
-        """Collect rows of a whole table; write a part whenever another row would exceed its limit."""
+        """Buffer rows of a table; write a part whenever it reaches the maximum number of rows."""
         while len(rows):
             free = self._most_rows - sum(map(len, self._kept[name]))
             if not free:
@@ -96,9 +96,9 @@ class DatasetWriter:
         self._n_whole[name] += 1
 
     def add_images(self, source: Dataset, frames: pa.Table, names: dict[str, str], *, link: bool) -> None:
-        """Bring frames of another dataset as files: `frames` are its rows, `names` give the new frame_id of each.
+        """Copy frames stored as files from another dataset: `frames` are its rows, `names` maps old to new frame_ids.
 
-        With `link` files are linked where the disk allows it, else copied.
+        With `link`, make hard links where the file system allows it.
         """
         by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path"]).to_pylist()}
         if source.info.images == "packed":
@@ -116,7 +116,7 @@ class DatasetWriter:
     def pack_images(
         self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int, most_images: int = MOST_IMAGES_WRITTEN
     ) -> None:
-        """Write frames (frame_id, png_path, PNG bytes) into shards images/*.parquet of about `shard_bytes` at most."""
+        """Write frames (frame_id, png_path, PNG bytes) into images/*.parquet, of up to about `shard_bytes` each."""
         shard, size, held, n_images, writer = 0, 0, 0, 0, None
         waiting: list[tuple[str, str, bytes]] = []
         self.root.joinpath("images").mkdir(parents=True, exist_ok=True)
@@ -127,7 +127,7 @@ class DatasetWriter:
                 return
             if writer is None:
                 path = self.root / "images" / f"{shard:05d}.parquet"
-                # PNG is compressed already, and no two frames are alike.
+                # PNG is already compressed, and all frames differ.
                 writer = pq.ParquetWriter(path, IMAGES, compression="none", use_dictionary=["frame_id"])
             rows = [{"frame_id": name, "image": {"bytes": png, "path": path}} for name, path, png in waiting]
             writer.write_table(pa.Table.from_pylist(rows, schema=IMAGES))
@@ -150,13 +150,13 @@ class DatasetWriter:
             writer.close()
 
     def finish(self, out: Path, progress: Progress | None = None) -> None:
-        """Write what remains, dataset.json and the checksums. Raises UserError about `out` where no frame came."""
+        """Write buffered rows, dataset.json and the checksums. Raises UserError about `out` if there are no frames."""
         if not self._rows["frames"]:
             raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
         for name in TABLES if self.whole_tables else ():
             if self._kept[name] or not self._n_whole[name]:
                 self._write_whole(name)
-        # A descent may come twice: rendered, and developed again with another sensor.
+        # A trajectory may occur twice: rendered, and developed again with another sensor.
         torn = any(len(splits) > 1 for splits in self._splits_of_descent.values())
         shared = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
         unit: SplitUnit = "frame" if torn else "trajectory" if shared else "scene"
@@ -178,13 +178,13 @@ def written(
     most_rows: int = MOST_ROWS_WRITTEN,
     progress: Progress | None = None,
 ) -> Iterator[DatasetWriter]:
-    """A writer for a new dataset in `out`, which appears whole or not at all.
+    """Give a writer for a new dataset; it appears at `out` only when the block succeeds.
 
-    With `whole_tables` each table is one part, or several of at most `most_rows` rows. `info` gives all that does not
-    follow from the rows. Raises UserError where there are no frames or `out` holds something.
+    With `whole_tables` each table is one part, or several of at most `most_rows` rows. `info` provides the metadata
+    that is not computed from the rows. Raises UserError if there are no frames or `out` is not empty.
     """
     with files.new_folder(out) as aside:
-        # A copy of an info with fields replaced was never checked.
+        # Copies with replaced fields have not been validated.
         checked_info(json.loads(info.model_dump_json()), out)
         writer = DatasetWriter(aside, info, whole_tables=whole_tables, most_rows=most_rows)
         yield writer
@@ -192,7 +192,7 @@ def written(
 
 
 def check_scene(where: object, tables: SceneTables) -> None:
-    """Raises UserError about a dataset (`where`) where a scene has not one row, or a descent with frames has none."""
+    """Raise UserError about `where` if the table scenes has not exactly one row, or a frame's trajectory is missing."""
     scenes, frames = tables["scenes"]["scene_id"], tables["frames"]
     if len(scenes) != 1:
         found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"
@@ -204,7 +204,7 @@ def check_scene(where: object, tables: SceneTables) -> None:
 
 
 def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
-    """A table with one column replaced."""
+    """Return a table with one column replaced."""
     place = table.schema.get_field_index(name)
     field = table.schema.field(place)
     array = values if isinstance(values, pa.Array | pa.ChunkedArray) else pa.array(values, field.type)
@@ -212,12 +212,12 @@ def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
 
 
 def frame_path(frame_id: str, kind: str) -> str:
-    """Where the PNG or EXR of a frame lies in every dataset that is written here."""
+    """Return the relative path of a frame's PNG or EXR in datasets written by this module."""
     return f"frames/{frame_id}.{kind}"
 
 
 def _placed(frames: pa.Table) -> pa.Table:
-    """Frames with the paths of their files here; another's dataset may keep them elsewhere."""
+    """Return frames with the file paths of the new dataset; the source dataset may use other paths."""
     ids = frames["frame_id"].to_pylist()
     for kind in ("png", "exr"):
         name = f"{kind}_path"
@@ -228,7 +228,7 @@ def _placed(frames: pa.Table) -> pa.Table:
 
 
 def _settled(trajectories: pa.Table, frames: pa.Table) -> pa.Table:
-    """The descents that have frames, with the number and the common split of these."""
+    """Return the trajectories that have frames, with the number of frames and their common split."""
     counted = frames.group_by("trajectory_id").aggregate(
         [("frame_id", "count"), ("split", "count_distinct"), ("split", "min")]
     )

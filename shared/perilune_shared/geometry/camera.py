@@ -1,6 +1,6 @@
-"""The camera: a pinhole, with or without lens distortion.
+"""Pinhole camera model with optional lens distortion.
 
-Theory: a point X in O_L goes to the camera by x_C = rotation_camera_from_site (X - position_m), and to the image by
+A point X in O_L has the camera coordinates x_C = rotation_camera_from_site (X - position_m) and the image coordinates
 u = fx x' + cx, v = fy y' + cy. Without distortion x' = a = x/z and y' = b = y/z. With it, after Brown (1966) and
 Conrady (1919) in OpenCV's form, with r^2 = a^2 + b^2 and s = 1 + k1 r^2 + k2 r^4 + k3 r^6,
 x' = a s + 2 p1 a b + p2 (r^2 + 2 a^2) and y' = b s + p1 (r^2 + 2 b^2) + 2 p2 a b.
@@ -22,31 +22,31 @@ from perilune_shared.geometry.frames import Array
 Distortion = tuple[float, float, float, float, float]
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
 _UNDISTORTED_TO = 1e-10
-"""Largest error of `rays`, in coordinates over the focal length."""
+"""Maximum error of `rays`, in coordinates divided by the focal length."""
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Intrinsics of a camera."""
+    """Camera intrinsics."""
 
     width_px: int
     """Image width, pixels."""
     height_px: int
     """Image height, pixels."""
     fx_px: float
-    """Focal length over the pixel's width, pixels."""
+    """Focal length divided by the pixel width, pixels."""
     fy_px: float
-    """Focal length over the pixel's height, pixels."""
+    """Focal length divided by the pixel height, pixels."""
     cx_px: float
     """Principal point, pixels right of the left edge."""
     cy_px: float
     """Principal point, pixels below the top edge."""
     distortion: Distortion = NO_DISTORTION
-    """k1, k2, p1, p2, k3 of Brown and Conrady, on coordinates over the focal length."""
+    """Brown-Conrady k1, k2, p1, p2, k3, for coordinates divided by the focal length."""
 
     @classmethod
     def from_field_of_view(cls, width_px: int, height_px: int, horizontal_fov_deg: float) -> "Camera":
-        """A camera with square pixels and a centred principal point."""
+        """Create a camera with square pixels and a centred principal point."""
         f = width_px / 2 / np.tan(np.radians(horizontal_fov_deg) / 2)
         return cls(width_px, height_px, float(f), float(f), width_px / 2, height_px / 2)
 
@@ -56,9 +56,9 @@ class Camera:
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     def project(self, points_camera_m: ArrayLike) -> Array:
-        """Pixels (..., 2) of points (..., 3) in O_C.
+        """Project points (..., 3) in O_C, metres, to pixels (..., 2).
 
-        NaN where the point is not in front of the camera, or so far off the axis that the distortion folds back.
+        NaN if the point is not in front of the camera, or so far off the axis that the distortion folds back.
         """
         p = np.asarray(points_camera_m, np.float64)
         z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
@@ -68,9 +68,10 @@ class Camera:
         return np.stack([self.fx_px * x + self.cx_px, self.fy_px * y + self.cy_px], axis=-1)
 
     def rays(self, pixels: ArrayLike) -> Array:
-        """Directions (..., 3) in O_C with z = 1 through pixels (..., 2): times a depth along the axis, points.
+        """Return directions (..., 3) in O_C with z = 1 through pixels (..., 2); multiply by the depth z to get points.
 
-        Undoes distortion to 1e-10; NaN where no ray comes to the pixel before the distortion folds back.
+        Inverts the distortion with an error below 1e-10. NaN if no ray reaches the pixel before the distortion folds
+        back.
         """
         uv = np.asarray(pixels, np.float64)
         x = (uv[..., 0] - self.cx_px) / self.fx_px
@@ -80,30 +81,30 @@ class Camera:
         return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def pixel_centres(self) -> Array:
-        """Image coordinates (height, width, 2) of all pixel centres."""
+        """Return the image coordinates (height, width, 2) of all pixel centres."""
         u, v = np.meshgrid(np.arange(self.width_px) + 0.5, np.arange(self.height_px) + 0.5)
         return np.stack([u, v], axis=-1)
 
     def inside(self, pixels: ArrayLike) -> np.ndarray:
-        """Whether pixels (..., 2) lie in the image; NaN does not."""
+        """Whether pixels (..., 2) are inside the image; false for NaN."""
         uv = np.asarray(pixels, np.float64)
         return (uv[..., 0] >= 0) & (uv[..., 0] < self.width_px) & (uv[..., 1] >= 0) & (uv[..., 1] < self.height_px)
 
     def outline(self) -> Array:
-        """Image coordinates (M, 2) along the image's outer edge, half a pixel apart."""
+        """Return image coordinates (M, 2) along the outer edge of the image, half a pixel apart."""
         u, v = (np.linspace(0, size, 2 * size + 1) for size in (self.width_px, self.height_px))
         sides = [(u, 0 * u), (u, 0 * u + self.height_px), (0 * v, v), (0 * v + self.width_px, v)]
         return np.concatenate([np.stack(side, axis=-1) for side in sides])
 
     def folds_back(self) -> bool:
-        """Whether the distortion folds back within the image, so that some pixels have no ray."""
+        """Whether the distortion folds back inside the image, so that some pixels have no ray."""
         return bool(np.isnan(self.rays(self.outline())).any())
 
     def covering_pinhole(self) -> "Camera":
-        """A camera without distortion and with the same focal lengths that sees every ray of this one's pixels.
+        """Return a camera without distortion, with the same focal lengths, that covers the whole view of this camera.
 
-        Its image is enlarged by whole pixels at each side where needed; without distortion it is this camera. Raises
-        ValueError where the distortion folds back within the image.
+        Its image is larger by whole pixels on each side as needed; without distortion it is this camera. Raises
+        ValueError if the distortion folds back inside the image.
         """
         if not any(self.distortion):
             return self
@@ -123,12 +124,12 @@ class Camera:
         )
 
     def covers(self, other: "Camera") -> bool:
-        """Whether every ray of another camera's pixels comes to this one's image too."""
+        """Whether every ray of the other camera's pixels falls inside this camera's image."""
         seen = self.project(other.rays(other.outline()))
         return bool((seen >= -1e-6).all() and (seen <= np.array([self.width_px, self.height_px]) + 1e-6).all())
 
     def _distorted(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Distorted coordinates; NaN from where the radial part turns back or the mapping changes its orientation."""
+        """Distort coordinates; NaN beyond the fold of the radial part or where the mapping reverses its orientation."""
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
         scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -141,7 +142,7 @@ class Camera:
         )
 
     def _jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Derivatives dx'/dx, dx'/dy = dy'/dx and dy'/dy of the distortion."""
+        """Return the derivatives dx'/dx, dx'/dy = dy'/dx and dy'/dy of the distortion."""
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
         scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -153,7 +154,7 @@ class Camera:
         )
 
     def _undistorted(self, wanted_x: Array, wanted_y: Array) -> tuple[Array, Array]:
-        """Newton's method from the inverse of the radial part, which a table gives safely within the fold."""
+        """Invert the distortion by Newton's method, from a tabulated inverse of the radial part inside the fold."""
         wanted_r = np.hypot(wanted_x, wanted_y)
         radial = self._radial_table(float(np.nanmax(wanted_r, initial=0.0)))
         start = np.interp(wanted_r, radial[1], radial[0]) / np.maximum(wanted_r, 1e-300)
@@ -161,7 +162,7 @@ class Camera:
         for _ in range(20):
             got_x, got_y = self._distorted(x, y)
             off_x, off_y = wanted_x - got_x, wanted_y - got_y
-            # A point on the fold itself has no way back; it stays NaN.
+            # A point exactly on the fold cannot be inverted; it stays NaN.
             if not (np.maximum(np.abs(off_x), np.abs(off_y)) > 1e-2 * _UNDISTORTED_TO).any():
                 break
             xx, xy, yy = self._jacobian(x, y)
@@ -173,7 +174,7 @@ class Camera:
         return np.where(found, x, np.nan), np.where(found, y, np.nan)
 
     def _radial_table(self, largest: float) -> Array:
-        """Radii before and after the radial distortion (2, 2000), ascending, to about `largest` or up to the fold."""
+        """Tabulate radii before and after radial distortion (2, 2000), ascending, to about `largest` or to the fold."""
         k1, k2, _, _, k3 = self.distortion
         fold = _fold_radius(self.distortion)
         end = min(fold, 1.0)
@@ -186,7 +187,7 @@ class Camera:
 
 @lru_cache
 def _fold_radius(distortion: Distortion) -> float:
-    """Least r > 0 at which the radial part r (1 + k1 r^2 + k2 r^4 + k3 r^6) turns back, or infinity."""
+    """Return the smallest r > 0 at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) has a maximum, or infinity."""
     k1, k2, _, _, k3 = distortion
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     turns = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 0)]
@@ -194,6 +195,6 @@ def _fold_radius(distortion: Distortion) -> float:
 
 
 def camera_from_site(points_site_m: ArrayLike, position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> Array:
-    """Points (..., 3) of O_L in O_C, for a camera at position_m (3,)."""
+    """Transform points (..., 3) from O_L to O_C, metres, for a camera at position_m (3,) in O_L."""
     offset = np.asarray(points_site_m, np.float64) - np.asarray(position_m, np.float64)
     return offset @ np.asarray(rotation_camera_from_site, np.float64).T

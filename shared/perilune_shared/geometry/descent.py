@@ -1,8 +1,8 @@
-"""The nominal descent: the curve that the lander means to fly, known to the guidance before the flight.
+"""The nominal descent: the planned trajectory, known to the guidance before the flight.
 
-The paper flies "a parabola" from 1500 m to 200 m without giving it. Here the lander sinks at constant speed while
-its horizontal speed falls evenly to zero above the end point, so that the path is a parabola whose axis is vertical
-and which ends going straight down: p(t) = p0 + v0 t + a t^2 / 2.
+The paper uses "a parabola" from 1500 m to 200 m and does not specify it. Here the vertical speed is constant and the
+horizontal speed decreases linearly to zero at the end point. The path is a parabola with a vertical axis that ends
+vertically: p(t) = p0 + v0 t + a t^2 / 2.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from perilune_shared.geometry.frames import Array
 
 @dataclass(frozen=True, slots=True)
 class NominalDescent:
-    """A path of constant acceleration in O_L, with the camera looking along -Z_L."""
+    """A trajectory of constant acceleration in O_L, with the camera looking along -Z_L."""
 
     position_m: tuple[float, float, float]
     """Position at time 0, metres, O_L."""
@@ -35,7 +35,7 @@ class NominalDescent:
         azimuth_deg: float,
         duration_s: float,
     ) -> "NominalDescent":
-        """Starts `downrange_m` from the site in the direction `azimuth_deg` (clockwise from north), ends above it."""
+        """Create a descent from `downrange_m` at `azimuth_deg` (clockwise from north) to a point above the site."""
         azimuth = np.radians(azimuth_deg)
         x, y = -np.sin(azimuth) * downrange_m, -np.cos(azimuth) * downrange_m
         sink = (end_altitude_m - start_altitude_m) / duration_s
@@ -47,17 +47,17 @@ class NominalDescent:
         )
 
     def position_at(self, time_s: ArrayLike) -> Array:
-        """Positions (..., 3) in metres, O_L, at times (...)."""
+        """Return positions (..., 3) in O_L, metres, at times (...)."""
         t = np.asarray(time_s, np.float64)[..., None]
         return np.array(self.position_m) + np.array(self.velocity_mps) * t + np.array(self.acceleration_mps2) * t**2 / 2
 
     def velocity_at(self, time_s: ArrayLike) -> Array:
-        """Velocities (..., 3) in metres per second, O_L, at times (...)."""
+        """Return velocities (..., 3) in O_L, metres per second, at times (...)."""
         return (
             np.array(self.velocity_mps) + np.array(self.acceleration_mps2) * np.asarray(time_s, np.float64)[..., None]
         )
 
 
 ROTATION_CAMERA_FROM_BODY = np.diag([1.0, -1.0, -1.0])
-"""The camera looks along -Z_B with its x axis along X_B: the default mounting, and with a body that is level in O_L
-the paper's "along the negative axis of Z_L"."""
+"""Default mounting: the camera looks along -Z_B, its x axis along X_B. With the body level in O_L this is the paper's
+"along the negative axis of Z_L"."""

@@ -1,9 +1,9 @@
-"""Projection of circles in space to ellipses in the image: exact without lens distortion, fitted with it.
+"""Project circles in space to ellipses in the image: exactly without lens distortion, by a fit with distortion.
 
-A circle with centre c, radius r and normal n is the set c + r (cos t p + sin t q) with p, q spanning its plane. Its
+A circle with centre c, radius r and normal n is the set c + r (cos t p + sin t q), where p and q span its plane. Its
 image is the conic H^-T diag(1, 1, -1) H^-1 with H = K [r p, r q, c] (Hartley & Zisserman, Multiple View Geometry,
 2nd ed., section 8.1; for craters Christian et al. 2021, doi 10.1007/s40295-021-00287-8). The image of the circle's
-centre is not the centre of the ellipse. A distorted image of a circle is no ellipse; then one is fitted to it.
+centre is not the centre of the ellipse. The distorted image of a circle is not an ellipse; an ellipse is fitted to it.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _UNIT_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
 @dataclass(frozen=True, slots=True)
 class Ellipses:
-    """N ellipses in the image; NaN where the circle has no elliptical image."""
+    """N ellipses in the image; NaN if the image of the circle is not an ellipse."""
 
     cx_px: Array
     """Centre, pixels from the left edge (N,)."""
@@ -35,19 +35,19 @@ class Ellipses:
     """Direction of the semi-major axis, from x towards y, in [0, pi) (N,)."""
 
     def bounding_boxes(self) -> Array:
-        """Tight boxes (N, 4) as x0, y0, x1, y1 in pixels, of the whole ellipse also where it leaves the image."""
+        """Return tight boxes (N, 4) of the whole ellipses as x0, y0, x1, y1, pixels, not clipped to the image."""
         cos, sin = np.cos(self.theta_rad), np.sin(self.theta_rad)
         half_w = np.hypot(self.a_px * cos, self.b_px * sin)
         half_h = np.hypot(self.a_px * sin, self.b_px * cos)
         return np.stack([self.cx_px - half_w, self.cy_px - half_h, self.cx_px + half_w, self.cy_px + half_h], axis=-1)
 
     def radius_px(self) -> Array:
-        """Radius of the circle of equal area, sqrt(a b), pixels (N,)."""
+        """Return the radius of the circle of equal area, sqrt(a b), pixels (N,)."""
         return np.sqrt(self.a_px * self.b_px)
 
 
 def plane_basis(normals: ArrayLike) -> tuple[Array, Array]:
-    """Unit vectors p, q (N, 3) that span the planes of unit normals (N, 3): p, q, n right-handed."""
+    """Return unit vectors p, q (N, 3) that span the planes with unit normals n (N, 3); p, q, n is right-handed."""
     n = np.asarray(normals, np.float64)
     helper = np.where(np.abs(n[..., :1]) < 0.9, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     p = np.cross(helper, n)
@@ -56,7 +56,7 @@ def plane_basis(normals: ArrayLike) -> tuple[Array, Array]:
 
 
 def rim_points(centres_m: ArrayLike, normals: ArrayLike, radii_m: ArrayLike, n_points: int) -> Array:
-    """Points (N, n_points, 3), evenly spaced on N circles with centres (N, 3), normals (N, 3), radii (N,)."""
+    """Return points (N, n_points, 3) evenly spaced on N circles with centres (N, 3), normals (N, 3), radii (N,)."""
     p, q = plane_basis(normals)
     angle = 2 * np.pi * np.arange(n_points) / n_points
     round_trip = np.cos(angle)[:, None] * p[:, None, :] + np.sin(angle)[:, None] * q[:, None, :]
@@ -66,16 +66,16 @@ def rim_points(centres_m: ArrayLike, normals: ArrayLike, radii_m: ArrayLike, n_p
 def project_circles(
     camera: Camera, centres_camera_m: ArrayLike, normals_camera: ArrayLike, radii_m: ArrayLike
 ) -> Ellipses:
-    """Images of N circles given in O_C: centres (N, 3) metres, unit normals (N, 3), radii (N,) metres.
+    """Project N circles in O_C: centres (N, 3) and radii (N,) in metres, unit normals (N, 3).
 
-    With distortion, the ellipse nearest to 64 points of the rim by least squares: at up to 50 px radius and 5 px of
-    distortion in the corners of 256 px the points lie within 0.05 px of it. NaN where the circle reaches behind the
-    camera or to where its distortion folds back, or is seen edge on, so that its image is no ellipse.
+    With distortion, fit an ellipse to 64 points of the rim by least squares. The points are within 0.05 px of the
+    ellipse for radii up to 50 px and 5 px of distortion in the corners of 256 px images. NaN if the image is not an
+    ellipse: the circle reaches behind the camera or past the fold of the distortion, or is seen edge on.
     """
     c, n = np.asarray(centres_camera_m, np.float64), np.asarray(normals_camera, np.float64)
     r = np.asarray(radii_m, np.float64)
     p, q = plane_basis(n)
-    # A circle whose nearest point is not in front of the camera has an open conic as image.
+    # If the nearest point of the circle is not in front of the camera, the image is an open conic.
     nearest = c[:, 2] - r * np.hypot(p[:, 2], q[:, 2])
     edge_on = np.abs(np.einsum("ij,ij->i", n, c)) < 1e-9 * np.linalg.norm(c, axis=1)
     bad = (nearest <= 0) | edge_on
@@ -91,9 +91,9 @@ def project_circles(
 
 
 def _exact(camera: Camera, c: Array, h: Array, bad: Array) -> Ellipses:
-    """Images of circles with centres c (N, 3) and matrices [r p, r q, c] (N, 3, 3); anything where `bad` (N,)."""
+    """Project circles with centres c (N, 3) and matrices [r p, r q, c] (N, 3, 3); undefined if `bad` (N,)."""
     h[bad] = np.eye(3)
-    # The image is taken in coordinates centred on the circle's centre, else small far ellipses lose their digits.
+    # Use image coordinates relative to the projected centre: otherwise small, distant ellipses lose precision.
     u0, v0 = (
         np.where(bad, 0, c[:, 0] / np.where(bad, 1, c[:, 2])),
         np.where(bad, 0, c[:, 1] / np.where(bad, 1, c[:, 2])),
@@ -110,10 +110,10 @@ def _exact(camera: Camera, c: Array, h: Array, bad: Array) -> Ellipses:
 
 
 def fit_ellipses(points_px: ArrayLike) -> Ellipses:
-    """Ellipses nearest to N sets of M points around them (N, M, 2), pixels, by direct least squares.
+    """Fit N ellipses to N sets of M points (N, M, 2), pixels, by direct least squares.
 
-    The points are first moved, turned and stretched so that they lie about a unit circle: there the residual of the
-    conic's equation is about twice the distance, and an ellipse of any size, place and flatness is as well conditioned.
+    The points are first whitened (shifted, rotated and scaled) so that they are close to a unit circle. There the
+    algebraic residual is about twice the distance, and the condition does not depend on size, position or flatness.
     """
     points = np.asarray(points_px, np.float64)
     middle = points.mean(axis=1)
@@ -136,12 +136,12 @@ def fit_ellipses(points_px: ArrayLike) -> Ellipses:
 
 
 def _ellipse_of_conic(conic: Array) -> tuple[Array, Array, Array]:
-    """Centre (N, 2), semi-axes (N, 2) with a >= b, direction (N,) of conics (N, 3, 3)."""
+    """Return centre (N, 2), semi-axes (N, 2) with a >= b and direction (N,) of conics (N, 3, 3)."""
     quadratic, linear = conic[:, :2, :2], conic[:, :2, 2]
     centre = -np.linalg.solve(quadratic, linear[:, :, None])[:, :, 0]
     constant = conic[:, 2, 2] + np.einsum("ij,ij->i", linear, centre)
     eigenvalues, vectors = np.linalg.eigh(quadratic)
-    # The sign of a conic is free: both eigenvalues take the sign opposite to the constant.
+    # A conic is defined up to its sign; for an ellipse both eigenvalues have the sign opposite to the constant.
     ratio = -constant[:, None] / eigenvalues
     axes = np.sqrt(ratio)
     swap = axes[:, 0] < axes[:, 1]

@@ -1,16 +1,16 @@
 """Frames of reference and rotations.
 
-Frames, as the paper names them (section "Coordinates"):
+Names follow the paper (section "Coordinates"):
 
 - O_S selenographic: latitude (north positive) and longitude (east positive) on a sphere of the IAU mean radius.
-- O_L landing site: origin at the ideal landing point, Z up, Y to the Moon's south pole, X completing the right
-  hand, so X points west.
-- O_W world: O_L's axes, origin at the lander's first position.
+- O_L landing site: origin at the ideal landing point, Z up, Y towards the Moon's south pole, X west
+  (right-handed).
+- O_W world: axes of O_L, origin at the lander's first position.
 - O_B body: fixed to the lander.
-- O_C camera: OpenCV axes, x right, y down, z along the view.
+- O_C camera: OpenCV axes, x right, y down, z along the viewing direction.
 
 A rotation is named `rotation_<to>_from_<from>` and acts on column vectors: v_to = R v_from. A quaternion is
-(w, x, y, z), of length 1, and stands for the same matrix.
+(w, x, y, z), of length 1, and represents such a matrix.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 def matrix_from_quaternion(rotation_wxyz: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4); the length is divided out."""
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), which are normalised first."""
     q = np.asarray(rotation_wxyz, dtype=np.float64)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
@@ -35,10 +35,10 @@ def matrix_from_quaternion(rotation_wxyz: ArrayLike) -> Array:
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Array:
-    """Quaternion (4,) with w >= 0 of a rotation matrix (3, 3).
+    """Return the quaternion (4,) with w >= 0 of a rotation matrix (3, 3).
 
-    Takes the eigenvector of the largest eigenvalue (Bar-Itzhack 2000, doi 10.2514/2.4654), which stays accurate
-    at half turns.
+    It is the eigenvector of the largest eigenvalue (Bar-Itzhack 2000, doi 10.2514/2.4654), which is accurate also for
+    rotations by 180 degrees.
     """
     r = np.asarray(rotation, dtype=np.float64)
     k = np.array(
@@ -54,7 +54,7 @@ def quaternion_from_matrix(rotation: ArrayLike) -> Array:
 
 
 def matrix_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Array:
-    """Rotation matrix (3, 3) that turns by |v| radians about v (3,) (Rodrigues' formula)."""
+    """Return the matrix (3, 3) that rotates by |v| radians about v (3,) (Rodrigues' formula)."""
     v = np.asarray(rotation_vector_rad, dtype=np.float64)
     angle = float(np.linalg.norm(v))
     if angle == 0.0:
@@ -65,16 +65,16 @@ def matrix_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Array:
 
 
 def sun_direction(azimuth_deg: float, elevation_deg: float) -> Array:
-    """Unit vector (3,) in O_L towards the Sun; azimuth clockwise from north, so 90 degrees is east."""
+    """Return the unit vector (3,) in O_L towards the Sun; azimuth clockwise from north, so 90 degrees is east."""
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     east, north = np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation)
     return np.array([-east, -north, np.sin(elevation)])
 
 
 def earth_direction(latitude_deg: float, longitude_deg: float) -> Array:
-    """Unit vector (3,) in O_L from a site towards the Earth's mean place, above latitude 0 and longitude 0.
+    """Return the unit vector (3,) in O_L towards the Earth's mean position, above latitude 0, longitude 0.
 
-    Deviation: libration, up to about 8 degrees, and the parallax of the site, up to 0.3 degrees, are left out.
+    Deviation: ignores libration (up to about 8 degrees) and the parallax of the site (up to 0.3 degrees).
     """
     latitude, longitude = np.radians([latitude_deg, longitude_deg])
     west, south = np.sin(longitude), np.sin(latitude) * np.cos(longitude)
@@ -84,11 +84,11 @@ def earth_direction(latitude_deg: float, longitude_deg: float) -> Array:
 def selenographic_from_site(
     x_m: ArrayLike, y_m: ArrayLike, latitude_deg: float, longitude_deg: float
 ) -> tuple[Array, Array]:
-    """Latitude and longitude in degrees of points on O_L's ground plane, for a site at the given place.
+    """Convert x and y in O_L, metres, to latitude and longitude, degrees, for a site at the given coordinates.
 
-    The plane is wrapped onto the sphere by an azimuthal equidistant projection about the site: distance and
-    bearing from the site are kept. Inverse of `site_from_selenographic`. At a pole, where "to the south pole"
-    names no direction, longitude_deg gives it: the plane's -Y is along that meridian.
+    Inverse of `site_from_selenographic`. The plane maps to the sphere by an azimuthal equidistant projection about
+    the site: distance and bearing from the site are preserved. At a pole, where "towards the south pole" is
+    ambiguous, -Y is along the meridian longitude_deg.
     """
     west, south = np.asarray(x_m, np.float64), np.asarray(y_m, np.float64)
     distance = np.hypot(west, south)
@@ -108,7 +108,7 @@ def selenographic_from_site(
 def site_from_selenographic(
     point_latitude_deg: ArrayLike, point_longitude_deg: ArrayLike, latitude_deg: float, longitude_deg: float
 ) -> tuple[Array, Array]:
-    """x and y in O_L, metres, of points on the sphere, for a site at (latitude_deg, longitude_deg)."""
+    """Convert points on the sphere to x and y in O_L, metres, for a site at (latitude_deg, longitude_deg)."""
     lat, lon = (
         np.radians(np.asarray(point_latitude_deg, np.float64)),
         np.radians(np.asarray(point_longitude_deg, np.float64)),
