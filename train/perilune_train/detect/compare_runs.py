@@ -1,4 +1,4 @@
-"""Several evaluations in one table and one picture."""
+"""Compare several evaluations in one table and one picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,8 +34,8 @@ _LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius
 def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
     """Write compare.md and precision_recall.png into `out`; returns the table.
 
-    Raises UserError where a folder lacks its metrics or its curve, or was evaluated on terrain that its network was
-    trained on, unless `allow_overlap`; then table and picture are marked.
+    Raises UserError if a folder has no metrics or no curve, or was evaluated on terrain that its network was trained
+    on, unless `allow_overlap`; then table and picture are marked.
     """
     rows, curves, marks = [], {}, []
     for folder in folders:
@@ -49,7 +49,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
                 "ap50_paper: run `perilune-train detect evaluate` again",
             )
         if "images/name" in metrics:
-            # An evaluation on real images, whose figures have no split before them.
+            # An evaluation on real images; its keys have no split as prefix.
             split, figures, wanted = "images", metrics, f"from {metrics.get('min_size_px')} px"
             told: list[object] = [metrics.get("images/name"), split, None, wanted, metrics.get("scales")]
         else:
@@ -63,7 +63,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         cells = [name, *map(_text, (*told, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
-        # Of the whole curve, not of the points that are kept of it.
+        # AP of the whole curve, not of the saved points.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
     head = ["run", "dataset", "split", "protocol", "terrain", "wanted", "scales", "frames", "labels"]
@@ -91,7 +91,7 @@ def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, 
 
 
 def read_curve(path: Path) -> Curve:
-    """The curve that an evaluation left. Raises UserError where it is missing or another table."""
+    """Read the curve of an evaluation. Raises UserError if it is missing or another table."""
     if not path.is_file():
         raise UserError(path, "curve", "no such file", "one that `perilune-train detect evaluate` writes")
     try:
@@ -104,7 +104,7 @@ def read_curve(path: Path) -> Curve:
 
 
 def _name(folder: Path) -> str:
-    """A run by its own name, an evaluation of it as run/evaluation."""
+    """Name of a run, or run/evaluation for an evaluation of it."""
     parts = folder.resolve().parts
     return "/".join(parts[-2:]) if not (folder / "checkpoints").is_dir() else parts[-1]
 

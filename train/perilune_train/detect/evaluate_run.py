@@ -27,7 +27,7 @@ from perilune_train.training import runs
 
 
 def read_metrics(folder: Path) -> dict[str, float | int | str | None]:
-    """metrics.json of a run or of an evaluation. Raises UserError where it is missing or no flat table of figures."""
+    """Read metrics.json of a run or of an evaluation. Raises UserError if it is missing or no flat table."""
     path = folder / "metrics.json"
     if not path.is_file():
         raise UserError(path, "metrics", "no such file", "the folder of a finished run")
@@ -42,7 +42,7 @@ def read_metrics(folder: Path) -> dict[str, float | int | str | None]:
 
 
 def threshold_of(metrics: dict[str, float | int | str | None], path: Path) -> float:
-    """The score threshold that a run chose on its validation split. Raises UserError where it has none."""
+    """The score threshold that a run chose on its validation split. Raises UserError if it has none."""
     found = metrics.get("test/threshold")
     if isinstance(found, bool) or not isinstance(found, float | int) or not math.isfinite(found):
         raise UserError(path, "test/threshold", found, "a number; or give --threshold")
@@ -50,7 +50,7 @@ def threshold_of(metrics: dict[str, float | int | str | None], path: Path) -> fl
 
 
 def check_folder(folder: Path, run: Path) -> None:
-    """Refuse to write an evaluation over the run's own report and figures."""
+    """Refuse to write an evaluation over the run's own report and metrics."""
     if folder.resolve() == run.resolve():
         raise UserError(folder, "--out", "the run's own folder", "another: its figures stay as training left them")
 
@@ -65,9 +65,10 @@ def evaluate_again(
     choose_threshold: bool = False,
     allow_overlap: bool = False,
 ) -> Path:
-    """Evaluate a run's best weights on a split of a dataset; everything it leaves is in the returned folder.
+    """Evaluate a run's best weights on a split of a dataset; all output is in the returned folder.
 
-    The threshold is the one given, else the run's own; with `choose_threshold` one chosen on the dataset's val.
+    The threshold is the given one, else the run's own; `choose_threshold` chooses one on the dataset's validation
+    split.
     """
     folder = out or run / "evaluation"
     check_folder(folder, run)

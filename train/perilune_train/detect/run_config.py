@@ -1,4 +1,4 @@
-"""The settings that a detect run was trained with, read back from its config.yaml."""
+"""Settings that a detect run was trained with, read from its config.yaml."""
 
 from pathlib import Path
 
@@ -10,9 +10,9 @@ _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
 
 def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
-    """Settings of a run, from its own config.yaml alone; a setting that the file lacks has its default.
+    """Settings of a run, from its own config.yaml only; a setting missing in the file has its default.
 
-    `settings` replaces single settings of the evaluation. Raises UserError on a setting that would change the network.
+    `settings` overrides single settings of the evaluation. Raises UserError on a setting that would change the network.
     """
     path = run / "config.yaml"
     if not path.is_file():
@@ -29,6 +29,6 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
             )
     named = any(text.startswith("detect.labels.selection=") for text in settings)
     if named:
-        # The run stores every threshold of its own selection; another name brings its own.
+        # The run stores every threshold of its own selection; another name sets its own thresholds.
         section = {key: value for key, value in section.items() if key != "labels"}
     return resolve_over(DetectConfig, "detect", str(path), section, None, settings)

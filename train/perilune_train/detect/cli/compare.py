@@ -1,4 +1,4 @@
-"""`perilune-train detect compare`: several runs or evaluations side by side."""
+"""`perilune-train detect compare`: compare runs or evaluations."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ def compare(
     out: Annotated[Path, typer.Option(help="Folder to write into.")] = Path("runs/detect/compare"),
     allow_overlap: AllowOverlap = False,
 ) -> None:
-    """Put runs side by side: compare.md, one table with the protocol of each, and their precision-recall curves."""
+    """Compare runs: compare.md, one table with the protocol of each, and their precision-recall curves."""
     # matplotlib and torch take seconds to load.
     from perilune_train.detect.compare_runs import compare_folders
 

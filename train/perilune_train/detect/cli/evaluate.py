@@ -1,4 +1,4 @@
-"""`perilune-train detect evaluate`: judge a finished run again, also on another dataset or other labels."""
+"""`perilune-train detect evaluate`: evaluate a finished run again, also on another dataset or other labels."""
 
 from pathlib import Path
 from typing import Annotated
@@ -55,10 +55,10 @@ def evaluate(
     overlap: Overlap = 64,
     box_margin: BoxMargin = 0.0,
 ) -> None:
-    """Judge a run's best weights: report.md, metrics.json, detections.parquet and pictures.
+    """Evaluate a run's best weights: report.md, metrics.json, detections.parquet and pictures.
 
-    The threshold is the run's own, chosen on the validation split it was trained beside, unless --threshold gives one
-    or --choose-threshold asks for a new one.
+    The threshold is the run's own, chosen on the validation split of its training dataset, unless --threshold sets one
+    or --choose-threshold chooses a new one.
     """
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
@@ -92,7 +92,7 @@ def evaluate(
         own = config.model_dump(mode="json")
         own["evaluation"]["scales"] = scale
         config = resolve_over(DetectConfig, "detect", "--scale", own)
-    # Torch takes seconds to load: not for a wrong key.
+    # Importing torch takes seconds; check the settings first.
     from perilune_train.detect.evaluate_run import evaluate_again
 
     place = dataset or Path("data", run.resolve().name, "detect")

@@ -21,9 +21,9 @@ def export(
 ) -> None:
     """Write a trained detector as ONNX and OpenVINO files, for flight.
 
-    Leaves detector.onnx, detector.xml and .bin, detector.json (anchors, threshold, normalisation) and README.md. Every
-    file is run and compared with torch before it is left. --int8 adds detector-int8.onnx, quantised on training
-    frames, only if it loses at most half a point of AP on the validation frames and is faster.
+    Writes detector.onnx, detector.xml and .bin, detector.json (anchors, threshold, normalisation) and README.md. Every
+    file is run and compared with torch first. --int8 adds detector-int8.onnx, quantised on training frames, only if it
+    loses at most half a point of AP on the validation frames and is faster.
     """
     asked = tuple(part.strip() for part in formats.split(","))
     if not set(asked) <= {"onnx", "openvino"}:
@@ -32,7 +32,7 @@ def export(
         raise UserError("options", "--size-px", size_px, "a multiple of 32")
     if int8 and dataset is None:
         raise UserError("options", "--int8", "no --dataset", "a dataset to calibrate and to judge on")
-    # Torch takes seconds to load: not for a wrong option.
+    # Importing torch takes seconds; check the options first.
     from perilune_train.detect.deploy.export import export_run
 
     export_run(run, out, asked, size_px, dataset, int8, allow_overlap)

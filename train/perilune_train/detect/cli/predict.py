@@ -25,13 +25,13 @@ def predict(
 ) -> None:
     """Find craters in images.
 
-    Leaves detections.parquet and detections.csv (one row a crater, in pixels of the image, from the outer corner of its
-    top-left pixel), <image>.overlay.png, and detections.geojson where an image has a georeference.
+    Writes detections.parquet and detections.csv (one row per crater, in pixels of the image, from the outer corner of
+    its top-left pixel), <image>.overlay.png, and detections.geojson if an image has a georeference.
     """
     if threshold is not None and not 0 < threshold <= 1:
         raise UserError("--threshold", "score", threshold, "above 0, at most 1")
     config = config_of_run(run, ())
-    # Torch takes seconds to load: not for a wrong option.
+    # Importing torch takes seconds; check the options first.
     from perilune_train.detect.images.predict import predict_images
     from perilune_train.detect.inference.tiles import Tiling
 

@@ -25,16 +25,16 @@ def train(
     allow_overlap: AllowOverlap = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of this name.")] = False,
 ) -> None:
-    """Train the crater detector (attention YOLOv3) and judge it on the test split.
+    """Train the crater detector (attention YOLOv3) and evaluate it on the test split.
 
-    Leaves runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, report.md,
+    Writes runs/detect/<name>/ with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, report.md,
     detections.parquet, detections.png, precision_recall.png and .parquet, bins.png and TensorBoard events. The same
-    command resumes an interrupted run and leaves a finished one as it is; --overwrite replaces it.
+    command resumes an interrupted run and leaves a finished one unchanged; --overwrite replaces it.
 
     The baseline without attention: perilune-train detect train --set detect.attention=none --name small-plain
     """
     settings = resolve(DetectConfig, "detect", "perilune_train", preset, config, tuple(set_ or ()))
-    # Torch and Lightning take seconds to load: not for a wrong key.
+    # Importing torch and Lightning takes seconds; check the settings first.
     from perilune_train.detect.train.run import run_detect
 
     run_detect(settings, dataset or Path("data", preset, "detect"), runs, name or preset, overwrite, allow_overlap)

@@ -15,14 +15,14 @@ def weights(
         Path, typer.Option(help="File to write: NAME.conv.74 for the backbone, NAME.weights for the whole network.")
     ],
 ) -> None:
-    """Write the weights of a run as a Darknet file, which `detect.init_from` reads too.
+    """Write the weights of a run as a Darknet file, which `detect.init_from` can read.
 
-    NAME.conv.74 holds the 52 convolutions of the backbone, NAME.weights all 75 (a network without attention, strides
-    8 16 32; its output layers have 15 filters: x, y, width, height, objectness of 3 anchors).
+    NAME.conv.74 holds the 52 convolutions of the backbone, NAME.weights all 75 (a network without attention, strides 8
+    16 32; its output layers have 15 filters: x, y, width, height, objectness of 3 anchors).
     """
     if not out.name.endswith((".conv.74", ".weights")):
         raise UserError(out, "--out", f"the name {out.name}", "a name that ends in .conv.74 or .weights")
-    # Torch takes seconds to load: not for a wrong name.
+    # Importing torch takes seconds; check the name first.
     from perilune_train.detect.inference.detector import load_detector
     from perilune_train.detect.train.transfer import darknet_content
     from perilune_train.models.darknet_weights import write_darknet

@@ -1,4 +1,4 @@
-"""Which predictors answer for which label."""
+"""Assignment of predictors to labels."""
 
 from dataclasses import dataclass
 
@@ -13,9 +13,9 @@ class Targets:
     boxes: Tensor
     """x0, y0, x1, y1 in pixels (T, 4)."""
     frame: Tensor
-    """Place of the label's frame in the batch (T,)."""
+    """Index in the batch of each label's frame (T,)."""
     wanted: Tensor
-    """False for a hardly visible crater, which is ignored (T,)."""
+    """False for a label to ignore, such as a hardly visible crater (T,)."""
 
     def to(self, device: torch.device) -> "Targets":
         """The same on another device."""
@@ -24,18 +24,18 @@ class Targets:
 
 @dataclass(frozen=True)
 class Assignment:
-    """One scale's predictors: those that answer for a label, and those that are left alone."""
+    """One scale's predictors: positive ones with their labels, and free ones."""
 
     frame: Tensor
-    """Of each positive predictor, its frame (P,)."""
+    """Frame of each positive predictor (P,)."""
     anchor: Tensor
-    """... its anchor (P,)."""
+    """Anchor of each positive predictor (P,)."""
     row: Tensor
-    """... its cell's row (P,)."""
+    """Row of its cell (P,)."""
     column: Tensor
-    """... its cell's column (P,)."""
+    """Column of its cell (P,)."""
     label: Tensor
-    """... the label it answers for, a row of Targets (P,)."""
+    """Its label, a row of Targets (P,)."""
     free: Tensor
     """Predictors that are neither positive nor negative (N, 3, h, w), bool."""
 
@@ -48,9 +48,9 @@ class Assignment:
 
 
 def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float) -> Tensor:
-    """Whether anchors (K, 2) take part in boxes (T, 4): (T, K) bool.
+    """Whether anchors (K, 2) are assigned to boxes (T, 4): (T, K) bool.
 
-    All anchors whose width and height are within the factor `ratio`, and always the one of best IoU.
+    True for every anchor whose width and height are within the factor `ratio`, and always for the one of best IoU.
     """
     size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)[:, None]
     quotient = size / anchors
@@ -68,12 +68,14 @@ def assign(
 ) -> list[Assignment]:
     """Positive and free predictors of every scale, for anchors (scales, 3, 2) and grids (N, h, w).
 
-    Deviation from YOLOv3, which makes one predictor of one scale positive for each label: every anchor of every
-    scale within the factor `ratio` is, in the cell that holds the label's centre and in the two cells nearest to the
-    centre beside it (as later members of the family do): about nine times as many positives, so that a short
-    training suffices. Free are predictors with a matching anchor whose cell touches the middle half of an ignored
-    label's box. All others are negative, also those around a wanted label: YOLOv3 leaves them free where their boxes
-    overlap it by more than 0.5, and then nothing tells their scores from those of the boxes that sit well.
+    Positive is every anchor of every scale within the factor `ratio` of a selected label, in the cell that holds the
+    label's centre and in the nearest cell beside it along x and along y (as in later YOLO versions). Deviation: YOLOv3
+    makes one predictor of one scale positive for each label. This gives about nine times as many positives, so that a
+    short training suffices.
+
+    Free are predictors with a matching anchor whose cell touches the middle half of an ignored label's box. All others
+    are negative, also those around a selected label. YOLOv3 leaves those free if their boxes overlap the label by more
+    than 0.5; then nothing makes their scores differ from those of better boxes.
     """
     matches = matching_anchors(targets.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
     centre = (targets.boxes[:, :2] + targets.boxes[:, 2:]) / 2
@@ -105,9 +107,9 @@ def assign(
 
 
 def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shape: tuple[int, int, int, int]) -> Tensor:
-    """Cells (N, 3, h, w) whose centre is within a quarter of a box, plus half a cell, of the box's middle.
+    """Cells (N, 3, h, w) whose centre is within a quarter of a box, plus half a cell, of the box's centre.
 
-    `at` and `size` (P, 2) are the boxes' middles and sizes in cells.
+    `at` and `size` (P, 2) are the centres and sizes of the boxes in cells.
     """
     touched = torch.zeros(shape, dtype=torch.bool, device=at.device)
     if not len(at):

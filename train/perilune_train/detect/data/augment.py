@@ -1,4 +1,4 @@
-"""Random changes of training frames, with their boxes."""
+"""Random augmentation of training frames and their boxes."""
 
 import cv2
 import numpy as np
@@ -11,8 +11,10 @@ Array = NDArray[np.float64]
 
 
 def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
-    """One of the eight symmetries of a frame (height, width) with its boxes (M, 4): bit 0 mirrors left and right,
-    bit 1 top and bottom, bit 2 (applied last) exchanges x and y."""
+    """Apply one of the eight symmetries to a frame (height, width) and its boxes (M, 4).
+
+    Bit 0 of `kind` mirrors left and right, bit 1 top and bottom, bit 2 (applied last) exchanges x and y.
+    """
     height, width = image.shape
     x0, y0, x1, y1 = boxes.T
     if kind & 1:
@@ -25,16 +27,16 @@ def turn(image: NDArray, boxes: Array, kind: int) -> tuple[NDArray, Array]:
 
 
 def rescale(image: NDArray, boxes: Array, factor: float, place: tuple[float, float]) -> tuple[NDArray, Array]:
-    """A frame (height, width) and its boxes (M, 4), enlarged or shrunk to an image of the same size.
+    """Enlarge or shrink a frame (height, width) and its boxes (M, 4) within the same image size.
 
-    `place` in [0, 1] tells, in x and y, which part of an enlarged frame is kept, or where a shrunk one lies; around
-    that is the frame's mean grey.
+    `place` in [0, 1] selects, in x and y, the part of an enlarged frame to keep or the position of a shrunk one. A
+    shrunk frame is surrounded by its mean grey.
     """
     height, width = image.shape
     shift = np.array([width, height]) * (1 - 1 / factor) * np.array(place)
     if factor < 1:
         image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / factor**2 - 1))
-    # OpenCV counts from the middle of the first pixel, boxes from its edge.
+    # OpenCV counts from the centre of the first pixel, boxes from its edge.
     origin = shift + 0.5 / factor - 0.5
     matrix = np.array([[1 / factor, 0, origin[0]], [0, 1 / factor, origin[1]]])
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -43,7 +45,7 @@ def rescale(image: NDArray, boxes: Array, factor: float, place: tuple[float, flo
 
 
 def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.random.Generator) -> NDArray[np.float32]:
-    """What each of the 256 grey levels of a frame becomes: stretched, brightened, bent, clipped at 255."""
+    """Output value of each of the 256 grey levels of a frame: stretch, gamma, gain, clipped at 255."""
     level = np.arange(256) / 255
     if settings.stretch:
         below = np.bincount(image.ravel(), minlength=256).cumsum() / image.size
@@ -62,10 +64,10 @@ def augment(
     settings: AugmentSettings,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_]]:
-    """A changed frame (height, width), grey levels as float32, its boxes (M, 4), and which of them are wanted (M,).
+    """Augment a frame: returns it (height, width) in float32 grey levels, its boxes (M, 4) and which are selected (M,).
 
-    A crater that rescaling moves out of the range `radius_px`, or its centre off the image, is wanted no more; one
-    that becomes much smaller is left out.
+    A crater is deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is
+    left out if it becomes much smaller than that.
     """
     turned: NDArray = image
     if settings.flips_and_turns:

@@ -1,4 +1,4 @@
-"""Frames and labels as batches: the order of an epoch, shares of several processes, the network's input."""
+"""Batches of frames and labels: order of an epoch, shares of several processes, the network's input."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ from perilune_train.detect.data.split import DetectSplit
 
 Array = NDArray[np.float64]
 Sample = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
-"""A normalised frame (H, W), its boxes (M, 4) in pixels, and which of them are wanted (M,)."""
+"""A normalised frame (H, W), its boxes (M, 4) in pixels, and which of them are selected (M,)."""
 Batch = tuple[Tensor, Targets]
 
 
 class TrainingFrames(torch_data.Dataset):
-    """A split in the order and with the augmentation of one epoch, both a function of seed and epoch alone."""
+    """A split in the order and with the augmentation of one epoch; both depend on seed and epoch only."""
 
     def __init__(self, split: DetectSplit, settings: AugmentSettings, seed: int, epoch: int):
         self.split, self.settings, self.key = split, settings, [seed, epoch]
@@ -41,7 +41,7 @@ class TrainingFrames(torch_data.Dataset):
 
 
 class EvaluationFrames(torch_data.Dataset):
-    """A split as it is, in order; of several `processes` each sees every n-th frame."""
+    """A split in order, not augmented; each of several `processes` takes every n-th frame."""
 
     def __init__(self, split: DetectSplit, process: int = 0, processes: int = 1):
         self.split, self.own = split, range(process, len(split), processes)
@@ -56,17 +56,17 @@ class EvaluationFrames(torch_data.Dataset):
 
 
 def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Tensor:
-    """Normalised frames (N, H, W) as the network takes them: (N, in_channels, H, W), channels last in memory."""
+    """Convert normalised frames (N, H, W) to the network's input (N, in_channels, H, W), channels last in memory."""
     stacked = torch.as_tensor(images)[:, None].expand(-1, in_channels, -1, -1)
     return stacked.contiguous(memory_format=torch.channels_last)
 
 
 class Share(torch_data.Sampler[list[int]]):
-    """The places in an epoch's order that one of `processes` takes, batch by batch.
+    """Positions in an epoch's order that one of `processes` takes, batch by batch.
 
-    In every step the processes together take the next `size * processes` places, each an equal part, so that all
-    have equally many batches and each place is taken once. Only of a last step with fewer places than processes
-    nothing is taken (at most processes - 1 frames of an epoch, other ones in each).
+    In every step the processes together take the next `size * processes` positions, each an equal part, so that all
+    have the same number of batches and each position is taken once. If the last step has fewer positions than
+    processes, they are skipped (at most processes - 1 frames of an epoch, different ones in each epoch).
 
     Iterates from batch `start` on; the length is that of the whole epoch.
     """
@@ -86,10 +86,10 @@ class Share(torch_data.Sampler[list[int]]):
 
 @dataclass(frozen=True)
 class Collate:
-    """Makes a batch (images (N, in_channels, H, W), Targets) of frames. A class, so that `spawn` can pickle it."""
+    """Makes a batch (images (N, in_channels, H, W), Targets) from frames. A class, so that `spawn` can pickle it."""
 
     in_channels: int
-    """Channels of the network's input."""
+    """Input channels of the network."""
 
     def __call__(self, samples: list[Sample]) -> Batch:
         images, boxes, wanted = zip(*samples, strict=True)
@@ -104,7 +104,7 @@ class Collate:
 def loader(
     frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: Share | None = None
 ) -> torch_data.DataLoader:
-    """Batches (images (N, in_channels, H, W), Targets) in the given order; of a share where there is one."""
+    """Batches (images (N, in_channels, H, W), Targets) in the given order, or of a share if one is given."""
     return torch_data.DataLoader(
         frames,
         batch_sampler=share or Share(len(frames), config.batch_size),

@@ -1,4 +1,4 @@
-"""What is known of judged frames beside their labels: place, altitude, Sun. Real images may lack any of it."""
+"""Facts about evaluated frames besides their labels: place, altitude, Sun. Real images may lack any of them."""
 
 from dataclasses import dataclass
 
@@ -12,27 +12,27 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrameFacts:
-    """One entry a frame."""
+    """One entry per frame."""
 
     name: list[str]
     """For titles (N)."""
     sizes_px: NDArray[np.int64]
     """Width and height (N, 2)."""
     scene: list[str]
-    """Terrain, the unit over which intervals are drawn (spread.py); "" where not known (N)."""
+    """Terrain, the unit of the bootstrap intervals (spread.py); "" if unknown (N)."""
     descent: list[str]
-    """Descent over it, of a name of its own; "" where not known (N)."""
+    """Trajectory over the terrain, with a unique name; "" if unknown (N)."""
     altitude_m: Array
-    """Of the camera over the site's ground plane; NaN where not known (N,)."""
+    """Altitude of the camera above the site's ground plane; NaN if unknown (N,)."""
     sun_elevation_deg: Array
-    """Above the site's ground plane; NaN where not known (N,)."""
+    """Elevation of the Sun above the site's ground plane; NaN if unknown (N,)."""
 
     def __len__(self) -> int:
         return len(self.name)
 
 
 def unknown_facts(name: list[str], sizes_px: NDArray) -> FrameFacts:
-    """Facts of images of which nothing but name and width and height (N, 2) is known."""
+    """Facts of images of which only name and width and height (N, 2) are known."""
     nothing = np.full(len(name), np.nan)
     return FrameFacts(name, np.asarray(sizes_px), [""] * len(name), [""] * len(name), nothing, nothing)
 

@@ -1,4 +1,4 @@
-"""Frames and labels for the detector: what to find, what to ignore, augmentation, batches."""
+"""Frames and labels of a split for the detector; selection of labels to find and to ignore."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +23,8 @@ _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "e
 _SHAPE = [*_BOX, "radius_px", *_ELLIPSE]
 
 MARGIN = np.sqrt(0.5)
-"""Craters below the least radius are ignored down to this share of it: no box in range overlaps lesser ones by half."""
+"""Craters below the least radius are ignored down to this fraction of it; no box in range overlaps smaller ones by
+half."""
 
 
 @dataclass(frozen=True)
@@ -31,17 +32,17 @@ class FrameLabels:
     """Labels of one frame."""
 
     boxes: Array
-    """Tight on the whole ellipse: x0, y0, x1, y1 in pixels (M, 4)."""
+    """Box around the whole ellipse: x0, y0, x1, y1 in pixels (M, 4)."""
     radius_px: Array
     """Radius of the circle of equal area, pixels (M,)."""
     ellipses: Array
     """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5), for drawing."""
     wanted: NDArray[np.bool_]
-    """False for a crater that is ignored: hardly visible, or not labelled (M,)."""
+    """False for a crater to ignore: hardly visible, or not labelled (M,)."""
     labelled: NDArray[np.bool_]
-    """False for a crater that is not in the manifest's labels: a little too small, too large, or off the image (M,)."""
+    """False for a crater that is not in the manifest's labels: slightly too small, too large, or off the image (M,)."""
     depth_ratio: Array | None = None
-    """Depth over diameter (M,), by which a crater is fresh or worn; NaN or None where it is not known."""
+    """Depth over diameter (M,), the freshness of a crater; NaN or None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,9 @@ class DetectSplit:
     frames: FrameStore
     """Pixels and poses."""
     labels: list[FrameLabels]
-    """One entry a frame."""
+    """One entry per frame."""
     radius_px: tuple[float, float]
-    """Radii that are labelled and judged, pixels."""
+    """Range of radii that are labelled and evaluated, pixels."""
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -62,10 +63,10 @@ class DetectSplit:
 def load_split(
     dataset: Dataset, split: str, settings: LabelSettings, scale: tuple[float, float] = (1.0, 1.0)
 ) -> DetectSplit:
-    """Frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take.
+    """Load frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take.
 
-    `scale` holds the least and the largest factor by which frames will be shrunk and enlarged: what is ignored reaches
-    up and down accordingly. For the account of the edge the largest is 1 / EDGE.
+    `scale` holds the least and the largest zoom factor that will be applied to frames; the range of ignored craters is
+    extended accordingly. For the edge account the largest is 1 / EDGE.
     """
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
@@ -85,7 +86,7 @@ def load_split(
     parts = []
     for frame in frames.table.to_dict("records"):
         rows = rows_of.get(frame["frame_id"], np.empty(0, np.intp))
-        # Of the hundred thousand craters of a scene, those of the right size first: the rest is then cheap.
+        # First select by size: a scene has a hundred thousand craters, and the other checks cost more.
         scene, points, radius_m = by_scene.get(frame["scene_id"], nowhere)
         near = _right_size(points, radius_m, camera.intrinsics(), frame, _ignored_range(radius_px, scale))
         others = scene[near]
@@ -112,9 +113,9 @@ def _ignored_range(radius_px: tuple[float, float], scale: tuple[float, float]) -
 def _right_size(
     points_m: Array, radius_m: Array, camera: Camera, frame: dict[Any, Any], range_px: tuple[float, float]
 ) -> NDArray[np.bool_]:
-    """Craters (N,) before the camera whose radius in the frame may lie in a range, from their depth alone.
+    """Select craters (N,) in front of the camera whose radius in the frame may be in a range, from their depth only.
 
-    Exact for level ground under a level camera; what a tilt changes stays well within the margins.
+    Exact for level ground and a level camera; the effect of a tilt is well within the margins.
     """
     forward = matrix_from_quaternion(frame["rotation_wxyz"])[2]
     depth_m = points_m @ forward - np.asarray(frame["position_m"], np.float64) @ forward
@@ -123,7 +124,7 @@ def _right_size(
 
 
 def _judged_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
-    """Least and largest radius that a selection asks for, pixels; where it is open, that of the dataset's labels."""
+    """Least and largest selected radius, pixels; the dataset's labels give limits that the selection leaves open."""
     if settings.radius_px is None:
         return _labelled_range(dataset)
     least_px, largest_px = settings.radius_px
@@ -143,13 +144,14 @@ def unlabelled_craters(
     radius_px: tuple[float, float],
     scale: tuple[float, float] = (1.0, 1.0),
 ) -> pd.DataFrame:
-    """Craters of the scene that a frame shows just outside what is labelled, as rows to be ignored.
+    """Craters of the scene that a frame shows just outside the labelled range, as rows to ignore.
 
-    A crater of 1.9 px looks like one of 2.1 px: with only the second in the table, half of what is labelled near the
-    limit would be trained away as background, and finding the first would count as false. So, as COCO does with
-    objects outside its area range, craters within a factor of sqrt(2) of the range (beyond that no box within the
-    range overlaps them by half) and those whose centre is off the image are ignored; smaller and larger ones too where
-    frames will be enlarged and shrunk (`scale`, see load_split). `frame` is a row of the table.
+    A crater of 1.9 px looks like one of 2.1 px. If only the second were in the table, half of the labels near the limit
+    would be trained away as background, and detecting the first would be a false positive. So two kinds of crater are
+    ignored, as COCO ignores objects outside its area range: craters within a factor of sqrt(2) of the range (beyond it
+    no box within the range overlaps them by half) and craters with their centre off the image. If frames will be
+    enlarged or shrunk (`scale`, see load_split), smaller and larger ones are ignored too. `frame` is a row of the
+    table.
     """
     low, high = _ignored_range(radius_px, scale)
     points, radius_m = _places(craters)

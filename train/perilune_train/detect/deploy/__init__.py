@@ -1,1 +1,1 @@
-"""Networks for flight: ONNX, OpenVINO, int8."""
+"""Export of networks for flight: ONNX, OpenVINO, int8."""

@@ -1,4 +1,4 @@
-"""One detector, several engines: each becomes a function from images to boxes and scores."""
+"""Inference engines: each makes a detector a function from images to boxes and scores."""
 
 import contextlib
 import functools
@@ -22,8 +22,8 @@ Precision = Literal["f32", "bf16"]
 
 
 def package(name: str) -> Any:
-    """A module of the extra `export`. Raises UserError where it is not installed."""
-    # Official builds of ONNX Runtime send events to their maker unless this is set before the import.
+    """Import a module of the extra `export`. Raises UserError if it is not installed."""
+    # Official builds of ONNX Runtime send telemetry unless this is set before the import.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
         return importlib.import_module(name)
@@ -32,7 +32,7 @@ def package(name: str) -> Any:
 
 
 def torch_engine(network: nn.Module, precision: Precision = "f32") -> Engine:
-    """A network whose call gives boxes and scores, channels last, on as many threads as torch is set to."""
+    """Engine of a torch network that returns boxes and scores; channels last, with torch's number of threads."""
     network = network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
     @torch.inference_mode()
@@ -46,7 +46,7 @@ def torch_engine(network: nn.Module, precision: Precision = "f32") -> Engine:
 
 
 def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
-    """A written .onnx file by ONNX Runtime; 0 threads are as many as there are cores."""
+    """ONNX Runtime engine of an .onnx file; 0 threads means one per core."""
     onnxruntime = package("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
@@ -57,18 +57,18 @@ def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
 
 @functools.cache
 def openvino_core() -> Any:
-    """The one `openvino.Core` of this process, kept to its end.
+    """The one `openvino.Core` of this process, kept until it ends.
 
-    Each core replaces the thread's signal stack and restores the one before when it goes. Where several overlap, the
-    last one restores a stack that is unmapped, and the next Ctrl-C ends Python with a segmentation fault.
+    Each core replaces the thread's signal stack and restores the previous one when it is destroyed. If several overlap,
+    the last one restores an unmapped stack, and the next Ctrl-C ends Python with a segmentation fault.
     """
     return package("openvino").Core()
 
 
 def openvino_engine(path: Path, precision: Precision = "f32", threads: int = 0, batch: int | None = None) -> Engine:
-    """A written .onnx or .xml file by OpenVINO; with `batch` for that many images only, which is faster.
+    """OpenVINO engine of an .onnx or .xml file; with `batch` for that number of images only, which is faster.
 
-    Left alone OpenVINO takes bfloat16 where the processor has it; here `precision` says so.
+    By default OpenVINO uses bfloat16 if the processor has it; here `precision` decides.
     """
     core = openvino_core()
     with _readable(path):
@@ -94,7 +94,7 @@ def has_bf16() -> bool:
 
 @contextlib.contextmanager
 def _readable(path: Path) -> Any:
-    """A file that an engine refuses, told in one line; both engines raise RuntimeErrors of kinds of their own."""
+    """Raise a one-line UserError if an engine refuses a file; both engines raise their own kinds of RuntimeError."""
     if not path.is_file():
         raise UserError(path, "network", "no such file", "a file of `perilune-train detect export`")
     try:

@@ -1,4 +1,4 @@
-"""A trained detector as files for flight: ONNX and OpenVINO, compared with torch before they are left."""
+"""Export of a trained detector for flight: ONNX and OpenVINO files, checked against torch."""
 
 import json
 import warnings
@@ -44,9 +44,9 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 FORMATS = ("onnx", "openvino")
 MOST_PX = 1e-3
-"""Largest difference of a box's coordinate from torch's in float32, of the boxes that count."""
+"""Largest allowed difference of a box coordinate from torch's float32, pixels, of the boxes compared."""
 MOST_SCORE = 1e-3
-"""Largest difference of a score, of all predictors."""
+"""Largest allowed difference of a score, of all predictors."""
 _OPSET = 17
 _CHECKED_FRAMES = 8
 _CHECKED_BOXES = 100
@@ -61,13 +61,13 @@ class Trained:
     config: DetectConfig
     """Its settings."""
     threshold: float
-    """The score at which F1 was highest on its validation split."""
+    """Score threshold that the run chose on its validation split."""
     checkpoint: Path
-    """The file of the weights."""
+    """File of the weights."""
 
 
 def load_trained(root: Path) -> Trained:
-    """A finished run's network, settings and threshold. Raises UserError where it is none."""
+    """Load a finished run's network, settings and threshold. Raises UserError if it is none."""
     run = RunFolder(root)
     config = config_of_run(root)
     if not run.finished:
@@ -80,7 +80,7 @@ def load_trained(root: Path) -> Trained:
 
 
 def facts(trained: Trained, size_px: int) -> dict[str, Any]:
-    """All that is needed to use the exported files without this code, as plain data."""
+    """All data needed to use the exported files without this code."""
     network, settings = trained.network, trained.config.evaluation
     return {
         "input": {
@@ -110,12 +110,12 @@ def facts(trained: Trained, size_px: int) -> dict[str, Any]:
 
 
 def write_onnx(detector: FlightDetector, path: Path, told: dict[str, Any], in_channels: int, size_px: int) -> None:
-    """The graph with any number of images; `told` goes into its metadata, each entry as JSON."""
+    """Write the graph for any number of images; `told` goes into its metadata, each entry as JSON."""
     onnx = package("onnx")
     names = {"images": {0: "n"}, "boxes": {0: "n"}, "scores": {0: "n"}}
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
-        # The tracing exporter: the newer one needs two packages more and gives the same graph.
+        # The tracing exporter: the newer one needs two more packages and gives the same graph.
         torch.onnx.export(
             detector,
             (torch.zeros(1, in_channels, size_px, size_px),),
@@ -133,9 +133,9 @@ def write_onnx(detector: FlightDetector, path: Path, told: dict[str, Any], in_ch
 
 
 def write_openvino(onnx_path: Path, path: Path) -> None:
-    """OpenVINO's own form of an ONNX file: `path` (.xml) and, beside it, the weights (.bin) in float32."""
+    """Convert an ONNX file to OpenVINO's format: `path` (.xml) and, beside it, the weights (.bin) in float32."""
     openvino = package("openvino")
-    # Read by the runtime, not by the converter, which reports its use over the network.
+    # Read with the runtime: the converter sends telemetry.
     openvino.save_model(openvino_core().read_model(str(onnx_path)), str(path), compress_to_fp16=False)
 
 
@@ -143,13 +143,13 @@ def write_openvino(onnx_path: Path, path: Path) -> None:
 def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float) -> tuple[float, float]:
     """Largest differences from torch's float32: of box coordinates in pixels, and of scores.
 
-    Compared are all scores, and the boxes of at least `min_score` or among the best 100 of their image.
+    Compares all scores, and the boxes with a score of at least `min_score` or among the best 100 of their image.
     """
     boxes, scores = (part.numpy() for part in network.detect(torch.as_tensor(images)))
     found_boxes, found_scores = engine(images)
     if found_boxes.shape != boxes.shape or found_scores.shape != scores.shape:
         return float("inf"), float("inf")
-    # A check on frames in which the network sees nothing would check nothing.
+    # Always compare some boxes, also if the network detects nothing in these frames.
     best = np.sort(scores, axis=1)[:, -_CHECKED_BOXES:, None].min(axis=1)
     counts = scores >= np.minimum(best, min_score)
     apart = np.abs(found_boxes - boxes)[counts]
@@ -157,7 +157,7 @@ def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float)
 
 
 def check(path: Path, name: str, trained: Trained, engine: Engine, images: Array) -> dict[str, float]:
-    """The differences of a written file, seen over all images at once. Raises UserError on too large a one."""
+    """Largest differences of a written file over all images. Raises UserError if one exceeds its limit."""
     px, score = difference(trained.network, engine, images, trained.config.evaluation.min_score)
     if not (px <= MOST_PX and score <= MOST_SCORE):
         raise UserError(
@@ -167,14 +167,14 @@ def check(path: Path, name: str, trained: Trained, engine: Engine, images: Array
 
 
 def noise_frames(count: int, size_px: int) -> np.ndarray:
-    """Grey frames (count, size_px, size_px) of seeded noise, where there are no real ones to compare on."""
+    """Grey frames (count, size_px, size_px) of seeded noise, used if there are no real frames to compare on."""
     return np.random.default_rng(0).integers(0, 256, (count, size_px, size_px)).astype(np.uint8)
 
 
 def _terrain(
     checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
 ) -> tuple[Provenance, TerrainCheck | None]:
-    """The record of the exported network, with what int8 is calibrated and chosen on, and its check."""
+    """Terrain record of the exported network, including int8's calibration and validation, and its check."""
     provenance = read_provenance(load_weights(checkpoint), checkpoint)
     if calibration is None:
         return provenance, None
@@ -192,14 +192,14 @@ def export_run(
     int8: bool = False,
     allow_overlap: bool = False,
 ) -> Int8Verdict | None:
-    """Write a run's detector into the new folder `out`, checked; with `int8` also quantised, if that is worth it.
+    """Write a run's detector into the new folder `out`, checked; with `int8` also quantised, if that is kept.
 
-    Leaves detector.onnx, detector.xml and .bin (as asked for), detector-int8.onnx (if kept), detector.json (the
-    facts) and README.md. Compares on frames of the dataset's validation split, without one on noise.
+    Writes detector.onnx, detector.xml and .bin (as selected), detector-int8.onnx (if kept), detector.json (the facts)
+    and README.md. Compares on frames of the dataset's validation split, or on noise without a dataset.
 
-    Raises UserError, and leaves nothing, where a file differs from torch, the dataset has frames of another size, or
+    Raises UserError, and writes nothing, if a file differs from torch, if the dataset has frames of another size, or if
     int8 is calibrated on terrain that the run was tested on, or that the dataset's own test split shares with what the
-    network was fitted to, unless `allow_overlap`; then facts and README say so.
+    network was fitted to. With `allow_overlap` such terrain is allowed, and facts and README say so.
     """
     for name in ("onnx", "onnxruntime", *formats, *(("openvino", "onnxruntime.quantization") if int8 else ())):
         package(name)

@@ -1,4 +1,4 @@
-"""The detector as it flies: for inference alone, the same function in fewer and plainer operations."""
+"""The detector for flight: inference only, the same function in fewer and simpler operations."""
 
 import copy
 
@@ -13,9 +13,9 @@ from perilune_train.models.yolo import YOLOv3, decode
 class FlightDetector(nn.Module):
     """Images (N, in_channels, size_px, size_px) to boxes (N, K, 4), x0 y0 x1 y1 in pixels, and scores (N, K).
 
-    What `YOLOv3.detect` gives, up to rounding: batch norm folded into the convolutions (exactly:
-    W' = W g / sqrt(v + eps), b' = beta - m g / sqrt(v + eps)), CBAM without its own backward pass, decoding inside,
-    no suppression. The network given stays as it is.
+    Equal to `YOLOv3.detect` up to rounding: batch norm is folded into the convolutions (exactly: W' = W g / sqrt(v +
+    eps), b' = beta - m g / sqrt(v + eps)), CBAM has no custom backward pass, decoding is included, suppression is not.
+    The given network is not changed.
     """
 
     def __init__(self, network: YOLOv3, size_px: int = 256):
@@ -41,7 +41,7 @@ class FlightDetector(nn.Module):
 
 
 class FlightCBAM(nn.Module):
-    """CBAM by plain operations, the channel gate's linear layers as 1 x 1 convolutions. (N, C, H, W) to the same."""
+    """CBAM in standard operations, the channel gate's linear layers as 1 x 1 convolutions. (N, C, H, W) to the same."""
 
     def __init__(self, cbam: CBAM):
         super().__init__()
@@ -57,7 +57,7 @@ class FlightCBAM(nn.Module):
 
 
 def fold(network: nn.Module) -> None:
-    """Fold every batch norm of a network's `conv_block`s and make every CBAM plain, in place."""
+    """Fold every batch norm of a network's `conv_block`s and replace every CBAM by FlightCBAM, in place."""
     for name, child in list(network.named_children()):
         if isinstance(child, CBAM):
             setattr(network, name, FlightCBAM(child))

@@ -1,4 +1,4 @@
-"""The detector in 8-bit integers: made after training, measured, and kept only where it is worth it."""
+"""Quantisation of the detector to int8 after training; kept only if it is faster and nearly as accurate."""
 
 import dataclasses
 import logging
@@ -23,31 +23,31 @@ from perilune_train.detect.evaluate.split_evaluation import match_detections
 from perilune_train.detect.inference.suppression import detections_of
 
 MOST_LOSS = 0.005
-"""Average precision on the validation split that int8 may lose: half a point."""
+"""Largest loss of average precision on the validation split that is accepted for int8: half a point."""
 _CALIBRATION_FRAMES = 64
 _TIMED = 30
 _KEPT_FLOAT = ("/squeeze", "/excite", "/spatial", "/heads.")
-"""Parts of the graph that stay in floating point: the gates, which are cheap, and the layers that the boxes are."""
+"""Parts of the graph that stay in floating point: the gates, which are cheap, and the heads, which give the boxes."""
 
 
 @dataclass(frozen=True)
 class Int8Verdict:
-    """What quantisation cost and gave, by OpenVINO on this machine."""
+    """Accuracy and speed before and after quantisation, by OpenVINO on this machine."""
 
     ap50_paper_float: float
-    """AP on the validation split in float32, frames as they are, whatever the run's scales."""
+    """AP on the validation split in float32, at scale 1, whatever the run's scales."""
     ap50_paper_int8: float
-    """... in int8, the rest in `precision`."""
+    """AP of the int8 network, with its other parts in `precision`."""
     float_s: float
     """Median time of one image before quantisation, in `precision`."""
     int8_s: float
-    """... in int8."""
+    """Median time of one image in int8."""
     precision: Precision
-    """What is not int8: bf16 where the processor has it."""
+    """Precision of the parts that are not int8: bf16 if the processor has it."""
 
     @property
     def kept(self) -> bool:
-        """At most half a point of AP lost, and faster."""
+        """Whether at most half a point of AP is lost and int8 is faster."""
         return self.ap50_paper_float - self.ap50_paper_int8 <= MOST_LOSS and self.int8_s < self.float_s
 
     def as_facts(self) -> dict[str, Any]:
@@ -55,7 +55,7 @@ class Int8Verdict:
         return {**dataclasses.asdict(self), "kept": self.kept}
 
     def words(self) -> str:
-        """In one line."""
+        """Summary in one line."""
         told = (
             f"AP {self.ap50_paper_int8:.4f} (float32 {self.ap50_paper_float:.4f}) on the validation split, "
             f"{1000 * self.int8_s:.1f} ms an image ({self.precision} {1000 * self.float_s:.1f} ms)"
@@ -64,7 +64,7 @@ class Int8Verdict:
 
 
 def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config: DetectConfig) -> Int8Verdict:
-    """Quantise the ONNX file `source` into `out`, judge both on `val`; `out` is left only if that is worth it.
+    """Quantise the ONNX file `source` into `out` and evaluate both on `val`; `out` is deleted unless it is kept.
 
     Calibrated on 64 frames spread over the training split.
     """
@@ -86,9 +86,9 @@ def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config
 
 
 def quantise(source: Path, out: Path, images: Array) -> None:
-    """Static quantisation of an ONNX file (ONNX Runtime's): weights by channel, activations at convolutions' inputs.
+    """Static quantisation of an ONNX file (ONNX Runtime's): weights per channel, activations at convolutions' inputs.
 
-    `images` (N, C, H, W) are run through the network to see how large each activation gets.
+    `images` (N, C, H, W) are run through the network to measure the range of each activation.
     """
     onnx, quantization = package("onnx"), package("onnxruntime.quantization")
 
@@ -114,7 +114,7 @@ def quantise(source: Path, out: Path, images: Array) -> None:
             activation_type=quantization.QuantType.QUInt8,
             weight_type=quantization.QuantType.QInt8,
             nodes_to_exclude=[node.name for node in graph.node if any(part in node.name for part in _KEPT_FLOAT)],
-            # So that engines can join a convolution with what follows it before they round.
+            # So that engines can fuse a convolution with the next operation before rounding.
             extra_options={"OpTypesToExcludeOutputQuantization": ["Conv"]},
         )
     finally:
@@ -122,7 +122,7 @@ def quantise(source: Path, out: Path, images: Array) -> None:
 
 
 def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, label: str) -> float:
-    """The paper's AP, at the run's IoU, of an engine on a split: image by image, at scale 1 alone as in flight."""
+    """The paper's AP, at the run's IoU, of an engine on a split: image by image, at scale 1 only, as in flight."""
     import torch
 
     found = []
@@ -137,7 +137,7 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
 
 
 def interleaved(engines: dict[str, Engine], images: Array, rounds: int, warm_up: int = 5) -> dict[str, list[float]]:
-    """Seconds of each call of each engine, taken in turn, so that whatever else runs here slows all alike."""
+    """Seconds of each call of each engine, called in turn, so that other load on the machine slows all alike."""
     for engine in engines.values():
         for _ in range(warm_up):
             engine(images)

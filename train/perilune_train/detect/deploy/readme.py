@@ -1,4 +1,4 @@
-"""The note that goes with an exported detector."""
+"""README of an exported detector."""
 
 from typing import Any
 
@@ -34,7 +34,7 @@ def detect(grey):
 
 
 def readme(told: dict[str, Any]) -> str:
-    """Markdown for whoever flies the files with these facts (detector.json)."""
+    """Markdown for users of the files with these facts (detector.json)."""
     _, channels, size_px, _ = told["input"]["shape"]
     lines = [
         "# Crater detector",

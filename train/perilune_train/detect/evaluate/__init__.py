@@ -1,1 +1,1 @@
-"""Evaluation over plain data, without torch."""
+"""Evaluation of detections over plain data, without torch."""

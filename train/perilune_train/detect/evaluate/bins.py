@@ -1,9 +1,9 @@
-"""Figures by the size of craters, altitude, Sun and freshness.
+"""Metrics by crater size, altitude, Sun elevation and freshness.
 
-Altitude and Sun are of a frame: a bin holds whole frames. The radius is of a label: a bin follows COCO's rule for
-areas, so it is matched anew with the labels of other bins ignored, and detections that find nothing are ignored where
-their own radius is outside the bin. Freshness, depth over diameter, is of a label too, but a false detection has
-none: there only recall is defined.
+Altitude and Sun elevation belong to a frame: a bin holds whole frames. Radius belongs to a label: a bin follows COCO's
+rule for areas, so detections are matched again with the labels of other bins ignored, and an unmatched detection is
+ignored if its own radius is outside the bin. Freshness, depth over diameter, belongs to a label too, but a false
+positive has none, so only recall is defined.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from perilune_train.evaluation.spread import Resamples, Spread, spreads
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 RADIUS_BINS_PX = (2.0, 3.0, 5.0, 10.0, 20.0, 50.0, float("inf"))
-"""Up to 50 px the paper's range; above it one open bin, for the larger labels of wider images."""
+"""The paper's range up to 50 px, then one open bin for the larger labels of wider images."""
 _PAPERS_LARGEST_PX = 50.0
 ALTITUDE_BINS_M = (200.0, 500.0, 1000.0, 1500.0)
 SUN_BINS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
@@ -31,36 +31,36 @@ _ALTITUDE_MARGIN = 0.1
 
 @dataclass(frozen=True)
 class BinFigures:
-    """Figures of one bin, at the run's threshold; NaN where not defined."""
+    """Metrics of one bin, at the run's threshold; NaN where undefined."""
 
     by: str
     """radius, altitude, sun or depth_ratio."""
     unit: str
-    """px, m, deg or nothing."""
+    """px, m, deg or empty."""
     low: float
-    """Least value."""
+    """Lower limit, included."""
     high: float
-    """Values below this, in the last bin up to it."""
+    """Upper limit; included in the last bin only."""
     frames: int
-    """Frames with a wanted label in the bin."""
+    """Number of frames with a selected label in the bin."""
     labels: int
-    """Wanted labels."""
+    """Number of selected labels."""
     ap50_paper: float
-    """AP as in the paper (metrics.py)."""
+    """AP as defined in the paper (metrics.py)."""
     ap50_paper_spread: Spread
-    """Over the units that have wanted labels in the bin."""
+    """Spread of ap50_paper over the units with selected labels in the bin."""
     precision: float
-    """In the usual account."""
+    """Precision in the usual account (matching.py)."""
     recall: float
-    """Share of the wanted labels found."""
+    """Fraction of the selected labels that were found."""
     recall_spread: Spread
-    """Over the same units."""
+    """Spread of recall over the same units."""
     f1: float
-    """Of precision and recall."""
+    """F1 of precision and recall."""
 
     @property
     def key(self) -> str:
-        """Under which metrics.json has its figures, for example radius_2_3_px."""
+        """Key of the bin in metrics.json, for example radius_2_3_px."""
         return "_".join([self.by, f"{self.low:g}", f"{self.high:g}"] + [self.unit] * bool(self.unit))
 
     @property
@@ -71,7 +71,7 @@ class BinFigures:
 
 
 def within(values: Array, low: float, high: float, last: bool) -> Flags:
-    """Whether values lie in a bin; NaN lies in none."""
+    """Whether values are in a bin; False for NaN."""
     return (values >= low) & ((values <= high) if last else (values < high))
 
 
@@ -84,10 +84,10 @@ def figures_by_bin(
     threshold: float,
     resamples: Resamples,
 ) -> list[BinFigures]:
-    """Figures of every bin that holds wanted labels. `matches` are at `match_iou` with the judged `radius_px`.
+    """Metrics of every bin that holds selected labels. `matches` are at `match_iou` and the evaluated `radius_px`.
 
-    Frames up to a tenth beyond the first and the last altitude count in the outer bins: descents end near the
-    nominal altitude, not at it.
+    The outer altitude bins include frames up to a tenth beyond the first and the last altitude, because trajectories
+    end near the nominal altitude, not exactly at it.
     """
     made = []
     for low, high in pairwise(RADIUS_BINS_PX):
@@ -147,7 +147,7 @@ def _of_labels(
     threshold: float,
     resamples: Resamples,
 ) -> BinFigures:
-    """Recall of the labels `own` (L,) as they were matched among all."""
+    """Recall of the labels `own` (L,) in the matching with all labels."""
     hit = np.zeros(len(own), np.bool_)
     hit[matches.label[(matches.label >= 0) & (matches.scores >= threshold)]] = True
     frames = overlaps.label_frame[own]

@@ -1,4 +1,4 @@
-"""Figures of detections in every resample of units (spread.py)."""
+"""Detection metrics in every bootstrap resample of units (spread.py)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,10 @@ _GROUPS = 2000
 
 
 def average_precisions(matches: Matches, resamples: Resamples) -> Array:
-    """The paper's AP (`Curve.ap_paper`) of every resample (R,); NaN without wanted labels.
+    """The paper's AP (`Curve.ap_paper`) of every resample (R,); NaN without selected labels.
 
-    The sorted detections are counted by unit in at most 2000 groups of neighbouring scores, and a curve has one point
-    per group: exact for that many distinct scores, else within a few ten-thousandths.
+    For speed the sorted detections are counted by unit in at most 2000 groups of neighbouring scores, one curve point
+    per group. This is exact for up to that many distinct scores, otherwise within a few ten-thousandths.
     """
     counted = np.flatnonzero(matches.outcome != IGNORED)
     order = counted[np.argsort(-matches.scores[counted], kind="stable")]
@@ -35,7 +35,7 @@ def average_precisions(matches: Matches, resamples: Resamples) -> Array:
 
 
 def at_threshold_resampled(matches: Matches, threshold: float, resamples: Resamples) -> dict[str, Array]:
-    """precision, recall and f1 of every resample (R,), at one score threshold; NaN without wanted labels."""
+    """precision, recall and f1 of every resample (R,), at one score threshold; NaN without selected labels."""
     strong = matches.scores >= threshold
     hits, counted = (
         resamples.totals(matches.frame[strong & chosen])

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 def iou_matrix(first: ArrayLike, second: ArrayLike) -> Array:
     """Intersection over union (N, M) of boxes (N, 4) and (M, 4); 0 where both are empty."""
     a, b = (np.asarray(boxes, np.float64).reshape(-1, 4).T for boxes in (first, second))
-    # A matrix for each side: a last axis of two takes twice as long.
+    # One matrix per side, because a last axis of length two takes twice as long.
     width, height = (
         np.maximum(np.minimum(a[i + 2, :, None], b[i + 2]) - np.maximum(a[i, :, None], b[i]), 0) for i in (0, 1)
     )
@@ -23,9 +23,9 @@ def iou_matrix(first: ArrayLike, second: ArrayLike) -> Array:
 def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, most: int) -> NDArray[np.intp]:
     """Non-maximum suppression (OpenCV's): indices of the kept boxes, best first, at most `most`.
 
-    A box goes where it overlaps a kept better one by more than `threshold_iou`; equal scores keep their order. Every
-    box is looked at: several hundred craters with a dozen predictors each would fill any usual limit on candidates
-    and end the precision-recall curve early.
+    A box is removed if its IoU with a kept box of a higher score exceeds `threshold_iou`; equal scores keep their
+    order. All boxes are considered: several hundred craters with a dozen predictors each would exceed any usual limit
+    on candidates and cut the precision-recall curve short.
     """
     boxes, scores = np.asarray(boxes, np.float64).reshape(-1, 4), np.asarray(scores, np.float64)
     if not len(boxes):

@@ -1,13 +1,14 @@
-"""Judging detections: everything that is computed, over plain data.
+"""Evaluation of detections: all computations, over plain data.
 
-For rendered datasets and real images alike::
+Use it for rendered datasets and real images alike::
 
     evaluation = evaluate_detections(found, labels, facts, threshold, radius_px=(2.0, 50.0))
     figures = evaluation.figures()                       # flat keys, for metrics.json
     write_evaluation(folder, evaluation, images, about)  # report.py: report.md, pictures
 
-with `found` a list of Detections, `labels` a list of FrameLabels (real images: all wanted and labelled, ellipses of the
-boxes), `facts` a FrameFacts (`unknown_facts` where nothing is known), one entry a frame each.
+`found` is a list of Detections, `labels` a list of FrameLabels (real images: all selected and labelled, with the
+ellipses inscribed in the boxes) and `facts` a FrameFacts (`unknown_facts` if nothing is known). Each has one entry per
+frame.
 """
 
 from dataclasses import dataclass
@@ -38,41 +39,45 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Detections judged, with all that a report tells."""
+    """Evaluated detections, with all values that a report prints."""
 
     found: list[Detections]
-    """One entry a frame."""
+    """One entry per frame."""
     labels: list[FrameLabels]
-    """One entry a frame."""
+    """One entry per frame."""
     facts: FrameFacts
-    """Of the frames."""
+    """Facts about the frames."""
     threshold: float
-    """Score from which a detection counts in precision, recall and F1."""
+    """Least score of the detections that count in precision, recall and F1."""
     match_iou: float
-    """Least IoU of a find, in everything that is not over several."""
+    """Least IoU of a match, except in averages over several IoUs."""
     overlaps: Overlaps
-    """Which detection may be which label."""
+    """Pairs of detections and labels that may match."""
     matches: Matches
-    """At match_iou."""
+    """Matches at match_iou."""
     at_edge: Matches
-    """The same in the account of the edge (matching.py)."""
+    """Matches at match_iou in the edge account (matching.py)."""
     by_iou: list[Matches]
-    """At COCO_IOUS."""
+    """Matches at each of COCO_IOUS."""
     bins: list[BinFigures]
-    """By radius, altitude, Sun, freshness; only bins that hold labels."""
+    """By radius, altitude, Sun elevation and freshness; only bins that hold labels."""
     spreads: dict[str, Spread]
-    """Of ap50_paper, ap50_95_paper, precision, recall, f1, and of ap50_paper at the edge and strict."""
+    """Spreads of ap50_paper, ap50_95_paper, precision, recall and f1, and of ap50_paper in the edge and strict
+    accounts."""
     resamples: Resamples
-    """What the intervals are drawn from."""
+    """Resamples of the bootstrap intervals."""
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """Centre and radius errors of what was found, see `errors_of_found`."""
+        """Centre and radius errors of the found craters, see `errors_of_found`."""
         return errors_of_found(self.overlaps, self.matches, self.threshold)
 
     def figures(self) -> dict[str, float | int | str | None]:
-        """Flat keys: those of `metrics.figures` and `figures_over_ious`, `Spread.keys` of the spreads,
-        <bin>/ap50_paper and others, recall_radius_..., errors. What is not defined is NaN."""
+        """Flat keys for metrics.json; NaN where undefined.
+
+        The keys are those of `metrics.figures`, `figures_over_ious` and `Spread.keys`, <bin>/ap50_paper and others,
+        recall_radius_... and the errors.
+        """
         result: dict[str, float | int | str | None] = {
             **figures(self.matches, self.threshold),
             **figures_of_account(self.at_edge, self.threshold, "edge/"),
@@ -100,7 +105,7 @@ class Evaluation:
         return result
 
     def frame_f1(self) -> Array:
-        """F1 of every frame (N,) at the threshold; NaN without wanted labels."""
+        """F1 of every frame (N,) at the threshold; NaN without selected labels."""
         n_frames = len(self.facts)
         strong = self.matches.scores >= self.threshold
         hits, false = (
@@ -121,10 +126,10 @@ def evaluate_detections(
     match_iou: float = 0.5,
     seed: int = 0,
 ) -> Evaluation:
-    """Judge the detections of all frames; `radius_px` is the range of radii that is labelled.
+    """Evaluate the detections of all frames; `radius_px` is the range of labelled radii.
 
-    The account of the edge is fair only where `labels` hold craters, ignored ones, well below that range.
-    `threshold` must come from other frames (validation). `seed` is of the bootstrap alone.
+    The edge account is valid only if `labels` include craters, as ignored ones, well below that range. `threshold` must
+    be chosen on other frames (validation). `seed` is the random seed of the bootstrap only.
     """
     overlaps = find_overlaps(found, labels, facts.sizes_px, min(match_iou, *COCO_IOUS))
     matches = overlaps.match(match_iou, radius_px)
@@ -158,10 +163,11 @@ def evaluate_detections(
 
 
 def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> dict[str, float]:
-    """Errors of found craters, in pixels and (`_relative`) over the label's radius; NaN where none was found.
+    """Errors of found craters, in pixels and (`_relative`) over the label's radius; NaN if none was found.
 
-    The centre is that of the box, the radius sqrt(w h) / 2 of the detection's box against the same of the label's box:
-    for an ellipse that lies askew a little more than its sqrt(a b), which no box tells. Bias is mean found minus true.
+    The centre is the centre of the box. The radius is sqrt(w h) / 2 of a box, for the detection and for the label. For
+    a rotated ellipse it is slightly larger than sqrt(a b), which a box cannot show. Bias is the mean of detected minus
+    true.
     """
     own = (matches.label >= 0) & (matches.scores >= threshold)
     ours, truth = overlaps.boxes[own], overlaps.label_boxes[matches.label[own]]

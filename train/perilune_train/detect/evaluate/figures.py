@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: precision-recall curves, AP by bin, and frames with labels and detections drawn."""
+"""Pictures of an evaluation: precision-recall curves, AP by bin, frames with labels and detections."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,13 +24,13 @@ _GOAL = 0.85
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG atomically."""
     with written_aside(path) as aside:
         figure.savefig(aside, dpi=110)
 
 
 def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] | None = None) -> None:
-    """Precision against recall, a line for each curve under its name."""
+    """Draw precision against recall, one named line per curve."""
     figure = Figure(figsize=(7.5, 4.8), layout="constrained")
     axes = figure.subplots()
     for group, style in ((curves, "-"), (dashed or {}, "--")):
@@ -43,7 +43,8 @@ def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] |
 
 
 def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
-    """AP by radius, altitude and Sun as bars with 95 % intervals or single units, labels counted, goal 0.85 dashed."""
+    """Draw AP by radius, altitude and Sun as bars with 95 % intervals or single units, label counts, and the goal 0.85
+    dashed."""
     unit = bins[0].ap50_paper_spread.unit if bins else "unit"
     drawn = [(by, title) for by, title in _PANELS.items() if any(part.by == by for part in bins)]
     figure = Figure(figsize=(4.4 * max(len(drawn), 1), 3.8), layout="constrained")
@@ -74,8 +75,11 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
 
 
 def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) -> dict[str, list[int]]:
-    """`count` frames each of best, typical (nearest the median) and worst F1 (N,), if they can be of different
-    `groups` (descents); a frame without wanted labels (NaN) is never chosen, and none is twice."""
+    """Select `count` frames each of best, typical (nearest the median) and worst F1 (N,).
+
+    Prefer frames of different `groups` (trajectories). Never select a frame without selected labels (NaN), nor a frame
+    twice.
+    """
     known = np.flatnonzero(np.isfinite(f1))
     middle = np.median(f1[known]) if len(known) else 0.0
     orders = {
@@ -98,7 +102,7 @@ def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) ->
 
 
 def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], path: Path, count: int = 2) -> None:
-    """Rows of best, typical and worst frames by F1: each plain, and with its labels and detections."""
+    """Draw rows of best, typical and worst frames by F1: each plain, and with its labels and detections."""
     chosen = choose_frames(evaluation.frame_f1(), evaluation.facts.descent, count)
     rows = [(name, index) for name, part in chosen.items() for index in part]
     f1 = evaluation.frame_f1()

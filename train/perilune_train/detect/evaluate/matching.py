@@ -1,24 +1,27 @@
 """Matching of detections to labels, over plain data.
 
-Whoever has detections and labels of some images, rendered or real, judges them so::
+Evaluate detections against labels of rendered or real images with::
 
     overlaps = find_overlaps(found, labels, sizes_px)          # list[Detections], list[FrameLabels], (N, 2)
     matches = overlaps.match(0.5, (2.0, 50.0))                 # at one IoU
     curve(matches).ap_paper()                                  # metrics.py
 
-A detection is taken in order of score and finds the free wanted label of highest IoU, if that is at least the
-IoU asked for. Two accounts are kept. The usual one leaves out what no one can judge: a detection that finds no wanted
-label is not counted where it lies on an ignored crater (hardly visible, or just outside the labelled range), where
-its radius sqrt(w h) / 2 is outside the labelled range, or where its centre is off the image. The strict one leaves
-out nothing: all these are false. Between the two lies the account of the edge (`edge_range`). In the usual one nobody
-pays for calling everything just under the least radius a crater, yet some of such boxes meet a label and count; in
-this one a detection somewhat below the least radius is false too, unless it lies on a crater, wanted or not. In all of
-them only wanted labels are to be found.
+Detections are matched in order of score. Each takes the free selected label of highest IoU, if that is at least the
+given IoU. Only selected labels (`wanted`) count in recall. Three accounts differ in which unmatched detections are
+false positives:
 
-COCO (COCOeval without crowds) is the same but for two things. There an ignored label absorbs one detection, here any
-number, since several detections on a crater that nobody can judge cannot be judged either; COCO comes to the same
-figures where each ignored label is there once for every detection (a test does that). And COCO counts a detection
-whose centre is off the image as false; the labels given to it know no such centres.
+- Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the
+  labelled range), if its radius sqrt(w h) / 2 is outside the labelled range, or if its centre is off the image. The
+  labels cannot decide whether such a detection is right.
+- Edge (`edge_range`): a detection somewhat below the least radius is a false positive too, unless it overlaps a crater,
+  selected or not. In the usual account a detector can report boxes just under the least radius everywhere at no cost,
+  although some of them match a label and count.
+- Strict: every unmatched detection is a false positive.
+
+Two things differ from COCO (COCOeval without crowds). There an ignored label absorbs one detection, here any number,
+since none of several detections on an ignored crater can be evaluated; COCO gives the same metrics if each ignored
+label is repeated once for every detection (a test does that). COCO counts a detection whose centre is off the image as
+a false positive, because the labels given to it have no such centres.
 """
 
 from dataclasses import dataclass, replace
@@ -35,13 +38,13 @@ Rows = NDArray[np.intp]
 FOUND, FALSE, IGNORED = 1, 0, -1
 NO_LABEL, ON_IGNORED = -1, -2
 EDGE = 0.75
-"""The account of the edge judges radii down to this share of the least."""
+"""The edge account counts false positives down to this fraction of the least radius."""
 COCO_IOUS = tuple(np.linspace(0.5, 0.95, 10).tolist())
-"""The IoUs over which COCO averages, to the last bit."""
+"""The IoUs over which COCO averages, equal to the last bit."""
 
 
 def edge_range(radius_px: tuple[float, float]) -> tuple[float, float]:
-    """Range of radii, pixels, in which the account of the edge calls unmatched detections false."""
+    """Range of radii, pixels, in which the edge account counts unmatched detections as false positives."""
     return radius_px[0] * EDGE, radius_px[1]
 
 
@@ -57,25 +60,25 @@ class Detections:
 
 @dataclass(frozen=True)
 class Matches:
-    """All detections of some frames, judged at one IoU."""
+    """All detections of some frames, matched at one IoU."""
 
     scores: Array
     """(D,)."""
     outcome: NDArray[np.int8]
     """FOUND, FALSE or IGNORED (D,)."""
     label: Rows
-    """The label that was found, a row of Overlaps; NO_LABEL or ON_IGNORED where none (D,)."""
+    """Matched label, a row of Overlaps; NO_LABEL or ON_IGNORED if there is none (D,)."""
     frame: Rows
     """Frame of each detection (D,)."""
     wanted_frame: Rows
-    """Frame of each wanted label (L,)."""
+    """Frame of each selected label (L,)."""
 
     def strict(self) -> "Matches":
-        """The same with every ignored detection counted as false."""
+        """The same matches with every ignored detection counted as a false positive."""
         return replace(self, outcome=np.where(self.outcome == IGNORED, FALSE, self.outcome).astype(np.int8))
 
     def of_frames(self, chosen: Flags) -> "Matches":
-        """Those of the frames (N,) that are chosen."""
+        """The matches in the frames that are True in `chosen` (N,)."""
         own = chosen[self.frame]
         return Matches(
             self.scores[own],
@@ -88,42 +91,43 @@ class Matches:
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Detections and labels of some frames end to end, and every pair of the two that may match."""
+    """Detections and labels of some frames, concatenated, and all pairs of the two that may match."""
 
     boxes: Array
-    """Of the detections, pixels, best first within a frame (D, 4)."""
+    """Boxes of the detections, pixels, best first within a frame (D, 4)."""
     scores: Array
-    """(D,)."""
+    """Scores of the detections (D,)."""
     frame: Rows
     """Frame of each detection (D,)."""
     off_image: Flags
     """Whether a detection's centre is off the image (D,)."""
     label_boxes: Array
-    """Pixels (L, 4)."""
+    """Boxes of the labels, pixels (L, 4)."""
     label_radius_px: Array
-    """(L,)."""
+    """Radius of each label, pixels (L,)."""
     label_depth_ratio: Array
-    """Depth over diameter, NaN where not known (L,)."""
+    """Depth over diameter of each label, NaN if unknown (L,)."""
     label_wanted: Flags
-    """(L,)."""
+    """Whether each label is selected (L,)."""
     label_frame: Rows
     """Frame of each label (L,)."""
     pair_detection: Rows
-    """Of each pair, its detection, rising (P,)."""
+    """Detection of each pair, ascending (P,)."""
     pair_label: Rows
-    """... its label; of one detection those of higher IoU come first, of equal ones the later (as COCO does) (P,)."""
+    """Label of each pair; for one detection by falling IoU, and for equal IoU the later label first, as in COCO
+    (P,)."""
     pair_iou: Array
-    """... their IoU (P,)."""
+    """IoU of each pair (P,)."""
 
     def radius_px(self) -> Array:
         """Radius sqrt(w h) / 2 of every detection, pixels (D,)."""
         return np.sqrt(np.prod(np.maximum(self.boxes[:, 2:] - self.boxes[:, :2], 0), axis=1)) / 2
 
     def match(self, match_iou: float, radius_px: tuple[float, float], wanted: Flags | None = None) -> Matches:
-        """Judge every detection at one IoU, at least that of `find_overlaps`.
+        """Match every detection at one IoU, at least that of `find_overlaps`.
 
-        `radius_px` is the range of radii outside which nothing can be judged; `wanted` (L,) takes the place of what
-        the labels say.
+        `radius_px` is the evaluated range of radii; unmatched detections outside it are ignored. `wanted` (L,) replaces
+        `label_wanted`.
         """
         wanted = self.label_wanted if wanted is None else wanted
         label = np.full(len(self.scores), NO_LABEL, np.intp)
@@ -187,7 +191,7 @@ def match_split(
     match_iou: float,
     radius_px: tuple[float, float],
 ) -> Matches:
-    """Judge the detections of frames of one size (width, height) at one IoU."""
+    """Match the detections of frames of one size (width, height) at one IoU."""
     sizes = np.tile(image_size_px, (len(found), 1))
     return find_overlaps(found, labels, sizes, match_iou).match(match_iou, radius_px)
 

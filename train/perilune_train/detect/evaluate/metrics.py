@@ -1,4 +1,4 @@
-"""Precision, recall, F1 and average precision of judged detections (matching.py)."""
+"""Precision, recall, F1 and average precision of matched detections (matching.py)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ class Curve:
     """(K,)."""
 
     def ap_paper(self) -> float:
-        """The paper's AP and the headline: sum of (R_n - R_(n-1)) P_n over all thresholds, with raw precision.
+        """The paper's AP, the headline metric: sum of (R_n - R_(n-1)) P_n over all thresholds, with raw precision.
 
-        One threshold per distinct score, as in scikit-learn's average_precision_score: equal scores count together.
-        Never above `ap_envelope`.
+        There is one threshold per distinct score, as in scikit-learn's average_precision_score: equal scores count
+        together. Never above `ap_envelope`.
         """
         ends = self._thresholds()
         return float(np.sum(np.diff(self.recall[ends], prepend=0.0) * self.precision[ends]))
@@ -34,18 +34,18 @@ class Curve:
     def ap_envelope(self) -> float:
         """All-point interpolated AP: P_n is replaced by the best precision at that recall or a higher one.
 
-        Equal scores count one by one, in the order of the detections, as in COCO's tools.
+        Equal scores count one by one in the order of the detections, as in COCO's tools.
         """
         envelope = np.maximum.accumulate(self.precision[::-1])[::-1]
         return float(np.sum(np.diff(self.recall, prepend=0.0) * envelope))
 
     def ap_coco101(self) -> float:
-        """COCO's AP: mean of the interpolated precision at recalls 0, 0.01 .. 1."""
+        """COCO's AP: mean of the interpolated precision at recalls 0, 0.01, ..., 1."""
         envelope = np.append(np.maximum.accumulate(self.precision[::-1])[::-1], 0.0)
         return float(envelope[np.searchsorted(self.recall, np.linspace(0, 1, 101), side="left")].mean())
 
     def _thresholds(self) -> NDArray[np.bool_]:
-        """Which points are possible thresholds (K,): of equal scores the last, since a threshold keeps all of them."""
+        """Which points are possible thresholds (K,): the last of equal scores, since a threshold keeps all of them."""
         return np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
 
     def best_threshold(self) -> float:
@@ -55,9 +55,9 @@ class Curve:
         return float(self.scores[int(f1_score(self.precision, self.recall).argmax())])
 
     def operating_threshold(self, min_precision: float | None) -> tuple[float, str]:
-        """A score (0 to 1) as threshold and its name: of best F1, or of most recall at a precision of min_precision.
+        """Score threshold (0 to 1) and its description: highest F1, or highest recall at a precision of min_precision.
 
-        Where no threshold has that precision, best F1 decides again, and the words say so.
+        If no threshold reaches that precision, highest F1 is used, and the description says so.
         """
         if min_precision is None:
             return self.best_threshold(), "of best F1"
@@ -74,7 +74,7 @@ def f1_score(precision: Array, recall: Array) -> Array:
 
 
 def curve(matches: Matches) -> Curve:
-    """The precision-recall curve of all counted detections. Without wanted labels recall is 0."""
+    """The precision-recall curve of all detections that are not ignored. Without selected labels recall is 0."""
     counted = matches.outcome != IGNORED
     order = np.argsort(-matches.scores[counted], kind="stable")
     hits = np.cumsum(matches.outcome[counted][order] == FOUND)
@@ -97,7 +97,7 @@ def figures(matches: Matches, threshold: float) -> dict[str, float]:
 
 
 def figures_of_account(matches: Matches, threshold: float, prefix: str) -> dict[str, float]:
-    """The six figures of one account by key, with a prefix."""
+    """The six metrics of one account by key, with a prefix."""
     points = curve(matches)
     precision, recall, f1 = at_threshold(matches, threshold)
     return {

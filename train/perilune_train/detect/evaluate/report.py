@@ -1,4 +1,4 @@
-"""What an evaluation leaves in a folder: report.md, pictures, and the curve as a table. Needs no dataset."""
+"""Output files of an evaluation: report.md, pictures, and the curve as a table. Needs no dataset."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,9 +32,9 @@ _ROWS = {
 def write_evaluation(
     folder: Path, evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], about: Sequence[str]
 ) -> None:
-    """Write report.md, precision_recall.png and .parquet, bins.png (where there are bins) and detections.png.
+    """Write report.md, precision_recall.png and .parquet, bins.png (if there are bins) and detections.png.
 
-    `images` are the frames (height, width), grey; `about` are lines of Markdown that say what was judged and how.
+    `images` are the frames (height, width), grey; `about` are lines of Markdown that state what was evaluated and how.
     """
     write_text(folder / "report.md", markdown(evaluation, about))
     curves = {f"IoU {COCO_IOUS[k]:.1f}": curve(evaluation.by_iou[k]) for k in (0, 2, 4, 6, 8)}
@@ -51,7 +51,7 @@ def _with_ap(curves: dict[str, Curve]) -> dict[str, Curve]:
 
 
 def write_curve(path: Path, points: Curve) -> None:
-    """Table score, precision, recall: at most 1000 points, evenly along the curve, by which runs are compared."""
+    """Write the table score, precision, recall: at most 1000 points, evenly along the curve, for comparing runs."""
     count = len(points.scores)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _CURVE_POINTS)).astype(int)) if count else np.empty(0, int)
     columns = {name: pa.array(getattr(points, f)[chosen]) for name, f in _CURVE_COLUMNS.items()}
@@ -63,12 +63,12 @@ _CURVE_COLUMNS = {"score": "scores", "precision": "precision", "recall": "recall
 
 
 def number(value: object) -> str:
-    """A figure with three digits behind the point; a dash where it is not defined."""
+    """A number with three decimals; a dash if undefined."""
     return f"{value:.3f}" if isinstance(value, int | float) and math.isfinite(value) else "-"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table; an upright bar within a cell is escaped."""
+    """Lines of a Markdown table; escapes vertical bars within cells."""
     lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
     lines.insert(1, ["---"] * len(head))
     return ["| " + " | ".join(row) + " |" for row in lines]
@@ -126,7 +126,7 @@ def _cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], key: str
 
 
 def _of_brackets(resamples: Resamples) -> str:
-    """Explains the brackets after a figure."""
+    """Explanation of the brackets after a number."""
     count, unit = resamples.count, resamples.unit
     if count < LEAST_UNITS:
         return f"in brackets: the value of each {unit}; {count} of them are too few for an interval"

@@ -1,4 +1,4 @@
-"""Detections of a split against its labels: matches, figures, and the files of an evaluation."""
+"""Evaluation of a split's detections: matches, metrics and output files."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def match_detections(split: DetectSplit, found: list[Detections], config: Detect
 
 
 def evaluate_split(split: DetectSplit, found: list[Detections], config: DetectConfig, threshold: float) -> Evaluation:
-    """Every figure of a split's detections."""
+    """Compute all metrics of a split's detections."""
     return evaluate_detections(
         found,
         split.labels,
@@ -46,13 +46,13 @@ def evaluate_split(split: DetectSplit, found: list[Detections], config: DetectCo
 
 
 def selection_entries(config: DetectConfig, split: DetectSplit) -> dict[str, float | int | str | None]:
-    """What was wanted, for metrics.json: the selection's name and its thresholds; null asks for nothing."""
+    """The label selection for metrics.json: its name and thresholds; null means no limit."""
     used = {f"labels/{key}": value for key, value in config.labels.model_dump(exclude={"radius_px"}).items()}
     return used | {"labels/min_radius_px": split.radius_px[0], "labels/max_radius_px": split.radius_px[1]}
 
 
 def dataset_entries(dataset: Dataset, split: str, config: DetectConfig) -> dict[str, float | int | str | None]:
-    """What was evaluated and how, for metrics.json."""
+    """Dataset, split and settings of an evaluation, for metrics.json."""
     return {
         "dataset/name": dataset.info.name,
         "dataset/split_by": dataset.info.split_by,
@@ -65,7 +65,7 @@ def dataset_entries(dataset: Dataset, split: str, config: DetectConfig) -> dict[
 def report_head(
     dataset: Dataset, split: str, config: DetectConfig, protocol: str, run: str, chosen_on: str
 ) -> list[str]:
-    """What was evaluated and how, for the head of a report."""
+    """Dataset, split and settings of an evaluation, for the head of a report."""
     settings = config.evaluation
     thresholds = config.labels.model_dump(exclude={"selection"}, exclude_none=True)
     return [
@@ -83,7 +83,7 @@ def at_scales(scales: tuple[float, ...]) -> str:
 
 
 def write_detections(path: Path, split: DetectSplit, found: list[Detections]) -> None:
-    """Table frame_id, x0_px, y0_px, x1_px, y1_px, score, one row a detection."""
+    """Write the table frame_id, x0_px, y0_px, x1_px, y1_px, score, one row per detection."""
     boxes = np.concatenate([part.boxes for part in found])
     names = np.repeat(split.frames.table["frame_id"].to_numpy(), [len(part.scores) for part in found])
     columns = {"frame_id": pa.array(names, pa.string())}

@@ -1,1 +1,1 @@
-"""From the network's output to detections: scales, tiles, suppression."""
+"""Detections from the network's output: scales, tiles, suppression."""

@@ -16,7 +16,7 @@ from perilune_train.training import runs
 
 
 def load_detector(path: Path) -> YOLOv3:
-    """The network of a detect run's best.ckpt, in evaluation mode. Raises UserError on another kind of file."""
+    """Load the network of a detect run's best.ckpt, in evaluation mode. Raises UserError on another kind of file."""
     content = runs.load_weights(path)
     architecture = content["architecture"]
     if set(architecture) != {"in_channels", "width", "attention", "strides"}:
@@ -29,7 +29,7 @@ def load_detector(path: Path) -> YOLOv3:
 def detect_split(
     network: YOLOv3, split: DetectSplit, name: str, config: DetectConfig, device: str, bf16: bool
 ) -> tuple[list[Detections], float]:
-    """Detections of all frames of a split, and frames a second."""
+    """Detections of all frames of a split, and frames per second."""
     with progress_bar() as progress:
         bar = progress.add_task(f"detect {name}", total=len(split), unit="frames", note="")
         started = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Frames looked at enlarged or shrunk: small craters become as large as those that a network finds best."""
+"""Detection on resized frames: enlarging brings small craters to the sizes that a network finds best."""
 
 import cv2
 import numpy as np
@@ -14,20 +14,20 @@ from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
 
 _STEP = 32
-"""The network's coarsest stride, of which the sides of its input are multiples."""
+"""Coarsest stride of the network; the sides of its input are multiples of it."""
 
 
 def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """An image (height, width) of another size; the same object where the size stays."""
+    """Resize an image (height, width); returns the same object if the size is the same."""
     if image.shape == (height_px, width_px):
         return image
-    # Averaging, when shrinking, keeps noise from aliasing into craters.
+    # Area averaging, when shrinking, keeps noise from aliasing into craters.
     how = cv2.INTER_AREA if width_px < image.shape[1] else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=how), np.uint8)
 
 
 def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]:
-    """Height and width of a frame enlarged by about `factor`: the nearest that the network can look at, pixels."""
+    """Height and width, pixels, nearest to `factor` times those of a frame that the network accepts."""
     if factor == 1:
         return height_px, width_px
     height, width = (max(_STEP, round(side * factor / _STEP) * _STEP) for side in (height_px, width_px))
@@ -35,7 +35,7 @@ def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]
 
 
 def multiply_adds_of_a_frame(network: YOLOv3, config: DetectConfig, height_px: int, width_px: int) -> int:
-    """Multiplications with an addition of the network for a frame, at all scales together."""
+    """Multiply-adds of the network for one frame, all scales together."""
     sizes = [scaled_size(height_px, width_px, factor) for factor in config.evaluation.scales]
     return sum(multiply_adds(network, (1, config.in_channels, *size)) for size in sizes)
 
@@ -44,10 +44,9 @@ def multiply_adds_of_a_frame(network: YOLOv3, config: DetectConfig, height_px: i
 def detect_at_scales(
     network: YOLOv3, frames: NDArray[np.uint8], config: DetectConfig, device: str, bf16: bool
 ) -> list[Detections]:
-    """Detections of frames (N, height, width), one entry a frame, in pixels of the frames.
+    """Detections of frames (N, height, width), one entry per frame, in pixels of the frames.
 
-    The network looks at each frame once a scale of `detect.evaluation.scales`; what it sees goes through one
-    suppression.
+    The network runs once for each of `detect.evaluation.scales`; one suppression merges the detections of all scales.
     """
     height, width = frames.shape[1:]
     boxes, scores = [], []

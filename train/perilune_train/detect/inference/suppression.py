@@ -8,14 +8,14 @@ from perilune_train.detect.evaluate.boxes import suppress
 from perilune_train.detect.evaluate.matching import Detections
 
 _BLOCK = 256
-"""Boxes that are decided at once: more cost more overlaps, fewer cost more steps."""
+"""Boxes decided together: a larger block computes more overlaps, a smaller one needs more steps."""
 
 
 def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> list[Detections]:
     """Detections of each frame from all predictors' boxes (N, K, 4) and scores (N, K).
 
-    On a GPU the whole batch is suppressed there; on a CPU frame by frame by OpenCV, which is faster on it
-    (`make bench-suppress`). Both keep the same boxes in the same order.
+    On a GPU the whole batch is suppressed there; on a CPU OpenCV suppresses frame by frame, which is faster (`make
+    bench-suppress`). Both keep the same boxes in the same order.
     """
     strong = scores >= settings.min_score
     if settings.max_aspect is not None:
@@ -24,7 +24,7 @@ def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -
     if boxes.device.type == "cpu":
         return [_of_frame(*frame, settings) for frame in zip(boxes, scores, strong, strict=True)]
     kept = suppress_batch(boxes, scores, strong, settings.nms_iou)
-    # One transfer for the batch.
+    # One transfer for the whole batch.
     found_boxes, found_scores, kept = (part.cpu() for part in (boxes, scores, kept))
     found = []
     for some_boxes, some_scores, chosen in zip(found_boxes, found_scores, kept, strict=True):
@@ -41,21 +41,22 @@ def _of_frame(boxes: Tensor, scores: Tensor, strong: Tensor, settings: Evaluatio
 
 @torch.no_grad()
 def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou: float) -> Tensor:
-    """Non-maximum suppression of N frames at once, on the tensors' device: the same boxes as `suppress` keeps.
+    """Non-maximum suppression of N frames at once, on the tensors' device; keeps the same boxes as `suppress`.
 
-    Takes boxes (N, K, 4), scores (N, K) and which boxes take part (N, K). Returns indices (N, M) of the kept boxes of
-    each frame, best first, padded with -1.
+    Takes boxes (N, K, 4), scores (N, K) and a mask (N, K) of the boxes to consider. Returns indices (N, M) of the kept
+    boxes of each frame, best first, padded with -1.
 
-    Boxes are decided in blocks from the best down. Within a block the greedy rule is a fixed point: a box is kept
-    unless a kept better one overlaps it. The overlaps are a strict triangle, so iterating reaches it. The kept boxes
-    of a block then remove others, and those that are left move up, so that later blocks hold no decided box.
+    Boxes are decided in blocks by falling score. Within a block the greedy rule is a fixed point: a box is kept unless
+    a kept box of a higher score overlaps it. The overlap matrix is strictly triangular, so the iteration converges to
+    it. The kept boxes of a block then remove others, and the remaining boxes move up, so that later blocks hold no
+    decided box.
     """
     rows = torch.arange(len(boxes), device=boxes.device)[:, None]
-    # Scores as OpenCV's float32; equal scores keep their order.
+    # Use float32 scores as OpenCV; equal scores keep their order.
     order = torch.where(allowed, scores.float(), -1.0).sort(dim=1, descending=True, stable=True).indices
     order = order[:, : int(allowed.sum(1).amax())] if allowed.any() else order[:, :0]
     alive, corners = allowed.gather(1, order), boxes.double()[rows, order]
-    # OpenCV's rectangles hold a corner and a size.
+    # OpenCV's rectangles store a corner and a size.
     corners = torch.cat([corners[..., :2], corners[..., :2] + (corners[..., 2:] - corners[..., :2])], dim=-1)
     kept = []
     while alive.shape[1]:
@@ -68,7 +69,7 @@ def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou
                 break
             chosen = again
         kept.append(torch.where(chosen, order[:, :_BLOCK], -1))
-        # Kept boxes first, so that overlaps are only computed for these.
+        # Kept boxes first, so that overlaps are computed only for these.
         first = chosen.byte().argsort(dim=1, descending=True, stable=True)[:, : int(chosen.sum(1).amax())]
         removed = (_overlap(block[rows, first], corners[:, _BLOCK:]) > threshold_iou) & chosen.gather(1, first)[
             ..., None

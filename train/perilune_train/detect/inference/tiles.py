@@ -1,9 +1,9 @@
 """Detection in images of any size: overlapping tiles, several scales, one list of boxes.
 
-The network was trained on frames of one size, normalised each by its own mean and deviation; so an image is cut into
-tiles of that size, each normalised for itself. Where tiles overlap, a box is taken from the tile whose borders are
-farthest from it: near a border the network guesses what lies beyond, and both tiles' boxes together would hold more
-false ones than the rest of the image does.
+The network was trained on frames of one size, each normalised by its own mean and standard deviation. So an image is
+cut into tiles of that size, each normalised separately. Where tiles overlap, a box is taken from the tile whose borders
+are farthest from it. Near a border the network has to guess what is outside, and the boxes of both tiles together would
+hold more false positives than the rest of the image.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,30 +25,31 @@ from perilune_train.models.yolo import YOLOv3
 
 Array = NDArray[np.float64]
 _STEP = 32
-"""The network's coarsest stride, of which the sides of its input are multiples."""
+"""Coarsest stride of the network; the sides of its input are multiples of it."""
 _AT_ONCE = 5_000
-"""Boxes that are suppressed together; above that, block by block."""
+"""Largest number of boxes that are suppressed together; above it, block by block."""
 _TOLERANCE_PX = 2.0
-"""Two tiles place one crater a little differently: so far may each leave it to the other before it is lost."""
+"""Tolerance of the distance to a tile's border. Two tiles place a crater slightly differently; without a tolerance each
+could leave it to the other."""
 
 
 @dataclass(frozen=True)
 class Tiling:
-    """How an image is cut, and how large the boxes are drawn."""
+    """How to cut an image into tiles, and the margin of the boxes."""
 
     tile_px: int = 256
-    """Side of a tile: that of the training frames, pixels."""
+    """Side of a tile, pixels: that of the training frames."""
     overlap_px: int = 64
-    """Least overlap of two neighbours, pixels: craters up to this size are whole in at least one tile."""
+    """Least overlap of two neighbouring tiles, pixels: craters up to this size are whole in at least one tile."""
     scales: tuple[float, ...] = (1.0,)
-    """Factors by which the image is enlarged or shrunk before it is cut. Above 1 for smaller craters than those
-    trained on, below 1 for larger ones; what several scales find is merged."""
+    """Factors by which the image is resized before it is cut; detections at all scales are merged. Above 1 for smaller
+    craters than those trained on, below 1 for larger ones."""
     box_margin_px: float = 0.0
-    """Added to the boxes found at every side. Ours end at the crest of the rim, to fractions of a pixel; the smallest
-    box of whole pixels around a crater is half a pixel larger at every side on average."""
+    """Margin added to the found boxes at every side, pixels. Our boxes end at the crest of the rim, to fractions of a
+    pixel; the smallest box of whole pixels around a crater is on average half a pixel larger at every side."""
 
     def check(self) -> None:
-        """Raise UserError on what cannot be cut."""
+        """Raise UserError on values that cannot be used."""
         if self.tile_px < _STEP or self.tile_px % _STEP:
             raise UserError("--tile", "pixels", self.tile_px, f"a multiple of {_STEP}")
         if not 0 <= self.overlap_px < self.tile_px:
@@ -61,7 +62,7 @@ class Tiling:
 
 @dataclass(frozen=True)
 class Detector:
-    """A trained network and how it is run."""
+    """A trained network and how to run it."""
 
     network: YOLOv3
     """The network, in evaluation mode, on the device."""
@@ -74,7 +75,7 @@ class Detector:
 
 
 def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
-    """Where tiles begin along a side: evenly, the first at 0, the last ending at the side's end."""
+    """Tile starts along a side: evenly spaced, the first at 0, the last tile ending at the side's end."""
     if length_px <= tile_px:
         return np.zeros(1, np.intp)
     count = -(-(length_px - overlap_px) // (tile_px - overlap_px))
@@ -82,7 +83,8 @@ def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.int
 
 
 def padded(image: NDArray[np.uint8], tile_px: int) -> NDArray[np.uint8]:
-    """The image with reflected pixels at right and bottom where a side is shorter than a tile and no multiple of 32."""
+    """Pad the image with reflected pixels at right and bottom if a side is shorter than a tile and no multiple of
+    32."""
     more = [max(0, min(tile_px, -(-side // _STEP) * _STEP) - side) for side in image.shape]
     return np.pad(image, [(0, more[0]), (0, more[1])], mode="reflect") if any(more) else image
 
@@ -101,7 +103,7 @@ def detect_image(
 ) -> Detections:
     """Craters of an image (height, width) of any size, best first; `advance(n)` is called after n more tiles.
 
-    An image of the size of one tile gets what `detect_at_scales` finds at scale 1.
+    For an image of the size of one tile the result is that of `detect_at_scales` at scale 1.
     """
     height, width = image.shape
     boxes, scores = [np.zeros((0, 4))], [np.zeros(0)]
@@ -112,7 +114,7 @@ def detect_image(
         for found in _detect_tiles(detector, whole, tiling, advance):
             own = np.ones(len(found.scores), bool)
             if whole.shape != scaled.shape:
-                # Craters of the reflection are none.
+                # Drop craters in the reflected padding.
                 own = ((found.boxes[:, :2] + found.boxes[:, 2:]) / 2 < size).all(axis=1)
             boxes.append(found.boxes[own] / np.tile([size[0] / width, size[1] / height], 2))
             scores.append(found.scores[own])
@@ -125,9 +127,10 @@ def detect_image(
 def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_px: float = 512.0) -> NDArray[np.intp]:
     """Non-maximum suppression of any number of boxes (N, 4): indices of the kept ones, best first.
 
-    The time of `suppress` grows with the square of the number. Where there are many, each block of an image is dealt
-    with among the boxes centred within a margin of it: half a block, or half the largest box (centres farther apart do
-    not overlap by half). Only long chains of boxes that suppress each other could come out otherwise.
+    The time of `suppress` grows with the square of the number. Many boxes are therefore suppressed by blocks of the
+    image, each with the boxes centred within a margin around it: half a block, or half the largest box (boxes with
+    centres farther apart do not overlap by half). Only long chains of boxes that suppress each other could give another
+    result.
     """
     if len(boxes) <= _AT_ONCE:
         return suppress(boxes, scores, threshold_iou, len(boxes))
@@ -146,7 +149,7 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
 def _detect_tiles(
     detector: Detector, image: NDArray[np.uint8], tiling: Tiling, advance: Callable[[int], object]
 ) -> Iterator[Detections]:
-    """What each tile of an image finds, in pixels of the image, without what another tile sees better."""
+    """Detections of each tile of an image, in pixels of the image, without those left to another tile."""
     tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)
     places = [(int(top), int(left)) for top in tops for left in lefts]
     tile_h, tile_w = (min(tiling.tile_px, side) for side in image.shape)
@@ -168,7 +171,7 @@ def _detect_tiles(
 
 
 def _clearance(spans: Array, starts: NDArray[np.intp], tile_px: int, length_px: int) -> Array:
-    """Least distance (D, T) of spans (D, 2) from the borders of tiles along a side; the image's own edges are none."""
+    """Least distance (D, T) of spans (D, 2) from the tile borders along a side; the image's own edges do not count."""
     low = np.where(starts > 0, spans[:, :1] - starts, np.inf)
     high = np.where(starts + tile_px < length_px, starts + tile_px - spans[:, 1:], np.inf)
     return np.minimum(low, high)
@@ -176,7 +179,7 @@ def _clearance(spans: Array, starts: NDArray[np.intp], tile_px: int, length_px: 
 
 @torch.no_grad()
 def detect_batch(detector: Detector, tiles: NDArray[np.uint8]) -> list[Detections]:
-    """Detections of tiles (N, height, width), one entry a tile."""
+    """Detections of tiles (N, height, width), one entry per tile."""
     images = network_input(normalised(tiles), detector.config.in_channels).to(detector.device)
     with torch.autocast(detector.device, torch.bfloat16, enabled=detector.bf16):
         boxes, scores = detector.network.detect(images)

@@ -18,9 +18,9 @@ def size_iou(sizes: Array, anchors: Array) -> Array:
 def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator) -> Array:
     """`count` anchors (count, 2), width and height in pixels, sorted by area, for sizes (N, 2) > 0.
 
-    Clustered are 20,000 sizes drawn by `rng`, each with a probability by the inverse root of how common its size is:
-    craters of 40 px are a hundred times rarer than those of 5 px, and without that all anchors would go to the small.
-    Starts from evenly spaced steps of the area; a cluster that runs empty takes the size that is fitted worst.
+    Clusters 20,000 sizes drawn by `rng`, weighted by the inverse square root of the frequency of each size. Without the
+    weights all anchors would go to small craters: craters of 40 px are a hundred times rarer than those of 5 px. Starts
+    from evenly spaced logarithms of the area. An empty cluster takes the size with the worst fit.
     """
     sizes = np.asarray(sizes_px, np.float64)
     if len(sizes) == 0:
@@ -46,11 +46,11 @@ def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator) -> Arr
 
 
 def best_possible_recall(sizes_px: Array, anchors: Array, ratio: float) -> float:
-    """Share of sizes (N, 2) that have an anchor within the factor `ratio` in width and in height."""
+    """Fraction of sizes (N, 2) that have an anchor within the factor `ratio` in width and in height."""
     quotient = np.asarray(sizes_px)[:, None] / anchors[None]
     return float((np.maximum(quotient, 1 / quotient).max(axis=2) < ratio).any(axis=1).mean())
 
 
 def mean_best_iou(sizes_px: Array, anchors: Array) -> float:
-    """Mean over sizes (N, 2) of the IoU with the anchor that fits best, both centred on one point."""
+    """Mean over sizes (N, 2) of the IoU with the best anchor, both centred on one point."""
     return float(size_iou(np.asarray(sizes_px, np.float64), anchors).max(axis=1).mean())

@@ -15,7 +15,7 @@ _TINY = 1e-7
 
 
 def iou(first: Tensor, second: Tensor) -> Tensor:
-    """Intersection over union (N,) of pairs of boxes (N, 4), x0 y0 x1 y1; 0 where neither has an area."""
+    """Intersection over union (N,) of pairs of boxes (N, 4), x0 y0 x1 y1; 0 if neither has an area."""
     area = (first[:, 2:] - first[:, :2]).clamp(min=0).prod(1) + (second[:, 2:] - second[:, :2]).clamp(min=0).prod(1)
     shared = torch.minimum(first[:, 2:], second[:, 2:]) - torch.maximum(first[:, :2], second[:, :2])
     intersection = shared.clamp(min=0).prod(1)
@@ -25,7 +25,7 @@ def iou(first: Tensor, second: Tensor) -> Tensor:
 def ciou_loss(predicted: Tensor, label: Tensor, aspect: Literal["circular", "standard"] = "circular") -> Tensor:
     """1 - IoU + rho^2 / c^2 + alpha v of pairs of boxes (N, 4), x0 y0 x1 y1 in pixels: losses (N,) in float32.
 
-    rho is the distance of the centres and c the diagonal of the box around both. v = 4 / pi^2 (arctan(r) -
+    rho is the distance between the centres and c the diagonal of the box around both. v = 4 / pi^2 (arctan(r) -
     arctan(w / h))^2 with r the label's w / h (`standard`, Zheng et al. 2020, doi 10.1609/aaai.v34i07.6999) or 1
     (`circular`, the paper's prior). alpha = v / (1 - IoU + v) carries no gradient. Boxes without area are allowed.
     """
@@ -57,14 +57,14 @@ def detection_loss(
 ) -> tuple[Tensor, Tensor]:
     """L_ciou and L_obj of raw outputs (N, 3, h, w, 5) per scale; the loss is their weighted sum.
 
-    Of each scale, L_ciou is the mean over its positive predictors, 0 without any, and L_obj the sum of the binary
-    cross-entropy of the objectness over positive and (times lambda_noobj) negative predictors, over the number of all
-    its predictors; the scales are averaged with weights 1 / stride. Deviation: the paper writes plain sums over all
-    scales. With means its weights 0.05 and 1 let both parts train, and with the weights the coarse scales, whose
-    craters are a hundred times rarer, do.
+    For each scale, L_ciou is the mean over its positive predictors, 0 if there are none. L_obj is the sum of the binary
+    cross-entropy of the objectness over positive and (times lambda_noobj) negative predictors, divided by the number of
+    all predictors of the scale. The scales are averaged with weights 1 / stride. Deviation: the paper writes plain sums
+    over all scales. The means let both parts train with the paper's weights 0.05 and 1. The weights of the scales let
+    the coarse scales train, whose craters are a hundred times rarer.
 
-    A positive predictor's objectness is to become 1 (`hard`, YOLOv3) or the IoU of its box with the label it answers
-    for (`iou`): then the score says how well a box sits, and suppression keeps the best of those on one crater.
+    The objectness target of a positive predictor is 1 (`hard`, YOLOv3) or the IoU of its box with its label (`iou`).
+    With `iou` the score measures how well a box fits, and suppression keeps the best box on a crater.
     """
     shapes = [(raw.shape[0], raw.shape[2], raw.shape[3]) for raw in outputs]
     box, confidence = outputs[0].new_zeros(()), outputs[0].new_zeros(())
@@ -77,13 +77,13 @@ def detection_loss(
         cells = torch.stack([found.column, found.row], 1)
         boxes, labels = decode(chosen, cells, prior[found.anchor], stride), targets.boxes[found.label]
         share = 1 / stride / total
-        # The sum over nothing keeps the graph, so that a batch of empty frames can still be differentiated.
+        # The sum over nothing keeps the graph, so that a batch of empty frames remains differentiable.
         box = box + share * ciou_loss(boxes, labels, settings.aspect).sum() / max(len(labels), 1)
         positive = found.positive
         weight = torch.where(positive, 1.0, settings.lambda_noobj * (~found.free))
         goal = positive.float()
         if settings.objectness == "iou":
-            # Where two labels share a predictor, the one that it fits better counts.
+            # If two labels share a predictor, use the larger IoU.
             _, anchors_here, height, width = goal.shape
             flat = ((found.frame * anchors_here + found.anchor) * height + found.row) * width + found.column
             goal = (

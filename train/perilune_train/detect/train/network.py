@@ -1,4 +1,4 @@
-"""A new network with anchors of the training labels, and a teacher."""
+"""Build a network with anchors fitted to the training labels; load a teacher."""
 
 from pathlib import Path
 
@@ -19,13 +19,13 @@ _ANCHOR_STREAM = 1
 
 
 def label_sizes(split: DetectSplit) -> np.ndarray:
-    """Widths and heights (N, 2) in pixels of all wanted labels of a split."""
+    """Widths and heights (N, 2) in pixels of all selected labels of a split."""
     boxes = np.concatenate([part.boxes[part.wanted] for part in split.labels])
     return boxes[:, 2:] - boxes[:, :2]
 
 
 def build_network(config: DetectConfig, sizes_px: np.ndarray, where: Path) -> YOLOv3:
-    """The network with anchors of these label sizes (N, 2). Raises UserError where there are no labels."""
+    """Build the network with anchors for these label sizes (N, 2). Raises UserError if there are no labels."""
     if len(sizes_px) == 0:
         raise UserError(where, "labels", "no visible crater in the training split", "at least one")
     count = len(config.strides) * ANCHORS_PER_SCALE
@@ -36,7 +36,7 @@ def build_network(config: DetectConfig, sizes_px: np.ndarray, where: Path) -> YO
 
 
 def load_teacher(path: Path, config: DetectConfig) -> Teacher:
-    """The network to learn from. Raises UserError where its input channels or strides are not the student's."""
+    """Load the teacher. Raises UserError if its input channels or strides differ from the student's."""
     network = load_detector(path)
     wanted = {"in_channels": config.in_channels, "strides": list(config.strides)}
     runs.check_architecture(path, runs.load_weights(path)["architecture"], wanted)
@@ -49,7 +49,7 @@ def anchor_sizes(network: YOLOv3) -> np.ndarray:
 
 
 def anchor_report(network: YOLOv3, sizes_px: np.ndarray, ratio: float) -> str:
-    """How well a network's anchors suit labels of these sizes (N, 2): recall that training can reach at best."""
+    """State how well a network's anchors fit labels of these sizes (N, 2): the best recall that training can reach."""
     recall = best_possible_recall(sizes_px, anchor_sizes(network), ratio)
     return (
         f"anchors: best possible recall {recall:.4f}, the share of the training labels that have one within a factor "

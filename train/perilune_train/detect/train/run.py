@@ -47,12 +47,12 @@ def run_detect(
     overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> runs.RunFolder:
-    """Train and evaluate a detector; everything it leaves is in the returned folder.
+    """Train and evaluate a detector; all output is in the returned folder.
 
-    An interrupted run of the same settings and dataset is resumed, a finished one left as it is; `overwrite` replaces
-    both. Raises UserError where its settings or dataset were others, where its last state is damaged, on a dataset,
-    weights or settings that cannot be trained with, and where a network that it starts or learns from was fitted to
-    terrain of the test split, unless `allow_overlap`.
+    Resumes an interrupted run of the same settings and dataset, and leaves a finished one unchanged; `overwrite`
+    replaces both. Raises UserError if the run's settings or dataset were different, if its last state is damaged, if
+    the dataset, weights or settings cannot be trained with, and, unless `allow_overlap`, if a network that it starts or
+    learns from was fitted to terrain of the test split.
     """
     console.quiet = not runs.is_first_process()
     run = runs.RunFolder(runs_root / "detect" / name)
@@ -84,7 +84,7 @@ def run_detect(
     frozen_epochs = config.frozen_epochs if config.init_from is not None else 0
     if config.frozen_epochs and not frozen_epochs:
         console.print("frozen_epochs without init_from: nothing to freeze, the whole network trains from the start")
-    # The anchors of a resumed run may be others, and are in its state.
+    # The anchors of a resumed run are in its state and may differ.
     if not resume:
         console.print(anchor_report(network, sizes, config.anchor_ratio))
     task = DetectTask(network, config, splits["train"], splits["val"], frozen_epochs, teacher)
@@ -134,7 +134,7 @@ def evaluate(
     device: str,
     bf16: bool,
 ) -> dict[str, float | int | str | None]:
-    """Judge the best weights on val and test, write tables and pictures; the threshold is chosen on val alone."""
+    """Evaluate the best weights on val and test; write tables and pictures. The threshold is chosen on val only."""
     network = load_detector(run.best)
     found_val, _ = detect_split(network, splits["val"], "val", config, device, bf16)
     found, rate = detect_split(network, splits["test"], "test", config, device, bf16)

@@ -22,11 +22,12 @@ from perilune_train.models.yolo import YOLOv3
 _FINAL_RATE = 0.01
 _EVERY_STEP_UNTIL = 100
 _STEPS_BETWEEN_AVERAGES = 4
-"""Reading and writing all weights takes a twentieth of a small network's step; four at a time change nothing."""
+"""Steps between updates of the average. Updating all weights takes a twentieth of a small network's step; every fourth
+step gives the same result."""
 
 
 def learning_rate_factor(step: int, warmup_steps: int, total_steps: int) -> float:
-    """Linear from nearly 0 to 1 over the warm-up, then half a cosine to a hundredth at the last step."""
+    """Factor on the learning rate: linear from nearly 0 to 1, then half a cosine to a hundredth at the last step."""
     warmup = min(warmup_steps, total_steps // 2)
     if step < warmup:
         return (step + 1) / warmup
@@ -38,7 +39,7 @@ Pairs = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]
 
 
 def pairs(average: nn.Module, network: nn.Module) -> Pairs:
-    """Tensors of an average and of its network: floats of both, then counters of both."""
+    """Pairs of tensors of an average and of its network: first the floats, then the counters."""
     old, new = list(average.state_dict().values()), list(network.state_dict().values())
     floats = [value.is_floating_point() for value in old]
     return (
@@ -51,14 +52,14 @@ def pairs(average: nn.Module, network: nn.Module) -> Pairs:
 
 @torch.no_grad()
 def update_average(tensors: Pairs, decay: float) -> None:
-    """Move an average of weights and batch statistics towards the network by 1 - decay; counters are copied."""
+    """Move an average of weights and batch statistics towards the network by 1 - decay; copy the counters."""
     old, new, old_counters, new_counters = tensors
     torch._foreach_lerp_(old, new, 1 - decay)
     torch._foreach_copy_(old_counters, new_counters)
 
 
 class DetectTask(lightning.LightningModule):
-    """AdamW, warm-up and cosine, a moving average of the weights that is judged instead of them.
+    """Training with AdamW, warm-up and cosine; a moving average of the weights is evaluated in their place.
 
     While frozen, the backbone keeps its weights and batch statistics, and only its attention gates learn.
     """
@@ -90,7 +91,7 @@ class DetectTask(lightning.LightningModule):
 
     @property
     def process(self) -> tuple[int, int]:
-        """This process among all that train together."""
+        """Rank of this process and number of processes that train together."""
         return (self._trainer.global_rank, self._trainer.world_size) if self._trainer else (0, 1)
 
     def train_dataloader(self) -> Any:
@@ -124,7 +125,7 @@ class DetectTask(lightning.LightningModule):
             lr=self.config.learning_rate,
             fused=True,
         )
-        # Lightning's own count would ask for the batches of an epoch before it knows where a resumed run stands.
+        # Lightning's own count would load the batches of an epoch before it knows the position of a resumed run.
         total = self.config.epochs * len(Share(len(self.splits["train"]), self.config.batch_size, *self.process))
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda step: learning_rate_factor(step, self.config.warmup_steps, total)
@@ -157,10 +158,11 @@ class DetectTask(lightning.LightningModule):
         return loss
 
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
-        # Lightning's own refuses fused optimisers, for fear of float16's scaled gradients, which are not in use here.
+        # Lightning's own clipping refuses fused optimisers because of float16's scaled gradients, which are not used
+        # here.
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         norm = nn.utils.get_total_norm(gradients, foreach=True)
-        # On a CPU the look is free, and most steps need no second pass over all gradients.
+        # On a CPU reading the norm is free, and most steps need no second pass over all gradients.
         if norm.is_cuda or norm > self.config.gradient_clip:
             nn.utils.clip_grads_with_norm_(self.network.parameters(), self.config.gradient_clip, norm, foreach=True)
 
@@ -169,8 +171,8 @@ class DetectTask(lightning.LightningModule):
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         super().optimizer_step(*args, **kwargs)
-        # Here, not after the batch: a checkpoint in between would lack it. Early on the average forgets faster, or
-        # it would carry the random start through a short training.
+        # Update here, not after the batch: a checkpoint in between would lack it. The decay is smaller in early steps;
+        # otherwise the random start would dominate the average in a short training.
         steps = self.global_step + 1
         every = 1 if steps <= _EVERY_STEP_UNTIL else _STEPS_BETWEEN_AVERAGES
         if steps % every == 0:
@@ -182,7 +184,7 @@ class DetectTask(lightning.LightningModule):
     def on_validation_epoch_start(self) -> None:
         self.judged = []
         if self.process[1] > 1:
-            # Weights are equal in all processes; batch statistics are each one's own, and the first one's count.
+            # Weights are equal in all processes; batch statistics differ, and those of the first process are used.
             for value in self.evaluated.buffers():
                 torch.distributed.broadcast(value, 0)
 

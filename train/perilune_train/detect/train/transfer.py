@@ -1,4 +1,4 @@
-"""What a detector takes from an earlier run or from Darknet's weight files, and gives back as one of these."""
+"""Initial weights from an earlier run or from Darknet's weight files, and export to the latter."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -24,19 +24,20 @@ from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
-"""Of photographs on Darknet's scale of 0 to 1, about. A power of two scales without rounding."""
+"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. A power of two scales without
+rounding."""
 _GATES = "backbone.attentions."
 DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}
 
 
 @torch.no_grad()
 def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"]) -> None:
-    """Change the stem of a backbone so that it sees the same in another scale of its input.
+    """Change the stem of a backbone so that it gives the same features for another scale of its input.
 
-    Darknet's files were trained on grey values from 0 to 1 (`grey`), our networks see frames with their mean taken
-    off and their deviation divided out (`normalised`). Without this a frozen backbone would get an input some four
-    times stronger than its batch statistics are made for. grey = 0.25 normalised + 0.45, folded into the stem's
-    weights and its batch norm's mean: exact but for rounding and for the border, where zero padding then means grey.
+    Darknet's files were trained on grey values from 0 to 1 (`grey`). Our networks take frames with zero mean and unit
+    standard deviation (`normalised`). Without this change a frozen backbone would get an input some four times stronger
+    than its batch statistics expect. grey = 0.25 normalised + 0.45 is folded into the stem's weights and its batch
+    norm's mean. This is exact except for rounding and for the border, where zero padding then means grey.
     """
     stem: Any = backbone.stem
     weight, mean = stem.conv.weight, stem.norm.running_mean
@@ -50,11 +51,11 @@ def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"
 
 
 def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
-    """Give the network what an earlier detect run, or a Darknet file, has for it.
+    """Fill the network with weights of an earlier detect run or of a Darknet file.
 
-    A run of the same strides gives everything, its anchors too; one of other strides gives the backbone. Where their
-    attention differs the gates stay as they are. Raises UserError where width or in_channels are not the same, and
-    where the backbone is to be frozen behind new plain gates.
+    A run of the same strides gives all weights and its anchors; a run of other strides gives the backbone. If the
+    attention differs, the gates are not changed. Raises UserError if width or in_channels differ, or if the backbone is
+    to be frozen with new plain gates.
     """
     if is_darknet(path):
         check_gates(path, config)
@@ -76,10 +77,10 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
 
 
 def check_gates(path: Path, config: DetectConfig) -> None:
-    """Raises UserError where a frozen backbone would sit behind plain gates that start at random.
+    """Raise UserError if a frozen backbone would have plain gates with random initial weights.
 
     Each such gate scales its input by about 0.25, so that the frozen layers get features that they were not trained on:
-    the cosine to those of the plain backbone falls to about 0.5 (`make bench-transfer`).
+    their cosine similarity to those of the plain backbone falls to about 0.5 (`make bench-transfer`).
     """
     if config.frozen_epochs and config.attention == "cbam":
         wanted = (
@@ -92,7 +93,7 @@ def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenanc
     """Terrain records of the networks that a run starts or learns from.
 
     A resumed run has them in its last state, `last`. Darknet's files were trained on photographs of the Earth. Raises
-    UserError where a checkpoint is missing or damaged.
+    UserError if a checkpoint is missing or damaged.
     """
     if last is not None:
         content = runs.read_saved(last, "last state", {"state_dict"}, "the state of an interrupted run")
@@ -102,13 +103,14 @@ def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenanc
 
 
 def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> None:
-    """Fill a network with all that a Darknet file holds for it; the rest stays as it is.
+    """Fill a network with the weights of a Darknet file; other weights are not changed.
 
-    A darknet53.conv.74 fills the backbone. A yolov3.weights fills the neck and the heads' 3 x 3 convolutions too if
-    the strides are 8, 16, 32, else the backbone alone. Its output layers are left out: they tell COCO's 80 classes
-    by COCO's anchors, and would undo the prior that a cell is empty. Those of a file of our own (15 filters) count.
+    A darknet53.conv.74 fills the backbone. A yolov3.weights also fills the neck and the heads' 3 x 3 convolutions if
+    the strides are 8, 16, 32; otherwise only the backbone. Its output layers are not used: they predict COCO's 80
+    classes with COCO's anchors, and would undo the prior that a cell is empty. The output layers of a file written by
+    perilune (15 filters) are used.
 
-    Raises UserError where width is not 1 or in_channels not 3, and on a file of another size; then nothing changed.
+    Raises UserError if width is not 1 or in_channels not 3, and on a file of another size; then nothing is changed.
     """
     for key, value in DARKNET_SHAPE.items():
         if getattr(config, key) != value:
@@ -129,9 +131,9 @@ def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> Non
 
 
 def darknet_content(network: YOLOv3, architecture: dict[str, Any], checkpoint: Path, whole: bool) -> DarknetFile:
-    """The Darknet file of a trained network, which is changed: its backbone, or the whole with 15 output filters.
+    """Darknet file of a trained network, its backbone or the whole with 15 output filters. Changes the network.
 
-    Attention gates have no place in these files. Raises UserError where the network has not the file's shape.
+    These files cannot hold attention gates. Raises UserError if the network does not have the file's shape.
     """
     wanted: dict[str, Any] = dict(DARKNET_SHAPE)
     if whole:
