@@ -1,4 +1,4 @@
-"""`perilune-render`: datasets, previews and meshes from a configuration."""
+"""The command line `perilune-render`: datasets, previews and meshes from a configuration."""
 
 import tempfile
 from pathlib import Path
@@ -25,7 +25,7 @@ app = typer.Typer(
 
 
 def _warn_of_size(config: DatasetConfig) -> None:
-    """Warn, before hours of rendering, of frames that the detector cannot be trained on."""
+    """Warn, before hours of rendering, of a frame size that the detector cannot be trained on."""
     sides = {"width_px": config.camera.width_px, "height_px": config.camera.height_px}
     for name, side in sides.items():
         if side % 32:
@@ -89,7 +89,7 @@ def dataset(
     folder = out or Path("data") / preset
     from perilune_render.dataset.render import (
         make_dataset,
-    )  # Blender is loaded only once the settings are known to be right.
+    )  # imports Blender: only after the settings were checked
 
     names: tuple[Literal["detect", "nav"], ...] = ("detect", "nav")
     for name in names if kind is Kind.BOTH else (first_kind(kind),):

@@ -1,4 +1,4 @@
-"""Options that several commands of `perilune-render` share."""
+"""Options shared by several commands of `perilune-render`."""
 
 import enum
 from pathlib import Path
@@ -10,7 +10,7 @@ from perilune_shared.errors import UserError
 
 
 class Kind(enum.StrEnum):
-    """Which of a preset's datasets."""
+    """Which of a preset's two datasets."""
 
     DETECT = "detect"
     NAV = "nav"
@@ -38,12 +38,12 @@ Catalogue = Annotated[
 
 
 def first_kind(kind: Kind) -> Literal["detect", "nav"]:
-    """The kind itself; detect for both."""
+    """The dataset of this kind; detect for `both`."""
     return "nav" if kind is Kind.NAV else "detect"
 
 
 def one_kind(kind: Kind) -> Literal["detect", "nav"]:
-    """The kind itself. Raises UserError for both."""
+    """The dataset of this kind. Raises UserError for `both`."""
     if kind is Kind.BOTH:
         raise UserError("--kind", "kind", "both", "detect or nav: one dataset")
     return first_kind(kind)

@@ -11,18 +11,18 @@ from perilune_shared.dataset.selection import default_label_bound_px
 
 
 class DistortionConfig(Section):
-    """Lens distortion of Brown and Conrady, on image coordinates over the focal length, in OpenCV's form."""
+    """Brown-Conrady lens distortion in OpenCV's form, on image coordinates divided by the focal length."""
 
     k1: float = 0.0
-    """Radial, r^2."""
+    """Radial coefficient of r^2."""
     k2: float = 0.0
-    """Radial, r^4."""
+    """Radial coefficient of r^4."""
     p1: float = 0.0
-    """Tangential."""
+    """First tangential coefficient."""
     p2: float = 0.0
-    """Tangential."""
+    """Second tangential coefficient."""
     k3: float = 0.0
-    """Radial, r^6."""
+    """Radial coefficient of r^6."""
 
 
 class CameraConfig(Section):
@@ -33,19 +33,19 @@ class CameraConfig(Section):
     height_px: Annotated[int, Field(ge=16, le=4096)] = 256
     """Image height, pixels."""
     horizontal_fov_deg: Annotated[float, Field(ge=1, le=120)] = 50.0
-    """Horizontal field of view of the whole image width without distortion, degrees."""
+    """Horizontal field of view over the image width, without distortion, degrees."""
     focal_length_px: Positive | None = None
-    """Focal length over the pixel's width, pixels; null takes it from horizontal_fov_deg."""
+    """Focal length, pixels; null computes it from horizontal_fov_deg."""
     principal_x_px: float | None = None
-    """Principal point right of the left edge, pixels; null is the middle."""
+    """Principal point, from the left edge, pixels; null is the image centre."""
     principal_y_px: float | None = None
-    """Principal point below the top edge, pixels; null is the middle."""
+    """Principal point, from the top edge, pixels; null is the image centre."""
     distortion: DistortionConfig = DistortionConfig()
     """Lens distortion."""
 
 
 class FlightConfig(Section):
-    """The descent: a parabola with smooth Gaussian perturbations."""
+    """The trajectory: a parabola with smooth Gaussian perturbations."""
 
     start_altitude_m: Positive = 1500.0
     """Altitude of the first frame above the site, metres."""
@@ -54,15 +54,15 @@ class FlightConfig(Section):
     downrange_m: NotNegative = 500.0
     """Horizontal distance from the site at the start, metres."""
     azimuth_deg: Span = Span(low=0.0, high=0.0)
-    """Direction from the site to the start, clockwise from north, drawn for each descent, degrees."""
+    """Direction from the site to the start, clockwise from north, drawn for each trajectory, degrees."""
     duration_s: Positive = 65.0
-    """Time from first to last frame, seconds."""
+    """Time from the first frame to the last, seconds."""
     position_sigma_m: NotNegative = 8.0
-    """Standard deviation of the position about the nominal curve, per axis, metres."""
+    """Standard deviation of the position from the nominal parabola, per axis, metres."""
     attitude_sigma_deg: NotNegative = 0.3
-    """Standard deviation of the attitude about level, per axis, degrees."""
+    """Standard deviation of the attitude from level, per axis, degrees."""
     correlation_time_s: Positive = 3.0
-    """Time over which perturbations stay alike (squared-exponential kernel), seconds."""
+    """Correlation time of the perturbations (squared-exponential kernel), seconds."""
 
     @model_validator(mode="after")
     def _sinking(self) -> "FlightConfig":
@@ -72,12 +72,12 @@ class FlightConfig(Section):
 
 
 class SunConfig(Section):
-    """Where the Sun stands, drawn for each scene."""
+    """Direction of the Sun, drawn for each scene."""
 
     azimuth_deg: Span = Span(low=0.0, high=360.0)
-    """Clockwise from north, degrees."""
+    """Azimuth, clockwise from north, degrees."""
     elevation_deg: Span = Span(low=12.0, high=55.0)
-    """Above the ground plane, degrees, above 0 and at most 90."""
+    """Elevation above the ground plane, above 0 and at most 90, degrees."""
 
     @model_validator(mode="after")
     def _risen(self) -> "SunConfig":
@@ -87,24 +87,24 @@ class SunConfig(Section):
 
 
 class KindConfig(Section):
-    """How many scenes, descents and frames one dataset has, how they are split, and how it flies."""
+    """Settings of one dataset: numbers of scenes, trajectories and frames, split, flight and Sun."""
 
     n_scenes: Count
-    """Terrains."""
+    """Number of scenes, each with its own terrain."""
     trajectories_per_scene: Count
-    """Descents over each terrain."""
+    """Number of trajectories over each scene."""
     n_frames: Annotated[int, Field(ge=2)]
-    """Frames of each descent."""
+    """Number of frames of each trajectory."""
     split_by: Literal["scene", "trajectory", "frame"]
-    """What is never shared between two splits."""
+    """Unit of the split: each scene, trajectory or frame belongs to one split as a whole."""
     val_share: Share = 0.1
     """Share of the units in the validation split."""
     test_share: Share = 0.1
     """Share of the units in the test split."""
     flight: FlightConfig = FlightConfig()
-    """The descents."""
+    """Trajectories."""
     sun: SunConfig = SunConfig()
-    """The Sun."""
+    """Direction of the Sun."""
 
     @model_validator(mode="after")
     def _units(self) -> "KindConfig":
@@ -114,43 +114,43 @@ class KindConfig(Section):
 
 
 class LightConfig(Section):
-    """How the ground reflects, and what lights it."""
+    """Reflectance of the ground, and light sources."""
 
     photometry: Literal["hapke_highland", "hapke_mare", "hapke_mean", "lommel_seeliger", "lunar_lambert", "lambert"] = (
         "hapke_highland"
     )
     """Reflectance law and parameter set."""
     sun_angular_diameter_deg: Annotated[float, Field(ge=0, le=5)] = 0.533
-    """The Sun's disc, degrees."""
+    """Angular diameter of the Sun, degrees."""
     albedo_variation: NotNegative = 1.0
-    """Strength of bright young ejecta, of rays and of albedo patches; 0 for an even ground."""
+    """Strength of bright ejecta, rays and albedo patches; 0 for uniform albedo."""
     bounce: bool = False
-    """Whether light that the ground scatters once reaches other ground: shadows are then not quite black."""
+    """Whether ground is also lit by light that other ground scattered once, so that shadows are not fully black."""
     earthshine: bool = False
-    """Whether the Earth, where it stands above the horizon, lights the ground too."""
+    """Whether the Earth also lights the ground where it is above the horizon."""
 
 
 class SensorConfig(Section):
-    """From radiance factor to grey values (EMVA 1288)."""
+    """Sensor model, from radiance factor to grey values (EMVA 1288)."""
 
     exposure: Literal["automatic", "fixed"] = "automatic"
-    """Automatic puts exposure_percentile of each frame at exposure_level; fixed takes exposure_time_s."""
+    """Automatic brings exposure_percentile of each frame to exposure_level; fixed uses exposure_time_s."""
     exposure_percentile: Annotated[float, Field(gt=0, le=100)] = 99.0
-    """Percentile of a frame that automatic exposure looks at."""
+    """Percentile of the frame's radiance factor that automatic exposure uses."""
     exposure_level: Annotated[float, Field(gt=0, le=1)] = 0.8
-    """Share of the largest grey value at which automatic exposure puts it."""
+    """Grey value of that percentile under automatic exposure, share of the largest grey value."""
     exposure_time_s: Positive = 0.002
-    """Fixed exposure, seconds."""
+    """Exposure time if exposure is fixed, seconds."""
     longest_exposure_s: Positive = 0.02
-    """Longest automatic exposure, seconds."""
+    """Longest exposure time if exposure is automatic, seconds."""
     responsivity_e_per_s: Positive = 2e8
-    """Electrons per second in a pixel that sees a radiance factor of 1."""
+    """Electrons per second in a pixel at radiance factor 1."""
     full_well_e: Positive = 30_000.0
-    """Electrons at saturation."""
+    """Full-well capacity (saturation), electrons."""
     gain: Positive = 1.0
-    """Over the gain at which the full well is the largest grey value."""
+    """Gain, relative to the gain at which the full well is the largest grey value."""
     bits: Annotated[int, Field(ge=8, le=16)] = 8
-    """Of a grey value; above 8 the PNG holds 16-bit numbers."""
+    """Bits of a grey value; above 8 the PNG has 16 bits."""
     black_level_share: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
     """Offset added before quantisation, share of the largest grey value."""
     read_noise_e: NotNegative = 15.0
@@ -158,17 +158,17 @@ class SensorConfig(Section):
     dark_current_e_per_s: NotNegative = 50.0
     """Mean dark current, electrons per second."""
     dark_nonuniformity_e: NotNegative = 3.0
-    """Fixed pattern: standard deviation of the pixels' offsets (DSNU), electrons."""
+    """Standard deviation of the pixels' fixed offsets (DSNU), electrons."""
     gain_nonuniformity: Annotated[float, Field(ge=0, le=0.5)] = 0.005
-    """Fixed pattern: standard deviation of the pixels' relative response (PRNU)."""
+    """Standard deviation of the pixels' fixed relative response (PRNU)."""
     hot_pixel_share: Share = 2e-5
-    """Share of the pixels that are hot."""
+    """Share of hot pixels."""
     hot_pixel_e: NotNegative = 6_000.0
-    """Mean of the hot pixels' exponentially distributed extra signal in an exposure of 2 ms, electrons."""
+    """Mean extra signal of the hot pixels in a 2 ms exposure (exponential distribution), electrons."""
     psf_sigma_px: NotNegative = 0.45
-    """Standard deviation of the point spread, a discrete Gaussian over the pixels; 0 for none."""
+    """Standard deviation of the point spread function, a discrete Gaussian, pixels; 0 for none."""
     motion_blur: bool = True
-    """Whether the camera's velocity during the exposure blurs the frame."""
+    """Whether the camera's motion during the exposure blurs the frame."""
 
     @model_validator(mode="after")
     def _above_black(self) -> "SensorConfig":
@@ -178,25 +178,25 @@ class SensorConfig(Section):
 
 
 class RenderConfig(Section):
-    """How Blender renders."""
+    """Settings of the renderer (Blender)."""
 
     samples: Annotated[int, Field(ge=1, le=4096)] = 4
     """Camera rays per pixel."""
     threads: Annotated[int, Field(ge=0, le=1024)] = 0
-    """Threads; 0 takes every core."""
+    """Number of threads; 0 uses all cores."""
     exr: bool = False
-    """Whether to keep an EXR (radiance factor, depth, normals, crater index) beside each PNG."""
+    """Whether to write an EXR (radiance factor, depth, normals, sunlit mask, crater index) for each PNG."""
     cache_gib: NotNegative = 4.0
-    """Most that grown scenes may occupy in the cache folder, GiB; 0 keeps none."""
+    """Size limit of the cache of generated scenes, GiB; 0 disables the cache."""
 
 
 class LabelsConfig(Section):
-    """Which craters become labels: the paper's rule."""
+    """Which craters become labels, by the paper's rule."""
 
     min_radius_px: Positive = 2.0
-    """Least sqrt(a b), pixels."""
+    """Smallest radius of a label, sqrt(a b) of its ellipse, pixels."""
     max_radius_px: Positive | None = None
-    """Largest sqrt(a b), pixels; null is 50, and in images wider than 256 px width x 50 / 256."""
+    """Largest radius of a label, pixels; null is 50, or width x 50 / 256 in images wider than 256 px."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "LabelsConfig":
@@ -206,30 +206,31 @@ class LabelsConfig(Section):
         return self
 
     def bounds_px(self, width_px: int) -> tuple[float, float]:
-        """Least and largest sqrt(a b) of a label in images of a width, pixels."""
+        """Smallest and largest radius sqrt(a b) of a label in images of this width, pixels."""
         return self.min_radius_px, self.max_radius_px or default_label_bound_px(width_px)
 
 
 _GROUND_FIELDS = ("start_altitude_m", "end_altitude_m", "downrange_m")
-"""Of the flight: what the extent and spacing of the ground follow from, beside the sizes of the perturbations."""
+"""Flight settings that must agree if both kinds share terrain: they set the ground's extent and spacing."""
 _SPREAD_FIELDS = ("position_sigma_m", "attitude_sigma_deg")
+"""Flight settings of which shared terrain uses the larger value."""
 
 
 class DatasetConfig(Section):
-    """One preset's two datasets."""
+    """Settings of a preset's two datasets."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,59}$")] = "unnamed"
-    """Name of the dataset; terrain, Sun and splits follow from it and the seed. Every preset has its own."""
+    """Name, unique to the preset; terrain, Sun and splits are derived from the name and the seed."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
-    """From which, with the name, every random stream is derived."""
+    """Random seed; with the name it determines every random stream."""
     shared_terrain: bool = False
-    """Whether both kinds fly over the same scenes, as in the paper; else each kind has its own."""
+    """Whether both kinds use the same scenes, as in the paper; otherwise each kind has its own."""
     camera: CameraConfig = CameraConfig()
     """Camera."""
     terrain: TerrainConfig = TerrainConfig()
-    """Ground."""
+    """Terrain."""
     light: LightConfig = LightConfig()
-    """Reflectance and Sun's disc."""
+    """Reflectance and light sources."""
     sensor: SensorConfig = SensorConfig()
     """Sensor."""
     labels: LabelsConfig = LabelsConfig()
@@ -251,11 +252,11 @@ class DatasetConfig(Section):
         return self
 
     def kind(self, name: str) -> KindConfig:
-        """The settings of the dataset `detect` or `nav`."""
+        """Settings of the dataset `detect` or `nav`."""
         return self.detect if name == "detect" else self.nav
 
     def ground_flight(self, kind: str) -> FlightConfig:
-        """The flight for which the ground of `detect` or `nav` is made: with `shared_terrain` it covers both."""
+        """Flight settings that the ground of `detect` or `nav` must cover: both kinds' with `shared_terrain`."""
         if not self.shared_terrain:
             return self.kind(kind).flight
         first, second = self.detect.flight, self.nav.flight

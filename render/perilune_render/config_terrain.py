@@ -1,4 +1,4 @@
-"""Settings of the ground: the section `dataset.terrain`."""
+"""Settings of the terrain: the section `dataset.terrain`."""
 
 from typing import Annotated, Literal
 
@@ -8,60 +8,60 @@ from perilune_render.config_values import NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
 
 LARGEST_SPACING_PX = 4.0
-"""Largest vertex spacing over the smallest ground pixel."""
+"""Largest allowed vertex spacing, in smallest ground pixels."""
 
 
 class CratersConfig(Section):
     """The crater population."""
 
     surface_age_gyr: Annotated[float, Field(gt=0, le=4.4)] = 3.5
-    """Age of the surface, which sets the production of large craters, Gyr."""
+    """Age of the surface, which sets the number of large craters, Gyr."""
     equilibrium: Literal["trask", "minton", "viper", "chang_e_4"] = "chang_e_4"
-    """Law at which small craters are erased as fast as they form."""
+    """Equilibrium law: density at which small craters are erased as fast as they form."""
     equilibrium_share: Span = Span(low=0.9, high=1.7)
-    """Density of small craters over the equilibrium law, drawn for each scene."""
+    """Density of small craters, as a multiple of the equilibrium law, drawn for each scene."""
     min_diameter_spacings: Annotated[float, Field(ge=1.5)] = 2.2
-    """Smallest crater over the local vertex spacing."""
+    """Diameter of the smallest crater, local vertex spacings."""
     max_diameter_m: Positive = 800.0
-    """Largest crater, metres."""
+    """Diameter of the largest crater, metres."""
     profile: Literal["fassett_thomson", "pangu"] = "fassett_thomson"
     """Shape of a fresh crater."""
     depth: Literal["stopar", "pike"] = "stopar"
-    """Law of a fresh crater's depth."""
+    """Depth law of fresh craters."""
     irregularity: Annotated[float, Field(ge=0, le=1)] = 1.0
-    """Departure of outline and rim height from a circle; at 1 the outline strays by about one percent of the radius."""
+    """Irregularity of outline and rim height; 0 is a circle, at 1 the outline deviates by about 1 % of the radius."""
     flat_floor_share: Share = 0.15
-    """Share of the craters that form with a flat floor, as in thin regolith over rock."""
+    """Share of craters that form with a flat floor, as in thin regolith over rock."""
     secondary_share: Share = 0.08
-    """Share of the craters under 30 m that lie in clusters of secondaries."""
+    """Share of craters under 30 m that belong to clusters of secondaries."""
     n_rayed: Annotated[int, Field(ge=0, le=100)] = 4
-    """How many craters have bright rays: the largest among the fresh ones."""
+    """Number of craters with bright rays: the largest of the fresh ones."""
 
 
 class BouldersConfig(Section):
     """The boulder population."""
 
     density: NotNegative = 0.1
-    """Times the published size-frequency law, on the plain."""
+    """Boulder density on the plain, as a multiple of the published size-frequency law."""
     field_density: NotNegative = 100.0
-    """Density at the rim of a newly formed crater over that of the plain."""
+    """Boulder density at the rim of a newly formed crater, as a multiple of that on the plain."""
     min_diameter_spacings: Annotated[float, Field(ge=0.3)] = 0.7
-    """Smallest boulder over the local vertex spacing."""
+    """Diameter of the smallest boulder, local vertex spacings."""
     max_diameter_m: Positive = 5.0
-    """Largest boulder, metres."""
+    """Diameter of the largest boulder, metres."""
     n_shapes: Annotated[int, Field(ge=1, le=100)] = 12
-    """Different rocks in a scene."""
+    """Number of different rock shapes in a scene."""
 
 
 class ReliefConfig(Section):
-    """Self-affine relief."""
+    """The self-affine relief."""
 
     hurst_exponent: Annotated[float, Field(gt=0, lt=1)] = 0.9
-    """How slopes fall with wavelength, L^(H-1)."""
+    """Hurst exponent H: slopes fall with wavelength L as L^(H-1)."""
     rms_slope_deg: Span = Span(low=2.0, high=4.5)
-    """Root mean square slope of all waves down to a metre, without craters, drawn for each scene, degrees."""
+    """RMS slope over wavelengths down to 1 m, without craters, drawn for each scene, degrees."""
     longest_wavelength_m: Positive = 1600.0
-    """Longest wave, metres."""
+    """Longest wavelength, metres."""
 
     @model_validator(mode="after")
     def _gentle(self) -> "ReliefConfig":
@@ -74,23 +74,23 @@ Outside = Literal["procedural", "refuse", "mirror"]
 
 
 class ElevationConfig(Section):
-    """How an elevation model is used."""
+    """Use of an elevation model."""
 
     outside: Outside = "procedural"
-    """Ground beyond the model's edge: procedural with the model's statistics, refused, or the model's mirror image."""
+    """Ground outside the model: procedural with the model's statistics, an error (refuse), or the model mirrored."""
 
 
 class TerrainConfig(Section):
-    """The ground."""
+    """The terrain."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] = -45.5
-    """Latitude of the site, degrees; an elevation model has its own."""
+    """Latitude of the site, degrees; an elevation model overrides it."""
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
-    """Longitude of the site, degrees; an elevation model has its own."""
+    """Longitude of the site, degrees; an elevation model overrides it."""
     spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
-    """Vertex spacing over the smallest ground pixel from which a place is seen."""
+    """Vertex spacing at each place, in units of the smallest ground pixel in which a frame shows the place."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
-    """Most vertices of the ground; a camera and flight that need more are refused."""
+    """Largest number of ground vertices; a camera and flight that need more are an error."""
     craters: CratersConfig = CratersConfig()
     """Craters."""
     boulders: BouldersConfig = BouldersConfig()
@@ -98,8 +98,8 @@ class TerrainConfig(Section):
     relief: ReliefConfig = ReliefConfig()
     """Relief."""
     dem: str | None = None
-    """A GeoTIFF elevation model as the base, or null."""
+    """GeoTIFF elevation model to start from, or null."""
     elevation: ElevationConfig = ElevationConfig()
     """Use of the elevation model."""
     catalogue: str | None = None
-    """A CSV of the model's own craters (longitude_deg, latitude_deg, diameter_m), which become labels, or null."""
+    """CSV of the model's craters (longitude_deg, latitude_deg, diameter_m), which become labels, or null."""

@@ -1,4 +1,4 @@
-"""Types of values that several sections of a configuration share."""
+"""Value types shared by several sections of a configuration."""
 
 from typing import Annotated, Any
 
@@ -13,10 +13,10 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class Span(Section):
-    """A range from which a value is drawn evenly; in a configuration a single number stands for itself."""
+    """Range of a uniform distribution; in a configuration a single number is a range of that one value."""
 
     low: float
-    """Least value."""
+    """Smallest value."""
     high: float
     """Largest value."""
 

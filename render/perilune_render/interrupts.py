@@ -1,4 +1,4 @@
-"""Delays Ctrl-C until a step is done."""
+"""Delay Ctrl-C until a step is finished."""
 
 import contextlib
 import os
@@ -13,9 +13,9 @@ _NOTICE = b"\nstopping after this step; press Ctrl-C again to end at once\n"
 def interrupts_held() -> Iterator[None]:
     """Delay KeyboardInterrupt until the block ends. A second Ctrl-C ends the process at once.
 
-    Cycles' own Python callback would swallow the interrupt and render on; Numba may end the process with a fault when
-    it is interrupted while it loads compiled code. Where Ctrl-C is ignored, as in a process that a shell started in
-    the background, it stays ignored.
+    Without the delay, Cycles' Python callback swallows the interrupt and rendering continues, and Numba may crash if it
+    is interrupted while it loads compiled code. If Ctrl-C is ignored, as in a process that a shell started in the
+    background, it stays ignored.
     """
     before = signal.getsignal(signal.SIGINT)
     if before is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
@@ -25,7 +25,7 @@ def interrupts_held() -> Iterator[None]:
 
     def delay(*_: object) -> None:
         asked.append(True)
-        # The operating system answers the second one, even while no Python code runs.
+        # The operating system handles the second one, even while no Python code runs.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         with contextlib.suppress(OSError):
             os.write(2, _NOTICE)

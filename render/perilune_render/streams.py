@@ -1,4 +1,4 @@
-"""Random streams derived by name from one seed, so that any scene, descent or frame can be made again alone."""
+"""Random streams derived by name from one seed, so that any scene, trajectory or frame can be regenerated alone."""
 
 import hashlib
 
@@ -6,11 +6,11 @@ import numpy as np
 
 
 def derived_seed(seed: int, *names: object) -> int:
-    """A 63-bit seed that depends on `seed` and on every name, and on nothing else."""
+    """A 63-bit seed that depends only on `seed` and the names."""
     text = "\x1f".join(str(part) for part in (seed, *names))
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 1
 
 
 def stream(seed: int, *names: object) -> np.random.Generator:
-    """The generator of a named stream, for example `stream(scene.seed, "craters")`."""
+    """The random generator of a named stream, for example `stream(scene.seed, "craters")`."""
     return np.random.default_rng(derived_seed(seed, *names))

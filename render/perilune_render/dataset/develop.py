@@ -1,7 +1,7 @@
 """Develop a dataset's frames again from their EXRs, with another sensor or another camera at the same place.
 
-Nothing is rendered, so Blender is not needed. What a stop leaves goes on like a rendering: a descent's part of `frames`
-is written last.
+Nothing is rendered, so Blender is not needed. An interrupted run is resumed as in rendering: a trajectory is finished
+once its part of `frames` is written, which comes last.
 """
 
 from dataclasses import asdict
@@ -42,12 +42,12 @@ from perilune_shared.storage.checksums import seal
 def develop_dataset(
     source: Dataset, out: Path, progress: Progress, config_file: Path | None = None, settings: tuple[str, ...] = ()
 ) -> Dataset:
-    """Make a dataset in `out` from the EXRs of another; its settings are those of `source`, with changes.
+    """Make a dataset in `out` from the EXRs of `source`, with changes to its settings.
 
-    A file and single settings may change `dataset.sensor` and `dataset.camera`. Scenes, craters, boulders and descents
-    are the source's; so are the labels where the camera is the same, but for their contrast, else they are made again.
-    Raises UserError where another setting is changed, the source is incomplete or lacks EXRs, or those do not show all
-    that the camera sees.
+    `config_file` and `settings` may change `dataset.sensor` and `dataset.camera` only. Scenes, craters, boulders and
+    trajectories are copied. With the same camera the labels are copied and only their contrast is measured again; with
+    another camera all labels are made again. Raises UserError if another setting is changed, if the source is
+    incomplete or lacks EXRs, or if the EXRs do not cover the camera's view.
     """
     if len(source.info.recipes) != 1:
         raise UserError(source.root, "recipes", len(source.info.recipes), "one: the dataset as it was rendered")
@@ -94,7 +94,7 @@ def _develop(
     out: Path,
     progress: Progress,
 ) -> Dataset:
-    """The dataset in `out`, begun or resumed; `cameras` are those of its PNGs and of the source's EXRs."""
+    """Begin or resume the dataset in `out`; `cameras` are that of its PNGs and that of the source's EXRs."""
     camera, exr_camera = cameras
     info = begin_or_go_on(out, info)
     if info.complete:
@@ -120,7 +120,7 @@ def _develop(
 
 
 def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
-    """The source's settings with the user's changes, all of which must be of the sensor or the camera."""
+    """The source's settings with the user's changes, which may concern the sensor and the camera only."""
     where = str(source.root / "dataset.json")
     given = settings_of(source.info.recipe())
     before = resolve_over(DatasetConfig, "dataset", where, given)
@@ -138,7 +138,7 @@ def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...
 
 
 def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
-    """The camera to develop for, and that of the EXRs, which must show all that the first sees."""
+    """The camera to develop for, and that of the EXRs, which must cover the view of the first."""
     if not source.info.complete:
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
     camera = camera_of(config.camera)
@@ -157,7 +157,7 @@ def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
 def _develop_descent(
     source: Dataset, out: Path, studio: Studio, key: dict[str, str], frames: pa.Table, seed: int
 ) -> None:
-    """One part of `frames`, with its images and labels."""
+    """Develop one trajectory: write its images, labels and part of `frames`."""
     known = None
     if studio.camera == source.info.camera.intrinsics():
         table = source.table("labels", scene_id=key["scene_id"], trajectory_id=key["trajectory_id"]).to_pandas()
@@ -179,7 +179,7 @@ def _develop_descent(
             found = studio.contrasted(Labels.from_table(known.get(shot.frame_id, none)), shot, exposure)
         labels.append(tables.label_table(shot.frame_id, found))
     name = ".".join(key.values())
-    # A labels part without its frames part is left from a stop between the two.
+    # A run interrupted between the two leaves a labels part without its frames part.
     (out / "manifest" / "labels" / f"{name}.parquet").unlink(missing_ok=True)
     write_part(out, "labels", name, pa.concat_tables(labels))
     sync_frames(out, written)
@@ -187,7 +187,7 @@ def _develop_descent(
 
 
 def _copy_scene(source: Dataset, out: Path, scene_id: str, recipe: Recipe) -> None:
-    """Bring the parts of a scene that are not there yet, the scene's row with its new recipe."""
+    """Copy the missing parts of a scene; the scene's row gets the new recipe."""
     for name in ("scenes", "craters", "boulders", "trajectories"):
         if not (out / "manifest" / name / f"{scene_id}.parquet").exists():
             rows = source.table(name, scene_id=scene_id)

@@ -1,4 +1,4 @@
-"""One frame from a rendering: its PNG, its EXR, its labels. The same for a new dataset and for a frame made again."""
+"""Make one frame from a rendering: its PNG, EXR and labels. Used for new, regenerated and developed frames."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,24 +20,24 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Where, when and by which seed one frame is taken."""
+    """Pose, velocity and random seed of one frame."""
 
     frame_id: str
-    """Names its files."""
+    """Id in the manifest; names the files."""
     frame_index: int
-    """Place in the descent, from 0."""
+    """Index in the trajectory, from 0."""
     trajectory_seed: int
-    """Of the descent's random streams."""
+    """Random seed of the trajectory."""
     position_m: Array
-    """Camera, O_L, metres (3,)."""
+    """Position of the camera, O_L, metres (3,)."""
     rotation_camera_from_site: Array
-    """(3, 3)."""
+    """Rotation matrix (3, 3)."""
     velocity_mps: Array
-    """Camera, O_L, metres per second (3,)."""
+    """Velocity of the camera, O_L, metres per second (3,)."""
 
     @classmethod
     def planned(cls, trajectory: TrajectoryPlan, place: int) -> "Shot":
-        """The frame at a place in a planned descent."""
+        """The frame at index `place` of a planned trajectory's frames."""
         flight = trajectory.flight
         return cls(
             trajectory.frame_id(place),
@@ -50,7 +50,7 @@ class Shot:
 
     @classmethod
     def recorded(cls, row: dict[str, Any], trajectory_seed: int) -> "Shot":
-        """A frame of a manifest, by its row of the table `frames`."""
+        """The frame of a row of the manifest's table `frames`."""
         return cls(
             row["frame_id"],
             row["frame_index"],
@@ -62,55 +62,55 @@ class Shot:
 
     @property
     def render_seed(self) -> int:
-        """Of the renderer's samples."""
+        """Random seed of the renderer's samples."""
         return derived_seed(self.trajectory_seed, "frame", self.frame_index)
 
 
 @dataclass(frozen=True, slots=True)
 class Studio:
-    """What all frames over one scene have in common."""
+    """What all frames of one scene share."""
 
     config: DatasetConfig
     """Settings of sensor, labels and files."""
     camera: Camera
-    """Of the PNGs and labels."""
+    """Camera of the PNGs and labels."""
     exr_camera: Camera
-    """Of the rendering and the EXRs."""
+    """Camera of the rendering and the EXRs."""
     pattern: FixedPattern
-    """Of the sensor."""
+    """Fixed pattern of the sensor."""
     circles: RimCircles
-    """Of the scene's craters."""
+    """Rims of the scene's craters."""
     sun: Array
     """Unit vector towards the Sun, O_L (3,)."""
 
     def write_png(self, out: Path, shot: Shot, radiance: Radiance) -> tuple[dict[str, str | int], Exposure]:
-        """Develop and write a frame's PNG; its columns png_* of the manifest, and its exposure."""
+        """Develop and write a frame's PNG; returns its columns png_* of the manifest, and its exposure."""
         image, exposure = self.take(shot, radiance)
         return write_png(out, shot.frame_id, image, self.config.sensor.bits), exposure
 
     def take(self, shot: Shot, radiance: Radiance) -> tuple[np.ndarray, Exposure]:
-        """A frame's grey values (h, w), as the sensor gives them, and its exposure."""
+        """Grey values (h, w), DN, and exposure of a frame."""
         velocity = shot.rotation_camera_from_site @ shot.velocity_mps
         exposure = expose(radiance, self.config.sensor, self.camera, self.exr_camera, velocity)
         noise = stream(shot.trajectory_seed, "sensor", shot.frame_index)
         return read_out(exposure, self.config.sensor, self.pattern, noise), exposure
 
     def write_exr(self, out: Path, shot: Shot, radiance: Radiance) -> dict[str, str | int]:
-        """Write a frame's EXR; its columns exr_* of the manifest."""
+        """Write a frame's EXR; returns its columns exr_* of the manifest."""
         path = f"frames/{shot.frame_id}.exr"
         pose = shot.position_m, shot.rotation_camera_from_site
         write_exr(out / path, radiance, crater_index(self.circles, self.exr_camera, *pose, radiance.depth_m))
         return file_columns(out, "exr", path)
 
     def label(self, shot: Shot, radiance: Radiance, exposure: Exposure) -> Labels:
-        """The labels of a frame."""
+        """Labels of a frame."""
         pose = shot.position_m, shot.rotation_camera_from_site
         seen = seen_by(radiance, self.camera, self.exr_camera)
         limits = self.config.labels.bounds_px(self.camera.width_px)
         return self.contrasted(label_frame(self.circles, self.camera, *pose, seen, *limits), shot, exposure)
 
     def contrasted(self, labels: Labels, shot: Shot, exposure: Exposure) -> Labels:
-        """Labels with their contrast in an exposure."""
+        """The labels with their contrast in this exposure."""
         shown = Shown(*expected(exposure, self.config.sensor), np.asarray(self.sun))
         pose = shot.position_m, shot.rotation_camera_from_site
         return with_contrast(labels, self.circles, self.camera, *pose, shown)

@@ -1,4 +1,4 @@
-"""What every command that makes a dataset does alike: begin or go on, write a PNG, draw the overview."""
+"""Steps shared by all commands that make a dataset: begin or resume it, write PNGs, draw the overview."""
 
 import contextlib
 from pathlib import Path
@@ -27,11 +27,11 @@ _SAME_PLACE_M = 1e-6
 
 
 def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
-    """The dataset.json of a dataset that is begun."""
+    """The dataset.json of a new dataset."""
     settings = config.kind(recipe.kind)
     split_by = settings.split_by
     if split_by == "scene" and config.terrain.dem is not None and settings.n_scenes > 1:
-        split_by = "trajectory"  # all scenes are of the elevation model's one ground
+        split_by = "trajectory"  # all scenes show the same elevation model
     return DatasetInfo(
         name=f"perilune-{config.name}-{recipe.kind}",
         kind=recipe.kind,
@@ -48,21 +48,20 @@ def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
 
 
 def writing(out: Path) -> contextlib.AbstractContextManager[None]:
-    """The lock of a dataset's folder, but none where the dataset is finished: it is only read, perhaps from a disk that
-    cannot be written."""
+    """The lock of a dataset's folder; none for a finished dataset, which is only read, maybe from a read-only disk."""
     return contextlib.nullcontext() if (out / SUMS_NAME).exists() else locked(out)
 
 
 def sync_frames(root: Path, rows: list[dict[str, Any]]) -> None:
-    """Wait until the files of frames, given by their columns png_path and exr_path, are on the disk.
+    """Wait until the files of frames, given by the columns png_path and exr_path of `rows`, are on the disk.
 
-    Frames are written without waiting. Once they stand in the manifest they count as finished.
+    Each frame is written without waiting. This call must precede the manifest part that marks the frames as finished.
     """
     files.sync_all(root / row[name] for row in rows for name in ("png_path", "exr_path") if row.get(name) is not None)
 
 
 def is_begun(out: Path) -> bool:
-    """Whether a folder holds a dataset. Raises UserError where it holds something else."""
+    """Whether a folder holds a dataset. Raises UserError if it holds something else."""
     begun = (out / "dataset.json").exists()
     if not begun and out.exists() and any(not path.name.startswith(LOCK_NAME) for path in out.iterdir()):
         wanted = "an empty or new folder, or a dataset to resume"
@@ -71,9 +70,9 @@ def is_begun(out: Path) -> bool:
 
 
 def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
-    """Write the dataset.json of a new dataset, or read that of one that was begun with the same settings.
+    """Write the dataset.json of a new dataset, or read that of an existing one with the same settings.
 
-    Raises UserError where `out` holds something else.
+    Raises UserError if `out` holds anything else.
     """
     if not is_begun(out):
         write_info(out, info)
@@ -96,9 +95,9 @@ def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
 
 
 def check_begun(out: Path, plan: Plan) -> None:
-    """Raises UserError where descents that a dataset holds already are not those of the plan it is to go on with.
+    """Raises UserError if trajectories that the dataset already holds differ from those of the plan to resume.
 
-    Two manifests may tell of the same settings and differ in their descents, frames and splits.
+    Two manifests with the same settings may still differ in trajectories, frames and splits.
     """
     planned = {f"{t.scene_id}.{t.trajectory_id}": t for t in plan.trajectories}
     for part in sorted(out.joinpath("manifest", "frames").glob("[A-Za-z0-9]*.parquet")):
@@ -119,20 +118,20 @@ def check_begun(out: Path, plan: Plan) -> None:
 
 
 def open_finished(out: Path) -> Dataset:
-    """A complete dataset; its checksums are written where it was stopped just before they were."""
+    """Open a complete dataset; write its checksums if the run was interrupted just before that."""
     if not (out / SUMS_NAME).exists():
         seal(out)
     return open_dataset(out)
 
 
 def _compared(recipe: Recipe, name: str) -> object:
-    """One field of a recipe, without the numbers of perilune's own releases: its code has hashes."""
+    """One field of a recipe, without perilune's release numbers, since hashes identify its code."""
     value = getattr(recipe, name)
     return {k: v for k, v in value.items() if not k.startswith("perilune")} if name == "versions" else value
 
 
 def first_difference(theirs: object, ours: object, path: str = "") -> str:
-    """The first setting, by name, in which two trees of plain data differ, with both values."""
+    """The first setting, in order of names, in which two trees of plain data differ, with both values."""
     if isinstance(theirs, dict) and isinstance(ours, dict):
         for key in sorted({*theirs, *ours}):
             if theirs.get(key) != ours.get(key):
@@ -141,9 +140,9 @@ def first_difference(theirs: object, ours: object, path: str = "") -> str:
 
 
 def write_png(root: Path, frame_id: str, image: np.ndarray, bits: int) -> dict[str, str | int]:
-    """Write a frame's PNG; its columns png_* of the manifest.
+    """Write a frame's PNG; returns its columns png_* of the manifest.
 
-    Above 8 bits a grey value stands in the upper bits of a 16-bit number, with zeros below.
+    Above 8 bits the PNG has 16 bits: a grey value fills the upper bits, the lower ones are 0.
     """
     path = f"frames/{frame_id}.png"
     stored = image if bits == 8 else image << (16 - bits)
@@ -152,7 +151,7 @@ def write_png(root: Path, frame_id: str, image: np.ndarray, bits: int) -> dict[s
 
 
 def file_columns(root: Path, kind: str, path: str) -> dict[str, str | int]:
-    """The columns png_* or exr_* of a file that was written."""
+    """The columns png_* or exr_* (by `kind`) of a written file."""
     whole = root / path
     return {
         f"{kind}_path": path,
@@ -162,7 +161,7 @@ def file_columns(root: Path, kind: str, path: str) -> dict[str, str | int]:
 
 
 def write_overview(dataset: Dataset) -> None:
-    """overview.png: frames from the whole dataset, each beside itself with its labels, green where they are visible."""
+    """Write overview.png: frames from the whole dataset, each also with its labels, visible ones in green."""
     frames = dataset.table("frames", ["frame_id", "scene_id", "trajectory_id", "png_path"]).to_pandas()
     chosen = frames.iloc[np.unique(np.linspace(0, len(frames) - 1, _SHEET_FRAMES).astype(int))]
     pictures = []

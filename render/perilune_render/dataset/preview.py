@@ -1,4 +1,4 @@
-"""One contact sheet of a configuration: for anyone who changes a setting and wants to see what it does."""
+"""A contact sheet of a configuration, to see the effect of a setting quickly."""
 
 from pathlib import Path
 
@@ -23,9 +23,9 @@ from perilune_shared.geometry.frames import sun_direction
 
 
 def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 4) -> None:
-    """The first scene from the first descent, evenly spaced in time: frames above, the same with labels below.
+    """Write a contact sheet of the first scene and trajectory: frames evenly spaced in time, and below with labels.
 
-    Over an elevation model its outline is drawn there too.
+    The lower row also shows the outline of the elevation model, if there is one.
     """
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]

@@ -1,4 +1,4 @@
-"""A manifest read back as a plan, so that somebody else's dataset can be rendered, labels and all."""
+"""Read a manifest as a plan, so that a published dataset can be rendered again with its labels."""
 
 from pathlib import Path
 
@@ -19,11 +19,11 @@ from perilune_shared.storage.files import sha256_of
 def plan_of(
     manifest: Dataset, dem: Path | None = None, catalogue: Path | None = None
 ) -> tuple[Plan, DatasetConfig, DatasetInfo]:
-    """The plan of a manifest's scenes, descents and frames, its settings, and the dataset.json to begin with.
+    """The plan of a manifest's scenes, trajectories and frames, its settings, and the dataset.json to begin with.
 
-    Names, seeds, poses and splits are the manifest's; files that its recipe names are given by the user. Raises
-    UserError where it has several recipes (merged of different datasets), its frames were developed again, or the
-    elevation model is another.
+    Names, seeds, poses and splits come from the manifest; `dem` and `catalogue` are the user's copies of the files that
+    its recipe names. Raises UserError if the manifest has several recipes (merged from different datasets), if its
+    frames were developed again, or if the elevation model differs.
     """
     info, where = manifest.info, manifest.root / "dataset.json"
     if len(info.recipes) != 1:
@@ -51,7 +51,7 @@ def plan_of(
 
 def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
     dem = Path(config.terrain.dem) if config.terrain.dem is not None else None
-    if dem is None or not dem.is_file():  # whoever opens it tells
+    if dem is None or not dem.is_file():  # reported when it is opened
         return
     found = f"sha256:{sha256_of(dem)}"
     for wanted in manifest.table("scenes", ["dem_source"])["dem_source"].unique().to_pylist():
@@ -77,7 +77,7 @@ def _descents(manifest: Dataset, scene_id: str) -> list[TrajectoryPlan]:
 
 
 def as_before(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:
-    """How many frames have the hash that the manifest states, how many it states, and how many scenes differ."""
+    """Number of frames whose hash equals the manifest's, of frames with a hash there, and of scenes that differ."""
     old, new = (
         dict(zip(*(d.table("frames", ["frame_id", "png_sha256"]).to_pydict().values()), strict=True))
         for d in (manifest, made)

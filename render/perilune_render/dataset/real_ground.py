@@ -1,4 +1,4 @@
-"""How much of a frame shows real ground, and where the elevation model ends in it."""
+"""Share of a frame that shows real ground, and the outline of the elevation model in it."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ _OUTLINE = (230, 190, 60)
 def real_ground_share(
     scene: Scene, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth_m: np.ndarray
 ) -> float:
-    """Share of a frame's pixels on the ground that lie on known ground of the elevation model; 0 where none does.
+    """Share of a frame's ground pixels that show measured ground of the elevation model; 0 without ground pixels.
 
     depth_m (h, w) is along the camera's axis, infinite where nothing is hit.
     """
@@ -29,7 +29,7 @@ def real_ground_share(
 
 
 def outline_m(model: ElevationModel) -> Array:
-    """Places (N, 2) in O_L's plane, metres, around the edge of an elevation model's raster."""
+    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres."""
     rows, columns = model.height_m.shape
     along, zero = np.linspace(0, 1, _POINTS_PER_SIDE, endpoint=False), np.zeros(_POINTS_PER_SIDE)
     column = np.concatenate([along, zero + 1, 1 - along, zero]) * columns
@@ -47,7 +47,7 @@ def draw_outline(
     position_m: Array,
     rotation_camera_from_site: Array,
 ) -> None:
-    """Draw the model's outline (N, 2) on a colour picture of a frame, of any whole scale, in place."""
+    """Draw the model's outline (N, 2) on a colour picture of a frame, enlarged by any integer, in place."""
     scale = picture.shape[1] / camera.width_px
     height = value_at(scene.height_m.astype(np.float64), scene.grid, outline[:, 0], outline[:, 1])
     pixels = camera.project(camera_from_site(np.column_stack([outline, height]), position_m, rotation_camera_from_site))

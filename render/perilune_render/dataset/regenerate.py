@@ -1,7 +1,7 @@
-"""Frames of a manifest made again from the manifest alone: seeds, poses and the recorded recipe.
+"""Make frames again from a manifest alone: seeds, poses and the recorded recipe.
 
-On the same kind of machine a frame comes out byte for byte. Elsewhere rays may meet the ground a rounding apart, which
-can move single pixels: then the two are compared within a stated tolerance.
+On the same kind of machine a frame is identical byte for byte. On another kind, rounding may change where a ray hits
+the ground and so change single pixels: frames are then compared within a tolerance.
 """
 
 from collections.abc import Sequence
@@ -38,33 +38,33 @@ from perilune_shared.storage.locks import locked
 from perilune_shared.storage.png import png_header
 
 GREY_TOLERANCE = 2
-"""Grey levels of 255 by which pixels may differ."""
+"""Largest difference of a pixel within tolerance, grey levels of 255."""
 RELATIVE_TOLERANCE = 1e-3
-"""Relative difference by which values of an EXR may differ."""
+"""Largest difference of an EXR value within tolerance, relative, and absolute for values near 0."""
 OUTLIERS = 0.001
-"""Share of pixels that may differ by more: rays that meet another facet."""
+"""Share of pixels that may differ by more, where a ray hits another facet."""
 State = Literal["identical", "within tolerance", "different", "new"]
 _ORDER: tuple[State, ...] = ("identical", "new", "within tolerance", "different")
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How one frame came out."""
+    """Result of regenerating one frame."""
 
     frame_id: str
-    """Of the manifest."""
+    """Id in the manifest."""
     png: State
-    """The PNG against the manifest's hash, else against the dataset's own file; new where the manifest has no hash."""
+    """The PNG compared with the manifest's hash, then with the dataset's file; new if the manifest has no hash."""
     exr: State | None
-    """The EXR likewise; None where the frame has none."""
+    """The EXR compared likewise; None if the frame has none."""
     same_ground: bool
-    """Whether craters and boulders have the content that the scene's row states."""
+    """Whether the content hash of craters and boulders equals that of the scene's row."""
     png_path: Path
-    """The new PNG."""
+    """Path of the new PNG."""
 
     @property
     def state(self) -> State:
-        """The worse of both files."""
+        """The worse state of both files."""
         return max((state for state in (self.png, self.exr) if state is not None), key=_ORDER.index)
 
 
@@ -76,11 +76,11 @@ def regenerate(
     dem: Path | None = None,
     catalogue: Path | None = None,
 ) -> list[Outcome]:
-    """Make frames again as `out`/frames/<frame_id>.png and .exr, and compare them.
+    """Make frames again as `out`/frames/<frame_id>.png and .exr, and compare them with the manifest.
 
-    `dem` and `catalogue` are this machine's copies of files that the recipes name; the manifest's own paths are never
-    opened. Raises UserError on frames that the manifest has not, on recipes that this version cannot follow, and where
-    `out` is a dataset.
+    `dem` and `catalogue` are the user's copies of the files that the recipes name; file names in the manifest are never
+    opened. Raises UserError on frames that are not in the manifest, on recipes that this version does not support, and
+    if `out` holds a dataset.
     """
     if (out / "dataset.json").exists():
         raise UserError(out, "--out", "a dataset, whose frames would be replaced", "another folder")
@@ -142,7 +142,7 @@ def _of_scene(
             shot = Shot.recorded(row, seed_of[row["trajectory_id"]])
             radiance = renderer.render(shot.position_m, shot.rotation_camera_from_site, seed=shot.render_seed)
             studio.write_png(out, shot, radiance)
-            # Frames that were developed again have no EXR, though their recipe has.
+            # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
             if row["exr_path"] is not None:
                 studio.write_exr(out, shot, radiance)
             png = _compared(dataset, row, "png", out)
@@ -156,7 +156,7 @@ def _of_scene(
 
 
 def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> DatasetConfig:
-    """The settings that ground and EXRs were made by: of a dataset that was developed again, with the first camera."""
+    """The settings that ground and EXRs were made with; those of a developed dataset have the source's camera."""
     origin = recipe.developed_from
     if origin is None:
         return config
@@ -169,7 +169,7 @@ def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> Datase
 
 
 def _compared(dataset: Dataset, row: dict, kind: str, out: Path) -> State:
-    """A new file against the hash of the old one, and against the old file where it is here and the hash differs."""
+    """Compare a new file with the old one's hash and, if the hash differs, with the old file if it is present."""
     new = out / f"frames/{row['frame_id']}.{kind}"
     if row[f"{kind}_sha256"] is None:
         return "new"
@@ -192,9 +192,9 @@ def _state(far: float) -> State:
 
 
 def png_far(first: bytes, second: bytes) -> float:
-    """Share of the pixels of two PNGs that differ by more than GREY_TOLERANCE; 1 where they are not of one shape."""
+    """Share of the pixels of two PNGs that differ by more than GREY_TOLERANCE; 1 if their shapes differ."""
     try:
-        # A small file may unpack to any size.
+        # A small file may decompress to any size: compare the headers first.
         if png_header(first) != png_header(second):
             return 1.0
     except ValueError:
@@ -207,7 +207,7 @@ def png_far(first: bytes, second: bytes) -> float:
 
 
 def exr_far(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> float:
-    """Largest share, over the channels, of pixels that differ by more than RELATIVE_TOLERANCE."""
+    """Largest share, over the channels, of pixels that differ by more than RELATIVE_TOLERANCE; 1 if shapes differ."""
     if {k: v.shape for k, v in first.items()} != {k: v.shape for k, v in second.items()}:
         return 1.0
     shares = []

@@ -1,7 +1,7 @@
-"""Render a planned dataset: scene by scene, descent by descent, resumable at every descent.
+"""Render a planned dataset, scene by scene and trajectory by trajectory; an interrupted run can be resumed.
 
-A descent's frames part is written last, after its images and labels: whatever has a frames part is finished, and what
-has none is rendered again.
+A trajectory's part of `frames` is written last, after its images and labels. A trajectory with this part is finished;
+one without it is rendered again.
 """
 
 from collections.abc import Callable
@@ -48,9 +48,9 @@ _GROUND = ("craters", "boulders")
 
 
 def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> Dataset:
-    """Render the dataset `detect` or `nav` into `out`, going on where an earlier call stopped.
+    """Render the dataset `detect` or `nav` into `out`, or resume it.
 
-    Raises UserError where `out` holds something else.
+    Raises UserError if `out` holds something else.
     """
     plan, where = make_plan(config, kind), f"configuration: dataset.{kind}"
     return render_plan(plan, config, info_of(config, plan, recipe_of(config, kind, preset)), out, progress, where)
@@ -61,9 +61,9 @@ def render_plan(
 ) -> Dataset:
     """Render a plan into `out`, or resume it; `info` is the dataset.json to begin with.
 
-    Raises UserError where `out` holds something else or another process is writing it, and, naming `where` the plan
-    comes from, where a pose does not fit the ground. The first scene is checked before anything is written, every
-    other one before its first frame is rendered.
+    Raises UserError if `out` holds something else, if another process is writing it, or if a pose does not fit the
+    ground; the last error names `where`, the origin of the plan. The first scene is checked before anything is written,
+    every other one before its first frame is rendered.
     """
     flight = config.ground_flight(info.recipe().kind)
     check_ground(config, plan.exr_camera, flight)
@@ -118,7 +118,7 @@ def _render(
 
 
 def _grow(plan: Plan, scene_plan: ScenePlan, config: DatasetConfig, kind: Kind, where: object) -> Scene:
-    """The ground of a scene, once all its poses are found to fit it."""
+    """Generate the ground of a scene, and check that all its poses fit it."""
     with interrupts_held():
         scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
     trajectories = plan.of_scene(scene_plan.scene_id)
@@ -140,7 +140,7 @@ def _write_scene(
     }
     paths = {name: out / "manifest" / name / f"{plan.scene_id}.parquet" for name in parts}
     there = {name: read_part(paths[name], name) if paths[name].exists() else parts[name] for name in _GROUND}
-    # By content, since another processor's craters differ in the last digits.
+    # Compared by content hash, since craters computed on another processor differ in the last digits.
     if content_sha256(*there.values()) != content_sha256(*(parts[name] for name in _GROUND)):
         wanted = "the elevation model and catalogue that it was begun with"
         raise UserError(paths["craters"], "craters", "other craters or boulders", wanted)
@@ -157,7 +157,7 @@ def _render_trajectory(
     renderer: Renderer,
     advance: Callable[[], None],
 ) -> list[str]:
-    """Render and write one trajectory; the ids of its dark frames."""
+    """Render and write one trajectory; returns the ids of its dark frames."""
     rows: list[dict] = []
     labels, dark = [], []
     for index in range(len(trajectory.splits)):
@@ -175,7 +175,7 @@ def _render_trajectory(
             dark.append(shot.frame_id)
         advance()
     name = f"{trajectory.scene_id}.{trajectory.trajectory_id}"
-    # A labels part without its frames part is left from a stop between the two.
+    # A run interrupted between the two leaves a labels part without its frames part.
     (out / "manifest" / "labels" / f"{name}.parquet").unlink(missing_ok=True)
     write_part(out, "labels", name, pa.concat_tables(labels))
     sync_frames(out, rows)

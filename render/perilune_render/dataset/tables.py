@@ -1,4 +1,4 @@
-"""The manifest's rows, from scenes, plans and labels."""
+"""Rows of the manifest's tables, from scenes, plans and labels."""
 
 import numpy as np
 import pyarrow as pa
@@ -29,7 +29,7 @@ def _vectors(values: ArrayLike) -> pa.Array:
 
 
 def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
-    """Parts of the tables craters and boulders for one scene."""
+    """Parts of the tables `craters` and `boulders` for one scene."""
     craters, rims, boulders = scene.craters, scene.rims, scene.boulders
     latitude, longitude = selenographic_from_site(craters.x_m, craters.y_m, scene.latitude_deg, scene.longitude_deg)
     return {
@@ -70,7 +70,7 @@ def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
 
 
 def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str) -> dict[str, pa.Table]:
-    """Parts of the tables scenes, craters and boulders for one scene, made by the recipe of a key."""
+    """Parts of the tables `scenes`, `craters` and `boulders` for one scene; `recipe` is the key of its recipe."""
     ground = ground_tables(plan.scene_id, scene)
     return {
         "scenes": _table(
@@ -94,7 +94,7 @@ def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: s
 
 
 def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
-    """Part of the table trajectories: the descents over one scene."""
+    """Part of the table `trajectories` for one scene."""
     nominal = [trajectory.flight.nominal for trajectory in trajectories]
     return _table(
         "trajectories",
@@ -113,7 +113,7 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table frames: one descent. `files` holds the columns png_*, exr_* and what was measured of each."""
+    """Part of the table `frames` for one trajectory; `files` holds each frame's columns png_*, exr_* and measures."""
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],
@@ -133,7 +133,7 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
 
 
 def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) -> pa.Table:
-    """Part of the table frames as in `table`, with another camera and other files (see `frame_table`)."""
+    """The part `table` of the table `frames` with another camera and other files (see `frame_table`)."""
     columns = {name: table[name] for name in table.column_names}
     columns |= {name: [getattr(camera, name)] * len(table) for name in _CAMERA}
     renewed = (*_FILES, *(name for name in _OF_LABELS if name in files[0]))
@@ -141,7 +141,7 @@ def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) ->
 
 
 def label_table(frame_id: str, labels: Labels) -> pa.Table:
-    """Rows of the table labels: one frame."""
+    """Rows of the table `labels` for one frame."""
     e, boxes = labels.ellipses, labels.ellipses.bounding_boxes()
     return _table(
         "labels",

@@ -1,4 +1,4 @@
-"""A plan as a dataset without a frame: scenes, trajectories and frames as Parquet, for others to render."""
+"""Write a plan as a dataset without images: scenes, trajectories and frames as Parquet, to be rendered later."""
 
 from pathlib import Path
 
@@ -22,8 +22,8 @@ from perilune_shared.geometry.frames import sun_direction
 def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> None:
     """Write the plan of the dataset `detect` or `nav` into the new folder `out`.
 
-    Every scene is grown once, for the hash of its content; nothing is rendered. Raises UserError on faults of the
-    settings, or where `out` holds something.
+    Every scene is generated once, for the hash of its content; nothing is rendered. Raises UserError on invalid
+    settings, or if `out` is not empty.
     """
     plan, where = make_plan(config, kind), f"configuration: dataset.{kind}"
     check_ground(config, plan.exr_camera, config.ground_flight(kind))

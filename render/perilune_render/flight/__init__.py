@@ -1,1 +1,1 @@
-"""Plans: scenes, perturbed trajectories, poses, and the checks of poses."""
+"""Plans: scenes, perturbed trajectories, poses, and checks of the poses."""

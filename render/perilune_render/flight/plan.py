@@ -1,7 +1,7 @@
-"""The plan: every scene, descent and frame of a dataset, decided before a pixel is rendered.
+"""The plan: every scene, trajectory and frame of a dataset, fixed before rendering.
 
-The plan is plain data and follows from the configuration alone. Scenes are planned by their seed: their craters and
-boulders (`perilune_render.terrain.scene.grow_scene`) follow from it without rendering.
+The plan is plain data and depends on the configuration alone. A scene is planned as a seed, which determines its
+craters and boulders (`perilune_render.terrain.scene.grow_scene`).
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 
 _LARGEST_COVER = 9
-"""Pixels rendered over pixels wanted, at most."""
+"""Largest ratio of rendered pixels to the camera's pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,37 +25,37 @@ class ScenePlan:
     scene_id: str
     """Unique in the dataset."""
     seed: int
-    """Of the scene's own streams."""
+    """Random seed of the scene."""
     sun_azimuth_deg: float
-    """Clockwise from north, degrees."""
+    """Azimuth of the Sun, clockwise from north, degrees."""
     sun_elevation_deg: float
-    """Above the ground plane, degrees."""
+    """Elevation of the Sun above the ground plane, degrees."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryPlan:
-    """One descent."""
+    """One trajectory."""
 
     scene_id: str
-    """Its terrain."""
+    """Scene it belongs to."""
     trajectory_id: str
     """Unique in its scene."""
     seed: int
-    """Of the descent's own streams."""
+    """Random seed of the trajectory."""
     frame_index: tuple[int, ...]
-    """Place of each frame in the descent, from 0; with gaps where only some of its frames are wanted."""
+    """Index of each frame in the trajectory, from 0; with gaps if only some of its frames are selected."""
     splits: tuple[str, ...]
     """Split of each frame."""
     flight: Flight
-    """True motion."""
+    """True motion of the camera."""
 
     def frame_id(self, place: int) -> str:
-        """The name, unique in the dataset, of the frame at a place in these lists."""
+        """Id, unique in the dataset, of the frame at index `place` of `frame_index`."""
         return f"{self.scene_id}/{self.trajectory_id}/{self.frame_index[place]:06d}"
 
     @property
     def split(self) -> str | None:
-        """The descent's split, or None where its frames are split among several."""
+        """The split of the trajectory, or None if its frames are in several splits."""
         return self.splits[0] if len(set(self.splits)) == 1 else None
 
 
@@ -64,21 +64,25 @@ class Plan:
     """A dataset before rendering."""
 
     camera: Camera
-    """Of all frames."""
+    """Camera of all frames."""
     exr_camera: Camera
-    """What Blender renders and the EXRs hold: a pinhole that sees all that `camera` sees."""
+    """Camera of the rendering and the EXRs: a pinhole that covers the view of `camera`."""
     scenes: tuple[ScenePlan, ...]
-    """Terrains."""
+    """All scenes."""
     trajectories: tuple[TrajectoryPlan, ...]
-    """Descents, in the order of their scenes."""
+    """All trajectories, in the order of their scenes."""
 
     def of_scene(self, scene_id: str) -> list[TrajectoryPlan]:
-        """The descents over one terrain."""
+        """The trajectories of one scene."""
         return [trajectory for trajectory in self.trajectories if trajectory.scene_id == scene_id]
 
 
 def camera_of(config: CameraConfig) -> Camera:
-    """The camera of a configuration. Raises UserError where the distortion folds back within the image."""
+    """The camera of a configuration. Raises UserError if its distortion is too strong.
+
+    That is: it folds back within the image, or the pinhole that covers the view needs more than _LARGEST_COVER times
+    the pixels.
+    """
     width, height, lens = config.width_px, config.height_px, config.distortion
     focal = config.focal_length_px or width / 2 / np.tan(np.radians(config.horizontal_fov_deg) / 2)
     camera = Camera(
@@ -111,8 +115,8 @@ def camera_of(config: CameraConfig) -> Camera:
 def make_plan(config: DatasetConfig, kind: str) -> Plan:
     """The plan of the dataset `detect` or `nav`. Raises UserError on an impossible camera.
 
-    Seeds follow from the configuration's seed and name and from the kind, so that no two presets share terrain, nor do
-    the two kinds of one preset, unless `shared_terrain` says so.
+    Seeds are derived from the configuration's seed, its name and the kind, so that no two presets share terrain. The
+    two kinds of one preset share it only with `shared_terrain`.
     """
     settings = config.kind(kind)
     camera = camera_of(config.camera)
@@ -134,7 +138,7 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
 
 
 def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:
-    """Split names (n_scenes, trajectories_per_scene, n_frames); whole units of `split_by` go together."""
+    """Split names (n_scenes, trajectories_per_scene, n_frames); a unit of `split_by` is never divided."""
     shape = (settings.n_scenes, settings.trajectories_per_scene, settings.n_frames)
     n_axes = ("scene", "trajectory", "frame").index(settings.split_by) + 1
     n_units = int(np.prod(shape[:n_axes]))

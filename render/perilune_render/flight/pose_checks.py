@@ -1,4 +1,4 @@
-"""Check the poses of a plan against the ground: the camera stands above it and every frame shows nothing else."""
+"""Check the poses of a plan against the ground: the camera is above it, and frames show nothing but ground."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,25 +14,25 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 LEAST_CLEARANCE_M = 1.0
-"""Least height of the camera above the ground right below it, metres."""
+"""Smallest height of the camera above the ground below it, metres."""
 _POINTS_PER_SIDE = 8
 _UNIT_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Where the camera stands in N frames of one scene."""
+    """Poses of the camera in N frames of one scene."""
 
     frame_id: Sequence[str]
-    """Names of the frames (N,)."""
+    """Ids of the frames (N,)."""
     position_m: Array
-    """Camera, O_L, metres (N, 3)."""
+    """Position of the camera, O_L, metres (N, 3)."""
     rotation_wxyz: Array
     """rotation_camera_from_site, quaternions (N, 4)."""
 
     @classmethod
     def planned(cls, trajectories: Sequence[TrajectoryPlan]) -> "Poses":
-        """All frames of some trajectories over one scene."""
+        """Poses of all frames of these trajectories, all of one scene."""
         return cls(
             [t.frame_id(i) for t in trajectories for i in range(len(t.splits))],
             np.concatenate([t.flight.position_m for t in trajectories]),
@@ -41,9 +41,9 @@ class Poses:
 
 
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
-    """Check what is known before the ground is grown: the Sun up, poses over the mesh, no horizon in view.
+    """Check what needs no terrain heights: the Sun is up, poses are over the mesh, no horizon is in view.
 
-    Raises UserError with `where` (the configuration or the manifest) and the first frame at fault.
+    Raises UserError with `where` (the configuration or the manifest) and the first scene or frame that fails.
     """
     for scene in plan.scenes:
         if not 0 < scene.sun_elevation_deg <= 90:
@@ -57,9 +57,9 @@ def check_plan(plan: Plan, grid: Grid, where: object) -> None:
 def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:
     """Check poses against the ground of a scene.
 
-    The camera stands at least LEAST_CLEARANCE_M above the ground, and the ray through every tested point of the image's
-    edge meets the mesh. A ray from above the ground meets it exactly where it leaves the mesh's square below the height
-    of the mesh's edge there. Raises UserError with `where` and the first frame at fault.
+    The camera must be at least LEAST_CLEARANCE_M above the ground, and the ray through every tested point of the image
+    border must hit the mesh. A ray that starts above the ground hits the mesh if and only if it is below the mesh's
+    edge where it leaves the mesh's square. Raises UserError with `where` and the first frame that fails.
     """
     rays = _check_mesh(poses, camera, scene.grid, where)
     x, y, z = poses.position_m.T
@@ -85,7 +85,7 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
 
 
 def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object) -> Array:
-    """Directions (N, S, 3), O_L, through points of the image's edge, once the poses are over the mesh and look down."""
+    """Check that poses are over the mesh and look down; returns rays (N, S, 3), O_L, through S image border points."""
     position, rotation = poses.position_m, poses.rotation_wxyz
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= _UNIT_TOLERANCE
     _refuse(
@@ -117,14 +117,14 @@ def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object) -> Arra
 
 
 def _edge_points(camera: Camera) -> Array:
-    """Image coordinates (S, 2) of points along the image's edge, corners included."""
+    """Image coordinates (S, 2) of points on the image border, with its corners, pixels."""
     share = np.arange(_POINTS_PER_SIDE) / _POINTS_PER_SIDE
     sides = [(share, 0 * share), (1 + 0 * share, share), (1 - share, 1 + 0 * share), (0 * share, 1 - share)]
     return np.concatenate([np.stack(side, axis=-1) for side in sides]) * [camera.width_px, camera.height_px]
 
 
 def _leaving(position_m: Array, rays: Array, half_m: float) -> tuple[Array, Array, Array]:
-    """Height, x and y (N, S) at which downward rays (N, S, 3) leave the square of half side `half_m`."""
+    """Height, x and y (N, S) where downward rays (N, S, 3) leave the square of half side `half_m`, metres."""
     start = position_m[:, None, :2]
     with np.errstate(divide="ignore"):
         way = np.where(rays[..., :2] != 0, (half_m - np.sign(rays[..., :2]) * start) / np.abs(rays[..., :2]), np.inf)
@@ -134,7 +134,7 @@ def _leaving(position_m: Array, rays: Array, half_m: float) -> tuple[Array, Arra
 
 
 def _refuse(faulty: np.ndarray, poses: Poses, where: object, found, wanted) -> None:
-    """Raise UserError for the first faulty frame (N,); `found` and `wanted` make text of its place in `poses`."""
+    """Raise UserError for the first true value of `faulty` (N,); `found` and `wanted` make texts from its index."""
     if faulty.any():
         n = int(np.argmax(faulty))
         raise UserError(where, f"frame {poses.frame_id[n]}", found(n), wanted(n))

@@ -1,4 +1,4 @@
-"""Perturbed descents: a nominal parabola plus smooth Gaussian departures in position and attitude."""
+"""Perturbed trajectories: a nominal parabola plus smooth Gaussian perturbations of position and attitude."""
 
 from dataclasses import dataclass
 
@@ -17,32 +17,32 @@ from perilune_shared.geometry.frames import (
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """The true motion of the camera over one descent of N frames."""
+    """True motion of the camera along one trajectory of N frames."""
 
     nominal: NominalDescent
-    """The curve that was meant."""
+    """Nominal parabola."""
     time_s: Array
-    """Since the first frame, seconds (N,)."""
+    """Time since the first frame, seconds (N,)."""
     position_m: Array
-    """Camera, O_L, metres (N, 3)."""
+    """Position of the camera, O_L, metres (N, 3)."""
     velocity_mps: Array
-    """Camera, O_L, metres per second (N, 3)."""
+    """Velocity of the camera, O_L, metres per second (N, 3)."""
     rotation_wxyz: Array
-    """rotation_camera_from_site as unit quaternions (N, 4), as the manifest keeps them."""
+    """rotation_camera_from_site as unit quaternions (N, 4), as stored in the manifest."""
 
     @property
     def rotation_camera_from_site(self) -> Array:
-        """Matrices (N, 3, 3), made of the quaternions, so that a manifest's pose is that of the rendering exactly."""
+        """Matrices (N, 3, 3), computed from the quaternions, so that the manifest holds exactly the rendered pose."""
         return matrix_from_quaternion(self.rotation_wxyz)
 
 
 def fly(config: FlightConfig, n_frames: int, seed: int) -> Flight:
-    """The descent of a seed.
+    """Draw the trajectory of a random seed.
 
-    Position and attitude depart from the nominal curve by independent stationary Gaussian processes with the kernel
-    sigma^2 exp(-dt^2 / (2 tau^2)) on each axis (the paper gives "small perturbations with Gaussian distribution" and no
-    sizes; white noise on each frame would be no motion that a lander can make). The velocity is the exact derivative,
-    drawn jointly.
+    Position and attitude deviate from the nominal motion by independent stationary Gaussian processes with the kernel
+    sigma^2 exp(-dt^2 / (2 tau^2)) on each axis. The paper states "small perturbations with Gaussian distribution"
+    without sizes; white noise on each frame would not be a motion that a lander can make. The velocity is the exact
+    derivative of the position.
     """
     rng = stream(seed, "flight")
     azimuth = rng.uniform(config.azimuth_deg.low, config.azimuth_deg.high)
@@ -67,9 +67,9 @@ def smooth_process(
 ) -> tuple[Array, Array]:
     """Values and time derivatives (N, n_axes) of unit-variance Gaussian processes with a squared-exponential kernel.
 
-    Built from random Fourier features (Rahimi & Recht 2007), 256 waves an axis: unlike a Cholesky factor it is smooth
-    at any frame rate, and its derivative is exact. The finite number of waves leaves the variance of one draw within
-    about 5 % of the kernel's.
+    Built from random Fourier features (Rahimi & Recht 2007), 256 waves per axis. Unlike samples from a Cholesky factor
+    they are smooth at any frame rate, and their derivative is exact. With the finite number of waves the variance of
+    one draw is within about 5 % of the kernel's.
     """
     n_waves = 256
     omega = rng.normal(size=(n_axes, n_waves)) / correlation_time_s

@@ -1,1 +1,1 @@
-"""Which code and which versions a result follows from, and the caches that are keyed by them."""
+"""The code and versions that determine a result, and the caches keyed by them."""

@@ -1,4 +1,4 @@
-"""Folders for files that can be computed again."""
+"""Cache folders, for files that can be computed again."""
 
 import functools
 import os
@@ -10,14 +10,14 @@ from pathlib import Path
 from perilune_render.provenance.fingerprint import compiled_functions, fingerprint
 
 _KEPT = 5
-"""Folders of machine code, of so many versions of the kernels."""
+"""Number of machine code folders kept, one for each version of the kernels."""
 
 
 def cache_home() -> Path:
-    """perilune's folder in the user's cache folder; for a user without a home, one in the temporary folder.
+    """perilune's folder in the user's cache folder; for a user without a home folder, one in the temporary folder.
 
-    Others may write to the temporary folder, and numba executes what it reads: where the folder there is not the user's
-    own alone, a new one of another name takes its place.
+    Other users may write to the temporary folder, and numba executes the files it reads. If the folder there is not
+    owned by the user or is accessible to others, a new folder with a random name is used.
     """
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"]) / "perilune"
@@ -25,7 +25,7 @@ def cache_home() -> Path:
         home = Path.home()
         if home.is_dir():
             return home / ".cache" / "perilune"
-    except RuntimeError:  # no HOME, and the user is in no list of users, as in containers
+    except RuntimeError:  # no HOME and no entry in the password database, as in containers
         pass
     folder = Path(tempfile.gettempdir()) / f"perilune-{os.getuid()}"
     try:
@@ -40,9 +40,9 @@ def cache_home() -> Path:
 
 @functools.cache
 def machine_code_folder() -> Path:
-    """The folder of machine code for the current kernels, in NUMBA_CACHE_DIR where that is set, else in `cache_home()`.
+    """The folder of machine code for the current kernels, in NUMBA_CACHE_DIR if that is set, else in `cache_home()`.
 
-    Removes the folders that were used least recently.
+    Removes the least recently used folders. If the folder cannot be written, a temporary one is used.
     """
     parent = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_home() / "kernels")
     folder = parent / f"perilune-{fingerprint(*compiled_functions()).sha256[:16]}"

@@ -1,8 +1,8 @@
-"""Hash of the code that a result follows from, without what changes no result.
+"""Hash of the code that determines a result.
 
-From some functions and classes, every function, class and constant of perilune that they name is followed, module by
-module. Comments, docstrings and error messages are left out, and so is the rest of each module: a docstring or a new
-command changes no hash, a constant five calls away does.
+Starting from some functions and classes, the hash covers every function, class and constant of perilune that they use,
+directly or indirectly. It leaves out comments, docstrings, error messages and unused code: a new docstring or command
+does not change it, a new value of a constant five calls away does.
 """
 
 import ast
@@ -18,7 +18,7 @@ import perilune_shared
 
 _FOLDERS = {module.__name__: Path(module.__path__[0]) for module in (perilune_render, perilune_shared)}
 _SETTINGS = "perilune_render.config"
-"""Modules that begin so hold settings, whose values stand in the recipe: defaults, bounds and checks are left out."""
+"""Prefix of the modules of settings. Their values are in the recipe, so the hash omits defaults, bounds and checks."""
 _NO_EFFECT = (
     "perilune_render.provenance.caches",
     "perilune_render.interrupts",
@@ -26,19 +26,19 @@ _NO_EFFECT = (
     "perilune_shared.errors",
     "perilune_shared.storage.files",
 )
-"""Modules that read settings, store results or report errors."""
+"""Modules that read settings, store results or report errors, and so change no result."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fingerprint:
-    """What a result follows from."""
+    """The code that determines a result."""
 
     sha256: str
-    """Of the code, in hexadecimal."""
+    """SHA-256 of the code, hexadecimal."""
     modules: frozenset[str]
-    """Modules of perilune that any of it comes from."""
+    """Modules of perilune that contain this code."""
     libraries: frozenset[str]
-    """Other packages that it imports, by their import names."""
+    """Import names of the other packages that this code uses."""
 
 
 @dataclass(slots=True)
@@ -48,14 +48,14 @@ class _Module:
     definitions: dict[str, list[ast.stmt]] = field(default_factory=dict)
     """Statements that define each top-level name."""
     imported: dict[str, tuple[str, str | None]] = field(default_factory=dict)
-    """Module and name behind each imported name; None for a module as a whole."""
+    """Source module and name of each imported name; the name is None for a whole module."""
     others: list[ast.stmt] = field(default_factory=list)
     """Top-level statements that define nothing, such as calls."""
     contents: dict[str, tuple[str, frozenset[tuple[str, ...]]]] = field(default_factory=dict)
-    """What `content` has found."""
+    """Cached results of `content`."""
 
     def content(self, name: str) -> tuple[str, frozenset[tuple[str, ...]]]:
-        """The code that defines a name, and the dotted names in it; of "" the statements that define nothing."""
+        """The code that defines a name, and the dotted names in it; for "" the statements that define nothing."""
         if name not in self.contents:
             statements = self.definitions[name] if name else self.others
             names = frozenset(names for statement in statements for names in _names(statement))
@@ -64,9 +64,9 @@ class _Module:
 
 
 def fingerprint(*roots: str, folders: dict[str, Path] | None = None) -> Fingerprint:
-    """The fingerprint of functions and classes, each named as `package.module:name`, or of a whole `package.module:`.
+    """The fingerprint of functions and classes, given as `package.module:name`; `package.module:` is a whole module.
 
-    `folders` gives the folder of each package where it is not the imported one.
+    `folders` gives the folder of each package, by default those of the imported packages.
     """
     return _fingerprint(roots, tuple(sorted((folders or _FOLDERS).items())))
 
@@ -77,7 +77,7 @@ def _fingerprint(roots: tuple[str, ...], folders: tuple[tuple[str, Path], ...]) 
     for root in roots:
         module, _, name = root.partition(":")
         walk.follow(module, (name,) if name else ())
-    # Without the names of modules, so that code may move from file to file.
+    # Module names are left out, so that moving code between files does not change the hash.
     code = "\n".join(sorted(f"{name}\n{text}" for (_, name), text in walk.code.items()))
     modules = frozenset(module for module, _ in walk.code)
     libraries = frozenset(walk.libraries - sys.stdlib_module_names)
@@ -99,7 +99,7 @@ def compiled_functions() -> tuple[str, ...]:
 
 
 class _Walk:
-    """Follows names from module to module."""
+    """Collects the code that names refer to, across modules."""
 
     def __init__(self, folders: dict[str, Path]):
         self.folders = folders
@@ -108,7 +108,7 @@ class _Walk:
         self.sources: dict[str, _Module | None] = {}
 
     def follow(self, module: str, names: tuple[str, ...]) -> None:
-        """Take in what a dotted name means in a module; names that the module does not define are local or built in."""
+        """Collect what a dotted name refers to in a module; names that the module does not define are ignored."""
         if module.startswith(_NO_EFFECT):
             return
         source = self._source(module)
@@ -138,7 +138,7 @@ class _Walk:
                 self.follow(module, names)
 
     def _source(self, module: str) -> _Module | None:
-        """A module of perilune, or None."""
+        """The parsed module, or None if it is not perilune's."""
         if module not in self.sources:
             package, *parts = module.split(".")
             path = self.folders[package].joinpath(*parts) if package in self.folders else None
@@ -150,7 +150,7 @@ class _Walk:
 
 @functools.cache
 def _parsed(text: str, settings: bool = False) -> _Module:
-    """A source file without docstrings and error messages; of settings also without fields and checks."""
+    """Parse a source file without docstrings and error messages; `settings` also omits fields and checks."""
     module = _Module()
     for node in _Stripped(settings).visit(ast.parse(text)).body:
         if isinstance(node, ast.Import):
@@ -169,7 +169,7 @@ def _parsed(text: str, settings: bool = False) -> _Module:
 
 
 class _Stripped(ast.NodeTransformer):
-    """Removes docstrings and other bare texts, and what is raised; of settings the fields and their checks."""
+    """Removes docstrings, other bare strings and raised errors; for settings also fields and their checks."""
 
     def __init__(self, settings: bool):
         self.settings = settings
@@ -191,7 +191,7 @@ class _Stripped(ast.NodeTransformer):
 
 
 def _defined(node: ast.stmt) -> list[str]:
-    """Names that a top-level statement defines."""
+    """Names defined by a top-level statement."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
         return [node.name]
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
@@ -199,7 +199,7 @@ def _defined(node: ast.stmt) -> list[str]:
 
 
 def _names(node: ast.AST) -> Iterator[tuple[str, ...]]:
-    """Every name in a statement with the attributes that are taken of it, as (a, b, c) for a.b.c."""
+    """Every name in a statement with its attributes, as (a, b, c) for a.b.c."""
     for each in ast.walk(node):
         if isinstance(each, ast.Name):
             yield (each.id,)

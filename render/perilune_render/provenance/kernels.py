@@ -1,7 +1,7 @@
-"""numba.njit with a cache of machine code that is keyed by the sources of all kernels.
+"""numba.njit with a machine code cache that is keyed by the sources of all kernels.
 
-numba itself keeps a function's machine code as long as the function's own file is the same, though functions and
-constants of other files are compiled into it. Here a change in any of them makes another folder.
+numba's own cache only checks the file of the function, although functions and constants of other files are compiled
+into it. Here a change to any of them selects a new cache folder.
 """
 
 from collections.abc import Callable

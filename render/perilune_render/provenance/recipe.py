@@ -1,4 +1,4 @@
-"""The recipe that a dataset records, and the way back from it to a configuration."""
+"""The recipe that a dataset records, and the conversion from a recipe to a configuration."""
 
 import json
 from pathlib import Path
@@ -17,17 +17,17 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
-    """The recipe of a dataset; of a plan, with the versions of its ground only."""
+    """The recipe of a dataset; with `planned`, that of a plan, which has the versions for its ground only."""
     with_dem = config.terrain.dem is not None
     versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
     return Recipe(preset=preset, kind=kind, seed=config.seed, config=recorded_settings(config, kind), versions=versions)
 
 
 def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
-    """The settings that stand in a recipe, as plain data.
+    """The settings recorded in a recipe, as plain data.
 
-    Of files only the names are kept. Left out is what changes no byte: settings of speed, and the other kind's settings
-    where the kinds share no terrain.
+    Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
+    speed, and those of the other kind unless the kinds share terrain.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -41,21 +41,21 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
-    """The settings of a recipe with a section for each kind, as a configuration has them."""
+    """The settings of a recipe with a section for both kinds, as in a configuration."""
     other = _OTHER[recipe.kind]
     return {other: recipe.config[recipe.kind], **recipe.config} if recipe.kind in recipe.config else recipe.config
 
 
 def same_source(first: str, second: str) -> bool:
-    """Whether two scenes' `dem_source` are of one content, whatever the file was called."""
+    """Whether two values of `dem_source` have the same content hash; file names are ignored."""
     return first.rpartition("sha256:")[2] == second.rpartition("sha256:")[2]
 
 
 def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue: Path | None = None) -> DatasetConfig:
-    """The configuration of a recipe, with the user's own copies of the files that it names.
+    """The configuration of a recipe, with the user's copies of the files that it names.
 
-    A recipe may be anybody's: the files that it names are never opened, only those given here. Raises UserError where
-    one is needed and not given, or the configuration is none of this version.
+    Recipes are untrusted: the files that they name are never opened, only `dem` and `catalogue`. Raises UserError if a
+    needed file is not given, if one is given that the recipe does not use, or if this version rejects the settings.
     """
     given = {"dem": dem, "catalogue": catalogue}
     terrain = recipe.config.get("terrain", {})

@@ -1,4 +1,4 @@
-"""Versions of all that ground, rendering and images follow from: our code by its hash, libraries by their number."""
+"""Versions of the code behind ground, rendering and images: hashes of perilune's code, version numbers of libraries."""
 
 import functools
 from importlib import metadata
@@ -8,16 +8,16 @@ import perilune_shared
 from perilune_render.provenance.fingerprint import fingerprint
 
 GROUND = ("perilune_render.terrain.scene:grow_scene",)
-"""What makes ground, craters and boulders."""
+"""Code that generates ground, craters and boulders."""
 RENDERING = ("perilune_render.flight.plan:make_plan", "perilune_render.blender.renderer:Renderer")
-"""What makes radiance of it along the planned trajectories."""
+"""Code that plans trajectories and renders radiance."""
 IMAGING = (
     "perilune_render.imaging.sensor:FixedPattern",
     "perilune_render.dataset.frame:Shot",
     "perilune_render.dataset.frame:Studio",
     "perilune_render.dataset.tables:",
 )
-"""What makes images, labels and rows of the manifest of that."""
+"""Code that makes images, labels and manifest rows from radiance."""
 LIBRARIES = {
     "OpenEXR": ("openexr", "OpenEXR"),
     "bpy": ("blender", "bpy"),
@@ -28,22 +28,22 @@ LIBRARIES = {
     "scipy": ("scipy", "scipy"),
     "trimesh": ("trimesh", "trimesh"),
 }
-"""Recorded name and distribution of each library that computes, by its import name."""
+"""Recorded name and distribution of each library that affects results, by import name."""
 _NAMES = {"generator": GROUND, "renderer": RENDERING, "imaging": IMAGING}
 
 
 def ground_versions(*, with_dem: bool) -> dict[str, str]:
-    """Of what makes the ground. Elevation models are read by rasterio, which does nothing else."""
+    """Versions of what generates the ground. rasterio only reads elevation models: it is listed if there is one."""
     return _versions(("generator",), with_dem)
 
 
 def imaging_versions() -> dict[str, str]:
-    """Of what makes images and labels of EXRs. Needs no Blender."""
+    """Versions of what makes images and labels from EXRs. Works without Blender."""
     return _versions(("imaging",), False)
 
 
 def all_versions(*, with_dem: bool) -> dict[str, str]:
-    """Of everything that a rendered frame and its labels follow from."""
+    """Versions of everything that determines a rendered frame and its labels."""
     return _versions(tuple(_NAMES), with_dem)
 
 
