@@ -1,8 +1,8 @@
-"""Strict configuration: preset, then the user's YAML file, then single settings; every key must be known.
+"""Load configurations strictly: a preset, then the user's YAML file, then single settings; unknown keys are errors.
 
 A configuration file has up to four sections, one for each command that reads it: `dataset` (the renderer),
 `detect`, `navigate` and `explain` (the trainer). A command validates its own section and ignores the others,
-so that one file can describe a whole experiment.
+so one file can describe a whole experiment.
 """
 
 import json
@@ -22,7 +22,7 @@ _LARGEST_FILE_BYTES = 100_000
 
 
 class Section(BaseModel):
-    """Base of every part of a configuration: frozen, strict types, unknown keys refused."""
+    """Base class of all parts of a configuration: frozen, strictly typed, without unknown keys."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
@@ -33,7 +33,7 @@ SectionType = TypeVar("SectionType", bound=Section)
 
 
 def read_config_file(path: Path) -> dict[str, dict]:
-    """The sections of a user's YAML file. Raises UserError on a missing file or an unknown section."""
+    """Read the sections of a user's YAML file. Raises UserError on a missing file or an unknown section."""
     if not path.is_file():
         raise UserError(path, "configuration", "no such file", "a YAML file")
     if path.stat().st_size > _LARGEST_FILE_BYTES:
@@ -54,7 +54,7 @@ def read_config_file(path: Path) -> dict[str, dict]:
 
 
 def parse_setting(text: str) -> tuple[list[str], Any]:
-    """`"dataset.seed=3"` as (["dataset", "seed"], 3). Raises UserError on another form."""
+    """Parse `"dataset.seed=3"` to (["dataset", "seed"], 3). Raises UserError on any other form."""
     key, separator, value = text.partition("=")
     path = key.strip().split(".")
     if not separator or len(path) < 2 or not all(path):
@@ -72,9 +72,9 @@ def resolve(
     config_file: Path | None = None,
     settings: tuple[str, ...] = (),
 ) -> SectionType:
-    """The section `section` from a preset of `package`, a user's file and single settings, later ones winning.
+    """Resolve `section` from a preset of `package`, a user's file and single settings; later sources override.
 
-    Raises UserError naming the source, the key, the value and what would be right.
+    Raises UserError with the source, the key, the value and the expected value.
     """
     if preset not in PRESETS:
         raise UserError("--preset", "preset", preset, nearest(preset, PRESETS))
@@ -91,7 +91,7 @@ def resolve_over(
     config_file: Path | None = None,
     settings: tuple[str, ...] = (),
 ) -> SectionType:
-    """As `resolve`, from the plain data `base` in place of a preset; errors name it `base_name`."""
+    """Resolve like `resolve`, with plain data `base` instead of a preset; errors call it `base_name`."""
     sources: list[tuple[str, dict]] = [(base_name, base)]
     if config_file is not None:
         sources.append((str(config_file), read_config_file(config_file).get(section, {})))
@@ -111,7 +111,7 @@ def resolve_over(
 
 
 def to_yaml(section: str, config: Section) -> str:
-    """A resolved section as YAML that `resolve` reads again."""
+    """Return a resolved section as YAML that `resolve` can read."""
     return to_yaml_text({section: config.model_dump(mode="json")})
 
 

@@ -1,4 +1,4 @@
-"""Validation errors of settings as one line: source, key, value given and value expected."""
+"""Format validation errors of settings in one line: source, key, value found and value expected."""
 
 import difflib
 import json
@@ -13,9 +13,9 @@ from pydantic_core import ErrorDetails
 from perilune_shared.errors import UserError
 
 _LEAST_LIKENESS = 0.75
-"""Least similarity (difflib's ratio) of a known name that is worth a hint."""
+"""Minimum similarity (difflib's ratio) of a known name that is suggested."""
 
-# By pydantic's type of error; in braces its context.
+# Expected value by pydantic's error type; fields in braces come from the error's context.
 _EXPECTED = {
     "missing": "a value",
     "none_required": "null",
@@ -48,14 +48,14 @@ _COUNTED = {"too_short": ("at least", "min_length"), "too_long": ("at most", "ma
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """What is expected in place of an unknown name: the most similar known name, or else all known names."""
+    """Return what to suggest for an unknown name: the most similar known name, otherwise all known names."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=_LEAST_LIKENESS)
     return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)
 
 
 def expected_of(fault: ErrorDetails) -> str:
-    """What pydantic expected, as a noun phrase or a bound that completes "expected ..."."""
+    """Return what pydantic expected, as a noun phrase or bound that completes "expected ..."."""
     kind, context = fault["type"], fault.get("ctx", {})
     if kind in _COUNTED:
         bound, key = _COUNTED[kind]
@@ -71,7 +71,7 @@ def expected_of(fault: ErrorDetails) -> str:
 
 
 def shown(value: Any) -> str:
-    """A given value in YAML's words where they differ from Python's."""
+    """Format a value for a message, with YAML's true, false and null."""
     if isinstance(value, bool) or value is None:
         return json.dumps(value)
     return repr(value)
@@ -80,7 +80,7 @@ def shown(value: Any) -> str:
 def explained(
     error: ValidationError, model: type[BaseModel], section: str, sources: list[tuple[str, dict[str, Any]]]
 ) -> UserError:
-    """The first fault of a section that was merged from `sources` (name, content), later ones winning."""
+    """Return the first error of a section merged from `sources` (name, content), where later sources override."""
     fault = error.errors(include_url=False)[0]
     location = [str(part) for part in fault["loc"]]
     where = next((name for name, content in reversed(sources) if _holds(content, location)), sources[-1][0])

@@ -1,4 +1,4 @@
-"""A resolved configuration as YAML with a comment on each key: meaning, unit, choices and default."""
+"""Format a resolved configuration as YAML with a comment on each key: meaning, unit, choices and default."""
 
 import json
 import textwrap
@@ -14,7 +14,7 @@ _WIDTH = 118
 
 
 def annotated_yaml(section: str, config: Section) -> str:
-    """The section as a configuration file that `resolve` reads again.
+    """Return the section as a commented configuration file that `resolve` can read.
 
     The unit of a key is in its name or in its meaning.
     """
@@ -41,7 +41,7 @@ def _meaning(field: FieldInfo) -> str:
 
 
 def _choices(field: FieldInfo) -> str:
-    """The values of a Literal, which may stand beside other types."""
+    """List the values of a Literal, also inside a union with other types."""
     kinds = [field.annotation, *typing.get_args(field.annotation)]
     values = [
         str(value) for kind in kinds if typing.get_origin(kind) is typing.Literal for value in typing.get_args(kind)
@@ -57,7 +57,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def _flow(value: Any) -> str:
-    """A value on one line of YAML: what JSON has, with plain keys, and plain text where it is a word."""
+    """Format a value on one line of YAML: as JSON, but without quotes around keys and single words."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
     if isinstance(value, list | tuple):
@@ -68,5 +68,5 @@ def _flow(value: Any) -> str:
 
 
 def _is_span(value: Section) -> bool:
-    """Whether a section is a pair of bounds, which is one value to a user."""
+    """Whether a section is a pair of bounds (low, high), which is shown as one value."""
     return set(type(value).model_fields) == {"low", "high"}

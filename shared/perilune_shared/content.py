@@ -1,7 +1,7 @@
-"""A hash of what a scene holds, to tell whether the same seed grew the same ground again.
+"""Hash the content of a scene, to check whether the same seed reproduced the same terrain.
 
-Craters and boulders are measured on the finished ground, so that another ground shows in their heights and depths. The
-hash is taken of whole millimetres: processors and libraries may differ in a number's last digits.
+Craters and boulders are measured on the finished terrain, so a different terrain changes their heights and depths.
+Values are rounded to millimetres first, since processors and libraries may differ in the last digits.
 """
 
 import hashlib
@@ -10,13 +10,13 @@ import numpy as np
 import pyarrow as pa
 
 PROCEDURAL = "procedural"
-"""`dem_source` of scenes without an elevation model."""
+"""Value of `dem_source` for scenes without an elevation model."""
 _CRATER = ("x_m", "y_m", "z_m", "diameter_m", "depth_m")
 _BOULDER = ("x_m", "y_m", "z_m", "diameter_m")
 
 
 def content_sha256(craters: pa.Table, boulders: pa.Table) -> str:
-    """SHA-256 in hexadecimal of one scene's rows of `craters` and `boulders`, in the order of their ids."""
+    """Return the SHA-256 (hexadecimal) of one scene's rows of `craters` and `boulders`, in the order of their ids."""
     digest = hashlib.sha256()
     for table, key, columns in ((craters, "crater_id", _CRATER), (boulders, "boulder_id", _BOULDER)):
         order = np.argsort(table[key].to_numpy(), kind="stable")
@@ -28,8 +28,9 @@ def content_sha256(craters: pa.Table, boulders: pa.Table) -> str:
 
 
 def terrain_of(dem_source: str, content_sha256: str) -> str:
-    """What scenes of the same ground have in common: their elevation model, else their craters and boulders.
+    """Return a key of the terrain, equal for scenes with the same terrain.
 
-    Scenes over one elevation model differ in the small craters that were added; the ground that it shows is the same.
+    It is the elevation model if there is one, otherwise the hash of craters and boulders. Scenes on one elevation model
+    count as the same terrain, although the small craters added to them differ.
     """
     return content_sha256 if dem_source == PROCEDURAL else dem_source.rpartition("sha256:")[2]

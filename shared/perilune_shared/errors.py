@@ -1,4 +1,4 @@
-"""Errors that a user can cause, told in one line, and the exit code that goes with them."""
+"""Errors that a user can cause, printed in one line, and their exit code."""
 
 import errno
 import os
@@ -25,10 +25,10 @@ _DISK_FAULTS = (
 
 
 class UserError(Exception):
-    """A fault in what the user gave: file or place, field, value found, and what would be right."""
+    """An error in the user's input: file or place, field, value found, and value expected."""
 
     def __init__(self, where: object, field: str, found: object, wanted: str):
-        # Any of them may come out of a stranger's file, in any length.
+        # These texts may come from untrusted files and may be of any length.
         self.field, self.found, self.wanted = shortened(field), shortened(found), shortened(wanted, 500)
         super().__init__(
             one_line(f"{shortened(where, 4200)}: {self.field}: got {self.found}, expected {self.wanted}"),
@@ -36,18 +36,18 @@ class UserError(Exception):
 
 
 def one_line(text: object) -> str:
-    """Text on one line, with a question mark for what would steer a terminal."""
+    """Return text on one line, with terminal control characters replaced by question marks."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
 
 
 def shortened(value: object, most: int = 120) -> str:
-    """A value as text of at most `most` characters."""
+    """Return a value as text of at most `most` characters."""
     text = str(value)
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def run_command_line(app: Callable[[], object]) -> None:
-    """Run a command line; a user's fault or a failing disk ends it with one line and exit code 2."""
+    """Run a command line; print user errors and disk errors in one line and exit with code 2."""
     try:
         app()
     except UserError as error:
@@ -57,7 +57,7 @@ def run_command_line(app: Callable[[], object]) -> None:
             raise
         fail = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; what was finished stays valid"
     except (KeyboardInterrupt, SystemExit) as stop:
-        # Typer itself turns Ctrl-C into a bare exit with the shell's code for it.
+        # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
         if isinstance(stop, SystemExit) and stop.code != _EXIT_INTERRUPTED:
             raise
         print("stopped; what was finished stays valid and can be resumed", file=sys.stderr)

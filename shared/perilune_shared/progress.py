@@ -1,4 +1,4 @@
-"""One look of progress bar for every long work: what, how far, rate, time left."""
+"""The progress bar of all long tasks: name, progress, rate, remaining time."""
 
 from rich.console import Console
 from rich.progress import (
@@ -15,7 +15,7 @@ console = Console(stderr=True)
 
 
 class _Rate(ProgressColumn):
-    """Finished steps per second."""
+    """Column with the completed steps per second."""
 
     def render(self, task) -> Text:
         speed = task.finished_speed or task.speed
@@ -24,14 +24,14 @@ class _Rate(ProgressColumn):
 
 
 class _Note(ProgressColumn):
-    """What the task is at, where it says so."""
+    """Column with the task's current note, if it has one."""
 
     def render(self, task) -> Text:
         return Text(task.fields.get("note", ""))
 
 
 def progress_bar() -> Progress:
-    """A progress bar on standard error; give each task `unit="frames"` for its rate."""
+    """Create a progress bar on standard error; set e.g. `unit="frames"` in each task to show its rate."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),

@@ -1,8 +1,8 @@
-"""YAML 1.2 with the core schema (specification 1.2.2, section 10.3): untrusted text to plain data, and data to text.
+"""Parse untrusted YAML 1.2 with the core schema (specification 1.2.2, section 10.3), and write YAML.
 
 Only the core schema's forms are numbers, booleans and null. `yes`, `off`, `1:30`, `1_000` and `2024-01-17` are text;
 `012` is 12 (octal is `0o14`); `1e-4` is a number. Stricter than YAML: a repeated key, an alias, an anchor, a tag, a
-directive, a second document and a key that is not a scalar are errors, and size and depth are bounded. Keys stay text.
+directive, a second document and a key that is not a scalar are errors, and size and depth are limited. Keys stay text.
 """
 
 import io
@@ -43,21 +43,21 @@ _CORE_SCHEMA: tuple[tuple[re.Pattern, Callable[[str], Any]], ...] = (
     (re.compile(r"[-+]?\.(inf|Inf|INF)"), lambda text: float(text.replace(".", "").lower())),
     (re.compile(r"\.(nan|NaN|NAN)"), lambda text: float("nan")),
 )
-# Text that every YAML version reads as text without quotes.
+# Text that needs no quotes in any YAML version.
 _PLAIN_TEXT = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null)$)[A-Za-z][\w ./()-]*(?<! )", re.IGNORECASE)
 
 
 class _Refused(ValueError):
-    """Valid YAML that this reader refuses: what was found, and what is expected."""
+    """Valid YAML that this parser refuses: what was found and what is expected."""
 
     def __init__(self, event: Event, got: str, expected: str = _EXPECTED):
         self.got, self.expected = f"{got} at line {event.start_mark.line + 1}", expected
 
 
 def parse_yaml(text: str, where: object) -> Any:
-    """Plain data (dict, list, str, int, float, bool, None) from YAML text; None from empty text.
+    """Parse YAML text to plain data (dict, list, str, int, float, bool, None); empty text gives None.
 
-    Raises UserError, naming `where`, on text that is not YAML or that this reader refuses.
+    Raises UserError about `where` if the text is not YAML or if this parser refuses it.
     """
     if len(text) > _LARGEST_CHARACTERS:
         raise UserError(where, "size", f"{len(text)} characters", f"at most {_LARGEST_CHARACTERS}")
@@ -72,7 +72,7 @@ def parse_yaml(text: str, where: object) -> Any:
 
 
 def to_yaml_text(data: dict[str, Any]) -> str:
-    """Block YAML of plain data, keys in their order; text is quoted where YAML 1.1 would read something else."""
+    """Format plain data as block YAML, keys in order; text is quoted if YAML 1.1 would not read it as text."""
     yaml = YAML(typ="safe", pure=True)
     yaml.Representer = _Representer
     yaml.default_flow_style = False

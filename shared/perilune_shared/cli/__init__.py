@@ -1,1 +1,1 @@
-"""The command line `perilune-manifest`."""
+"""Command line `perilune-manifest`."""

@@ -1,4 +1,4 @@
-"""Commands of `perilune-manifest` that make one dataset of others."""
+"""Commands of `perilune-manifest` that edit or compare datasets."""
 
 import enum
 from pathlib import Path
@@ -25,7 +25,7 @@ EXIT_DIFFERENT = 1
 
 
 class Images(enum.StrEnum):
-    """How frames are written."""
+    """How frames are written to the new dataset."""
 
     COPY = "copy"
     NONE = "none"
@@ -33,7 +33,7 @@ class Images(enum.StrEnum):
 
 
 class Unit(enum.StrEnum):
-    """What stays together in one split."""
+    """Unit that is assigned to a split as a whole."""
 
     SCENE = "scene"
     TRAJECTORY = "trajectory"
@@ -60,13 +60,13 @@ def _mode(images: Images, link: bool) -> ImageMode:
 
 
 def add_to(app: typer.Typer) -> None:
-    """Add the commands to a command line."""
+    """Register the commands of this file."""
     for command in (merge, subset, split, diff, migrate, pack, unpack, attach):
         app.command()(command)
 
 
 def _tell(out: Path) -> None:
-    """What was made, and whether its splits share terrain."""
+    """Print the counts of the new dataset and whether its splits share terrain."""
     info = open_dataset(out).info
     counts = info.counts
     told = f"{counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames, {counts.labels} labels"

@@ -1,4 +1,4 @@
-"""`perilune-manifest export` and `card`: a dataset for the tools of other fields, and a page about it for people."""
+"""`perilune-manifest export` and `card`: convert a dataset to other formats, and write a page about it."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -20,7 +20,7 @@ from perilune_shared.storage.files import check_free
 
 
 class ExportFormat(StrEnum):
-    """What a dataset can be turned into."""
+    """Export formats."""
 
     COCO = "coco"
     YOLO = "yolo"
@@ -123,5 +123,5 @@ def card(
 
 
 def _say(line: str) -> None:
-    # As Text, since brackets would be read as markup.
+    # Text, since a plain string would be parsed as markup.
     Console().print(Text(line), soft_wrap=True)

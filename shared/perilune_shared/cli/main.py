@@ -1,4 +1,4 @@
-"""`perilune-manifest`: look after datasets without Blender and without torch."""
+"""`perilune-manifest`: validate, inspect, edit and export datasets, without Blender and without torch."""
 
 from typing import Annotated
 
@@ -38,7 +38,7 @@ def validate(
     table = Table("file", "row", "column", "got", "expected", title=Text(f"{one_line(dataset)}: {count}"))
     for fault in faults[:most]:
         row = "" if fault.row is None else str(fault.row)
-        # As Text, since brackets would be read as markup; so with all that a stranger may have named.
+        # Text, since a plain string would be parsed as markup; the values are untrusted.
         cells = (fault.file, row, fault.column, fault.found, fault.wanted)
         table.add_row(*(Text(cell, overflow="fold") for cell in cells))
     console.print(table)
@@ -53,7 +53,7 @@ def stats(dataset: DatasetArgument) -> None:
     info = opened.info
     state = "" if info.complete else ", not complete"
     table = Table(title=f"{info.name}{state}", caption=f"split by {info.split_by}{info.leak}")
-    # A measure a row, so that the table fits a narrow terminal.
+    # One measure per row, so that the table fits a narrow terminal.
     measures = frame.set_index("split").astype(object).T
     table.add_column("")
     for split in measures.columns:

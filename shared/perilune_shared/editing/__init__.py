@@ -1,1 +1,1 @@
-"""New datasets from old ones: subset, merge, split, pack, attach, migrate; and diff."""
+"""Make datasets from other datasets: subset, merge, split, pack, attach, migrate. Compare them: diff."""

@@ -1,4 +1,4 @@
-"""A manifest and the frames that were made from it, joined to a dataset."""
+"""Combine a manifest without frames and the frames rendered from it into a dataset."""
 
 from pathlib import Path
 
@@ -22,12 +22,12 @@ def attach(
     *,
     link: bool = False,
 ) -> None:
-    """Write a dataset of a manifest without frames and the frames under `frames_root`, at the manifest's own paths.
+    """Write a dataset from a manifest without frames and the frames under `frames_root`, at the manifest's paths.
 
-    Frames are copied, or linked with `link`. Every PNG must have the hash that the manifest states. With `rehash`
-    frames are taken as they are and their own hashes written down, as for those of another kind of machine. EXRs come
-    along where all of a scene's are there. Raises UserError where a frame is missing or another, and on a plan, which
-    has no labels.
+    Frames are copied, or hard-linked with `link`. Every PNG must match the hash in the manifest. With `rehash` the
+    hashes of the given frames replace those of the manifest, e.g. for frames rendered on another kind of machine. EXRs
+    of a scene are included if all of them exist. Raises UserError if a frame is missing or different, and if the
+    manifest is a plan, which has no labels.
     """
     check_source(manifest, out, progress)
     if manifest.info.images != "absent":
@@ -51,7 +51,7 @@ def attach(
 
 
 def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
-    """A scene's rows of `frames` with the hashes of the files that are there."""
+    """Return a scene's rows of `frames` with the hashes of the existing files."""
     camera = source.info.camera
     rows = frames.select(["frame_id", "png_path", "png_sha256", "exr_path", "exr_sha256"]).to_pylist()
     found: dict[str, list] = {f"{kind}_{name}": [] for kind in ("png", "exr") for name in ("sha256", "bytes", "path")}

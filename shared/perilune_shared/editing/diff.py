@@ -1,4 +1,4 @@
-"""What differs between two datasets, row by row and column by column."""
+"""Compare two datasets row by row and column by column."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,24 +15,24 @@ _NUMBER = "copy"
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One column in which rows differ, or rows that only one dataset has."""
+    """A column in which rows differ, or rows that exist in only one dataset."""
 
     place: str
     """Table, or dataset.json."""
     column: str
-    """Column or field; empty where whole rows are missing."""
+    """Column or field; empty if whole rows are missing."""
     rows: int
-    """How many rows differ."""
+    """Number of rows that differ."""
     example: str
     """Key of the first such row."""
     first: str
-    """Its value in the first dataset."""
+    """Value of the example in the first dataset."""
     second: str
-    """Its value in the second dataset."""
+    """Value of the example in the second dataset."""
 
 
 def differences(first: Dataset, second: Dataset) -> list[Difference]:
-    """All differences; none means that both hold the same, however their parts and frames are stored."""
+    """Return all differences. None means equal content; how parts and frames are stored does not matter."""
     found = list(_info(_plain(first), _plain(second), ""))
     one, two = set(first.scene_ids()), set(second.scene_ids())
     for there, other, only in ((one, two, True), (two, one, False)):
@@ -68,10 +68,10 @@ def _info(one: object, two: object, path: str) -> Iterator[Difference]:
 
 
 def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Difference]:
-    """Differences of one table of one scene."""
+    """Yield the differences in one table of one scene."""
     keys = KEYS[table]
     if any(frame.duplicated(keys).any() for frame in (one, two)):
-        # Rows of one key are told apart by a number, in an order that does not depend on how they are stored.
+        # Number rows with equal keys, in an order that does not depend on how they are stored.
         one, two = (_numbered(frame, keys) for frame in (one, two))
         keys = [*keys, _NUMBER]
     one, two = (frame.set_index(keys).sort_index() for frame in (one, two))
@@ -95,7 +95,7 @@ def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Differen
 
 
 def _numbered(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
-    """Rows with a column that numbers those of one key, from 0."""
+    """Add a column that numbers the rows of each key from 0."""
     plain = [name for name in rows.columns if not (rows[name].dtype == object and rows[name].map(np.ndim).gt(0).any())]
     rows = rows.sort_values(plain, kind="stable", ignore_index=True)
     return rows.assign(**{_NUMBER: rows.groupby(keys).cumcount()})

@@ -1,4 +1,4 @@
-"""Which trajectories are one flight: the same terrain seen from the same poses, whatever their names."""
+"""Find trajectories of the same flight: the same terrain seen from the same poses, independent of names."""
 
 import numpy as np
 import pandas as pd
@@ -9,11 +9,11 @@ from perilune_shared.dataset.manifest import Dataset
 
 
 def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
-    """Every frame, by frame_id, with what it must not share with another split: `terrain`, `flight` and `pose`.
+    """Return all frames, by frame_id, with the units that splits must not share: `terrain`, `flight` and `pose`.
 
-    Terrain is the ground's content (`terrain_of`), pose a position and rotation over a terrain. Trajectories over one
-    terrain are one flight where they have the same random seed or a pose in common: a flight that was rendered and
-    developed again, or rendered under another Sun, is one.
+    Terrain is the content of the terrain (`terrain_of`); pose is a position and rotation over a terrain. Trajectories
+    over one terrain are one flight if they have the same random seed or a common pose. So copies of a flight that was
+    developed again, or rendered under another Sun, are one flight.
     """
     columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
     rows = dataset.table("frames", columns).sort_by("frame_id")
@@ -27,7 +27,7 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
         rows[name].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(len(rows), -1)
         for name in columns[3:]
     ]
-    # Negative zero is zero.
+    # Adding 0.0 turns negative zero into zero.
     poses = pd.DataFrame(np.hstack(numbers) + 0.0).assign(terrain=frames["terrain"].to_numpy())
     frames["pose"] = poses.groupby(list(poses.columns), dropna=False).ngroup().to_numpy()
     trajectory = frames.groupby(["scene_id", "trajectory_id"], sort=False).ngroup().to_numpy()
@@ -37,7 +37,7 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
 
 
 def _joined(unit: NDArray[np.int64], keys: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """A number (N,) for each row, equal where units (N,) are connected by equal values of any key (N,)."""
+    """Number the rows (N,): rows whose units (N,) are connected by equal values of any key (N,) get equal numbers."""
     root = np.arange(unit.max(initial=-1) + 1)
 
     def find(one: int) -> int:

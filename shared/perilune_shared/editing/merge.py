@@ -1,4 +1,4 @@
-"""Several datasets as one."""
+"""Merge several datasets into one."""
 
 from collections.abc import Container, Sequence
 from pathlib import Path
@@ -16,9 +16,9 @@ from perilune_shared.errors import UserError
 
 _GROUND = ("scenes", "craters", "boulders")
 _CHANGING = ("scene_id", "trajectory_id", "n_frames", "split")
-"""Of a descent: what may differ though it is the same."""
+"""Columns that may differ between two copies of the same trajectory."""
 _RENDERED = ("position_m", "rotation_wxyz", "time_s", "png_sha256")
-"""Of a frame: what may not differ where it is the same."""
+"""Columns that must be equal in two copies of the same frame."""
 
 
 def merge(
@@ -30,10 +30,10 @@ def merge(
 ) -> None:
     """Write the frames of all sources, each once, as one dataset.
 
-    Scenes that are the same (recipe, seed, Sun, craters) become one; others of the same name get a new one, and so do
-    trajectories. A frame that several sources have is taken from the first, with that one's split and labels. Counts,
-    splits and what the splits share are recomputed from the rows. Raises UserError where kinds, cameras or cameras of
-    EXRs differ, a licence is no SPDX expression, or one frame was rendered in two ways.
+    Equal scenes (recipe, seed, Sun, craters) are merged; different scenes with the same name are renamed. The same
+    holds for trajectories. A frame in several sources is taken from the first, with its split and labels. Counts,
+    splits and the split unit are recomputed from the rows. Raises UserError if kinds, cameras or EXR cameras differ, a
+    licence is not an SPDX expression, or two copies of a frame differ.
     """
     if len(sources) < 2:
         raise UserError("merge", "datasets", len(sources), "at least two")
@@ -73,7 +73,7 @@ def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetI
 
 
 def _exr_camera(sources: Sequence[Dataset]) -> CameraInfo | None:
-    """The camera of all EXRs. Raises UserError where two sources have EXRs of different cameras."""
+    """Return the camera of all EXRs. Raises UserError if two sources have EXRs of different cameras."""
     with_exrs = [source for source in sources if _has_exrs(source)]
     for source in with_exrs:
         if source.info.exr_camera != with_exrs[0].info.exr_camera:
@@ -88,16 +88,16 @@ def _has_exrs(source: Dataset) -> bool:
 
 
 def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list[tuple[int, str]]]:
-    """For each scene of the result, the sources (by place) and names under which it comes.
+    """Return, for each scene of the result, the sources (by index) that contain it and its name in each.
 
-    In a plan, which has no labels, the numbers of craters do not count.
+    In a plan, which has no labels, crater ids are not compared.
     """
     groups: dict[str, list[tuple[int, str]]] = {}
     known: dict[tuple, str] = {}
     for i, source in enumerate(sources):
         for row in sorted(source.table("scenes").to_pylist(), key=lambda row: row["scene_id"]):
             own = row.pop("scene_id")
-            # Ids are part of what labels say, so that they must be the same too.
+            # Labels refer to craters by id, so the ids must be equal too.
             craters = [] if planned else source.table("craters", ["crater_id"], scene_id=own)["crater_id"].to_pylist()
             key = (*row.values(), tuple(craters))
             if key not in known or any(place == i for place, _ in groups[known[key]]):
@@ -108,7 +108,7 @@ def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list
 
 
 def free_name(name: str, taken: Container[str]) -> str:
-    """A name that is not taken yet: the same, or with -2, -3 and so on at its end."""
+    """Return a free name: `name` itself, or `name` with -2, -3, ... appended."""
     tried, number = name, 1
     while tried in taken:
         number += 1
@@ -119,7 +119,7 @@ def free_name(name: str, taken: Container[str]) -> str:
 def _join(
     scene_id: str, members: Sequence[tuple[Dataset, str]]
 ) -> tuple[SceneTables, list[tuple[Dataset, pa.Table, dict[str, str]]]]:
-    """The tables of a joined scene, and of each member the frames taken (as its own rows) with their new names."""
+    """Return the tables of a merged scene and, for each member, its frames that are used and their new names."""
     joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels")}
     brought: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
     descents: list[tuple[dict, str]] = []
@@ -154,9 +154,9 @@ def _join(
 
 
 def _descents(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tuple[dict[str, str], pa.Table]:
-    """New ids of a member's descents, by old; and the rows of those that were not known before, renamed.
+    """Map a member's trajectory ids to new ids; also return the renamed rows of trajectories not yet in `known`.
 
-    `known` holds the descents of the members before, by content and new id; the new ones are added to it.
+    `known` contains the trajectories of earlier members (content and new id); new ones are added to it.
     """
     names: dict[str, str] = {}
     new = []

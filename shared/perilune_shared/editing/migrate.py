@@ -1,6 +1,6 @@
-"""Datasets of older schema versions brought to this one.
+"""Convert datasets of older schema versions to the current one.
 
-Version 2 added to `craters` where a crater comes from, and made its age and fresh depth nullable. Version 3 added
+Version 2 added the column `origin` to `craters` and made age and fresh depth nullable. Version 3 added
 recipes and content hashes to `scenes`, `contrast` to `labels`, checksums of all files, and the state of the frames.
 """
 
@@ -32,14 +32,14 @@ def _without(tables: dict[str, pa.Schema], added: Mapping[str, tuple[str, ...]])
 
 _TABLES_2 = _without(_without(TABLES, OPTIONAL), _ADDED_IN_3)
 OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
-"""Columns of the tables in older versions."""
+"""Schemas of the tables in older versions."""
 
 
 def migrate(root: Path, out: Path, progress: Progress | None = None, *, link: bool = False) -> None:
-    """Write a dataset of schema version 1 or 2 as one of this version; frames are copied, or linked.
+    """Convert a dataset of schema version 1 or 2 to the current version; frames are copied, or hard-linked with `link`.
 
-    What older versions did not record becomes null: the contrast of labels. Raises UserError where there is nothing to
-    migrate, or the dataset is damaged or not complete.
+    The contrast of labels, which older versions did not record, becomes null. Raises UserError if the dataset has the
+    current version already, is damaged or is not complete.
     """
     path = root / INFO_NAME
     content = read_object(path)
@@ -65,7 +65,7 @@ def migrate(root: Path, out: Path, progress: Progress | None = None, *, link: bo
 
 
 def _info(content: dict[str, Any], path: Path) -> DatasetInfo:
-    """dataset.json of version 1 or 2, in which settings, seed and versions stood by themselves, as one of this."""
+    """Convert dataset.json of version 1 or 2, in which settings, seed and versions were not grouped in recipes."""
     version = content["schema_version"]
     missing = [name for name in ("preset", "kind", "seed", "config", "versions") if name not in content]
     if missing:
@@ -91,14 +91,14 @@ def _info(content: dict[str, Any], path: Path) -> DatasetInfo:
 
 
 class _Old(Dataset):
-    """A dataset of an older version, read as one of this."""
+    """A dataset of an older version, read as the current version."""
 
     def __init__(self, root: Path, info: DatasetInfo, version: str):
         super().__init__(root, info)
         self.version = version
 
     def rows(self, table: str, scene_id: str | None = None) -> pa.Table:
-        """Rows of a table, of one scene or all, with the columns of this version."""
+        """Read a table, of one scene or all, with the columns of the current version."""
         schema = OLD_TABLES[self.version][table]
         pieces = [Part(part, table, schema, self.version).read() for part in self.parts(table, scene_id)]
         rows = pa.concat_tables(pieces) if pieces else schema.empty_table()
@@ -119,10 +119,10 @@ class _Old(Dataset):
         return rows.filter(pa.array(own, pa.bool_()))
 
     def _added(self, table: str, name: str, rows: pa.Table, scene_id: str) -> pa.Array:
-        """A column that the older version has not."""
+        """Return a column that the older version lacks."""
         n = len(rows)
         fill: dict[tuple[str, str], Callable[[], list]] = {
-            # Before version 2 the generator drew single craters only, and knew no catalogues.
+            # Before version 2 all craters were primary: there were no clusters and no catalogues.
             ("craters", "origin"): lambda: ["primary"] * n,
             ("labels", "contrast"): lambda: [None] * n,
             ("scenes", "recipe"): lambda: [self.info.recipe().key] * n,

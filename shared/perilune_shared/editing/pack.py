@@ -1,4 +1,4 @@
-"""A dataset in few large files, and back: frames as PNG bytes in images/*.parquet, each table as one part."""
+"""Pack a dataset into few large files, and unpack it: PNGs in images/*.parquet, each table as one part."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +15,7 @@ from perilune_shared.errors import UserError
 
 _EXR = ("exr_path", "exr_sha256", "exr_bytes")
 _LARGEST_SHARD_MB = 8000
-"""Larger files are refused when they are read (perilune_shared.dataset.parts)."""
+"""Maximum shard size, 10^6 bytes: larger files are refused on reading (perilune_shared.dataset.parts)."""
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
 
 
@@ -28,11 +28,11 @@ def pack(
     most_rows: int = MOST_ROWS_WRITTEN,
     most_images: int = MOST_IMAGES_WRITTEN,
 ) -> None:
-    """Write a packed dataset: frames in shards of about `shard_mb` megabytes, which Hugging Face `datasets` opens too.
+    """Write a packed dataset: frames in shards of about `shard_mb` megabytes, readable by Hugging Face `datasets`.
 
-    A table of more than `most_rows` rows becomes several parts, and a shard holds at most `most_images` frames, so that
-    no file exceeds what a reader accepts (perilune_shared.dataset.parts).
-    A dataset without frames is packed as its tables alone. EXRs stay behind: their columns become null.
+    A table of more than `most_rows` rows becomes several parts, and a shard contains at most `most_images` frames, to
+    stay within the limits of readers (perilune_shared.dataset.parts). Of a dataset without frames, only the tables are
+    packed. EXRs are not packed: their columns become null.
     """
     check_source(source, out, progress)
     if not 0 < shard_mb <= _LARGEST_SHARD_MB:
@@ -61,7 +61,7 @@ def _images(source: Dataset, frames: pa.Table, progress: Progress | None, task) 
 def unpack(source: Dataset, out: Path, progress: Progress | None = None, *, link: bool = False) -> None:
     """Write a dataset with a part for each scene and trajectory, and frames as files.
 
-    Frames that are files already are copied, or linked with `link`.
+    Frames that already are files are copied, or hard-linked with `link`.
     """
     check_source(source, out, progress)
     info: DatasetInfo = source.info.changed("unpacked")

@@ -1,4 +1,4 @@
-"""One dataset rewritten as another: the way of all tools that change or choose rows."""
+"""Rewrite a dataset as a new one; used by all tools that change or select rows."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,9 +16,9 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage import checksums
 
 ImageMode = Literal["copy", "link", "none", "plan"]
-"""How frames are written: copies; hard links where the disk allows them (then a frame edited in one dataset changes in
-the other too); or left out. With `plan` craters, boulders and labels are left out too: they follow from scenes and
-poses."""
+"""How frames are written: `copy`; `link` (hard links where the file system allows them: an edit of a frame changes
+both datasets); `none` (left out); `plan` (frames, craters, boulders and labels left out: scenes and poses determine
+them)."""
 _FOLLOWING = ("craters", "boulders", "labels")
 
 
@@ -31,9 +31,9 @@ def rewrite(
     progress: Progress | None = None,
     scene_ids: Sequence[str] | None = None,
 ) -> None:
-    """Write every scene of `source`, or those named, as `change` gives it.
+    """Write the scenes of `source`, by default all, after applying `change` to the tables of each.
 
-    Scenes and labels without frames are left out. The caller has checked the source (`check_source`).
+    Scenes and labels without frames are left out. The caller must have checked the source (`check_source`).
     """
     info = info.model_copy(update={"images": state_of([source], images)})
     scene_ids = source.scene_ids() if scene_ids is None else scene_ids
@@ -54,10 +54,10 @@ def rewrite(
 
 
 def check_source(source: Dataset, out: Path, progress: Progress | None = None) -> None:
-    """Raises UserError on a dataset whose rows are not to be handed on into `out`.
+    """Raise UserError if a dataset must not be rewritten into `out`.
 
-    That is one that is still being rendered, whose files are not those of its SHA256SUMS (new sums would hide it for
-    good), whose keys are broken, or in whose folder `out` lies.
+    That is if the dataset is not complete, if its files do not match SHA256SUMS (new sums would hide the damage), if
+    its keys are broken, or if `out` is inside its folder.
     """
     if not source.info.complete:
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
@@ -69,7 +69,7 @@ def check_source(source: Dataset, out: Path, progress: Progress | None = None) -
 
 
 def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
-    """Where the frames of what is written will be. Raises UserError where only some of the sources have theirs."""
+    """Return where the result's frames will be. Raises UserError if only some of the sources have frames."""
     states = {source.info.images for source in sources}
     if states == {"planned"} or images == "plan":
         return "planned"
@@ -84,5 +84,5 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
 
 
 def bare(tables: SceneTables) -> SceneTables:
-    """A scene without the rows that follow from its seed and poses."""
+    """Return a scene without the rows that its seed and poses reproduce."""
     return tables | {name: tables[name].slice(0, 0) for name in _FOLLOWING}

@@ -1,4 +1,4 @@
-"""A dataset with another split into train, val and test."""
+"""Re-split a dataset into train, val and test."""
 
 from pathlib import Path
 from typing import Literal
@@ -28,11 +28,12 @@ def split_dataset(
 ) -> None:
     """Write a dataset whose whole scenes, trajectories or single frames are assigned to train, val and test at random.
 
-    Units go by content, not by name (`perilune_shared.editing.flights`). Scenes with the same ground stay together,
-    whatever their names and Suns, as do all over one elevation model. Trajectories of one flight stay together, also
-    where the flight was rendered and developed again, and so do frames of one pose. `frame` with shares of 0.1 is the
-    paper's protocol: the same ground in all three splits, which flatters the test; `split_by` in dataset.json says so.
-    At least one unit goes to each split with a share above 0. Raises UserError where there are too few.
+    Units are identified by content, not by name (`perilune_shared.editing.flights`). Scenes with the same terrain stay
+    together, whatever their names and Suns, as do all scenes on one elevation model. Trajectories of one flight stay
+    together, also if the flight was rendered or developed again, and so do frames of one pose. `frame` with shares of
+    0.1 is the paper's protocol: all three splits contain the same terrain, so test metrics are optimistic; `split_by`
+    in dataset.json records it. Each split with a share above 0 gets at least one unit. Raises UserError if there are
+    too few units.
     """
     if not (0 <= val_share < 1 and 0 <= test_share < 1 and val_share + test_share < 1):
         raise UserError("--val and --test", "shares", f"{val_share}, {test_share}", "from 0 to less than 1 in all")

@@ -1,4 +1,4 @@
-"""Part of a dataset: by conditions on columns, by a number of frames, by size."""
+"""Take part of a dataset: by conditions on columns, by number of frames, or by size."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,13 +25,12 @@ def subset(
     images: ImageMode = "copy",
     progress: Progress | None = None,
 ) -> None:
-    """Write the frames and labels of a dataset for which all conditions hold, at most so many, at most so large.
+    """Write the frames and labels that fulfil all conditions, up to a number of frames or a size of the PNGs.
 
-    A condition on columns of frames, trajectories and scenes chooses frames; one that names labels or craters chooses
-    labels, and frames stay. Scenes keep all their craters and boulders, since their content is what names them. A
-    number of frames or a size (of the PNGs, 10^6 bytes each megabyte) is filled with whole descents, taken in turn from
-    each scene so that the ground stays varied; the last is cut short at its end. Raises UserError where nothing is
-    left.
+    A condition on columns of frames, trajectories and scenes selects frames. One that uses labels or craters selects
+    labels and keeps all frames. Scenes keep all their craters and boulders, since these identify the terrain. Up to
+    `n_frames` or `megabytes` (10^6 bytes), whole trajectories are taken in turn from each scene, to keep the terrain
+    varied; the last trajectory is truncated. Raises UserError if nothing is left.
     """
     conditions = [Condition(text) for text in where]
     on_frames = [condition for condition in conditions if not condition.on_labels]
@@ -62,7 +61,7 @@ def subset(
 
 
 def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
-    """Scenes in which a frame may be chosen; of the others, only row groups' statistics or one column are read."""
+    """Return scenes in which a frame may be selected; for the others only statistics or few columns are read."""
     scene_ids = set(source.scene_ids())
     for condition in on_frames:
         if condition.columns_of_only("frames") is not None:
@@ -73,7 +72,7 @@ def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
 def _first_frames(
     source: Dataset, on_frames: Sequence[Condition], n_frames: int | None, megabytes: float | None
 ) -> pa.Array:
-    """frame_id of whole descents, in turn from each scene, up to a number or size."""
+    """Return frame_ids of whole trajectories, in turn from each scene, up to a number or size."""
     if (n_frames is not None and n_frames < 1) or (megabytes is not None and not megabytes > 0):
         raise UserError("--frames or --mb", "size", n_frames if n_frames is not None else megabytes, "above 0")
     pieces = []
@@ -96,7 +95,7 @@ def _first_frames(
 
 
 def _holds(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
-    """Where all conditions hold, for rows of a scene's frames or labels (N,)."""
+    """Return where all conditions hold (N,), for rows of a scene's frames or labels."""
     mask = np.ones(len(rows), bool)
     if not conditions or not len(rows):
         return mask
@@ -108,7 +107,7 @@ def _holds(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table)
 
 
 def _column(tables: SceneTables, rows: pa.Table, table: str, name: str) -> pa.ChunkedArray:
-    """A column of a table of one scene, joined to rows of frames or labels."""
+    """Return a column of a table of one scene, joined to rows of frames or labels."""
     values = tables[table][name]
     if table == "scenes":
         return values.take(np.zeros(len(rows), np.int64))

@@ -35,7 +35,10 @@ class NominalDescent:
         azimuth_deg: float,
         duration_s: float,
     ) -> "NominalDescent":
-        """Create a descent from `downrange_m` at `azimuth_deg` (clockwise from north) to a point above the site."""
+        """Create a descent to a point above the site.
+
+        It starts `downrange_m` from the site, in the direction `azimuth_deg` (clockwise from north) seen from the site.
+        """
         azimuth = np.radians(azimuth_deg)
         x, y = -np.sin(azimuth) * downrange_m, -np.cos(azimuth) * downrange_m
         sink = (end_altitude_m - start_altitude_m) / duration_s

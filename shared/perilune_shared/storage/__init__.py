@@ -1,1 +1,1 @@
-"""Files: written whole or not at all, locked, hashed, and read with bounds."""
+"""Files: atomic writing, locks, hashes, and reading with limits."""

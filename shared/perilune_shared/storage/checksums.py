@@ -1,6 +1,6 @@
-"""SHA256SUMS: the hash of every file of a dataset but its frames, whose hashes stand in the manifest.
+"""SHA256SUMS: the hashes of all files of a dataset except frames, whose hashes are in the manifest.
 
-The file has the form of `sha256sum`, so that `sha256sum -c SHA256SUMS` checks it too.
+The file has the format of `sha256sum`; check it with `sha256sum -c SHA256SUMS`.
 """
 
 import contextlib
@@ -21,9 +21,9 @@ _OWN_FOLDERS = ("manifest", "images")
 
 
 def seal(root: Path, progress: Progress | None = None, known: Mapping[str, str] | None = None) -> None:
-    """Write SHA256SUMS of all files of the dataset except links and odd names, which are faults.
+    """Write SHA256SUMS for all files of the dataset, except links and invalid names, which are faults.
 
-    `known` has the hashes of files that were computed in this run and have not changed since: these are not read.
+    `known` contains hashes computed earlier in this run; these files are not read again.
     """
     names = [name for name in _covered(root) if files.is_plain(name) and not (root / name).is_symlink()]
     hashes = dict(known or {})
@@ -35,13 +35,13 @@ def seal(root: Path, progress: Progress | None = None, known: Mapping[str, str] 
 
 
 def sums_of(root: Path) -> dict[str, str]:
-    """SHA-256 of each file that SHA256SUMS lists, for a dataset without faults (`faults_of`)."""
+    """Read the SHA-256 of each file in SHA256SUMS; the dataset must have no faults (`faults_of`)."""
     lines = [_LINE.fullmatch(line) for line in (root / SUMS_NAME).read_text(encoding="utf-8").splitlines()]
     return {line[2]: line[1] for line in lines if line is not None}
 
 
 def faults_of(root: Path, progress: Progress | None = None) -> Iterator[tuple[str, str, str]]:
-    """File, what was found and what was wanted, for all that differs from SHA256SUMS."""
+    """Yield file, value found and value expected for each difference from SHA256SUMS."""
     path = root / SUMS_NAME
     if not path.is_file() or path.is_symlink():
         yield SUMS_NAME, "no such file", "the hashes of the dataset's files"
@@ -77,7 +77,7 @@ def faults_of(root: Path, progress: Progress | None = None) -> Iterator[tuple[st
 
 @contextlib.contextmanager
 def _hashing(root: Path, names: list[str], progress: Progress | None) -> Iterator[Callable[[int], object]]:
-    """A function to call with the number of bytes read, which advances the progress bar."""
+    """Give a function that advances the progress bar by a number of bytes read."""
     if progress is None:
         yield lambda n_bytes: None
         return
@@ -88,7 +88,7 @@ def _hashing(root: Path, names: list[str], progress: Progress | None) -> Iterato
 
 
 def _covered(root: Path) -> list[str]:
-    """Files of the dataset's own folder, manifest/ and images/, sorted; hidden ones are work in progress."""
+    """List the files directly in the dataset's folder and below manifest/ and images/, sorted, without hidden files."""
     found = [path for path in root.iterdir() if path.is_file() and path.name != SUMS_NAME]
     for folder in _OWN_FOLDERS:
         found += [path for path in root.joinpath(folder).rglob("*") if path.is_file() or path.is_symlink()]

@@ -1,4 +1,4 @@
-"""Files and folders written to a temporary name and renamed, and relative paths that cannot leave their folder."""
+"""Write files and folders atomically (temporary name, then rename), and check relative paths."""
 
 import contextlib
 import errno
@@ -19,12 +19,12 @@ _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _LONGEST_PATH = 500
 _CHUNK_BYTES = 2**20
 _FICLONE = 0x40049409
-"""Of linux/fs.h, on all processors but PowerPC, MIPS and SPARC, where it fails and files are copied."""
+"""Value from linux/fs.h; PowerPC, MIPS and SPARC have another, so there the call fails and files are copied."""
 
 
 def temporary_name(path: Path) -> Path:
-    """A name beside `path` that no other process uses, with the suffix of `path`."""
-    # PIDs repeat: in a container they begin with 1.
+    """Return a unique temporary path in the folder of `path`, with the suffix of `path`."""
+    # Random, not the PID: PIDs are not unique across containers.
     return path.with_name(f".{path.stem}.{secrets.token_hex(8)}.part{path.suffix}")
 
 
@@ -32,8 +32,8 @@ def temporary_name(path: Path) -> Path:
 def written_aside(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """Give a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
 
-    The temporary name keeps the suffix of `path`, since image writers choose their format by it. A durable file is on
-    the disk before it has its name, so that a power cut leaves no empty one. Callers that write
+    The temporary name keeps the suffix of `path`, since image writers choose their format by it. With `durable` the
+    file is synchronised to disk before the rename, so that a power failure leaves no empty file. Callers that write
     many files synchronise them together at the end (`sync_all`).
     """
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,39 +50,39 @@ def written_aside(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's content, or the names in a folder, are on the disk."""
-    if os.name == "nt":  # folders cannot be opened there, nor files for reading alone be synchronised
+    """Synchronise a file's content, or a folder's entries, to disk."""
+    if os.name == "nt":  # Windows cannot open folders, nor synchronise files opened read-only
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # a file system without it
+        if error.errno != errno.EINVAL:  # EINVAL: the file system does not support it
             raise
     finally:
         os.close(descriptor)
 
 
 def sync_all(paths: Iterable[Path]) -> None:
-    """Wait until files and the names in their folders are on the disk."""
+    """Synchronise files and the entries of their folders to disk."""
     paths = list(paths)
     for path in [*paths, *sorted({path.parent for path in paths})]:
         sync(path)
 
 
 def write_bytes(path: Path, content: bytes, *, durable: bool = True) -> None:
-    """Write a whole file, or nothing."""
+    """Write a file atomically."""
     with written_aside(path, durable=durable) as aside:
         aside.write_bytes(content)
 
 
 def write_text(path: Path, content: str, *, durable: bool = True) -> None:
-    """Write a whole UTF-8 file, or nothing."""
+    """Write a UTF-8 text file atomically."""
     write_bytes(path, content.encode(), durable=durable)
 
 
 def sha256_of(path: Path, advance: Callable[[int], object] = lambda n_bytes: None) -> str:
-    """SHA-256 of a file's content, in hexadecimal; `advance` is called with the bytes read since its last call."""
+    """Return the SHA-256 of a file (hexadecimal); calls `advance` with the number of bytes read since the last call."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while chunk := stream.read(_CHUNK_BYTES):
@@ -92,23 +92,24 @@ def sha256_of(path: Path, advance: Callable[[int], object] = lambda n_bytes: Non
 
 
 def is_plain(relative: object) -> bool:
-    """Whether it is a relative POSIX path of plain names, without regard to links."""
+    """Whether `relative` is a relative POSIX path of plain names; does not check links."""
     short = isinstance(relative, str) and len(relative) <= _LONGEST_PATH
     parts = PurePosixPath(str(relative)).parts if short else ()
     return bool(parts) and all(_PLAIN_NAME.fullmatch(part) for part in parts)
 
 
 def inside(root: Path, relative: str) -> Path:
-    """The file that a manifest's relative POSIX path names below `root`.
+    """Return the path of `relative`, a POSIX path from a manifest, below `root`.
 
-    Raises UserError where the path is absolute, climbs, has an odd name, is too long or leaves `root` through a link.
+    Raises UserError if the path is absolute, contains "..", has an invalid name, is too long or leaves `root` by a
+    link.
     """
     if not is_plain(relative):
         raise UserError(root, "path", repr(relative), "a relative POSIX path of plain names inside the dataset")
     path = root.joinpath(*PurePosixPath(relative).parts)
     try:
         own = path.resolve().is_relative_to(root.resolve())
-    except (OSError, RuntimeError):  # links that lead to themselves
+    except (OSError, RuntimeError):  # cyclic links
         own = False
     if not own:
         raise UserError(root, "path", repr(relative), "a path that no link leads out of the dataset")
@@ -116,7 +117,7 @@ def inside(root: Path, relative: str) -> Path:
 
 
 def check_plain_file(path: Path) -> int:
-    """The size of a file, bytes. Raises UserError where it is none: opening a pipe or a device may never end."""
+    """Return the size of a file, bytes. Raises UserError on other types: opening a pipe or device may block."""
     try:
         state = path.lstat()
     except (OSError, ValueError):
@@ -129,13 +130,13 @@ def check_plain_file(path: Path) -> int:
 
 @contextlib.contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """A hidden folder beside `out`, renamed to `out` on success and removed on any failure.
+    """Give a hidden folder beside `out`; rename it to `out` on success, remove it on any failure.
 
-    Its files are on the disk before it is renamed. Folders left by killed writers of the same `out` are removed. Raises
-    UserError where `out` is not empty or another process is writing it.
+    Files are synchronised to disk before the rename. Folders left by killed writers of the same `out` are removed.
+    Raises UserError if `out` is not empty or another process is writing it.
     """
     check_free(out)
-    out = out.absolute()  # "." has no name to put another beside
+    out = out.absolute()  # "." has no name from which to form a temporary name
     out.parent.mkdir(parents=True, exist_ok=True)
     with lock(out.with_name(f".{out.name}.lock"), out):
         left = re.compile(rf"\.{re.escape(out.name)}\.[0-9a-f]+\.part")
@@ -157,23 +158,22 @@ def new_folder(out: Path) -> Iterator[Path]:
 
 
 def check_free(out: Path) -> None:
-    """Raises UserError where a folder for a new dataset is not empty."""
+    """Raise UserError if the folder for a new dataset is not empty."""
     if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
         raise UserError(out, "--out", "something that is there", "a new or empty folder")
 
 
 def bring(path: Path, to: Path, *, link: bool) -> None:
-    """Make a frame's file present at `to` too: copied, or with `link` linked where the disk allows it.
+    """Copy a frame's file to `to`; with `link`, make a hard link where the file system allows it.
 
-    A copy shares its blocks with the original until one is changed, where the file system can (reflink). Raises
-    UserError where it is missing.
+    Copies are reflinks (copy-on-write) where the file system supports them. Raises UserError if the file is missing.
     """
     if not path.is_file():
         raise UserError(path, "frame", "no such file", "the file that the manifest names")
     to.parent.mkdir(parents=True, exist_ok=True)
     if link:
         with contextlib.suppress(OSError):
-            # A link to a link would lead to what need not be here.
+            # Link to the target: the target of a symbolic link may not exist in the new place.
             os.link(path.resolve(), to)
             return
     if not _cloned(path, to):
@@ -181,7 +181,7 @@ def bring(path: Path, to: Path, *, link: bool) -> None:
 
 
 def _cloned(path: Path, to: Path) -> bool:
-    """Whether `to` is now a reflink of a file: Btrfs, XFS and others on Linux have them."""
+    """Try to make `to` a reflink of `path` (Btrfs, XFS and others on Linux); return whether it succeeded."""
     if not sys.platform.startswith("linux"):
         return False
     import fcntl

@@ -1,8 +1,8 @@
-"""One writer at a time on an output folder.
+"""Lock an output folder, so that only one process writes to it.
 
-The operating system holds the lock and releases it when the process ends, however it ends. A record beside the lock
-says who holds it. The record alone decides where two machines write to one network drive that does not pass locks on:
-its holder renews it, and it expires when it has not been renewed for ten minutes.
+The operating system holds the lock and releases it when the process ends for any reason. A record beside the lock file
+states the holder. On network drives that do not propagate locks between machines, only the record protects the folder:
+the holder renews it, and it expires ten minutes after the last renewal.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from perilune_shared.errors import UserError
 
 LOCK_NAME = ".perilune.lock"
-"""The lock in a folder that is written in place."""
+"""Lock file in a folder that is written in place."""
 _RENEWED_S = 30.0
 _EXPIRED_S = 600.0
 _LARGEST_RECORD_BYTES = 10_000
@@ -31,10 +31,10 @@ TEMPORARY_FILE = re.compile(r"\..+\.[0-9a-f]+\.part(\.[A-Za-z0-9]+)?")
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder that is written in place; remove temporary files that killed writers left in it.
+    """Hold the lock of a folder that is written in place; remove temporary files left by killed writers.
 
-    The folder and its parents are created where they do not exist, and removed again where they stay empty. Raises
-    UserError where another process holds the lock.
+    Creates the folder and its parents if they do not exist, and removes them again if they stay empty. Raises UserError
+    if another process holds the lock.
     """
     created = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
@@ -52,7 +52,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def lock(path: Path, folder: Path) -> Iterator[None]:
-    """Hold the lock file `path`, which protects `folder`. Raises UserError where another process holds it."""
+    """Hold the lock file `path`, which protects `folder`. Raises UserError if another process holds it."""
     held, record, elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
     try:
         try:
@@ -68,7 +68,7 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
             yield
     finally:
         if held.is_locked:
-            # Before the release: afterwards the file may be another process's lock.
+            # Remove the file before the release: afterwards it may be another process's lock.
             if not elsewhere:
                 with contextlib.suppress(OSError):
                     path.unlink(missing_ok=True)
@@ -76,9 +76,9 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
 
 
 def _left_s(record: Path) -> float:
-    """Seconds for which a process on another machine may still be writing; 0 for none.
+    """Return the seconds until the record of a process on another machine expires; 0 if there is none.
 
-    On this machine the lock is free only where the process that wrote the record has ended.
+    A record from this machine does not count: since the lock was free, that process has ended.
     """
     holder = _read(record)
     if holder is None or holder.get("boot_id") == _boot_id():
@@ -88,7 +88,7 @@ def _left_s(record: Path) -> float:
 
 @contextlib.contextmanager
 def _recorded(record: Path) -> Iterator[None]:
-    """Keep the record of this process as the holder, and renew it."""
+    """Write the record of this process as the holder and keep renewing it within the block."""
     since = datetime.now(UTC).isoformat(timespec="seconds")
     holder = {"pid": os.getpid(), "host": platform.node(), "since": since, "boot_id": _boot_id()}
     ended = threading.Event()
@@ -108,7 +108,7 @@ def _recorded(record: Path) -> Iterator[None]:
 
 
 def _read(record: Path) -> dict[str, Any] | None:
-    """The record of a holder, or None where there is none."""
+    """Read the record of a holder; None if there is none."""
     try:
         if not record.is_file() or record.stat().st_size > _LARGEST_RECORD_BYTES:
             return None
@@ -126,7 +126,7 @@ def _refusal(folder: Path, holder: dict[str, Any] | None, wanted: str) -> UserEr
 
 
 def _boot_id() -> str:
-    """Names the running kernel: the same in all containers of a machine, another one after every boot."""
+    """Return an id of the running kernel: equal in all containers of a machine, different after each boot."""
     with contextlib.suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return platform.node()

@@ -1,7 +1,7 @@
-"""What the pages of a Parquet column unpack to, by the headers that a reader goes by.
+"""Compute the decompressed size of a Parquet column from its page headers.
 
-A footer may say anything of its columns; the reader unpacks what the pages' own headers say. Both are Thrift's compact
-protocol, as parquet.thrift describes it.
+The sizes in the footer are untrusted: a Parquet reader allocates what the page headers state. Headers are in Thrift's
+compact protocol, with the fields of parquet.thrift.
 """
 
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ _TYPE, _UNPACKED, _PACKED, _DATA, _DATA_V2 = 1, 2, 3, 5, 8
 
 @dataclass(frozen=True, slots=True)
 class Pages:
-    """All pages of one column in one row group."""
+    """Totals over the pages of one column in one row group."""
 
     unpacked_bytes: int
-    """Room that they take once unpacked, at most."""
+    """Maximum size after decompression, bytes."""
     n_values: int
-    """Values in them."""
+    """Number of values."""
     has_dictionary: bool
-    """Whether one is a dictionary."""
+    """Whether one of the pages is a dictionary."""
 
 
 def pages_of(stream: BinaryIO, column: Any) -> Pages:
-    """Walk the pages of a column of an opened file, given its metadata as pyarrow has it.
+    """Read all page headers of a column from an open file; `column` is pyarrow's column metadata.
 
-    Raises ValueError where they are damaged.
+    Raises ValueError if a header is damaged.
     """
     start = column.data_page_offset
     if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
@@ -53,7 +53,7 @@ def pages_of(stream: BinaryIO, column: Any) -> Pages:
 
 
 def _header(stream: BinaryIO, start: int) -> tuple[dict, int]:
-    """A page's header and its length, bytes."""
+    """Read a page header; return it and its length, bytes."""
     stream.seek(start)
     buffer = stream.read(_HEADER_BYTES)
     try:
@@ -74,7 +74,7 @@ def _varint(buffer: bytes, at: int) -> tuple[int, int]:
 
 
 def _struct(buffer: bytes, at: int, depth: int) -> tuple[dict, int]:
-    """Integers and structs of a struct by their numbers, and where it ends. Raises IndexError at its buffer's end."""
+    """Parse integers and structs of a struct, by field id; return them and the end. IndexError past the buffer."""
     if depth > _DEEPEST:
         raise IndexError
     fields: dict[int, Any] = {}
@@ -97,6 +97,6 @@ def _struct(buffer: bytes, at: int, depth: int) -> tuple[dict, int]:
             fields[number], at = _struct(buffer, at, depth + 1)
         elif kind in (_BYTE, _DOUBLE):
             at += 1 if kind == _BYTE else 8
-        elif kind not in _BOOLS:  # no list stands in a page's header
+        elif kind not in _BOOLS:  # page headers contain no lists
             raise IndexError
     return fields, at + 1

@@ -1,4 +1,4 @@
-"""What a PNG says of itself before anything is unpacked."""
+"""Read the header of a PNG without decompressing the image."""
 
 import struct
 from dataclasses import dataclass
@@ -8,20 +8,20 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 @dataclass(frozen=True, slots=True)
 class PngHeader:
-    """The header chunk of a PNG file."""
+    """Size and bit depth from the header chunk of a PNG file."""
 
     width_px: int
     """Image width, pixels."""
     height_px: int
     """Image height, pixels."""
     bits: int
-    """Bits of a grey value in the file, 8 or 16."""
+    """Bits per grey value, 8 or 16."""
 
 
 def png_header(content: bytes) -> PngHeader:
-    """The header of a grey PNG of 8 or 16 bits. Raises ValueError on anything else.
+    """Read the header of a grey PNG of 8 or 16 bits. Raises ValueError on any other file.
 
-    A small file may unpack to any size: look here before a decoder sees it.
+    A small file may decompress to any size: check the header before decoding.
     """
     if len(content) < 33 or content[:8] != _SIGNATURE or content[12:16] != b"IHDR":
         raise ValueError("not a PNG file")

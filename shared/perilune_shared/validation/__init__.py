@@ -1,1 +1,1 @@
-"""Every fault of a dataset, with its file and row."""
+"""Validate datasets: find every fault, with file and row."""

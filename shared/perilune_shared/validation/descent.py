@@ -1,4 +1,4 @@
-"""Checks of one descent: its frames against scene and camera, its labels against craters and poses."""
+"""Check one trajectory: its frames against scene and camera, its labels against craters and poses."""
 
 from collections.abc import Iterator
 
@@ -27,7 +27,7 @@ def descent_faults(
     labels: pa.Table,
     where: dict[str, str],
 ) -> Iterator[Fault]:
-    """Faults of a descent: its scene's row and craters, its own row, its frames and labels, and these tables' files."""
+    """Yield the faults of a trajectory (row `descent`), given its scene and tables; `where` maps tables to files."""
     yield from _frames(info, scene, descent, frames, where["frames"])
     if len(labels):
         yield from _labels(info, craters, frames, labels, where)
@@ -80,7 +80,7 @@ def _frames(info: DatasetInfo, scene: dict, descent: dict, frames: pa.Table, whe
 def _labels(
     info: DatasetInfo, craters: pa.Table, frames: pa.Table, labels: pa.Table, places: dict[str, str]
 ) -> Iterator[Fault]:
-    """Frames and craters that labels name, and their ellipses, projected again from crater and pose."""
+    """Check the references of labels, and their ellipses against ellipses projected from crater and pose."""
     where = places["labels"]
     frame_of = _places(labels["frame_id"], frames["frame_id"])
     crater_of = _places(labels["crater_id"], craters["crater_id"])
@@ -99,7 +99,7 @@ def _labels(
         apart = np.abs(labels[name].to_numpy()[known] - values)
         tolerance = _LABEL_TOLERANCE_PX * size
         if name == "ellipse_theta_rad":
-            # A circle has no direction; half a turn is none.
+            # The direction has period pi and is undefined for a circle.
             apart = np.minimum(apart, np.pi - apart) * np.minimum(1, size - 1 - again["ellipse_b_px"])
         wrong = np.flatnonzero(~(apart < tolerance))
         misfit[wrong] = True
@@ -107,7 +107,7 @@ def _labels(
             row = int(known[wrong[0]])
             wanted = f"{values[wrong[0]]}, projected from crater and pose"
             yield Fault.of(where, row, name, labels[name][row].as_py(), wanted)
-    # One wrong label is the label's fault; where none fits, it is the pose's.
+    # If single labels of a frame are wrong, report the labels; if all are wrong, report the pose.
     labelled = np.bincount(frame_of[known], minlength=len(frames))
     lost = np.bincount(frame_of[known[misfit]], minlength=len(frames))
     odd = np.flatnonzero((labelled > 1) & (lost == labelled))
@@ -119,7 +119,7 @@ def _labels(
 def _projected(
     info: DatasetInfo, craters: pa.Table, frames: pa.Table, crater_of: np.ndarray, frame_of: np.ndarray
 ) -> dict[str, Array]:
-    """Geometric columns of labels, for places in the tables of craters and frames (M,)."""
+    """Compute the geometric columns of labels, for row numbers (M,) in the tables craters and frames."""
     rotation = matrix_from_quaternion(_vectors(frames["rotation_wxyz"]))[frame_of]
     centre = np.stack([craters[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
     normal = np.stack([craters[f"normal_{axis}"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
@@ -129,7 +129,7 @@ def _projected(
     radius = craters["diameter_m"].to_numpy()[crater_of] / 2
     sound = (np.abs(in_camera) < _FARTHEST_M).all(axis=1) & (np.abs(turned) <= 2).all(axis=1)
     sound &= (radius > 0) & (radius < _FARTHEST_M)
-    # A circle behind the camera has no image: then the label fits nothing.
+    # Replace invalid input by a circle behind the camera: its projection is NaN, so the label does not match.
     in_camera[~sound], turned[~sound], radius[~sound] = (0, 0, -10), (0, 0, 1), 1
     with np.errstate(all="ignore"):
         try:
@@ -143,12 +143,12 @@ def _projected(
 
 
 def _places(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
-    """Place of each value in a column (M,), -1 where it is not there."""
+    """Return the row number of each value in the column `within` (M,); -1 if it is missing."""
     found = pc.index_in(values, within.combine_chunks())
     return pc.fill_null(found, -1).to_numpy().astype(np.int64)
 
 
 def _vectors(column: pa.ChunkedArray) -> Array:
-    """A column of fixed-size lists as (N, k)."""
+    """Return a column of fixed-size lists as an array (N, k)."""
     flat = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
     return flat.reshape(len(column), -1)

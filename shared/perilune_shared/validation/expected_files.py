@@ -1,7 +1,7 @@
-"""Which paths a dataset's folder may hold.
+"""Find files that do not belong in a dataset's folder.
 
-Other tools read files that this package does not: every file below manifest/ of any name, every Parquet file or
-picture in the folder. So whatever is not expected is a fault, listed in SHA256SUMS or not.
+Other tools may read files that this package ignores: any file below manifest/, any Parquet file or image in the folder.
+So every unexpected file is a fault, even if it is listed in SHA256SUMS.
 """
 
 import os
@@ -26,16 +26,16 @@ EXTRA_NAMES = frozenset(
         "CITATION.cff",
     }
 )
-"""Files in the dataset's folder itself that tools or people may add; with dataset.json they are in SHA256SUMS."""
+"""Files that tools or users may add directly in the dataset's folder; like dataset.json they are in SHA256SUMS."""
 _LOCKS = (LOCK_NAME, f"{LOCK_NAME}.json")
 _MOST = 1000
 
 
 def unexpected(dataset: Dataset) -> Iterator[str]:
-    """Paths relative to the dataset of files and folders that do not belong to it, at most 1000 of them.
+    """Yield relative paths of files and folders that do not belong to the dataset, at most 1000.
 
-    A folder with files comes alone, without what lies in it; an empty one is no fault. The lock of a writer is no part
-    of the dataset; while a dataset is not complete, neither are the writer's temporary files.
+    An unexpected folder is reported without its content; an empty one is no fault. The lock of a writer is accepted,
+    and so are temporary files of the writer while the dataset is not complete.
     """
     own_folders = {"manifest", *(f"manifest/{table}" for table in TABLES)}
     own_files = {INFO_NAME, SUMS_NAME, *EXTRA_NAMES, *_LOCKS}
@@ -46,7 +46,7 @@ def unexpected(dataset: Dataset) -> Iterator[str]:
     if dataset.info.images == "files":
         frames = dataset.table("frames", ["png_path", "exr_path"])
         for kind in ("png", "exr"):
-            # A row must not make a table of any other file.
+            # A row of `frames` must not legitimise files of other types.
             paths = [path for path in frames[f"{kind}_path"].to_pylist() if path and path.endswith(f".{kind}")]
             own_files |= {path for path in paths if path.split("/")[0] not in ("manifest", "images")}
         own_folders |= {str(parent) for path in own_files for parent in Path(path).parents if str(parent) != "."}
@@ -69,7 +69,7 @@ def unexpected(dataset: Dataset) -> Iterator[str]:
 
 
 def _holds_files(folder: Path) -> bool:
-    """Whether a folder is a link or has a file at any depth."""
+    """Whether a folder is a link, or contains a file or link at any depth."""
     return folder.is_symlink() or any(
         names or any(Path(root, name).is_symlink() for name in folders) for root, folders, names in os.walk(folder)
     )

@@ -1,4 +1,4 @@
-"""Faults of a dataset, and the checks that need no more than one part: names, schema, values."""
+"""The class Fault, and the checks of a single part: name, schema, values."""
 
 import re
 from collections.abc import Iterator
@@ -59,27 +59,27 @@ _RANGES = {
 }
 _UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
 _MOST = 1e12
-"""No length, time or size of a descent comes near."""
+"""Largest plausible value of any length, time or size, far above that of any trajectory."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing wrong in a dataset."""
+    """One fault of a dataset."""
 
     file: str
-    """Relative to the dataset."""
+    """File, relative to the dataset."""
     row: int | None
-    """Row within the file or table, from 0; None where the fault is the whole file's."""
+    """Row in the file or table, from 0; None if the fault concerns the whole file."""
     column: str
-    """Column or property."""
+    """Column or property that is wrong."""
     found: str
-    """The value."""
+    """Value found."""
     wanted: str
-    """What would be right."""
+    """Value expected."""
 
     @classmethod
     def of(cls, file: object, row: int | None, column: object, found: object, wanted: object) -> "Fault":
-        """A fault from values of any origin, made short and plain."""
+        """Create a fault from untrusted values: shortened, on one line, without control characters."""
         return cls(
             shortened(one_line(file), 300),
             row,
@@ -90,12 +90,12 @@ class Fault:
 
     @classmethod
     def told(cls, file: object, row: int | None, error: UserError) -> "Fault":
-        """A fault that reading gave as an error."""
+        """Create a fault from an error raised while reading."""
         return cls.of(file, row, error.field, error.found, error.wanted)
 
 
 def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
-    """Whatever one part shows to be wrong by itself."""
+    """Yield the faults that can be found in one part alone."""
     where = path.relative_to(dataset.root).as_posix()
     if path.is_symlink() or not path.resolve().is_relative_to(dataset.root.resolve()):
         yield Fault.of(where, None, "part", "a link", "a file of the dataset's own")
@@ -108,7 +108,7 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
         names, known = part.found.names, TABLES[table].names
         missing = set(known) - set(names) - set(OPTIONAL.get(table, ()))
         odd = sorted({name for name in names if name not in known and not matches(_COLUMN, name)} | missing)
-        # Others are ignored: a later version may have added them.
+        # Unknown columns are ignored: a later version may have added them.
         present = [name for name in names if name in known]
         if odd or present != [name for name in known if name in names]:
             yield Fault.of(where, None, "schema", odd or "another order", f"the columns of {table}")
@@ -128,7 +128,7 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
 
 
 def _of_the_name(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
-    """A reader looks for a scene's rows by the parts' names, so that these must hold no others."""
+    """Yield a fault if a part has rows that its name excludes: readers select parts by name."""
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem):
         return
@@ -145,7 +145,7 @@ def _of_the_name(where: str, first_row: int, stem: str, rows: pa.Table) -> Itera
 
 
 def _of_values(where: str, first_row: int, field: pa.Field, column: pa.Array) -> Iterator[Fault]:
-    """Nulls, finiteness, ranges, lengths and patterns of one column."""
+    """Check one column for nulls, non-finite values, ranges, lengths and patterns."""
     present = ~np.asarray(column.is_null(), bool)
     if not field.nullable and not present.all():
         yield Fault.of(where, first_row + int(np.argmin(present)), field.name, "null", "a value")
@@ -179,5 +179,5 @@ def _of_values(where: str, first_row: int, field: pa.Field, column: pa.Array) ->
 
 
 def matches(pattern: str, text: object) -> bool:
-    """Whether a text is wholly of a pattern."""
+    """Whether the whole text matches a pattern."""
     return isinstance(text, str) and re.fullmatch(pattern.removeprefix("^").removesuffix("$"), text) is not None

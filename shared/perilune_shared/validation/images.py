@@ -1,4 +1,4 @@
-"""Checks of a dataset's frames: files or packed bytes against the manifest."""
+"""Check a dataset's frames, as files or packed, against the manifest."""
 
 import contextlib
 import hashlib
@@ -18,7 +18,7 @@ from perilune_shared.validation.faults import Fault
 
 
 def image_faults(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
-    """Faults in presence, size, header and hash of every frame's files, or of its packed bytes."""
+    """Yield missing frames and faults in size, header and hash of every frame's files or packed bytes."""
     info = dataset.info
     if info.images in ("absent", "planned"):
         return
@@ -50,7 +50,7 @@ def image_faults(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]
 
 
 def _groups(dataset: Dataset, part: Path, columns: list[str]) -> Iterator[pa.Table]:
-    """The row groups of a part of `frames`, as far as it can be read; why not further, the part's own checks tell."""
+    """Yield the readable row groups of a part of `frames`; `part_faults` reports the unreadable ones."""
     with contextlib.suppress(UserError):
         opened = dataset.open_part(part, "frames")
         for group in range(opened.n_groups):
@@ -98,7 +98,7 @@ def _file(dataset: Dataset, frame: dict, kind: str, row: int, where: str) -> Ite
 
 
 def _png(dataset: Dataset, head: bytes, n_bytes: int, sha256: str, frame: dict, row: int) -> Iterator[Fault]:
-    """A PNG's size, hash and header, given its first bytes."""
+    """Check a PNG's size, hash and header, given its first bytes."""
     where, camera = frame["png_path"], dataset.info.camera
     if n_bytes != frame["png_bytes"]:
         yield Fault.of(where, row, "png_bytes", n_bytes, frame["png_bytes"])

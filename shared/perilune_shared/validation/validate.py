@@ -1,6 +1,6 @@
-"""Checks of a whole dataset: every fault with file, row, column, what was found and what was wanted.
+"""Check a whole dataset; each fault has file, row, column, value found and value expected.
 
-Tables are read a part and then a descent at a time, so that memory does not grow with the dataset.
+Tables are read by part, then by trajectory, so memory does not grow with the dataset.
 """
 
 from collections import defaultdict
@@ -29,11 +29,11 @@ _NOT_PLANNED = ("craters", "boulders", "labels")
 
 
 def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
-    """All faults of a dataset; an empty list means that it can be trusted.
+    """Return all faults of a dataset; an empty list means that all checks passed.
 
-    Faults of the same file and column are told once, at their first row. The labels' projections are all made again.
+    Faults of the same file and column are reported once, at their first row. All labels are projected again.
     """
-    # What makes numbers overflow is told as a fault; numpy's warnings would come between the lines.
+    # Values that overflow are reported as faults; NumPy's warnings would clutter the output.
     with np.errstate(all="ignore"), dataset.parts_kept_open():
         return _faults(dataset, progress)
 
@@ -68,7 +68,7 @@ def _faults(dataset: Dataset, progress: Progress | None) -> list[Fault]:
 
 
 def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
-    """What rows of several tables must agree in."""
+    """Check rows of several tables against each other."""
     counts = count_rows(dataset).model_dump()
     for name, present in counts.items():
         counted = getattr(dataset.info.counts, name)
@@ -122,7 +122,7 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
 def _scene(
     dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int], told: set[tuple[str, str]]
 ) -> Iterator[Fault]:
-    """One scene's row, craters and boulders, then each of its descents; counts what it has seen."""
+    """Check one scene's row, craters and boulders, then each of its trajectories; count the rows seen."""
     where = {name: _place(dataset, name, scene_id) for name in TABLES}
     craters = dataset.table("craters", scene_id=scene_id)
     boulders = dataset.table("boulders", scene_id=scene_id)
@@ -151,9 +151,9 @@ def _scene(
 
 
 def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, told: set[tuple[str, str]]) -> Iterator[Fault]:
-    """Faults with rows counted within a scene or a descent (`own` begins its frames' names) as rows of the file.
+    """Convert row numbers within a scene or trajectory (prefix `own` of its frame_ids) to row numbers of the file.
 
-    What was told of a file and column is not told again.
+    Skips faults of files and columns already in `told`.
     """
     for fault in faults:
         path = dataset.root / fault.file
@@ -170,7 +170,7 @@ def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, told: set[tupl
 
 
 def _crater_places(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault]:
-    """Latitude and longitude follow from x and y; normals are of length 1."""
+    """Check that latitude and longitude match x and y, and that normals have length 1."""
     normals = np.stack([craters[f"normal_{axis}"].to_numpy() for axis in "xyz"], axis=1)
     wrong = np.flatnonzero(np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-6)
     if len(wrong):
