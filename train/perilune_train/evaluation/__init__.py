@@ -1,1 +1,1 @@
-"""What evaluations of all networks share: terrain records, marks, intervals."""
+"""Terrain records, marks and intervals for the evaluations of all networks."""

@@ -1,4 +1,4 @@
-"""Visible marks on all output of an evaluation on terrain that the network was fitted to."""
+"""Visible marks on the output of an evaluation on terrain that the network was fitted to."""
 
 import textwrap
 from collections.abc import Iterable
@@ -55,7 +55,7 @@ def mark_picture(path: Path, mark: str) -> None:
 
 
 def marked_page(text: str, mark: str) -> str:
-    """A Markdown page with the mark under its first heading, and its first words in every other heading."""
+    """Add the mark below a Markdown page's first heading, and its first words to every other heading."""
     short = mark.split(":")[0].split(",")[0]
     lines: list[str] = []
     for line in text.split("\n"):

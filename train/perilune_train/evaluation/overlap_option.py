@@ -1,4 +1,4 @@
-"""The option that allows test terrain that a network was trained on."""
+"""The command line option that allows test terrain that a network was trained on."""
 
 from typing import Annotated
 

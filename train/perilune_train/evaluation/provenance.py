@@ -1,9 +1,9 @@
 """Which terrain a network was fitted to, and whether a test split shares it.
 
-Every checkpoint carries a record of the ground that the network was trained, selected or calibrated on, by content hash
-(`perilune_shared.content`), with that of the networks it starts or learns from. A test figure on such ground measures
-memory, not generalisation, so the trainer refuses it unless the dataset's own protocol shares terrain or the user
-allows it. With the user's permission all output is marked.
+Every checkpoint carries a record of the terrain that the network was trained, selected or calibrated on, by content
+hash (`perilune_shared.content`), and of the terrain of the networks it starts or learns from. A test result on such
+terrain measures memory, not generalisation. The trainer therefore refuses it, unless the dataset's own protocol shares
+terrain or the user allows it. If the user allows it, all output is marked.
 """
 
 import re
@@ -36,7 +36,7 @@ _PROTOCOLS = {
 
 @dataclass(frozen=True, slots=True, order=True)
 class TerrainUse:
-    """One scene's ground and what it was used for."""
+    """The terrain of one scene and how it was used."""
 
     dataset: str
     """Name of the dataset."""
@@ -45,14 +45,14 @@ class TerrainUse:
     use: str
     """trained, selected (validation: best epoch, threshold), calibrated (threshold, int8), or tested."""
     sha256: str
-    """Of the ground, see `terrain_of`."""
+    """Content hash of the terrain, see `terrain_of`."""
     group: str
-    """What datasets that share terrain by their protocol have in common; otherwise the dataset's name."""
+    """Name shared by datasets that share terrain by their protocol; otherwise the dataset's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """All ground that a network was fitted to."""
+    """All terrain that a network was fitted to."""
 
     uses: frozenset[TerrainUse] = frozenset()
     """Also the test scenes of its own dataset (`tested`), which later calibration must avoid."""
@@ -60,13 +60,13 @@ class Provenance:
     """False where a network that it starts or learns from has no record."""
 
     def joined(self, parents: Iterable["Provenance"]) -> "Provenance":
-        """With the record of the networks that it starts or learns from, without what those were tested on."""
+        """This record joined with those of the networks that it starts or learns from, without their test terrain."""
         parents = list(parents)
         inherited = {use for parent in parents for use in parent.uses if use.use != "tested"}
         return Provenance(self.uses | inherited, self.known and all(parent.known for parent in parents))
 
     def plain(self) -> dict[str, Any]:
-        """As lists and text, for a checkpoint or a JSON file."""
+        """The record as lists and text, for a checkpoint or a JSON file."""
         rows = [[use.dataset, use.scene_id, use.use, use.sha256, use.group] for use in sorted(self.uses)]
         return {"known": self.known, "uses": rows}
 
@@ -75,7 +75,7 @@ UNKNOWN = Provenance(known=False)
 
 
 def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
-    """The record in a checkpoint's content; `UNKNOWN` where it has none. Raises UserError on a malformed one."""
+    """Read the record in a checkpoint's content; `UNKNOWN` if it has none. Raises UserError on a malformed one."""
     if RECORD not in content:
         return UNKNOWN
     record, wanted = content[RECORD], "a record of scenes, as training writes it"
@@ -94,7 +94,7 @@ def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
 
 
 def split_terrain(dataset: Dataset, split: str, use: Use) -> frozenset[TerrainUse]:
-    """The ground under the frames of a split; empty where it has none. Raises UserError on an odd scene_id."""
+    """The terrain under the frames of a split; empty if it has none. Raises UserError on an invalid scene_id."""
     scene_ids = set(dataset.table("frames", ["scene_id"], split=split)["scene_id"].to_pylist())
     rows = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pylist()
     for row in rows:
@@ -114,13 +114,14 @@ def training_provenance(dataset: Dataset) -> Provenance:
 
 
 def _group(info: DatasetInfo) -> str:
-    """The two datasets of a configuration with `shared_terrain` are one landing area by protocol, as the paper's."""
+    """Name of a group of datasets: those of a configuration with `shared_terrain` are one landing area, as the
+    paper's."""
     names = {
         str(recipe.config.get("name")) if recipe.config.get("shared_terrain") is True else ""
         for recipe in info.recipes.values()
     }
     (name,) = names if len(names) == 1 else ("",)
-    # Recipes are untrusted input: a name that a record cannot hold is no name.
+    # Recipes are untrusted input: ignore a name that a record cannot hold.
     return f"landing area of {name}" if name and _PLAIN.fullmatch(f"landing area of {name}") else info.name
 
 
@@ -131,32 +132,32 @@ def protocol_of(info: DatasetInfo) -> str:
 
 @dataclass(frozen=True, slots=True)
 class TerrainCheck:
-    """Result of comparing the ground of a test split with a network's record."""
+    """Result of comparing the terrain of a test split with a network's record."""
 
     status: Status
-    """disjoint; by protocol: shared with other splits of the dataset by its protocol; overlap: any other shared ground,
-    allowed by the user; unknown: the record is missing or incomplete."""
+    """disjoint; by protocol: shared with other splits of the dataset by its protocol; overlap: any other shared
+    terrain, allowed by the user; unknown: the record is missing or incomplete."""
     scenes: tuple[str, ...] = field(default=())
     """Overlapping scenes, each with the scene and use in the record; only the first few are named."""
 
     @property
     def mark(self) -> str:
-        """Text that all output must carry; empty for disjoint ground and for ground shared by protocol."""
+        """Text that all output must carry; empty for disjoint terrain and for terrain shared by protocol."""
         if self.status == "overlap":
             return f"TERRAIN OVERLAP, no test of unseen terrain: {', '.join(self.scenes)}"
         return "TRAINING TERRAIN UNKNOWN: the checkpoint has no record of it" if self.status == "unknown" else ""
 
     def metrics(self) -> dict[str, float | int | str | None]:
-        """For metrics.json."""
+        """Entries for metrics.json."""
         return {"terrain/status": self.status, "terrain/mark": self.mark}
 
 
 def check_terrain(
     provenance: Provenance, dataset: Dataset, split: str = "test", allow_overlap: bool = False
 ) -> TerrainCheck:
-    """Compare a record with the ground of a split.
+    """Compare a record with the terrain of a split.
 
-    Ground that splits of the same dataset share is by design where its protocol splits by frame or trajectory. Raises
+    Terrain shared by splits of the same dataset is by design if its protocol splits by frame or trajectory. Raises
     UserError naming the scenes of any other overlap with a test split, unless `allow_overlap`.
     """
     fitted = frozenset(use for use in provenance.uses if use.use != "tested")

@@ -1,8 +1,8 @@
-"""How far a figure varies: a 95 % interval by bootstrap over independent units, or the units' own values.
+"""Spread of a metric: a 95 % interval by bootstrap over independent units, or the values of the units.
 
-Frames of one scene are alike, so whole scenes are drawn with replacement. The unit is the scene; in a split with one
-scene the trajectory; the image where neither is known. Fewer than five units give no interval, but each unit's own
-value.
+Frames of one scene are alike, so whole scenes are drawn with replacement. The unit is the scene; the trajectory in a
+split with one scene; the image if neither is known. With fewer than five units there is no interval; the value of each
+unit is given instead.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,15 +26,15 @@ class Resamples:
     unit: str
     """scene, trajectory or image."""
     names: list[str]
-    """Of the units (U)."""
+    """Names of the units (U)."""
     of_row: Rows
-    """The unit of each row, a frame or a pair of frames (N,)."""
+    """Unit of each row (N,); a row is a frame or a pair of frames."""
     weights: Array
-    """(resamples, U)."""
+    """Weight of each unit in each resample (resamples, U)."""
 
     @property
     def count(self) -> int:
-        """Units there are."""
+        """Number of units."""
         return len(self.names)
 
     def of_units(self, units: Rows) -> "Resamples":
@@ -48,17 +48,17 @@ class Resamples:
 
 @dataclass(frozen=True)
 class Spread:
-    """How far one figure varies between units."""
+    """Spread of one metric between units."""
 
     unit: str
     """scene, trajectory or image."""
     interval: Interval | None
-    """95 %; None with fewer than LEAST_UNITS units."""
+    """95 % interval; None with fewer than LEAST_UNITS units."""
     by_unit: dict[str, float] = field(default_factory=dict)
-    """The figure of each unit, only where there is no interval."""
+    """Value of each unit; only if there is no interval."""
 
     def text(self, value: float | None) -> str:
-        """The figure `value` with what is known of its spread, three digits behind the point; a dash if undefined."""
+        """The value with its spread, if known, three decimals; a dash if undefined."""
         if value is None or not np.isfinite(value):
             return "-"
         known = {name: one for name, one in self.by_unit.items() if np.isfinite(one)}
@@ -69,7 +69,7 @@ class Spread:
         return f"{value:.3f}"
 
     def keys(self, key: str) -> dict[str, float | None]:
-        """For metrics.json: <key>_low and _high; or <key>_interval, null, and <key>/by_<unit>/<name>."""
+        """Keys for metrics.json: <key>_low and _high; or <key>_interval, null, and <key>/by_<unit>/<name>."""
         if self.interval is not None:
             return {f"{key}_low": self.interval[0], f"{key}_high": self.interval[1]}
         by_unit = {f"{key}/by_{self.unit}/{name}": value for name, value in self.by_unit.items()}
@@ -77,7 +77,7 @@ class Spread:
 
 
 def read_spread(figures: Mapping[str, object], key: str) -> Spread:
-    """What `Spread.keys` wrote, from flat figures; without interval and units where there is nothing."""
+    """Read the output of `Spread.keys` from flat metrics; no interval and no units if there is none."""
     low, high = figures.get(f"{key}_low"), figures.get(f"{key}_high")
     if isinstance(low, float) and isinstance(high, float):
         return Spread("", (low, high))
@@ -89,9 +89,9 @@ def read_spread(figures: Mapping[str, object], key: str) -> Spread:
 def draw_resamples(
     scenes: Sequence[str], trajectories: Sequence[str], images: Sequence[str], rng: np.random.Generator
 ) -> Resamples:
-    """RESAMPLES resamples of the units of N rows, from the names of their scenes, trajectories and images.
+    """Draw RESAMPLES resamples of the units of N rows, from the names of their scenes, trajectories and images.
 
-    A name is "" where it is not known.
+    An unknown name is "".
     """
     unit, names = "scene", scenes
     if len(set(scenes)) < 2:
@@ -103,9 +103,9 @@ def draw_resamples(
 
 
 def spreads(statistics: Callable[[Resamples], dict[str, Array]], rows: Rows, resamples: Resamples) -> dict[str, Spread]:
-    """The spread of each figure that `statistics` computes for every resample (R,).
+    """The spread of each metric that `statistics` computes for every resample (R,).
 
-    Units count if they hold one of `rows`, the rows that the figures are about.
+    `rows` are the rows that the metrics use; only units that hold one of them count.
     """
     units = np.unique(resamples.of_row[rows])
     if len(units) >= LEAST_UNITS:
@@ -120,7 +120,7 @@ def spreads(statistics: Callable[[Resamples], dict[str, Array]], rows: Rows, res
 
 
 def interval(values: Array) -> Interval | None:
-    """The middle 95 % of resampled figures (R,); None where fewer than two of them are defined."""
+    """The middle 95 % of resampled values (R,); None if fewer than two of them are defined."""
     known = values[np.isfinite(values)]
     if len(known) < 2:
         return None

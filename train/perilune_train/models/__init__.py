@@ -1,1 +1,1 @@
-"""Networks: plain torch modules that know nothing of datasets or runs."""
+"""Networks: plain torch modules, independent of datasets and runs."""

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 class MeanAndMax(torch.autograd.Function):
     """Mean and maximum of a tensor along one dimension, which is kept with length 1.
 
-    The same as x.mean and x.amax, but the backward pass writes the gradient in one go and in the layout of x, which
-    saves an eighth of a training step on a CPU. Of equal maxima the first takes the gradient.
+    Equal to x.mean and x.amax, but the backward pass writes the gradient once and in the layout of x, which saves an
+    eighth of a training step on a CPU. Of equal maxima the first gets the gradient.
     """
 
     @staticmethod
@@ -25,7 +25,7 @@ class MeanAndMax(torch.autograd.Function):
     def backward(ctx: Any, mean_grad: Tensor, max_grad: Tensor) -> tuple[Tensor, None]:
         (where,) = ctx.saved_tensors
         share = mean_grad / ctx.shape[ctx.dim]
-        # In the order in which x lies in memory: scatter_ copies a tensor of any other order twice.
+        # In the memory order of x: scatter_ copies a tensor of any other order twice.
         order = ctx.order
         grad = share.expand(ctx.shape).permute(order).contiguous()
         grad.scatter_(order.index(ctx.dim), where.permute(order), (share + max_grad).permute(order))
@@ -38,9 +38,9 @@ class CBAM(nn.Module):
     F'  = M_c(F) F,   M_c(F)  = s(W1 relu(W0 avg(F)) + W1 relu(W0 max(F))), avg and max over the image;
     F'' = M_s(F') F', M_s(F') = s(f_7x7 [avg(F'); max(F')]), avg and max over the channels.
 
-    Plain form: s is the sigmoid, both gates lie in (0, 1) and start near 0.5, so that one module scales its input
-    by about 0.25. Identity form: s is twice the sigmoid and W1 and f_7x7 start at zero, so that both gates are
-    exactly 1 at initialisation and a pretrained backbone keeps its features; then the gates lie in (0, 2).
+    Plain form: s is the sigmoid. Both gates are between 0 and 1 and start near 0.5, so that one module scales its input
+    by about 0.25. Identity form: s is twice the sigmoid, and W1 and f_7x7 start at zero. Both gates are between 0 and 2
+    and exactly 1 at initialisation, so that a pretrained backbone keeps its features.
 
     Shape: (N, C, H, W) to the same. The layers have no bias, as in the equations.
     """
@@ -59,7 +59,7 @@ class CBAM(nn.Module):
     def channel_gate(self, x: Tensor) -> Tensor:
         """M_c (N, C, 1, 1) of features (N, C, H, W)."""
         pooled = torch.stack(MeanAndMax.apply(x.flatten(2), 2))[..., 0]
-        # W1 is linear: summing before it gives the equation's sum with one product less.
+        # W1 is linear: summing before it gives the equation's sum with one multiplication less.
         logits = self.excite(torch.relu(self.squeeze(pooled)).sum(0))
         return (self.scale * torch.sigmoid(logits))[:, :, None, None]
 

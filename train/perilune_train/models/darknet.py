@@ -42,11 +42,11 @@ class ResidualUnit(nn.Module):
 
 
 class AttentionDarknet53(nn.Module):
-    """The backbone of all networks here, up to `stages` of Darknet53's five.
+    """The backbone of all networks, up to `stages` of Darknet53's five.
 
     At width 1 with 3 input channels and 5 stages it has 52 convolutions and 40,620,640 floats in Darknet's count
-    (weights, and scale, bias, mean and variance of each batch norm), attention aside. The residual unit j of stage
-    i is `units["B_ij"]`, its CBAM `attentions["B_ij"]` (i = 1..5, j = 1..1, 2, 8, 8, 4), as the paper names them.
+    (weights, and scale, bias, mean and variance of each batch norm), without attention. Residual unit j of stage i is
+    `units["B_ij"]`, its CBAM `attentions["B_ij"]` (i = 1..5, j = 1..1, 2, 8, 8, 4), named as in the paper.
 
     Deviation from the original at widths other than 1: channels are rounded to multiples of 8.
     """

@@ -34,7 +34,7 @@ _TENSORS_WITHOUT = ("bias", "weights")
 
 @dataclass(frozen=True)
 class DarknetFile:
-    """Content of a file; `write_darknet` gives the same bytes again."""
+    """Content of a file; `write_darknet` writes the same bytes."""
 
     header: bytes
     """Version and number of images seen, 16 or 20 bytes."""
@@ -81,7 +81,7 @@ def count_floats(slots: Sequence[Slot]) -> int:
 
 
 def is_darknet(path: Path) -> bool:
-    """Whether to read a file as Darknet's: by its first bytes, and where these say nothing by its name."""
+    """Whether to read a file as Darknet's: by its first bytes, and if these do not decide, by its name."""
     start = b""
     if path.is_file():
         with path.open("rb") as stream:
@@ -94,9 +94,9 @@ def is_darknet(path: Path) -> bool:
 
 
 def read_darknet(path: Path, wanted: Sequence[int]) -> DarknetFile:
-    """Read a file that holds one of the `wanted` numbers of floats; its size is known before it is read.
+    """Read a file that holds one of the `wanted` numbers of floats; checks its size before reading.
 
-    Raises UserError where it is missing, shorter or longer, or holds a number that is not finite.
+    Raises UserError if it is missing, has another size, or holds a number that is not finite.
     """
     if not path.is_file():
         raise UserError(path, "weights", "no such file", "darknet53.conv.74 or yolov3.weights")
@@ -119,15 +119,15 @@ def read_darknet(path: Path, wanted: Sequence[int]) -> DarknetFile:
 
 
 def write_darknet(path: Path, content: DarknetFile) -> None:
-    """Write a file, whole or not at all."""
+    """Write a file atomically."""
     write_bytes(path, content.header + content.values.astype("<f4", copy=False).tobytes())
 
 
 @torch.no_grad()
 def fill(slots: Sequence[Slot], content: DarknetFile, path: Path) -> None:
-    """Copy the first floats of a file into a network; output layers of another width than ours stay as they are.
+    """Copy the first floats of a file into a network; output layers of another width than ours are not changed.
 
-    Raises UserError (`path` is for its message) and copies nothing where a variance is negative.
+    Raises UserError (`path` is for its message) and copies nothing if a variance is negative.
     """
     parts = np.split(content.values[: count_floats(slots)], np.cumsum([slot.floats for slot in slots])[:-1])
     for slot, part in zip(slots, parts, strict=True):
@@ -139,7 +139,7 @@ def fill(slots: Sequence[Slot], content: DarknetFile, path: Path) -> None:
 
 
 def content_of(slots: Sequence[Slot]) -> DarknetFile:
-    """A file of a network's tensors, of version 0.2.0 and no images seen."""
+    """File content of a network's tensors, of version 0.2.0 and no images seen."""
     values = [slot.tensor.detach().float().cpu().contiguous().flatten().numpy() for slot in slots]
     return DarknetFile(_NEW_HEADER, np.concatenate(values))
 

@@ -1,4 +1,4 @@
-"""Two networks that tell the motion between the frames of a descent."""
+"""Two networks that estimate the motion between consecutive frames of a trajectory."""
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,7 @@ OUTPUTS = 9
 class Recurrent(nn.Module):
     """Two LSTM layers (as DeepVO, Wang et al. 2017, doi 10.1109/ICRA.2017.7989236), then a linear layer to 9.
 
-    The linear layer starts at zero, so that an untrained network gives the reference motion.
+    The linear layer starts at zero, so that an untrained network outputs the reference motion.
 
     Shape: features (batch, pairs, inputs) to (batch, pairs, 9).
     """
@@ -54,17 +54,18 @@ class StackNavigator(nn.Module):
 
 
 class WarpNavigator(nn.Module):
-    """The later frame warped onto the earlier by the nominal motion, stacked in channels; layout kept to the end.
+    """Network for the later frame warped onto the earlier by the nominal motion, stacked in channels.
 
     The channels are both frames and, from three blurs of them, the local shift between them after Lucas & Kanade
-    (`local_shift`): without it, hundreds of steps go into learning the product of brightness change and slope. The
-    backbone is cut at stride 8. On every place of that grid a head, which sees the mean local shifts too, tells the
-    flow that the nominal motion left over, and how far to trust it. The motion that fits the flow over the ground
-    plane best, least squares with a prior, is what the LSTM's output corrects.
+    (`local_shift`). Without the shift, training needs hundreds of steps to learn the product of brightness change and
+    slope. The backbone is cut at stride 8, and the spatial layout is kept to the end. At every cell of that grid a
+    head, which also takes the mean local shifts, estimates the residual flow after the nominal motion and its weight.
+    The motion that best fits the flow over the ground plane (least squares with a prior) is corrected by the LSTM's
+    output.
 
-    Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes
-    (batch, pairs) in metres, to the motion
-    (batch, pairs, 9) in the units of navigate/task.py and the flow (batch, pairs, height / 8, width / 8, 2), pixels.
+    Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes (batch,
+    pairs) in metres, to the motion (batch, pairs, 9) in the units of navigate/task.py and the flow (batch, pairs,
+    height / 8, width / 8, 2), pixels.
     """
 
     BLURS_PX = (3, 5, 9)
@@ -113,18 +114,18 @@ class WarpNavigator(nn.Module):
         correction = self.recurrent(summary.unflatten(0, first.shape[:2]))
         turn = fitted[:, 3:]
         zero = torch.zeros_like(turn[:, 0])
-        # A small rotation's first two columns beyond (1, 0, 0) and (0, 1, 0).
+        # First two columns of a small rotation, minus (1, 0, 0) and (0, 1, 0).
         columns = torch.stack([zero, turn[:, 2], -turn[:, 1], -turn[:, 2], zero, turn[:, 0]], dim=-1)
         motion = torch.cat([fitted[:, :3], columns], dim=-1).unflatten(0, first.shape[:2])
         return motion + correction, flow_px.unflatten(0, first.shape[:2])
 
     def fitted_motion(self, flow_px: Tensor, trust: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
-        """Translation and rotation vector (N, 6), over their spreads, of flows (N, h, w, 2) at altitudes (N,).
+        """Fit translation and rotation vector (N, 6), over their spreads, to flows (N, h, w, 2) at altitudes (N,).
 
-        Minimises the sum of trust |J m - flow|^2 + prior |m|^2; trust (N, h, w) is over 1 px^2. The prior decides
-        between tilt and sideways shift, which look much alike from above. J is the flow of a
-        plane at right angles to the view (Longuet-Higgins & Prazdny 1980, doi 10.1098/rspb.1980.0057), first order
-        in the motion, with the nominal step left out beside the altitude.
+        Minimises the sum of trust |J m - flow|^2 + prior |m|^2; trust (N, h, w) is in 1 / px^2. The prior decides
+        between tilt and sideways shift, which look alike from above. J is the flow of a plane at right angles to the
+        view (Longuet-Higgins & Prazdny 1980, doi 10.1098/rspb.1980.0057), to first order in the motion; it neglects the
+        nominal step compared with the altitude.
         """
         focal_px = self.focal_over_width * width_px
         over_altitude = torch.stack([1 / altitude_m] * 3 + [torch.ones_like(altitude_m)] * 3, dim=-1)
@@ -135,7 +136,7 @@ class WarpNavigator(nn.Module):
         return torch.linalg.solve(normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px))
 
     def plane_flow(self, rows: int, columns: int, width_px: int) -> Tensor:
-        """Flow over focal length by translation over altitude and rotation vector (rows, columns, 2, 6)."""
+        """Flow over focal length per unit of translation over altitude and of rotation vector (rows, columns, 2, 6)."""
         focal = self.focal_over_width * width_px / self.STRIDE
         x = ((torch.arange(columns, device=self.unit.device) + 0.5 - columns / 2) / focal).expand(rows, columns)
         y = ((torch.arange(rows, device=self.unit.device) + 0.5 - rows / 2) / focal)[:, None].expand(rows, columns)
@@ -146,7 +147,7 @@ class WarpNavigator(nn.Module):
 
 
 def blurred(images: Tensor, size_px: int) -> Tensor:
-    """Means over squares `size_px` wide (odd) about each pixel of images (N, C, H, W), cut off at the edge."""
+    """Means over squares `size_px` wide (odd) around each pixel of images (N, C, H, W), cropped at the edge."""
     half = size_px // 2
     rows = functional.avg_pool2d(images, (size_px, 1), stride=1, padding=(half, 0), count_include_pad=False)
     return functional.avg_pool2d(rows, (1, size_px), stride=1, padding=(0, half), count_include_pad=False)
@@ -155,9 +156,9 @@ def blurred(images: Tensor, size_px: int) -> Tensor:
 def local_shift(pair: Tensor, window_px: int = 25) -> Tensor:
     """Shift from the first to the second of two images (N, 2, H, W): (N, 2, H, W), pixels along x and y.
 
-    The least-squares shift of the square window about each pixel that explains the change of brightness by the
-    slope, one step (Lucas & Kanade 1981), damped where the slopes are weak; good for shifts below the width of the
-    images' finest features.
+    For a square window around each pixel, one least-squares step (Lucas & Kanade 1981) that explains the change of
+    brightness by the slope, damped where slopes are weak. Valid for shifts below the width of the images' finest
+    features.
     """
     slope_y, slope_x = torch.gradient(pair.mean(1, keepdim=True), dim=(2, 3))
     lost = pair[:, :1] - pair[:, 1:]

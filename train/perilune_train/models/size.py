@@ -1,4 +1,4 @@
-"""How much a network computes."""
+"""Computing cost of a network."""
 
 import copy
 from typing import Any
@@ -8,10 +8,10 @@ from torch import nn
 
 
 def multiply_adds(network: nn.Module, shape: tuple[int, ...]) -> int:
-    """Multiplications with an addition of all convolutions and linear layers, for an input of this shape.
+    """Number of multiply-adds of all convolutions and linear layers, for an input of this shape.
 
-    A convolution has (outputs' number) x (channels in / groups) x (kernel's area), a linear layer (outputs' number) x
-    (inputs). All else (norms, activations, gates' products, pooling) is left out, as usual.
+    A convolution has (number of outputs) x (input channels / groups) x (kernel area), a linear layer (number of
+    outputs) x (number of inputs). Norms, activations, products of gates and pooling are left out, as usual.
     """
     counted = 0
 
@@ -22,7 +22,7 @@ def multiply_adds(network: nn.Module, shape: tuple[int, ...]) -> int:
         else:
             counted += output.numel() * layer.weight[0].numel()
 
-    # On torch's `meta` device shapes are followed and nothing is computed.
+    # On torch's `meta` device shapes are propagated and nothing is computed.
     ghost = copy.deepcopy(network).to("meta").eval()
     for layer in ghost.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):

@@ -15,17 +15,17 @@ OUTPUTS = 5
 _STRIDES = (2, 4, 8, 16, 32)
 _LARGEST_LOG_SCALE = 4.0
 _PRIOR = 0.01
-"""Probability of a crater that every cell starts from, so that the many empty cells do not rule the first steps."""
+"""Initial crater probability of every cell, so that the many empty cells do not dominate the first steps."""
 
 
 class YOLOv3(nn.Module):
     """Backbone, top-down neck, and a head on each of three consecutive strides.
 
-    A cell predicts, for each of its 3 anchors, raw numbers (t_x, t_y, t_w, t_h, t_o); `decode` makes boxes of them.
+    A cell predicts, for each of its 3 anchors, raw numbers (t_x, t_y, t_w, t_h, t_o); `decode` converts them to boxes.
 
-    Deviations from the original: no class outputs (craters are the only class, so objectness is the score); the
-    heads may lie on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than 6 px, and then
-    the neck still starts at stride 32, by one 1 x 1 convolution; `width` scales the neck too.
+    Deviations from the original: no class outputs (craters are the only class, so objectness is the score). The heads
+    may be on strides 4, 8, 16 instead of 8, 16, 32, since half of all craters are narrower than 6 px; then the neck
+    still starts at stride 32, with one 1 x 1 convolution. `width` scales the neck too.
     """
 
     anchors: Tensor
@@ -38,7 +38,8 @@ class YOLOv3(nn.Module):
         attention: Attention = "none",
         strides: Sequence[int] = (8, 16, 32),
     ):
-        """Anchors are (3, 3, 2): finest stride first, width and height in pixels; without them a checkpoint's."""
+        """Anchors are (3, 3, 2): finest stride first, width and height in pixels; None if a checkpoint provides
+        them."""
         super().__init__()
         if tuple(strides) not in ((8, 16, 32), (4, 8, 16)):
             raise ValueError(f"strides are {tuple(strides)}, not (8, 16, 32) or (4, 8, 16)")
@@ -98,7 +99,7 @@ class YOLOv3(nn.Module):
 
 
 def _output(channels: int) -> nn.Conv2d:
-    """The last layer of a head: starts with all boxes at their anchors and objectness at its prior."""
+    """Last layer of a head, initialised with all boxes at their anchors and objectness at its prior."""
     layer = nn.Conv2d(channels, ANCHORS_PER_SCALE * OUTPUTS, 1)
     nn.init.normal_(layer.weight, std=0.01)
     bias = torch.zeros(ANCHORS_PER_SCALE, OUTPUTS)
@@ -110,9 +111,9 @@ def _output(channels: int) -> nn.Conv2d:
 def decode(raw: Tensor, cells: Tensor, anchors: Tensor, stride: int) -> Tensor:
     """Boxes (..., 4) as x0, y0, x1, y1 in pixels of raw outputs (..., 4 or more).
 
-    `cells` (..., 2) are column and row of the predicting cell, `anchors` (..., 2) width and height in pixels.
-    Centre: (cell + 2 s(t) - 0.5) stride; size: anchor exp(t). Deviation from YOLOv3, which has s(t) alone: the centre
-    reaches half a cell beyond the cell, because neighbouring cells are trained on a crater too (detect/assign.py).
+    `cells` (..., 2) are column and row of the predicting cell, `anchors` (..., 2) width and height in pixels. Centre:
+    (cell + 2 s(t) - 0.5) stride; size: anchor exp(t). Deviation from YOLOv3, which has s(t) alone: the centre can be up
+    to half a cell outside the cell, because neighbouring cells are trained on a crater too (detect/data/assign.py).
     """
     centre = (cells + 2 * raw[..., :2].sigmoid() - 0.5) * stride
     half = anchors * raw[..., 2:4].clamp(-_LARGEST_LOG_SCALE, _LARGEST_LOG_SCALE).exp() / 2

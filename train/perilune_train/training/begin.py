@@ -1,4 +1,4 @@
-"""Resume, keep, replace or refuse a run of the same name that exists already."""
+"""Resume, keep, replace or refuse an existing run of the same name."""
 
 import functools
 import json
@@ -33,13 +33,13 @@ def hashes_of(inputs: Mapping[str, Path | None]) -> dict[str, str | None]:
 
 
 def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrite: bool = False) -> State:
-    """What to do with a run's folder, the same in all processes.
+    """Decide what to do with a run's folder, the same in all processes.
 
-    new: start from the beginning, since no state is there or `overwrite` is given. resume: continue from last.ckpt.
-    finished: leave it as it is; a message says so.
+    new: start from the beginning, since there is no state or `overwrite` is given. resume: continue from last.ckpt.
+    finished: leave the run unchanged; a message says so.
 
-    Raises UserError where the run began with other settings or other inputs, where the folder holds no run of this
-    task, and where the first process resumes but this one has no last.ckpt (several machines, no shared folder).
+    Raises UserError if the run began with other settings or inputs, if the folder holds no run of this task, or if the
+    first process resumes but this one has no last.ckpt (several machines, no shared folder).
     """
     if is_first_process():
         state = _decide(run, task, config, inputs, overwrite)
@@ -48,7 +48,7 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
     elif torch.distributed.is_torchelastic_launched():
         state = _store().get(_AGREEMENT).decode()
     else:
-        # Lightning starts these processes on the first one's machine, after that has prepared the folder.
+        # Lightning starts these processes on the first process's machine, after the first has prepared the folder.
         state = "resume" if run.last.is_file() else "new"
     if state == "resume" and not run.last.is_file():
         wanted = "that of the first process: share the runs folder between the machines, or copy it"
@@ -63,7 +63,7 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
 def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state: State) -> None:
     """Prepare the folder of a run: with `new` remove an older run and write config.yaml and inputs.json.
 
-    Of several processes only the first touches the folder. Raises UserError on a folder that is no run of this task.
+    Of several processes only the first changes the folder. Raises UserError on a folder that is no run of this task.
     """
     if not is_first_process() or state != "new":
         return
@@ -76,7 +76,7 @@ def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state:
 
 @functools.cache
 def _store() -> Any:
-    """The key-value store of torchrun, to which every process connects; it works before training connects them."""
+    """The key-value store of torchrun, to which every process connects; available before training connects them."""
     return next(torch.distributed.rendezvous("env://"))[0]
 
 
@@ -84,7 +84,7 @@ def _decide(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrit
     if not _is_used(run):
         return "new"
     _check_own(run, task)
-    # A run that was stopped before it kept a state holds nothing to lose, whatever its settings were.
+    # A run that stopped before saving a state has nothing to lose, whatever its settings were.
     if overwrite or not (run.finished or run.last.is_file()):
         return "new"
     check_settings(run, task, config)
@@ -101,7 +101,7 @@ def _check_own(run: RunFolder, task: str) -> None:
     """Raise UserError unless the folder is a run of this task: its config.yaml has this section and no other."""
     wanted = f"another name: only a {task} run is resumed or replaced"
     if not run.config.is_file():
-        # inputs.json alone is a run that was killed before it wrote its configuration.
+        # A folder with only inputs.json is a run that was killed before it wrote its configuration.
         if [path.name for path in run.root.iterdir() if not path.name.startswith(".")] == [run.inputs.name]:
             return
         raise UserError(run.root, "--name", "a folder that is no run (no config.yaml)", wanted)
@@ -113,7 +113,7 @@ def _check_own(run: RunFolder, task: str) -> None:
 def check_settings(run: RunFolder, task: str, config: Section) -> None:
     """Raise UserError naming the first setting in which an older run, if there is one, differs from `config`.
 
-    A setting that config.yaml lacks, since it is newer than the run, has its default.
+    A setting missing in config.yaml is newer than the run; it has its default.
     """
     if not run.config.is_file():
         return
@@ -145,7 +145,7 @@ def _check_inputs(run: RunFolder, inputs: Hashes, missing_is_fine: bool) -> None
 
 
 def _differences(where: str, old: Mapping[str, Any], config: Section) -> Iterator[tuple[str, object, object]]:
-    """Key, old and new value of what differs between plain settings and a section."""
+    """Key, old and new value of each difference between plain settings and a section."""
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
         key, value = f"{where}.{name}", getattr(config, name)

@@ -1,4 +1,4 @@
-"""The training loop that all tasks share, by Lightning: best weights, last state, progress bar, several processes."""
+"""The training loop of all tasks, with Lightning: best weights, last state, progress bar, several processes."""
 
 import logging
 import math
@@ -27,15 +27,15 @@ from perilune_train.training.runs import (
 
 _STEPS_BETWEEN_LOOKS = 20
 _PROCESSES = "processes"
-"""Key of the number of processes in last.ckpt: position in the epoch and schedule are in steps of all of them."""
+"""Key of the number of processes in last.ckpt; position in the epoch and schedule count steps of all processes."""
 _STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
 
 
 class KeepBest(Callback):
-    """Saves the weights whenever the validation figure `monitor` improves (NaN never does).
+    """Save the weights whenever the validation metric `monitor` improves (NaN never does).
 
-    The task has `architecture` (plain settings) and `evaluated` (the network whose weights are judged), and may have
-    `terrain` (the plain record of the ground that it is fitted to).
+    The task has `architecture` (plain settings) and `evaluated` (the network to evaluate and save), and may have
+    `terrain` (the plain record of the terrain that it is fitted to).
     """
 
     def __init__(self, run: RunFolder, monitor: str, mode: Literal["min", "max"]):
@@ -60,9 +60,9 @@ class KeepBest(Callback):
 
 
 class KeepLast(Callback):
-    """Saves the whole state after every epoch and, with `minutes`, within an epoch at this interval.
+    """Save the whole state after every epoch and, with `minutes`, within an epoch at this interval.
 
-    A run that begins again within an epoch has its `on_train_epoch_start` called, which Lightning leaves out.
+    If a run is resumed within an epoch, call its `on_train_epoch_start`, which Lightning does not.
     """
 
     def __init__(self, run: RunFolder, minutes: float | None):
@@ -71,7 +71,8 @@ class KeepLast(Callback):
 
     @property
     def seconds(self) -> float:
-        """What the training took until now, with the earlier sittings up to the state from which it was resumed."""
+        """Training time until now, seconds, including earlier sessions up to the state from which the run was
+        resumed."""
         return self.earlier_s + time.monotonic() - self.began
 
     def state_dict(self) -> dict[str, float]:
@@ -86,10 +87,10 @@ class KeepLast(Callback):
             pl_module.on_train_epoch_start()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        # At the last batch the validation is still to come, and the epoch's own checkpoint after it.
+        # After the last batch validation follows, and then the checkpoint of the epoch.
         if self.minutes is None or trainer.is_last_batch:
             return
-        # Several processes agree on the time by asking the first, which costs a wait.
+        # Several processes agree on the time by asking the first, which makes them wait.
         if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_LOOKS == 0:
             due = time.monotonic() - self.saved >= 60 * self.minutes
             if trainer.strategy.broadcast(due):
@@ -102,13 +103,13 @@ class KeepLast(Callback):
         checkpoint[_PROCESSES] = trainer.world_size
 
     def save(self, trainer: lightning.Trainer) -> None:
-        """Write last.ckpt; an older one stays whole until the new one is."""
+        """Write last.ckpt atomically; the older file stays until the new one is complete."""
         trainer.save_checkpoint(self.run.last)
         self.saved = time.monotonic()
 
 
 class Bar(Callback):
-    """The workspace's own progress bar: steps done and to do, rate, time left, loss."""
+    """Progress bar: steps done, total steps, rate, time left, loss."""
 
     def __init__(self, label: str):
         self.label = label
@@ -123,7 +124,7 @@ class Bar(Callback):
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
         self.progress.advance(self.task)
-        # A look at the loss makes a GPU wait.
+        # Reading the loss makes the GPU wait.
         if batch_idx % _STEPS_BETWEEN_LOOKS == 0:
             note = f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, loss {float(outputs['loss']):.3f}"
             self.progress.update(self.task, note=note)
@@ -137,7 +138,7 @@ class Bar(Callback):
 
 
 def machines(devices: int, num_nodes: int) -> tuple[int, int]:
-    """Processes on each machine and machines: what torchrun says in the environment, or else what is asked for."""
+    """Processes on each machine and number of machines: torchrun's values from the environment, else the arguments."""
     if torch.distributed.is_torchelastic_launched():
         local = int(os.environ["LOCAL_WORLD_SIZE"])
         return local, int(os.environ["WORLD_SIZE"]) // local
@@ -161,16 +162,18 @@ def fit(
     strategy: str = "auto",
     checkpoint_minutes: float | None = None,
 ) -> float:
-    """Train `task` for a fixed number of epochs, keeping the best weights and the last state in the run's folder.
+    """Train `task` for a fixed number of epochs; keep the best weights and the last state in the run's folder.
 
-    Returns the seconds that it took; of a resumed run those of all its sittings.
+    Returns the training time in seconds; for a resumed run the sum over all its sessions.
 
-    The task gives its own loaders, asked for anew before every epoch (so that order and augmentation can follow
-    from seed and epoch alone; with several processes each gives its share), logs `monitor` in validation, and has
-    `architecture` and `evaluated` (see KeepBest). With `resume` training goes on from last.ckpt, if the run has one,
-    and repeats exactly what an uninterrupted run does. That is kept after every epoch, and with `checkpoint_minutes`
-    within epochs too; then the task's training batches must go on where the checkpoint was made. Raises UserError
-    where last.ckpt is damaged, of another network or of another number of processes.
+    The task provides its own loaders, which are requested again before every epoch, so that order and augmentation can
+    depend on seed and epoch only. With several processes each loader provides its share. The task logs `monitor` in
+    validation, and has `architecture` and `evaluated` (see KeepBest).
+
+    With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
+    uninterrupted run. The state is saved after every epoch, and with `checkpoint_minutes` within epochs too; then the
+    task's training batches must continue at the position of the checkpoint. Raises UserError if last.ckpt is damaged,
+    of another network or of another number of processes.
     """
     devices, num_nodes = machines(devices, num_nodes)
     resume_from = run.last if resume and run.last.is_file() else None
@@ -216,6 +219,6 @@ def fit(
         try:
             trainer.fit(task, ckpt_path=resume_from, weights_only=True)
         except SystemExit:
-            # Lightning answers Ctrl-C with a bare exit; the command line has words for it.
+            # Lightning answers Ctrl-C with a bare exit; the command line prints a message for KeyboardInterrupt.
             raise KeyboardInterrupt from None
     return keep_last.seconds

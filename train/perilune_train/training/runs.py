@@ -1,4 +1,4 @@
-"""A run's folder, its weights and figures; where and how precisely to compute."""
+"""A run's folder, weights and metrics; choice of device and precision."""
 
 import io
 import json
@@ -20,7 +20,7 @@ from perilune_train.evaluation.provenance import RECORD
 
 @dataclass(frozen=True)
 class RunFolder:
-    """`<runs>/<task>/<name>/`: everything that one run leaves behind."""
+    """`<runs>/<task>/<name>/`: the folder of all output of one run."""
 
     root: Path
     """The folder."""
@@ -37,7 +37,7 @@ class RunFolder:
 
     @property
     def metrics(self) -> Path:
-        """The figures, written last: a run that has them is finished."""
+        """The metrics, written last: a run that has them is finished."""
         return self.root / "metrics.json"
 
     @property
@@ -47,28 +47,28 @@ class RunFolder:
 
     @property
     def last(self) -> Path:
-        """The whole state when it was last kept, from which a run is resumed."""
+        """The last saved training state, from which a run is resumed."""
         return self.root / "checkpoints" / "last.ckpt"
 
     @property
     def finished(self) -> bool:
-        """Whether the run came to its end."""
+        """Whether the run is complete."""
         return self.metrics.is_file()
 
 
 def is_first_process() -> bool:
-    """Whether this process writes files and says things: the only one, or of several that train together the first.
+    """Whether this process writes files and messages: the only process, or the first of several that train together.
 
-    It is known from the start: Lightning reads it from what torchrun, or it itself, gives the processes they start.
+    Known from the start: Lightning reads the rank from the environment that it or torchrun sets for each process.
     """
-    # Here, so that commands that do not train need not import Lightning.
+    # Imported here, so that commands that do not train need not import Lightning.
     from lightning.pytorch.utilities import rank_zero_only
 
     return int(rank_zero_only.rank) == 0
 
 
 def write_metrics(run: RunFolder, metrics: Mapping[str, float | int | str | None]) -> None:
-    """Write metrics.json: flat keys; what is not finite becomes null."""
+    """Write metrics.json: flat keys; values that are not finite become null."""
     plain = {
         key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in metrics.items()
     }
@@ -78,11 +78,11 @@ def write_metrics(run: RunFolder, metrics: Mapping[str, float | int | str | None
 def save_weights(
     path: Path, architecture: Mapping[str, Any], network: nn.Module, terrain: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a network's weights beside the plain settings (`architecture`) that build it again.
+    """Write a network's weights with the plain settings (`architecture`) that rebuild it.
 
-    `terrain` is the plain record of the ground that it was fitted to (provenance.py); None leaves it unknown.
+    `terrain` is the plain record of the terrain that it was fitted to (provenance.py); None leaves it unknown.
     """
-    # Through memory: torch's own writer hides a full disk behind a RuntimeError.
+    # Via memory: torch's own writer hides a full disk behind a RuntimeError.
     content = io.BytesIO()
     record = {} if terrain is None else {RECORD: dict(terrain)}
     torch.save({"architecture": dict(architecture), "state_dict": network.state_dict(), **record}, content)
@@ -92,7 +92,7 @@ def save_weights(
 def load_weights(path: Path) -> dict[str, Any]:
     """`{"architecture": settings, "state_dict": tensors}` of a file that `save_weights` wrote, on the CPU.
 
-    Raises UserError where the file is missing, damaged, or anything but plain weights.
+    Raises UserError if the file is missing, damaged, or anything but plain weights.
     """
     if not path.is_file():
         raise UserError(path, "checkpoint", "no such file", "checkpoints/best.ckpt of a finished run")
@@ -100,12 +100,12 @@ def load_weights(path: Path) -> dict[str, Any]:
 
 
 def read_saved(path: Path, field: str, keys: set[str], wanted: str) -> dict[str, Any]:
-    """The dictionary that torch saved in a file, on the CPU. Raises UserError where it is damaged or lacks `keys`."""
+    """Read a dictionary saved by torch, on the CPU. Raises UserError if the file is damaged or lacks `keys`."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
-    # Torch names no kinds of error; damaged bytes raise a dozen.
+    # Torch documents no error types; damaged bytes raise a dozen.
     except Exception as error:
         raise UserError(path, field, str(error) or type(error).__name__, wanted) from None
     missing = keys - content.keys() if isinstance(content, dict) else keys
@@ -122,13 +122,13 @@ def check_architecture(path: Path, found: Mapping[str, Any], wanted: Mapping[str
 
 
 def fill(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
-    """Load all weights into a network. Raises UserError as `check_tensors`."""
+    """Load all weights into a network. Raises UserError like `check_tensors`."""
     check_tensors(path, state, network)
     network.load_state_dict(dict(state))
 
 
 def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Module) -> None:
-    """Raise UserError naming the first tensor of a checkpoint that is missing, extra or misshapen for a network."""
+    """Raise UserError naming the first tensor of a checkpoint that is missing, extra or of the wrong shape."""
     own = network.state_dict()
     for key in sorted(own.keys() | state.keys()):
         found = tuple(state[key].shape) if key in state else "nothing"
@@ -138,14 +138,14 @@ def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Mod
 
 
 def choose_device(device: str) -> str:
-    """`auto` is the GPU where there is one. Raises UserError where `cuda` is asked for in vain."""
+    """Resolve `auto` to the GPU if there is one, else the CPU. Raises UserError if `cuda` is not available."""
     if device == "cuda" and not torch.cuda.is_available():
         raise UserError("settings", "device", "cuda", "cpu or auto: torch finds no GPU")
     return ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
 
 
 def choose_bf16(precision: Precision, device: str) -> bool:
-    """Whether to compute in bfloat16: as asked, and with `auto` where the hardware has it."""
+    """Whether to compute in bfloat16: as set, and with `auto` if the hardware supports it."""
     if precision != "auto":
         return precision == "bf16"
     if device == "cuda":
