@@ -35,9 +35,9 @@ def run(root):
 
 def test_a_change_in_another_file_is_compiled_into_its_callers(tmp_path):
     package = tmp_path / "perilune_render"
-    package.mkdir()
-    for name in ("__init__", "caches", "fingerprint", "kernels"):
-        shutil.copy(Path(perilune_render.__path__[0]) / f"{name}.py", package)
+    source = Path(perilune_render.__path__[0])
+    shutil.copytree(source / "provenance", package / "provenance", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(source / "__init__.py", package)
     (package / "caller.py").write_text(CALLER)
     (package / "callee.py").write_text(CALLEE.format(step=2))
     assert run(tmp_path) == [302, 0]
