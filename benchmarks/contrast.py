@@ -1,10 +1,11 @@
-"""How well the labels' contrast tells craters that a trained detector finds from those that it misses.
+"""How well the labels' contrast separates craters that a trained detector finds from those that it misses.
 
-`python benchmarks/contrast.py DATASET RUN`: a dataset and a detect run on it. On the test split, for the craters of the
-selection `visible` without its contrast: the area under the ROC curve (AUC) of contrast, depth ratio and radius, over
-all and by radius; the share found by contrast; and the run's own detections judged by each selection. A crater is found
-where a detection with the run's threshold or more overlaps it by IoU 0.5, best scores first. Writes
-runs/bench/contrast.json, and with --picture FRAME_ID contrast.jpg, an enlarged frame, plain and coloured by contrast.
+`python benchmarks/contrast.py DATASET RUN`: a dataset and a detect run on it. Evaluates on the test split, for the
+craters of the selection `visible` without its contrast threshold: the area under the ROC curve (AUC) of contrast, depth
+ratio and radius, overall and by radius; the share found by contrast; and the run's own detections, evaluated with each
+selection. A crater is found if a detection with at least the run's threshold overlaps it by IoU 0.5, highest scores
+first. Writes runs/bench/contrast.json, and with --picture FRAME_ID contrast.jpg, an enlarged frame, plain and coloured
+by contrast.
 """
 
 import json
@@ -35,14 +36,14 @@ _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 _EDGES = (-1e9, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, np.inf)
 _COLOURS = ((2.0, (60, 60, 255)), (4.0, (0, 150, 255)), (8.0, (0, 235, 235)), (np.inf, (80, 220, 80)))
-"""Below each contrast, its colour (blue, green, red)."""
+"""Upper bounds of contrast with their colours (blue, green, red)."""
 _SCALE = 4
 
 
 def auc(values: Array, found: NDArray[np.bool_]) -> float | None:
     """Share of pairs of a found and a missed crater in which the found one has the larger value; a tie counts half.
 
-    None where there are no such pairs.
+    None if there are no such pairs.
     """
     rank = pd.Series(values).rank().to_numpy()
     n, m = int(found.sum()), int((~found).sum())
@@ -50,7 +51,7 @@ def auc(values: Array, found: NDArray[np.bool_]) -> float | None:
 
 
 def found_by(labels: pd.DataFrame, detections: dict[str, Detections], threshold: float) -> NDArray[np.bool_]:
-    """Whether each label (N,) is found: in order of score each detection takes the free label of highest IoU."""
+    """Whether each label (N,) is found: in order of score, each detection takes the unmatched label of highest IoU."""
     found = np.zeros(len(labels), np.bool_)
     for frame_id, rows in labels.groupby("frame_id").indices.items():
         own = detections.get(str(frame_id))
@@ -92,7 +93,7 @@ def measure(dataset: Dataset, detections: dict[str, Detections], threshold: floa
 
 
 def judge(dataset: Dataset, detections: dict[str, Detections], threshold: float) -> dict:
-    """The detections by each selection, and by `visible` without its contrast."""
+    """Evaluate the detections with each selection, and with `visible` without its contrast threshold."""
     settings = {name: LabelSettings(selection=name) for name in ("visible", "paper")}
     settings["visible without contrast"] = LabelSettings(selection="visible", min_contrast=None)
     result = {}
@@ -107,7 +108,7 @@ def judge(dataset: Dataset, detections: dict[str, Detections], threshold: float)
 
 
 def draw(dataset: Dataset, frame_id: str, path: Path) -> None:
-    """The left upper part of a frame, plain and with the labels that `visible` but for its contrast selects."""
+    """Draw the top left part of a frame, plain and with the labels of `visible` without its contrast threshold."""
     frames = dataset.table("frames", ["frame_id", "png_path"]).to_pandas().set_index("frame_id")
     grey = cv2.imread(str(dataset.file(frames.loc[frame_id, "png_path"])), cv2.IMREAD_GRAYSCALE)[:176, :176]
     large = cv2.resize(grey, None, fx=_SCALE, fy=_SCALE, interpolation=cv2.INTER_CUBIC)
@@ -130,7 +131,7 @@ def main(
     picture: Annotated[str, typer.Option(help="frame_id to draw.")] = "",
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Hold contrast beside what a detector found."""
+    """Compare the labels' contrast with what a detector found."""
     opened = open_dataset(dataset)
     table = pq.read_table(run / "detections.parquet").to_pandas().sort_values("score", ascending=False, kind="stable")
     detections = {

@@ -1,7 +1,8 @@
-"""Frames a second of `perilune-render develop` on one core: EXR read, sensor, PNG, hash, manifest.
+"""Frames per second of `perilune-render develop` on one core.
 
-Renders a dataset with EXRs first (256 x 256 px, small ground, half a minute), then develops it in this process, held to
-one core, as it is and for a distorted camera, whose labels are made again. Writes runs/bench/develop.json.
+Covers reading EXRs, sensor, PNG, hash and manifest. First renders a dataset with EXRs (256 x 256 px, small ground, half
+a minute). Then develops it in this process on one core, with unchanged settings and for a distorted camera, whose
+labels are computed again. Writes runs/bench/develop.json.
 """
 
 import json
@@ -58,7 +59,7 @@ def main() -> None:
         "frames": n,
         "frames_per_s": n / statistics.median(seconds["as it is"]),
         "frames_per_s_with_new_labels": n / statistics.median(seconds["distorted"]),
-        # What a core gives when no other program takes it.
+        # Frame rate of a core that no other program uses.
         "frames_per_cpu_s": n / statistics.median(cpu_s["as it is"]),
         "frames_per_cpu_s_with_new_labels": n / statistics.median(cpu_s["distorted"]),
         "exr_bytes": float(exr_bytes.mean()),

@@ -1,8 +1,9 @@
-"""Time of one image of 256 x 256 pixels by every engine, on two cores: what a flight computer of that size would need.
+"""Inference time per image of 256 x 256 pixels for every engine, on two cores.
 
-Networks of full and half width, without and with attention, of both strides, with random weights (their speed does
-not depend on them), or that of a run. Every engine is warmed up, then all are called in turn, so that what else runs
-on the machine slows all alike. Writes runs/bench/infer.json.
+Two cores stand for a flight computer of that size. Measures networks of full and half width, without and with
+attention, of both strides, with random weights (which do not affect the speed), or the network of a run. Every engine
+is warmed up, then all are called in turn, so that other load on the machine affects all equally. Writes
+runs/bench/infer.json.
 """
 
 import json
@@ -29,11 +30,11 @@ from perilune_train.models.yolo import YOLOv3
 
 CORES, SIZE_PX, WARM_UP = 2, 256, 5
 GOALS_S = {1.0: 0.030, 0.5: 0.010}
-"""Of the best engine, by width."""
+"""Goal for the best engine in seconds, by width."""
 
 
 class Eager(torch.nn.Module):
-    """The network as it is trained, called as the trainer calls it."""
+    """The network as trained, called as in the trainer."""
 
     def __init__(self, network: YOLOv3):
         super().__init__()
@@ -44,7 +45,7 @@ class Eager(torch.nn.Module):
 
 
 def engines(network: YOLOv3, folder: Path) -> dict[str, Engine]:
-    """All engines for one network; its files are written into `folder`."""
+    """All engines for one network; writes their files into `folder`."""
     channels = network.backbone.stem[0].in_channels
     flight = FlightDetector(network, SIZE_PX)
     plain, small = folder / "network.onnx", folder / "network-int8.onnx"
@@ -66,7 +67,7 @@ def engines(network: YOLOv3, folder: Path) -> dict[str, Engine]:
 
 
 def openvino_engines(plain: Path, small: Path, threads: int) -> dict[str, Engine]:
-    """OpenVINO's engines for the files in floating point and in int8."""
+    """OpenVINO's engines for the floating-point file and the int8 file."""
     made = {}
     for precision in ("f32", "bf16") if has_bf16() else ("f32",):
         made[f"openvino {precision}"] = openvino_engine(plain, precision, threads, 1)
@@ -75,7 +76,7 @@ def openvino_engines(plain: Path, small: Path, threads: int) -> dict[str, Engine
 
 
 def cpu_seconds(engine: Engine, image: np.ndarray, rounds: int) -> float:
-    """Median processor time of a call on one thread, which other programs hardly change."""
+    """Median processor time of a call on one thread; hardly affected by other programs."""
     seconds = []
     for _ in range(WARM_UP + rounds):
         start = time.process_time()
@@ -85,7 +86,7 @@ def cpu_seconds(engine: Engine, image: np.ndarray, rounds: int) -> float:
 
 
 def measure(network: YOLOv3, rounds: int) -> dict:
-    """Least and median time of every engine, the best of them, and the goal."""
+    """Minimum and median time of every engine, processor time on one thread, and the best engines."""
     channels = network.backbone.stem[0].in_channels
     image = np.random.default_rng(1).standard_normal((1, channels, SIZE_PX, SIZE_PX), np.float32)
     with tempfile.TemporaryDirectory() as folder:
@@ -112,7 +113,7 @@ def main(
     rounds: Annotated[int, typer.Option(help="Calls of each engine.", min=3)] = 40,
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Measure all networks, or a run's."""
+    """Measure all networks, or that of a run."""
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:CORES]))
     torch.set_num_threads(CORES)
     networks: list[tuple[float, str, tuple[int, ...], YOLOv3 | None]] = []
@@ -142,7 +143,7 @@ def main(
 
 
 def print_table(rows: list[dict]) -> None:
-    """Milliseconds, median (least), as Markdown."""
+    """Median (minimum) in milliseconds, as a Markdown table."""
     heads = [f"{row['width']:g} {row['attention']} {' '.join(map(str, row['strides']))}" for row in rows]
     print("| Engine, ms | " + " | ".join(heads) + " |\n|---|" + "---|" * len(rows))
     for name in rows[0]["engines"]:

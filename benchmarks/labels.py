@@ -1,10 +1,10 @@
-"""Label ellipses against the picture: how far they lie from glowing rings on the same rim circles.
+"""Error of label ellipses: their distance from glowing rings rendered on the same rim circles.
 
-Scenes of `small` are grown for their rim circles, tilts included. At altitudes of 200 to 1500 m and views of up to 45
-degrees from straight down the project's `label_frame` makes the labels; Blender renders rings on the labelled circles
-through the project's camera with 8 x 8 pixels in place of each; ring and ellipse are compared along 64 normals of each.
-The same once more with a lens that distorts, and at the frame's own resolution, where only large craters can be judged.
-Writes runs/bench/labels.json and, with `--picture FILE`, a histogram.
+Generates scenes of `small` for their rim circles, tilts included. At altitudes of 200 to 1500 m and views of up to 45
+degrees from nadir, `label_frame` makes the labels. Blender renders rings on the labelled circles through the project's
+camera with 8 x 8 pixels for each of its pixels. Ring and ellipse are compared along 64 normals of each label. The same
+is repeated with lens distortion, and at the frame's own resolution, where only large craters can be measured. Writes
+runs/bench/labels.json and, with `--picture FILE`, a histogram.
 """
 
 import argparse
@@ -40,36 +40,36 @@ TILTS_DEG = (0.0, 15.0, 30.0, 45.0)
 RADII_PX = (2.0, 5.0, 10.0, 20.0, 50.0)
 SCALE = 8
 DISTORTION = (-0.06, 0.0, 0.001, 0.0, 0.0)
-"""About 5 px in the corners."""
+"""About 5 px of distortion in the corners."""
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """What came of one pose."""
+    """Measurements of one pose."""
 
     altitude_m: float
-    """Over the ground that the camera's axis meets, metres."""
+    """Altitude above the ground point on the camera's axis, metres."""
     tilt_deg: float
-    """Of the axis from straight down, degrees."""
+    """Angle of the camera's axis from nadir, degrees."""
     radius_px: Array
     """sqrt(a b) of the labels, pixels (N,)."""
     offset_px: Array
-    """Of the rings from the labels, along the labels' outward normals, pixels (N, 64)."""
+    """Distances of the rings from the labels, along the labels' outward normals, pixels (N, 64)."""
     scale: int
-    """Pixels of the picture in place of one of the frame's, along each axis."""
+    """Pixels of the picture for one pixel of the frame, along each axis."""
     n_labels: int
-    """Labels of the frame, judged or not."""
+    """Number of labels of the frame, measured or not."""
     n_too_narrow: int
-    """Of those, the ones that the picture is too coarse for, whole in the frame or not."""
+    """Number of those that are too narrow to be measured in the picture, entirely in the frame or not."""
 
     @property
     def error_px(self) -> Array:
-        """R.m.s. over the directions, pixels (N,)."""
+        """R.m.s. distance over the directions, pixels (N,)."""
         return rings.errors_px(self.offset_px, self.scale)
 
     @property
     def ellipse_error_px(self) -> Array:
-        """The same of what an ellipse can follow: offsets up to the second harmonic, pixels (N,)."""
+        """R.m.s. of the distances' harmonics up to the second: shift, size, flattening and rotation, pixels (N,)."""
         part = np.fft.rfft(np.nan_to_num(self.offset_px, nan=rings.REACH_PX / self.scale), axis=1)[:, :3]
         weight = np.array([1.0, 2.0, 2.0]) / self.offset_px.shape[1] ** 2
         return np.sqrt(np.abs(part) ** 2 @ weight)
@@ -118,7 +118,7 @@ def main() -> None:
 
 
 def view(scene: Scene, altitude_m: float, tilt_deg: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Position (3,) and rotation_camera_from_site, turned at random, of a camera whose axis meets the ground nearby."""
+    """Position (3,) and rotation_camera_from_site, with random roll, of a camera whose axis meets the ground nearby."""
     turn, aside = rng.uniform(0, 2 * np.pi, 2)
     lean = np.radians(tilt_deg) * np.array([np.cos(aside), np.sin(aside), 0.0])
     turned = matrix_from_rotation_vector(np.array([0.0, 0.0, turn]))
@@ -139,7 +139,7 @@ def judge(
     position_m: Array,
     rotation: Array,
 ) -> Judged:
-    """Label, render and compare one pose; a lens's distortion is laid on the picture as it is on frames."""
+    """Label, render and compare one pose; lens distortion is applied to the picture as to frames."""
     circles = RimCircles.of_scene(scene)
     labels = rings.labels_of(circles, camera, position_m, rotation)
     rows = rings.apart(labels.ellipses, camera, scale)
@@ -152,7 +152,7 @@ def judge(
 
 
 def summary(judged: list[Judged], low_px: float = 0.0, high_px: float = np.inf) -> dict[str, float]:
-    """Figures over the craters of some poses whose radius lies within bounds."""
+    """Figures over the craters of several poses whose radius lies within bounds."""
     radius = np.concatenate([j.radius_px for j in judged])
     chosen = (radius >= low_px) & (radius < high_px)
     error = np.concatenate([j.error_px for j in judged])[chosen]
@@ -178,7 +178,7 @@ def by_radius(judged: list[Judged]) -> dict[str, dict[str, float]]:
 
 
 def draw_histogram(path: Path, judged: list[Judged]) -> None:
-    """Errors of all craters, stacked by the view's tilt: as measured, and what an ellipse can follow."""
+    """Draw errors of all craters, stacked by the view's tilt: total, and the part up to the second harmonic."""
     figure, panels = plt.subplots(1, 2, figsize=(8.4, 2.6), layout="constrained")
     colours = plt.get_cmap("viridis")(np.linspace(0.1, 0.9, len(TILTS_DEG)))
     bins = np.linspace(0, 0.011, 45)

@@ -1,7 +1,7 @@
-"""Reads of a manifest of 100,000 frames and 5 million labels: time and memory, as parts and as whole tables.
+"""Time and memory of reading a manifest of 100,000 frames and 5 million labels, as parts and as whole tables.
 
-The tables are filled with numbers of the right types and sizes; nothing is rendered. Every figure is of a process of
-its own, from opening the dataset on, the best of three. Writes runs/bench/manifest.json.
+The tables are filled with numbers of the right types and sizes; nothing is rendered. Each figure is the best of three,
+in a separate process, measured from opening the dataset. Writes runs/bench/manifest.json.
 """
 
 import json
@@ -24,7 +24,7 @@ from perilune_shared.storage.checksums import seal
 from perilune_shared.storage.files import write_text
 
 N_SCENES, N_FRAMES, N_LABELS, N_CRATERS = 1000, 100, 50, 2000
-"""Scenes of one descent each, frames of each, labels of each frame, craters of each scene."""
+"""Scenes of one trajectory each, frames per scene, labels per frame, craters per scene."""
 _MEASURED = """
 import sys, time
 from perilune_shared.dataset.manifest import open_dataset
@@ -131,7 +131,7 @@ def _fill(root: Path, progress) -> None:
 
 
 def _table(name: str, n: int, known: dict, rng: np.random.Generator) -> pa.Table:
-    """A table of n rows: known columns, random numbers elsewhere, nulls where no text is known."""
+    """A table of n rows: given columns, random numbers in the others, nulls for other texts."""
     columns = {}
     for field in TABLES[name]:
         if field.name in known:

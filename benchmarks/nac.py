@@ -1,9 +1,9 @@
-"""Our frames beside real Narrow Angle Camera crops at the same ground sampling and under the same Sun.
+"""Compare rendered frames with Narrow Angle Camera crops at the same ground sampling and under the same Sun.
 
-`python benchmarks/nac.py folder`: the folder holds 8-bit PNG crops named by their product number (from which follows
-where the Sun stood) and a text file of human crater boxes beside each. For every crop a frame of each of some scenes of
-the configuration is rendered, looking straight down. Writes into runs/nac/: nac.json, curves that may be shown
-(spectra, gradients, brightness, counts) and sheet.png, which holds real pixels and stays where it is.
+`python benchmarks/nac.py folder`: the folder holds 8-bit PNG crops named by their product number, from which the
+position of the Sun is computed, and a text file of human-drawn crater boxes beside each. For every crop, renders a
+nadir view of several scenes of the configuration. Writes to runs/nac/: nac.json, curves that may be published (spectra,
+gradients, brightness, counts) and sheet.png, which contains real pixels and must not be published.
 """
 
 import json
@@ -38,25 +38,25 @@ FRAME_PX, FOV_DEG = 400, 12.0
 THRESHOLDS_PX = (8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)
 DEPTH_RATIOS = (0.02, 0.03, 0.04, 0.05, 0.06)
 CLEAR = 0.04
-"""Depth over diameter from which a crater of ours counts as one that people would mark."""
+"""Least depth over diameter of a rendered crater that counts as clear enough for a human to mark."""
 LEAST_PX = 8.0
-"""Smaller craters were not marked."""
+"""Least diameter, pixels: smaller craters were not marked."""
 HIGHEST_ABOVE = 1.6
-"""Start of the flight over the frame's altitude: ground goes on beyond the frame, within the vertices allowed."""
+"""Start altitude over the frame's altitude: extends the ground beyond the frame, within the vertex limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A grey image with its craters: a real crop or a frame of ours."""
+    """A grey image with its craters: a real crop or a rendered frame."""
 
     name: str
-    """Product name, or scene."""
+    """Product name or scene."""
     image: np.ndarray
     """Grey values (h, w), north up."""
     azimuth_deg: float
-    """Of the Sun, clockwise from north."""
+    """Azimuth of the Sun, clockwise from north."""
     elevation_deg: float
-    """Of the Sun."""
+    """Elevation of the Sun."""
     circles: Array
     """Centre x, y and diameter in pixels of the craters that are centred in the image (N, 3)."""
     depth_ratio: Array
@@ -64,7 +64,7 @@ class Picture:
 
 
 def read_crops(folder: Path, latitude_deg: float, longitude_deg: float) -> list[Picture]:
-    """The folder's crops, by the height of the Sun over the site."""
+    """The folder's crops, sorted by the Sun's elevation at the site."""
     if not folder.is_dir():
         raise UserError(folder, "NAC", "no such folder", "a folder of NAC crops (make compare-nac NAC=folder)")
     crops = []
@@ -91,7 +91,7 @@ def read_crops(folder: Path, latitude_deg: float, longitude_deg: float) -> list[
 
 
 def downward(config: DatasetConfig, sampling_m: float) -> tuple[DatasetConfig, Camera, FlightConfig]:
-    """The configuration with a narrow camera that looks straight down from where a pixel is `sampling_m` wide."""
+    """Configuration with a narrow nadir camera at the altitude where a pixel is `sampling_m` wide."""
     settings = CameraConfig(width_px=FRAME_PX, height_px=FRAME_PX, horizontal_fov_deg=FOV_DEG)
     camera = Camera.from_field_of_view(FRAME_PX, FRAME_PX, FOV_DEG)
     altitude = sampling_m * camera.fx_px
@@ -108,13 +108,13 @@ def downward(config: DatasetConfig, sampling_m: float) -> tuple[DatasetConfig, C
 def take_frame(
     scene: Scene, config: DatasetConfig, camera: Camera, altitude_m: float, azimuth_deg: float, elevation_deg: float
 ) -> Picture:
-    """One frame of a scene from straight above the site."""
+    """Render one frame of a scene from vertically above the site."""
     pose = np.array([0.0, 0.0, altitude_m]), ROTATION_CAMERA_FROM_BODY
     with Renderer(scene, config, camera, sun_direction(azimuth_deg, elevation_deg)) as renderer:
         radiance = renderer.render(*pose)
     labels = label_frame(RimCircles.of_scene(scene), camera, *pose, radiance, LEAST_PX / 2, 1e4)
     e, ratio = labels.ellipses, scene.rims.depth_m / scene.craters.diameter_m
-    # X_L is west and Y_L south: half a turn brings north up.
+    # X_L points west and Y_L south: a rotation by 180 degrees puts north up.
     return Picture(
         f"scene {scene.seed % 10000:04d}",
         np.rot90(_developed(radiance, config, camera, scene.seed), 2),
@@ -126,13 +126,13 @@ def take_frame(
 
 
 def _developed(radiance: Radiance, config: DatasetConfig, camera: Camera, seed: int) -> np.ndarray:
-    """Grey values; the camera hangs still."""
+    """Grey values, for a camera at rest."""
     pattern = FixedPattern.draw(config.sensor, camera, seed)
     return develop(radiance, config.sensor, camera, camera, np.zeros(3), pattern, stream(seed, "nac"))
 
 
 def take_frames(config: DatasetConfig, crops: list[Picture], n_scenes: int, sampling_m: float) -> list[list[Picture]]:
-    """For each crop a frame of each scene under the crop's Sun."""
+    """For each crop, one frame of each scene under the crop's Sun."""
     config, camera, flight = downward(config, sampling_m)
     frames: list[list[Picture]] = [[] for _ in crops]
     with progress_bar() as bar:
@@ -148,7 +148,7 @@ def take_frames(config: DatasetConfig, crops: list[Picture], n_scenes: int, samp
 
 
 def figures_of(pictures: list[Picture], least_depth_ratio: float | None = None) -> dict:
-    """Statistics of pictures taken together: medians of each figure and of the spectrum, and the pooled count."""
+    """Statistics over several pictures: medians of each figure and of the spectrum, and the pooled count."""
     single = [st.summary(picture.image) for picture in pictures]
     area = sum(picture.image.size for picture in pictures)
     diameter = np.concatenate([_circles(picture, least_depth_ratio)[:, 2] for picture in pictures])
@@ -166,7 +166,7 @@ def _circles(picture: Picture, least_depth_ratio: float | None) -> Array:
 
 
 def contrasts(pictures: list[Picture], least_depth_ratio: float | None = None) -> dict[str, float | None]:
-    """Median contrast of the craters between two diameters; null where fewer than five are seen."""
+    """Median contrast of the craters between two diameters; null if there are fewer than five."""
     chosen = [_circles(picture, least_depth_ratio) for picture in pictures]
     contrast = np.concatenate([st.crater_contrast(p.image, c) for p, c in zip(pictures, chosen, strict=True)])
     diameter = np.concatenate(chosen)[:, 2]
@@ -178,10 +178,10 @@ def contrasts(pictures: list[Picture], least_depth_ratio: float | None = None) -
 
 
 def distances(ours: dict, real: dict) -> dict[str, float]:
-    """How far ours are from the real ones: 0 everywhere is alike. Logarithms are to base 10."""
+    """Differences between rendered and real statistics; 0 means equal. Logarithms are to base 10."""
     spectra = np.array(ours["spectrum"]), np.array(real["spectrum"])
     apart = st.log_difference(*spectra, 0.02, 0.4)
-    # A crop's contrast may have been stretched: the shape of its spectrum is what no stretch changes.
+    # A crop's contrast may have been stretched: stretching does not change the shape of its spectrum.
     found = {"spectrum_rms_0.02_0.4": float(np.sqrt(np.mean(apart**2))), "spectrum_shape_rms": float(apart.std())}
     for low, high in ((0.01, 0.03), (0.03, 0.1), (0.1, 0.25), (0.25, 0.5)):
         found[f"spectrum_log_{low}_{high}"] = float(np.mean(st.log_difference(*spectra, low, high)))
@@ -193,7 +193,7 @@ def distances(ours: dict, real: dict) -> dict[str, float]:
 
 
 def count_distances(ours: list[float], real: list[float]) -> dict[str, float | None]:
-    """log10 of our count over the real one from 8, 16 and 32 pixels on; null where one is 0."""
+    """log10 of the rendered over the real count from 8, 16 and 32 pixels; null if either is 0."""
     found: dict[str, float | None] = {}
     for threshold, a, b in zip(THRESHOLDS_PX, ours, real, strict=True):
         if threshold in (8, 16, 32):
@@ -202,7 +202,7 @@ def count_distances(ours: list[float], real: list[float]) -> dict[str, float | N
 
 
 def compare(crops: list[Picture], frames: list[list[Picture]]) -> dict:
-    """All figures: each crop beside the frames under its Sun, medians of their distances, and craters pooled."""
+    """All figures: each crop and the frames under its Sun, medians of their differences, and pooled craters."""
     rows = []
     for crop, taken in zip(crops, frames, strict=True):
         ours, real = figures_of(taken), figures_of([crop])
@@ -223,7 +223,7 @@ def compare(crops: list[Picture], frames: list[list[Picture]]) -> dict:
 
 
 def draw_sheet(path: Path, crops: list[Picture], frames: list[list[Picture]]) -> None:
-    """Pairs, the Sun rising: a middling part of each crop, then the frame of ours with the nearest share of shadow."""
+    """Draw pairs by ascending Sun: a crop's part of median contrast, and the frame closest in share of shadow."""
     pairs = []
     for crop, taken in zip(crops, frames, strict=True):
         n = FRAME_PX

@@ -1,4 +1,4 @@
-"""Curves of real NAC crops beside those of our frames. No picture holds a pixel of either."""
+"""Curves of real NAC crops and of rendered frames. The plots contain no pixels of either."""
 
 from pathlib import Path
 
@@ -15,9 +15,10 @@ REAL, OURS = "tab:orange", "tab:blue"
 
 
 def draw_curves(out: Path, figures: dict, real: list[np.ndarray], ours: list[np.ndarray]) -> None:
-    """spectra.png, gradients.png, brightness.png and counts.png: medians, and the band from 10 to 90 % of the images.
+    """Write spectra.png, gradients.png, brightness.png and counts.png.
 
-    `figures` are those of nac.json; `real` and `ours` are grey images.
+    They show medians and the band from 10 to 90 % of the images. `figures` is the content of nac.json; `real` and
+    `ours` are grey images.
     """
     _draw_spectra(out / "spectra.png", figures["crops"])
     middles = (st.GRADIENT_EDGES[1:] + st.GRADIENT_EDGES[:-1]) / 2
@@ -47,7 +48,7 @@ def _save(figure, path: Path) -> None:
 
 
 def _draw_spectra(path: Path, rows: list[dict]) -> None:
-    """A panel for each third of the crops, the Sun rising from left to right."""
+    """One panel for each third of the crops, with the Sun's elevation ascending from left to right."""
     thirds = [part for part in np.array_split(np.arange(len(rows)), 3) if len(part)]
     figure, axes = plt.subplots(1, len(thirds), figsize=(4.2 * len(thirds), 3.8), sharey=True, squeeze=False)
     for ax, part in zip(axes[0], thirds, strict=True):
@@ -82,7 +83,7 @@ def _draw_counts(path: Path, figures: dict) -> None:
 
 
 def _band(ax, x, curves: np.ndarray, colour: str, label: str) -> None:
-    """Median and 10 to 90 % of the curves (N, len(x))."""
+    """Median and 10 and 90 % quantiles of the curves (N, len(x))."""
     low, middle, high = np.percentile(curves, [10, 50, 90], axis=0)
     ax.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
     ax.plot(x, middle, color=colour, label=label)

@@ -1,4 +1,4 @@
-"""Statistics of grey images of the Moon and of the craters in them. Images are divided by their own mean first."""
+"""Statistics of grey images of the Moon and of their craters. Each image is first divided by its own mean."""
 
 from pathlib import Path
 
@@ -8,20 +8,23 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
 FREQUENCY_EDGES = np.geomspace(0.01, 0.5, 17)
-"""Of the power spectra's bands, cycles per pixel."""
+"""Edges of the bands of the power spectra, cycles per pixel."""
 FREQUENCY = np.sqrt(FREQUENCY_EDGES[1:] * FREQUENCY_EDGES[:-1])
 GRADIENT_EDGES = np.linspace(-3, 0.5, 71)
-"""Of the gradients' histogram, log10 of the change of brightness over its mean per pixel."""
+"""Edges of the gradient histogram: log10 of the change of brightness per pixel over the image's mean."""
 BRIGHTNESS_EDGES = np.linspace(0, 3, 76)
-"""Of the brightness' histogram, over its mean."""
+"""Edges of the brightness histogram, in units of the image's mean."""
 LEAST_POWER = 1e-9
-"""Of a spectrum: a tile that is black all over has none."""
+"""Least power of a spectrum: a completely black tile has no power."""
 DARK = 0.2
-"""Darker than this share of the mean counts as shadow."""
+"""Pixels below this share of the mean count as shadow."""
 
 
 def read_boxes(path: Path) -> Array:
-    """Crater boxes (N, 4) as left, top, width, height in pixels; columns ID, X, Y, W, H, ... by commas or tabs."""
+    """Read crater boxes (N, 4): left, top, width, height in pixels.
+
+    The columns are ID, X, Y, W, H, ..., separated by commas or tabs.
+    """
     boxes = []
     for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
         fields = line.replace("\t", ",").split(",")
@@ -37,14 +40,14 @@ def read_boxes(path: Path) -> Array:
 
 
 def box_circles(boxes: Array, width_px: int, height_px: int) -> Array:
-    """Centre x, y and diameter, mean of width and height (M, 3), of the boxes (N, 4) that are centred in the image."""
+    """Centre x, y and mean of width and height (M, 3) of the boxes (N, 4) that are centred in the image."""
     x, y = boxes[:, 0] + boxes[:, 2] / 2, boxes[:, 1] + boxes[:, 3] / 2
     inside = (x >= 0) & (y >= 0) & (x < width_px) & (y < height_px)
     return np.stack([x, y, boxes[:, 2:].mean(axis=1)], axis=1)[inside]
 
 
 def crater_contrast(image: np.ndarray, circles: Array) -> Array:
-    """Standard deviation of brightness over its mean within each circle x, y, diameter (N, 3); NaN at the edge."""
+    """Standard deviation over mean of the brightness within each circle x, y, diameter (N, 3); NaN at the edge."""
     height, width = image.shape
     contrast = np.full(len(circles), np.nan)
     for k, (x, y, diameter) in enumerate(circles):
@@ -57,15 +60,15 @@ def crater_contrast(image: np.ndarray, circles: Array) -> Array:
 
 
 def cumulative_counts(diameters_px: Array, area_px: float, thresholds_px: Array) -> Array:
-    """Craters of at least each threshold in a million pixels."""
+    """Number per million pixels of craters of at least each threshold."""
     return (diameters_px[:, None] >= np.asarray(thresholds_px)).sum(axis=0) * 1e6 / area_px
 
 
 def power_spectrum(image: np.ndarray, tile_px: int = 200) -> Array:
-    """Radially averaged power spectral density (FREQUENCY,) of an image (h, w) over its mean.
+    """Radially averaged power spectral density (FREQUENCY,) of an image (h, w) divided by its mean.
 
-    The median over Hann-windowed tiles, which one tile in shadow does not move; white noise of variance v has the
-    density v. Bands that hold no frequency of a tile are NaN.
+    The median over Hann-windowed tiles, so that a single tile in shadow has no effect; white noise of variance v has
+    the density v. Bands that contain no frequency of a tile are NaN.
     """
     relative = image / image.mean()
     window = np.outer(np.hanning(tile_px), np.hanning(tile_px))
@@ -86,19 +89,19 @@ def power_spectrum(image: np.ndarray, tile_px: int = 200) -> Array:
 
 
 def gradients(image: np.ndarray) -> np.ndarray:
-    """Size of the gradient (h, w), central differences of the image over its mean, per pixel."""
+    """Gradient magnitude (h, w) per pixel: central differences of the image divided by its mean."""
     down, right = np.gradient(image / image.mean())
     return np.hypot(down, right)
 
 
 def histogram(values: np.ndarray, edges: Array) -> Array:
-    """Density over the bins; what lies outside counts in the first or last."""
+    """Density over the bins; values outside count in the first or last bin."""
     inside = np.clip(values.ravel(), edges[0], edges[-1])
     return np.histogram(inside, edges)[0] / (inside.size * np.diff(edges))
 
 
 def summary(image: np.ndarray) -> dict[str, float]:
-    """Figures of one image (h, w): brightness over its mean, and gradients."""
+    """Figures of one image (h, w): brightness divided by its mean, and gradients."""
     relative = image / image.mean()
     gradient = gradients(image)
     return {
@@ -114,6 +117,6 @@ def summary(image: np.ndarray) -> dict[str, float]:
 
 
 def log_difference(ours: Array, real: Array, low: float, high: float) -> Array:
-    """log10 of the ratio of two spectra in the bands between two frequencies."""
+    """log10 of the ratio of two spectra, for the bands between two frequencies."""
     wanted = np.isfinite(ours * real) & np.less_equal(low, FREQUENCY) & np.less_equal(FREQUENCY, high)
     return np.log10(ours[wanted] / real[wanted])

@@ -1,8 +1,8 @@
-"""Where the Sun stood when a Narrow Angle Camera image was taken, from its product number alone.
+"""Position of the Sun for a Narrow Angle Camera image, computed from its product number alone.
 
-The digits after the M of a product's name count seconds of the spacecraft's clock; ten digits that begin with 1 go on
-where nine ended. Of the Sun and the Moon only the largest terms are taken (Meeus, Astronomical Algorithms, chapters 25,
-47 and 53): the Sun is right to a few tenths of a degree.
+The digits after the M of a product name count seconds of the spacecraft clock; ten-digit numbers that begin with 1
+continue the nine-digit ones. Only the largest terms of the Sun's and the Moon's motion are used (Meeus, Astronomical
+Algorithms, chapters 25, 47 and 53): the Sun's position is accurate to a few tenths of a degree.
 """
 
 import re
@@ -11,19 +11,19 @@ from datetime import datetime, timedelta
 import numpy as np
 
 _CLOCK = 128963531, datetime(2010, 5, 20, 2, 57, 44)
-"""Number and start of M128963531, from its label."""
+"""Clock number and start time of M128963531, from its label."""
 _MOON_LONGITUDE = (
     (6.288774, 0, 0, 1, 0), (1.274027, 2, 0, -1, 0), (0.658314, 2, 0, 0, 0), (0.213618, 0, 0, 2, 0),
     (-0.185116, 0, 1, 0, 0), (-0.114332, 0, 0, 0, 2), (0.058793, 2, 0, -2, 0), (0.057066, 2, -1, -1, 0),
 )  # fmt: skip
-"""Amplitude in degrees; multiples of the elongation, the Sun's and the Moon's anomaly and the node's distance."""
+"""Amplitude in degrees; multiples of the elongation, of the anomalies of Sun and Moon, and of the node's distance."""
 _INCLINATION_DEG = 1.54242
 _MOON_OVER_SUN = 1 / 389
-"""Mean distances from the Earth."""
+"""Ratio of the mean distances from the Earth."""
 
 
 def time_of(name: str) -> datetime | None:
-    """Start (UTC) of the image whose name begins with its product number; None where it does not."""
+    """Start (UTC) of the image whose name begins with a product number; None for other names."""
     found = re.match(r"M(1\d{8,9})(?!\d)", name)
     if found is None:
         return None
@@ -33,7 +33,7 @@ def time_of(name: str) -> datetime | None:
 
 
 def subsolar_point(time: datetime) -> tuple[float, float]:
-    """Latitude and longitude in degrees of the place on the Moon that has the Sun overhead; longitude -180 to 180."""
+    """Latitude and longitude, degrees, of the subsolar point on the Moon; longitude -180 to 180."""
     century = ((time - datetime(2000, 1, 1, 12)).total_seconds() + 67) / 86400 / 36525
     anomaly = 357.52911 + 35999.05029 * century
     sun = 280.46646 + 36000.76983 * century + 1.914602 * _sin(anomaly) + 0.019993 * _sin(2 * anomaly)
@@ -44,7 +44,7 @@ def subsolar_point(time: datetime) -> tuple[float, float]:
     moon = 218.3164477 + 481267.88123421 * century
     moon += sum(term[0] * _sin(np.dot(term[1:], angles)) for term in _MOON_LONGITUDE)
     moon_latitude = 5.128 * _sin(from_node)
-    # The Moon as seen from the Sun.
+    # Coordinates of the Moon seen from the Sun.
     longitude = sun + 180 + np.degrees(_MOON_OVER_SUN) * _cos(moon_latitude) * _sin(sun - moon)
     latitude = _MOON_OVER_SUN * moon_latitude
     w = longitude - (125.0445479 - 1934.1362891 * century)
@@ -60,7 +60,7 @@ def subsolar_point(time: datetime) -> tuple[float, float]:
 
 
 def sun_over(latitude_deg: float, longitude_deg: float, time: datetime) -> tuple[float, float]:
-    """Azimuth clockwise from north and elevation of the Sun at a place on the Moon, degrees."""
+    """Azimuth (clockwise from north) and elevation of the Sun at a place on the Moon, degrees."""
     sun_latitude, sun_longitude = subsolar_point(time)
     hour = longitude_deg - sun_longitude
     up = _sin(latitude_deg) * _sin(sun_latitude) + _cos(latitude_deg) * _cos(sun_latitude) * _cos(hour)

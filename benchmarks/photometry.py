@@ -1,9 +1,9 @@
-"""Rendered radiance against the formulas, over all directions of light and view.
+"""Compare rendered radiance with the formulas, over all directions of light and view.
 
-For each law and phase angle one image of a mosaic of small tilted planes, rendered through the project's own material,
-lamp and Cycles settings into an EXR. Every pixel whose four corners lie on one plane is compared with the law at that
-pixel's own angles. The planes throw no shadows here, and the Sun is a point: a disc of 0.5 degrees would average the
-law over directions, which is right but is not the formula. Writes runs/bench/photometry.json.
+For each law and phase angle, one image of a mosaic of small tilted planes is rendered through the project's own
+material, lamp and Cycles settings into an EXR. Every pixel whose four corners lie on one plane is compared with the law
+at the angles of that pixel. The planes cast no shadows, and the Sun is a point: a disc of 0.5 degrees would average the
+law over directions, which is physically correct but differs from the formula. Writes runs/bench/photometry.json.
 """
 
 import json
@@ -36,7 +36,7 @@ ROTATION_CAMERA_FROM_SITE = np.diag([1.0, -1.0, -1.0])
 def main() -> None:
     """Run the benchmark."""
     n_cells = int(np.ceil(np.sqrt(len(EMISSION_DEG) * len(AZIMUTH_DEG))))
-    # Half a degree across, so that an image holds nearly one phase angle.
+    # A field of view of half a degree, so that the phase angle is nearly constant over an image.
     camera = Camera.from_field_of_view(n_cells * CELL_PX, n_cells * CELL_PX, 0.5)
     cell_m = CELL_PX * HEIGHT_M / camera.fx_px
     laws = get_args(LightConfig.model_fields["photometry"].annotation)
@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def tilted_normals(sun: Array) -> Array:
-    """Normals (N, 3) at all emission angles and azimuths from the camera's axis that the Sun lights."""
+    """Sunlit normals (N, 3) at all emission angles and azimuths about the camera's axis."""
     emission, azimuth = (a.ravel() for a in np.radians(np.meshgrid(EMISSION_DEG, AZIMUTH_DEG, indexing="ij")))
     flat = np.sin(emission)
     normals = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.cos(emission)], axis=1)
@@ -104,7 +104,7 @@ def render_planes(
 
 
 def pixels_on_planes(camera: Camera, normals: Array, centres_m: Array, half_m: float) -> tuple[Array, np.ndarray]:
-    """Direction to the camera (h, w, 3), and the plane (h, w) on which all of a pixel lies, -1 where none."""
+    """Direction to the camera (h, w, 3), and the plane (h, w) that contains the whole pixel, -1 for none."""
     rays = camera.rays(camera.pixel_centres()) @ ROTATION_CAMERA_FROM_SITE
     view = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     plane = np.full(view.shape[:2], -1)
@@ -125,7 +125,7 @@ def pixels_on_planes(camera: Camera, normals: Array, centres_m: Array, half_m: f
 
 
 def law_figures(errors: list[Array]) -> dict[str, object]:
-    """Figures of one law, with the worst pixel of each phase angle."""
+    """Figures of one law, with the largest error of each phase angle."""
     both = np.concatenate(errors)
     return {
         "worst_relative": float(both.max()),

@@ -1,9 +1,9 @@
-"""Time of a frame of ours against a bare Blender loop over the same scene, poses and passes; both write EXR and PNG.
+"""Time per frame of perilune compared with a bare Blender loop over the same scene, poses and passes.
 
-The bare loop is what a script without perilune would do: set the camera, render to an EXR with depth and normals, turn
-it into a PNG. Ours adds the sensor, labels, visibility, hashes and the manifest. Both run in one process, frames
-alternating, so that a noisy machine slows both alike. The second pass that EXRs cost, for depth and normals at the
-pixels' centres, is timed apart. Writes runs/bench/render.json.
+Both write EXR and PNG. The bare loop is a script without perilune: set the camera, render to an EXR with depth and
+normals, convert it to a PNG. perilune adds the sensor, labels, visibility, hashes and the manifest. Both run in one
+process with frames alternating, so that other load on the machine affects both equally. The second pass for EXRs (depth
+and normals at the pixel centres) is timed separately. Writes runs/bench/render.json.
 """
 
 import json

@@ -1,8 +1,8 @@
-"""Thin glowing rings on rim circles: rendered by Blender, and found again in the picture to a fraction of a pixel.
+"""Thin glowing rings on rim circles: rendered by Blender, then located in the picture with subpixel accuracy.
 
-A ring is a tube about the circle. In the picture its middle line is the circle's image: the outlines of a thin tube lie
-evenly on both sides, but for terms of the tube's width squared over distance and radius. Along a normal of a label's
-ellipse the ring is a hump, whose centre of gravity is the place of its middle line.
+A ring is a tube around the circle. In the picture its middle line is the image of the circle: the outlines of a thin
+tube are symmetric about it, except for terms of the tube's width squared over distance and radius. Along a normal of a
+label's ellipse the ring's brightness is a hump; its centre of gravity is the position of the middle line.
 """
 
 from pathlib import Path
@@ -22,13 +22,13 @@ from perilune_shared.geometry.ellipse import Ellipses, rim_points
 from perilune_shared.geometry.frames import Array
 
 TUBE_PX = 1.5
-"""Half a ring's width, pixels of the picture."""
+"""Half the width of a ring, pixels of the picture."""
 REACH_PX = 6.0
-"""How far from the ellipse a ring is looked for, pixels of the picture."""
+"""Search distance from the ellipse, pixels of the picture."""
 LEAST_AXIS_PX = REACH_PX + TUBE_PX + 1
-"""Least semi-minor axis, pixels of the picture: a narrower ring's far side would come into reach."""
+"""Least semi-minor axis, pixels of the picture: the far side of a narrower ring would be within reach."""
 LEAST_BEND_PX = 2 * TUBE_PX
-"""Least radius of curvature, pixels of the picture: at sharper ends both sides are in reach."""
+"""Least radius of curvature, pixels of the picture: at sharper ends both sides are within reach."""
 APART_PX = REACH_PX + TUBE_PX + 4
 """Least distance between rings, pixels of the picture."""
 N_DIRECTIONS = 64
@@ -37,20 +37,20 @@ _STEP_PX = 0.125
 
 
 def labels_of(circles: RimCircles, camera: Camera, position_m: Array, rotation_camera_from_site: Array) -> Labels:
-    """Labels of 2 to 50 px by the project's own rule, with nothing in front of any."""
+    """Labels of 2 to 50 px by the project's rule, without occlusion."""
     shape = (camera.height_px, camera.width_px)
     nothing = Radiance(np.zeros(shape), np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros(shape, bool))
     return label_frame(circles, camera, position_m, rotation_camera_from_site, nothing, 2.0, 50.0)
 
 
 def rows_of(ellipses: Ellipses, rows: np.ndarray) -> Ellipses:
-    """Some of the ellipses."""
+    """The given rows of the ellipses."""
     e = ellipses
     return Ellipses(e.cx_px[rows], e.cy_px[rows], e.a_px[rows], e.b_px[rows], e.theta_rad[rows])
 
 
 def outline(ellipses: Ellipses, n: int) -> tuple[Array, Array]:
-    """Points (N, n, 2) on the ellipses and outward unit normals (N, n, 2) there."""
+    """Points (N, n, 2) on the ellipses and the outward unit normals (N, n, 2) at these points."""
     e, angle = ellipses, 2 * np.pi * np.arange(n) / n
     x, y = e.a_px[:, None] * np.cos(angle), e.b_px[:, None] * np.sin(angle)
     along, across = np.cos(angle) / e.a_px[:, None], np.sin(angle) / e.b_px[:, None]
@@ -61,15 +61,18 @@ def outline(ellipses: Ellipses, n: int) -> tuple[Array, Array]:
 
 
 def wide_enough(ellipses: Ellipses, scale: int) -> np.ndarray:
-    """Whether rings on the ellipses (N,) can be judged in a picture with `scale` pixels in place of each of theirs."""
+    """Whether rings on the ellipses (N,) can be measured in the picture.
+
+    The picture has `scale` x `scale` pixels for each label pixel.
+    """
     bend_px = ellipses.b_px**2 / ellipses.a_px
     return (ellipses.b_px * scale >= LEAST_AXIS_PX) & (bend_px * scale >= LEAST_BEND_PX)
 
 
 def apart(ellipses: Ellipses, camera: Camera, scale: int) -> np.ndarray:
-    """Rows of ellipses, the largest first, that lie whole in the frame and whose rings do not touch in the picture.
+    """Rows of ellipses, largest first, that lie entirely in the frame and whose rings do not touch in the picture.
 
-    The picture has `scale` pixels in place of each of the camera's.
+    The picture has `scale` x `scale` pixels for each of the camera's pixels.
     """
     boxes, edge = ellipses.bounding_boxes(), APART_PX / scale
     whole = (boxes[:, :2] > edge).all(axis=1)
@@ -97,7 +100,7 @@ def render_rings(
     rotation: Array,
     samples: int,
 ) -> np.ndarray:
-    """A picture (h, w) of glowing rings of 2 TUBE_PX of its pixels on some of the circles, 1 on them and 0 beside."""
+    """Render a picture (h, w) of rings, 2 TUBE_PX pixels wide, on some of the circles: 1 on rings, 0 elsewhere."""
     centres, radii = circles.centre_m[rows], circles.radius_m[rows]
     tubes_m = TUBE_PX / camera.fx_px * camera_from_site(centres, position_m, rotation)[:, 2]
     light, up = LightConfig(), np.array([0.0, 0.0, 1.0])
@@ -128,9 +131,9 @@ def tubes(centres_m: Array, normals: Array, radii_m: Array, tubes_m: Array) -> t
 
 
 def ring_offsets(picture: np.ndarray, scale: int, ellipses: Ellipses) -> Array:
-    """Distances (N, N_DIRECTIONS) of the rings from the ellipses along these' normals, outwards, label pixels.
+    """Distances (N, N_DIRECTIONS) of the rings from the ellipses along the ellipses' outward normals, label pixels.
 
-    `picture` has `scale` pixels in place of each of the labels'. NaN where no whole ring lies within REACH_PX.
+    `picture` has `scale` x `scale` pixels for each label pixel. NaN where no complete ring lies within REACH_PX.
     """
     points, normals = outline(ellipses, N_DIRECTIONS)
     steps = np.arange(-REACH_PX, REACH_PX + 0.5 * _STEP_PX, _STEP_PX)
@@ -142,15 +145,15 @@ def ring_offsets(picture: np.ndarray, scale: int, ellipses: Ellipses) -> Array:
 
 
 def errors_px(offsets: Array, scale: int) -> Array:
-    """Error (N,) of each label: the r.m.s. over all directions of the distance of ring and ellipse, label pixels.
+    """Error (N,) of each label: the r.m.s. distance of ring and ellipse over all directions, label pixels.
 
-    A direction without a ring counts as the largest distance that could have been seen.
+    A direction without a ring counts as the largest measurable distance.
     """
     return np.sqrt(np.mean(np.square(np.where(np.isnan(offsets), REACH_PX / scale, offsets)), axis=1))
 
 
 def _glow() -> bpy.types.Material:
-    """A surface of radiance 1 that lights nothing."""
+    """A surface of radiance 1 that does not illuminate others."""
     material = bpy.data.materials.new("glow")
     material.use_nodes = True
     material.cycles.emission_sampling = "NONE"

@@ -1,6 +1,6 @@
-"""Average precision against multiply-adds of several detect runs: what a smaller network costs.
+"""Average precision against multiply-adds of several detect runs.
 
-Takes folders of finished runs; those that learnt from a teacher are marked. Writes size.json and size.png.
+Takes folders of finished runs; distilled runs are marked. Writes size.json and size.png.
 """
 
 import json
@@ -18,7 +18,7 @@ SIZE_PX = 256
 
 
 def point(root: Path) -> dict[str, Any]:
-    """A run's size, for an image of 256 x 256 pixels, and its figures on the test split."""
+    """Multiply-adds of a run for an image of 256 x 256 pixels, and its metrics on the test split."""
     trained = load_trained(root)
     metrics = json.loads((root / "metrics.json").read_text(encoding="utf-8"))
     try:
@@ -40,7 +40,7 @@ def point(root: Path) -> dict[str, Any]:
 
 
 def draw(points: list[dict[str, Any]], path: Path) -> None:
-    """AP (the paper's sum) against multiply-adds; distilled runs have their own line."""
+    """Plot AP (the paper's sum) against multiply-adds; distilled runs have their own line."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -73,7 +73,7 @@ def main(
     runs: Annotated[list[Path], typer.Argument(help="Folders of finished runs.")],
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Draw size and precision of runs."""
+    """Plot size and precision of runs."""
     points = [point(root) for root in runs]
     write_text(out / "size.json", json.dumps(points, indent=1) + "\n")
     draw(points, out / "size.png")

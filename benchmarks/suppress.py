@@ -1,6 +1,6 @@
-"""Time of suppression: OpenCV's, frame by frame, against a whole batch on the device.
+"""Time of non-maximum suppression: OpenCV frame by frame against a whole batch on the device.
 
-A frame has 8,000 candidates, about fifteen for each crater. Both keep the same boxes. Writes runs/bench/suppress.json.
+A frame has 8,000 candidates, about fifteen per crater. Both keep the same boxes. Writes runs/bench/suppress.json.
 """
 
 import json
@@ -21,7 +21,7 @@ CANDIDATES, THRESHOLD_IOU, ROUNDS = 8000, 0.45, 7
 
 
 def candidates(rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """Boxes (K, 4) and scores (K,) of one frame of 256 px."""
+    """Boxes (K, 4) and scores (K,) for one frame of 256 px."""
     which = rng.integers(CANDIDATES // 15, size=CANDIDATES)
     side = rng.lognormal(1.8, 0.6, (CANDIDATES // 15, 1)).clip(3, 80)[which]
     centre = rng.uniform(0, 256, (CANDIDATES // 15, 2))[which] + 0.1 * side * rng.normal(size=(CANDIDATES, 2))
@@ -31,7 +31,7 @@ def candidates(rng: np.random.Generator) -> tuple[Tensor, Tensor]:
 
 
 def median_s(call: Callable[[], object]) -> float:
-    """Median time of a call, seconds."""
+    """Median time of a call in seconds."""
     times = []
     for _ in range(ROUNDS):
         begin = time.perf_counter()
@@ -41,7 +41,7 @@ def median_s(call: Callable[[], object]) -> float:
 
 
 def main() -> None:
-    """The command."""
+    """Run the benchmark."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     result: dict[str, object] = {"device": device, "candidates": CANDIDATES}
     for n_frames in (1, 8):

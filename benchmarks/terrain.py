@@ -1,7 +1,8 @@
-"""Speed and size of growing the ground, on one core: a 4 km scene, laying craters, a second descent from the cache.
+"""Time and memory of terrain generation on one core.
 
-Run on one core by itself (it gives up the others). Compilation by numba is done once and kept, so everything is warmed
-up on a small scene first. Writes runs/bench/terrain.json.
+Measures a 4 km scene, stamping craters, and a second trajectory from the cache. Runs on one core (it gives up the
+others). Compilation by numba is done once and cached, so a small scene warms everything up first. Writes
+runs/bench/terrain.json.
 """
 
 import json
@@ -35,14 +36,14 @@ COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000)
 
 
 def mesh_of(scene: Scene) -> int:
-    """Vertices and faces of ground and boulders in memory; their number of bytes."""
+    """Build vertices and faces of ground and boulders; returns their number of bytes."""
     ground = vertices(scene.grid, scene.height_m), scene.grid.quads()
     stones = boulder_mesh(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed)
     return sum(array.nbytes for array in (*ground, *stones))
 
 
 def lay(grid: Grid, craters: Craters) -> float:
-    """Seconds to lay craters on flat ground."""
+    """Time in seconds to stamp craters on flat ground."""
     height, albedo = np.zeros(grid.n_vertices), np.ones(grid.n_vertices)
     start = time.perf_counter()
     stamp_craters(height, albedo, grid, craters, np.zeros(len(craters)))
@@ -50,7 +51,7 @@ def lay(grid: Grid, craters: Craters) -> float:
 
 
 def numbered(grid: Grid, n: int, seed: int) -> Craters:
-    """n craters of the default law, oldest first, whatever density that takes."""
+    """n craters of the default law, oldest first, at the density that this number requires."""
     config = CratersConfig(equilibrium_share=Span(low=1.0, high=1.0))
     drawn = draw_craters(config, grid, seed)
     share = 1.3 * n / len(drawn)
@@ -67,7 +68,7 @@ def main() -> None:
     tiny = resolve(DatasetConfig, "dataset", "perilune_render", "tiny")
     grow_scene(config, camera_of(tiny.camera), FlightConfig(), 1)
     flight = config.detect.flight.model_copy(update={"downrange_m": 1090.0})
-    # The profiles' tables are part of the work; only what numba compiled is kept.
+    # Building the profile tables is part of the measured work; only numba's compiled code is kept.
     profile_tables.cache_clear()
     start = time.perf_counter()
     scene = grow_scene(config, camera, flight, 7)
@@ -103,7 +104,7 @@ def main() -> None:
 
 
 def second_descent(config: DatasetConfig) -> dict[str, float]:
-    """Seconds from the settings to the first rendered frame, without and with the scene in the cache."""
+    """Time in seconds from the settings to the first rendered frame, without and with the scene in the cache."""
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     plan = make_plan(config, "detect")
     times = []

@@ -1,6 +1,6 @@
-"""Frames a second of the detector's training, beside the same training fed from memory and a bare loop by hand.
+"""Training speed of the detector, compared with the same training fed from memory and a bare hand-written loop.
 
-The three take turns in one process, since a machine's speed changes. Each turn trains the preset's network from the
+The three alternate in one process, since a machine's speed changes. Each turn trains the preset's network from the
 same weights on the same batches; the first steps of a turn are not counted. Writes runs/bench/train.json.
 
 - ours: `fit` as `detect train` calls it: frames augmented on the fly, moving average, clipping, schedule,
@@ -42,7 +42,7 @@ _UNCOUNTED = 3
 
 
 class Clock(Callback):
-    """Seconds of the steps that count."""
+    """Measures the time of the counted steps in seconds."""
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
         if batch_idx == _UNCOUNTED - 1:
@@ -51,7 +51,7 @@ class Clock(Callback):
 
 
 class Timed(DetectTask):
-    """The detector's training, with batches from memory where some are given."""
+    """The detector's training, optionally with batches from memory."""
 
     batches: list | None = None
 
@@ -62,18 +62,18 @@ class Timed(DetectTask):
     def train_dataloader(self):
         if self.batches is None:
             return super().train_dataloader()
-        # As they are: a bare list would be taken for several loaders.
+        # A DataLoader returns the batches unchanged. Lightning would treat a bare list as several loaders.
         return DataLoader(self.batches, batch_size=None, collate_fn=lambda batch: batch)  # type: ignore[arg-type]
 
 
 def few(split: DetectSplit, count: int) -> DetectSplit:
-    """The first frames of a split."""
+    """The first `count` frames of a split."""
     frames = replace(split.frames, table=split.frames.table.iloc[:count], images=split.frames.images[:count])
     return replace(split, frames=frames, labels=split.labels[:count])
 
 
 def trained(network: YOLOv3, config: DetectConfig, train: DetectSplit, val: DetectSplit, batches: list | None) -> float:
-    """Seconds of an epoch's counted steps by `fit`."""
+    """Time in seconds of the counted steps of an epoch of `fit`."""
     task = Timed(copy.deepcopy(network), config, train, val, 0)
     task.batches = batches
     with tempfile.TemporaryDirectory() as folder:
@@ -83,7 +83,7 @@ def trained(network: YOLOv3, config: DetectConfig, train: DetectSplit, val: Dete
 
 
 def bare(network: YOLOv3, config: DetectConfig, batches: list, device: str, bf16: bool) -> float:
-    """Seconds of the counted steps by hand."""
+    """Time in seconds of the counted steps of the bare loop."""
     network = copy.deepcopy(network).to(device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, fused=True)
     start = 0.0
@@ -131,7 +131,7 @@ def main(
         seconds["ours"].append(trained(network, config, train, val, None))
         seconds["memory"].append(trained(network, config, train, val, batches))
         seconds["bare"].append(bare(network, config, batches, device, bf16))
-    # Of neighbouring turns, which share the machine's mood.
+    # Ratios of neighbouring turns, since the machine's speed changes over time.
     ratios = {
         name: [other / own for own, other in zip(seconds["ours"], seconds[name], strict=True)]
         for name in ("memory", "bare")

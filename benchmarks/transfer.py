@@ -1,15 +1,16 @@
-"""How to start from a pretrained backbone with frozen weights: four choices, compared on features and loss.
+"""Compare four ways to start from a pretrained, frozen backbone, on features and loss.
 
-A plain detector (no attention) is trained from scratch. Its backbone then starts networks with attention. The backbone
-weights stay frozen while gates, neck and heads learn. Neck and heads start at random, as from darknet53.conv.74.
+A plain detector (no attention) is trained from scratch. Its backbone then initialises networks with attention. The
+backbone weights stay frozen while gates, neck and heads are trained. Neck and heads start at random, as from
+darknet53.conv.74.
 
     frozen       plain CBAM, weights and batch statistics frozen
     adapt        plain CBAM, weights frozen, batch statistics adapt
     recalibrate  plain CBAM, batch statistics recomputed over the training frames first, then frozen
     identity     CBAM whose gates start at 1, weights and batch statistics frozen
 
-Prints for each: the cosine of the features after each stage to those of the plain backbone, and their size over the
-plain ones' (RMS), both before training; the mean training loss of the last 20 steps; the validation loss in evaluation
+Prints for each: the cosine of the features after each stage to those of the plain backbone and the ratio of their RMS
+values, both before training; the mean training loss of the last 20 steps; the validation loss in evaluation
 mode. Writes runs/bench/transfer.json.
 """
 
@@ -45,7 +46,7 @@ _LAST = 20
 
 
 def batches(split: DetectSplit, config: DetectConfig) -> Iterator[Batch]:
-    """Training batches without end."""
+    """Training batches in an endless sequence."""
     epoch = 0
     while True:
         yield from loader(TrainingFrames(split, config.augment, config.seed, epoch), config)
@@ -107,7 +108,7 @@ def likeness(network: YOLOv3, plain: YOLOv3, images: Tensor) -> dict[str, list[f
 
 
 def compare(train_split: DetectSplit, val_split: DetectSplit, config: DetectConfig, steps: int, before: int) -> dict:
-    """Figures of every choice, all from the same plain detector."""
+    """Figures of every choice, all starting from the same plain detector."""
     sizes = label_sizes(train_split)
     plain = build_network(config.model_copy(update={"attention": "none"}), sizes, Path())
     train(plain.train(), train_split, config, before)
@@ -135,7 +136,7 @@ def compare(train_split: DetectSplit, val_split: DetectSplit, config: DetectConf
 
 
 def main() -> None:
-    """The command."""
+    """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dataset", type=Path, required=True)
     parser.add_argument("--width", type=float, default=0.25)

@@ -1,4 +1,4 @@
-"""The tables of a dataset as Markdown: `describe_columns.py DATASET` fills in docs/manifest.md between its marks.
+"""Write the column tables of docs/manifest.md, between its marks: `describe_columns.py DATASET`.
 
 Types, units and meanings come from the schema, examples from the dataset's first row.
 """

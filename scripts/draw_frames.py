@@ -12,7 +12,7 @@ from perilune_shared.geometry.descent import NominalDescent
 
 
 def axes(ax, origin, vectors, names, colour, length):
-    """Three labelled arrows."""
+    """Draw three labelled arrows."""
     for vector, name in zip(vectors, names, strict=True):
         ax.quiver(*origin, *(length * np.asarray(vector)), color=colour, arrow_length_ratio=0.15, linewidth=1.8)
         ax.text(
@@ -21,7 +21,7 @@ def axes(ax, origin, vectors, names, colour, length):
 
 
 def main() -> None:
-    """Write the picture beside the page."""
+    """Write docs/frames.png."""
     figure = plt.figure(figsize=(10, 8))
     ax = figure.add_subplot(projection="3d", computed_zorder=False)
     descent = NominalDescent.parabola(1500, 200, 1100, 300.0, 65.0)

@@ -1,6 +1,6 @@
 """Draw the pictures of docs/terrain.md into a folder: profiles, altitudes, Suns, regions, a real elevation model.
 
-`python scripts/draw_terrain.py docs/terrain [--dem file.tif]`. Everything is grown and rendered by the package itself.
+`python scripts/draw_terrain.py docs/terrain [--dem file.tif]`. The package itself generates and renders everything.
 """
 
 import argparse
@@ -29,7 +29,7 @@ SEED = 23
 
 
 def draw_profiles(path: Path) -> None:
-    """Sections through craters: fresh by size and law above, one size by age below."""
+    """Draw sections through craters. Above: fresh craters by size and law. Below: one size by age."""
     figure, axes = plt.subplots(2, 2, figsize=(10, 6), sharex=True)
     x = np.linspace(-2, 2, 1201)
     for ax, name in zip(axes[0], ("fassett_thomson", "pangu"), strict=True):
@@ -61,7 +61,7 @@ def draw_profiles(path: Path) -> None:
 
 
 def settings(*changes: str, config_file: Path | None = None) -> DatasetConfig:
-    """The preset small with 384 px frames and changes."""
+    """The preset `small` with frames of 384 px and the given changes."""
     size = ("dataset.camera.width_px=384", "dataset.camera.height_px=384", "dataset.render.samples=8")
     wide = ("dataset.terrain.max_vertices=30000000", "dataset.detect.flight.downrange_m=0.0")
     return resolve(DatasetConfig, "dataset", "perilune_render", "small", config_file, (*size, *wide, *changes))
@@ -70,7 +70,7 @@ def settings(*changes: str, config_file: Path | None = None) -> DatasetConfig:
 def photographs(
     config: DatasetConfig, scene: Scene, views: list[tuple[float, float]], centre_m: tuple[float, float] = (0.0, 0.0)
 ) -> list[np.ndarray]:
-    """Grey frames from straight above for altitudes (metres) and Sun elevations (degrees)."""
+    """Grey frames from nadir for altitudes (metres) and Sun elevations (degrees)."""
     camera = camera_of(config.camera)
     pattern = FixedPattern.draw(config.sensor, camera, SEED)
     frames = []
@@ -83,7 +83,7 @@ def photographs(
 
 
 def write_row(path: Path, frames: list[np.ndarray], captions: list[str]) -> None:
-    """Frames side by side with a line of text in each, as JPEG."""
+    """Write frames side by side, each with a line of text, as JPEG."""
     pictures = []
     for frame, caption in zip(frames, captions, strict=True):
         picture = cv2.copyMakeBorder(frame, 0, 22, 2, 2, cv2.BORDER_CONSTANT, value=255)
@@ -94,7 +94,7 @@ def write_row(path: Path, frames: list[np.ndarray], captions: list[str]) -> None
 
 
 def main() -> None:
-    """Write every picture into the folder given."""
+    """Write every picture into the given folder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--dem", type=Path)

@@ -1,4 +1,4 @@
-"""Print the lowest versions that perilune-shared and perilune-train declare, one a line, as constraints for pip."""
+"""Print the lowest versions required by perilune-shared and perilune-train, one per line, as constraints for pip."""
 
 import re
 import tomllib
@@ -9,7 +9,7 @@ _BOUND = re.compile(r"([A-Za-z0-9._-]+)(?:\[[^]]*\])?>=([0-9.]+)")
 
 
 def lowest(project: Path) -> dict[str, str]:
-    """Name and lowest version of each dependency of a project. Raises ValueError on one without a lower bound.
+    """Name and lowest version of each dependency of a project. Raises ValueError if one has no lower bound.
 
     Build requirements are left out: torch itself requires a newer setuptools than the build.
     """
@@ -25,7 +25,7 @@ def lowest(project: Path) -> dict[str, str]:
 
 
 def main() -> None:
-    """Print the higher of both projects' bounds where both have one."""
+    """Print the bounds; if both projects have one, the higher."""
     bounds: dict[str, str] = {}
     for project in ("shared", "train"):
         for name, version in lowest(_ROOT / project).items():

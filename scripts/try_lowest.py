@@ -17,7 +17,7 @@ _OPTIONAL = {"rasterio", "onnx", "onnxruntime", "openvino", "datasets"}
 
 
 def import_all() -> int:
-    """The number of modules that were imported; those of extras that are not installed are left out."""
+    """Import every module; returns their number. A missing optional dependency is ignored."""
     count = 0
     for package in (perilune_shared, perilune_train):
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
@@ -31,7 +31,7 @@ def import_all() -> int:
 
 
 def main(folder: Path) -> None:
-    """Print what was done; raise where anything fails."""
+    """Print each completed step; raise if a step fails."""
     print(f"imported {import_all()} modules")
     sys.path.insert(0, str(ROOT))
     from tests.drawn_dataset import build_dataset
