@@ -1,4 +1,4 @@
-"""A dataset's frames in memory: pixels as 8-bit grey, beside their rows of the manifest."""
+"""A dataset's frames in memory: 8-bit grey pixels with their rows of the manifest."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -17,7 +17,7 @@ from perilune_shared.progress import progress_bar
 from perilune_shared.storage.png import png_header
 
 _AT_ONCE = 256
-"""Packed frames that wait for a free thread."""
+"""Number of compressed frames that may wait for a free thread."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class FrameStore:
 
 
 def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int | None = None) -> NDArray[np.uint8]:
-    """One frame (height, width), 8-bit grey, of a PNG's bytes; of a 16-bit PNG the upper eight bits.
+    """Decode a PNG's bytes to a frame (height, width), 8-bit grey; of a 16-bit PNG the upper eight bits.
 
-    Raises UserError where it is not `size_bytes` long as the manifest says, is no grey PNG, or has another size in
-    pixels (which is known before it is unpacked).
+    Raises UserError if it is not `size_bytes` long as in the manifest, is no grey PNG, or has another size in pixels
+    (checked before it is unpacked).
     """
-    # A decoder may fill the missing rows of a truncated file without a word; its length tells.
+    # A decoder may fill the missing rows of a truncated file silently, so check the length.
     if size_bytes is not None and len(png) != size_bytes:
         raise UserError(name, "png_bytes", f"{len(png)} bytes", f"{size_bytes} bytes; the file is damaged")
     try:
@@ -55,7 +55,7 @@ def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int
 
 
 def load_frames(dataset: Dataset, split: str) -> FrameStore:
-    """All frames of a split, 64 kB each at 256 x 256. Raises UserError on none, too many or a bad one."""
+    """Load all frames of a split, 64 kB each at 256 x 256. Raises UserError on none, too many or a bad one."""
     rows = dataset.table("frames", split=split)
     table = rows.to_pandas()
     if table.empty:
@@ -74,7 +74,7 @@ def load_frames(dataset: Dataset, split: str) -> FrameStore:
         i = place[frame[0]]
         images[i] = decode(frame[1], f"{dataset.root}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
 
-    # OpenCV lets go of Python's lock while it decodes.
+    # OpenCV releases Python's lock while it decodes.
     with progress_bar() as progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as threads:
         task = progress.add_task(f"load {split}", total=len(table), unit="frames", note="")
         for some in _portions(dataset.pngs(rows), _AT_ONCE):
@@ -90,9 +90,9 @@ def _portions(frames: Iterable[tuple[str, bytes]], size: int) -> Iterator[list[t
 
 
 def normalised(images: NDArray) -> NDArray[np.float32]:
-    """Images (..., height, width) with each image's mean taken off and its standard deviation divided out.
+    """Subtract each image's mean and divide by its standard deviation, at least 1. Images are (..., height, width).
 
-    A constant image becomes zero. The exposure of a frame carries nothing about craters or motion.
+    A constant image becomes zero. The exposure of a frame has no information about craters or motion.
     """
     pixels = images.astype(np.float32)
     mean = pixels.mean(axis=(-2, -1), keepdims=True)

@@ -114,8 +114,10 @@ def training_provenance(dataset: Dataset) -> Provenance:
 
 
 def _group(info: DatasetInfo) -> str:
-    """Name of a group of datasets: those of a configuration with `shared_terrain` are one landing area, as the
-    paper's."""
+    """Name of a dataset's group.
+
+    The datasets of a configuration with `shared_terrain` are one landing area, as in the paper.
+    """
     names = {
         str(recipe.config.get("name")) if recipe.config.get("shared_terrain") is True else ""
         for recipe in info.recipes.values()
@@ -126,7 +128,7 @@ def _group(info: DatasetInfo) -> str:
 
 
 def protocol_of(info: DatasetInfo) -> str:
-    """Name of a dataset's protocol: what its test split holds out and what its splits share."""
+    """Name of a dataset's protocol: what the test split holds out and what the splits share."""
     return _PROTOCOLS[info.split_by] + info.leak
 
 
@@ -172,7 +174,7 @@ def check_calibration(
 ) -> TerrainCheck:
     """Compare the ground of a calibration on `dataset` with the test ground of the dataset and of the run itself.
 
-    Raises UserError naming the scenes where they overlap, as `check_terrain` does, unless `allow_overlap`.
+    Raises UserError naming the scenes of any overlap, like `check_terrain`, unless `allow_overlap`.
     """
     tested = frozenset(use for use in provenance.uses if use.use == "tested") | split_terrain(dataset, "test", "tested")
     by_design = dataset.info.split_by != "scene"

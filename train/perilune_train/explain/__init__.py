@@ -1,1 +1,1 @@
-"""What the attention of the trained networks looks at, in pictures and correlations."""
+"""Attention of the trained networks, in pictures and correlations."""

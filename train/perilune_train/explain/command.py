@@ -43,16 +43,16 @@ def explain(
     allow_overlap: AllowOverlap = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of this name.")] = False,
 ) -> None:
-    """Draw what the attention of both networks looks at, and correlate it: PCC1 to PCC4 of the paper.
+    """Draw the attention masks of both networks and compute their correlations: PCC1 to PCC4 of the paper.
 
     PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
 
-    Leaves runs/explain/<name>/ with config.yaml, masks_detect.png, masks_navigate.png, pcc_detect.png,
-    pcc_navigate.png, correlations.parquet and metrics.json. A finished run of the same
-    settings, datasets and checkpoints is left as it is; --overwrite replaces it.
+    Writes runs/explain/<name>/ with config.yaml, masks_detect.png, masks_navigate.png, pcc_detect.png,
+    pcc_navigate.png, correlations.parquet and metrics.json. Leaves a finished run of the same settings, datasets and
+    checkpoints unchanged; --overwrite replaces it.
     """
     settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
-    # Torch and Lightning take seconds to load: not for a wrong key.
+    # Importing torch and Lightning takes seconds; check the settings first.
     from perilune_train.explain.run import explain_run
 
     name, root = name or preset, dataset or Path("data", preset)

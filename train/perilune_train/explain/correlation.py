@@ -10,7 +10,7 @@ from perilune_train.navigate.geometry import pixel_index_homography
 
 
 def pearson(a: ArrayLike, b: ArrayLike, seen: NDArray[np.bool_] | None = None) -> float:
-    """Pearson correlation of two images over the pixels `seen`; NaN where one is constant or no pixel is seen."""
+    """Pearson correlation of two images over the pixels `seen`; NaN if one is constant or no pixel is seen."""
     x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if x.shape != y.shape:
         raise ValueError(f"shapes {x.shape} and {y.shape} differ")
@@ -27,23 +27,23 @@ def pearson_between(images: NDArray[np.floating]) -> Array:
 
 
 def mean_of_others(correlations: Array) -> tuple[float, int]:
-    """PCC2: mean of the correlations (N, N) between different images, NaN left out, and how many were NaN.
+    """PCC2: mean of the correlations (N, N) between different images, NaN left out, and the number of NaN.
 
-    The paper pairs each image n with one m != n that it does not name; here all m are taken.
+    The paper pairs each image n with one unspecified m != n; here all m are used.
     """
     apart = correlations[~np.eye(len(correlations), dtype=bool)]
     return mean_defined(apart)
 
 
 def mean_defined(values: ArrayLike) -> tuple[float, int]:
-    """Mean of the values that are not NaN (NaN where none is), and the number that are."""
+    """Mean of the values that are not NaN (NaN if there are none), and their number."""
     array = np.asarray(values, np.float64)
     undefined = int(np.isnan(array).sum())
     return (float(np.nanmean(array)) if undefined < array.size else float("nan")), undefined
 
 
 def is_constant(values: ArrayLike) -> bool:
-    """Whether values vary by no more than rounding: 1e-6 of the largest, root mean square."""
+    """Whether the root mean square deviation of the values is within rounding: 1e-6 of the largest."""
     array = np.asarray(values, np.float64)
     return bool(np.std(array) <= 1e-6 * max(float(np.abs(array).max()), 1e-30))
 
@@ -51,11 +51,11 @@ def is_constant(values: ArrayLike) -> bool:
 def ground_truth_mask(
     width_px: int, height_px: int, centres_px: ArrayLike, radii_px: ArrayLike, ring_factors: tuple[float, ...]
 ) -> Array:
-    """The paper's mask G (height, width): 0 in craters, 0.2, 0.4, 0.6, 0.8 in rings around, 1 elsewhere.
+    """The paper's mask G (height, width): 0 in craters, 0.2, 0.4, 0.6, 0.8 in rings around them, 1 elsewhere.
 
     Takes centres (N, 2) and radii (N,) in pixels; the rings end at ring_factors times the radius (equation
-    "crater_width"). Where craters overlap the least value counts, which the paper leaves open. The paper's text
-    calls the craters white and the background black, and its numbers say the contrary: the numbers are followed.
+    "crater_width"). Where craters overlap the least value is used, which the paper leaves open. The paper's text calls
+    the craters white and the background black, which contradicts its numbers; the numbers are followed.
     """
     mask = np.ones((height_px, width_px))
     levels = np.arange(len(ring_factors) + 1) / (len(ring_factors) + 1)
@@ -81,11 +81,11 @@ def ground_affine(
     rotation_2_camera_from_site: Array,
     grid: int = 9,
 ) -> Array:
-    """The affine map (2, 3) from image coordinates of frame 1 to those of frame 2 that fits the true poses best.
+    """The affine map (2, 3) from image coordinates of frame 1 to those of frame 2 that best fits the true poses.
 
-    Least squares over a grid of pixels of frame 1 whose rays meet the ground plane z = 0 of O_L. The paper names
-    "the affine transformation matrix defined by groundtruth pose" and not how; between near-vertical views of a
-    plane the fit is close to the exact homography.
+    Least squares over a grid of pixels of frame 1 whose rays meet the ground plane z = 0 of O_L. The paper mentions
+    "the affine transformation matrix defined by groundtruth pose" without a definition; between near-vertical views of
+    a plane the fit is close to the exact homography.
     """
     u, v = np.meshgrid(np.linspace(0, camera.width_px, grid), np.linspace(0, camera.height_px, grid))
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
@@ -101,7 +101,7 @@ def ground_affine(
 
 
 def warped_mask(mask: NDArray[np.floating], affine: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """A mask of frame 2 (height, width) as frame 1 sees it, and which of frame 1's pixels frame 2 sees.
+    """Resample a mask of frame 2 (height, width) to frame 1; also returns which pixels of frame 1 are in frame 2.
 
     `affine` (2, 3) maps image coordinates of frame 1 to frame 2.
     """

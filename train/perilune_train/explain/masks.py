@@ -16,7 +16,7 @@ from perilune_train.models.navigator import StackNavigator
 from perilune_train.models.yolo import YOLOv3
 
 Masks = dict[str, NDArray[np.float32]]
-"""Block "B_ij" to the masks (N, height, width) of N images, resized to the frames' size."""
+"""Block "B_ij" to masks (N, height, width) of N images, resized to the size of the frames."""
 
 _BATCH = 8
 _CELL_PX = 160
@@ -25,7 +25,7 @@ _WHITE = (255, 255, 255)
 
 
 def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> Masks:
-    """Masks (N, height, width) that the detector lays over frames (N, height, width)."""
+    """Attention masks (N, height, width) of the detector for frames (N, height, width)."""
     backbone = detector.backbone
     channels = next(backbone.parameters()).shape[1]
     device = next(backbone.parameters()).device
@@ -45,7 +45,7 @@ def navigator_masks(
     size: tuple[int, int],
     where: Path,
 ) -> Masks:
-    """Masks (N, 2 height, width) over stacked pairs, of normalised frames (N, h, w); `size` is height and width."""
+    """Masks (N, 2 height, width) of stacked pairs, from normalised frames (N, h, w); `size` is height and width."""
     device = next(navigator.parameters()).device
     inputs = [
         navigator.stacked(
@@ -70,10 +70,10 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
 
 
 def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
-    """A sheet of PNG: for each image (N, height, width) the frame, then every block's mask, then a colour bar.
+    """Draw a PNG sheet: for each image (N, height, width) the frame, then every block's mask, then a colour bar.
 
-    One scale for all masks of the sheet, from the least to the greatest value. Under each mask stands its own range, or
-    "constant" where it does not vary.
+    All masks of the sheet share one scale, from the least to the greatest value. Below each mask is its own range, or
+    "constant" if it does not vary.
     """
     low = min(float(found.min()) for found in masks.values())
     high = max(float(found.max()) for found in masks.values())
@@ -99,13 +99,13 @@ def caption(block: str, mask: NDArray[np.floating]) -> str:
 
 
 def _coloured(values: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
-    """Values as colours of the sheet's scale, (height, width, 3) BGR."""
+    """Convert values to colours of the sheet's scale, (height, width, 3) BGR."""
     level = np.clip(255 * (values - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_TURBO), np.uint8)
 
 
 def _colour_bar(width_px: int, low: float, high: float) -> NDArray[np.uint8]:
-    """The sheet's scale with five values below it, as wide as the sheet."""
+    """Colour bar of the sheet's scale with five values below it, as wide as the sheet."""
     margin = 40
     bar = np.tile(np.linspace(low, high, width_px - 2 * margin), (16, 1))
     picture = cv2.copyMakeBorder(_coloured(bar, low, high), 10, 24, margin, margin, cv2.BORDER_CONSTANT, value=_WHITE)

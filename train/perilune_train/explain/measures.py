@@ -1,4 +1,4 @@
-"""PCC1 to PCC4 of the paper, block by block, from attention masks."""
+"""PCC1 to PCC4 of the paper, for each block, from attention masks."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,8 @@ PCC1_SIGN = (
 def detector_correlations(masks: Masks, truth: NDArray[np.floating]) -> list[dict]:
     """Rows of PCC1 and PCC2 for every block; `truth` (N, height, width) are the paper's masks G of the N frames.
 
-    pcc1_background is the paper's PCC1, the correlation with G, which is 1 on background: above 0 the gate is weaker
-    on craters. pcc1_craterness is the correlation with 1 - G: above 0 the gate is stronger on craters. pcc2 is the
+    pcc1_background is the paper's PCC1, the correlation with G, which is 1 on background: above 0 the gate is weaker on
+    craters. pcc1_craterness is the correlation with 1 - G: above 0 the gate is stronger on craters. pcc2 is the
     correlation of one block's masks of different frames.
     """
     rows = []
@@ -32,10 +32,10 @@ def detector_correlations(masks: Masks, truth: NDArray[np.floating]) -> list[dic
 def pair_correlations(mask: NDArray[np.floating], affine: Array) -> dict[str, float]:
     """pcc3 and pcc4 of one stacked mask (2 height, width), both over the overlap, and both over all pixels.
 
-    `affine` (2, 3) maps image coordinates of the upper, earlier frame to those of the lower one. The overlap are the
-    pixels of the upper frame that the lower one sees. The paper takes all pixels, at least for PCC3, and does not say
-    what the moved mask holds outside the overlap; 0 is taken, as OpenCV does by default. NaN where a half is constant,
-    in both of a kind: their means must be over the same pairs.
+    `affine` (2, 3) maps image coordinates of the upper, earlier frame to those of the lower one. The overlap is the
+    part of the upper frame that is in the lower one. The paper uses all pixels, at least for PCC3, and does not define
+    the moved mask outside the overlap; it is 0 here, OpenCV's default. If one half is constant, both values of that
+    kind (overlap or all pixels) are NaN, because their means must be over the same pairs.
     """
     upper, lower = np.split(np.asarray(mask, np.float64), 2)
     moved, seen = warped_mask(lower, affine)

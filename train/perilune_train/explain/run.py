@@ -48,7 +48,7 @@ _PICTURES = {
     "detector": ("masks_detect.png", "pcc_detect.png"),
     "navigator": ("masks_navigate.png", "pcc_navigate.png"),
 }
-"""By network."""
+"""Picture files of each network: masks and correlations."""
 
 
 def explain_run(
@@ -64,10 +64,10 @@ def explain_run(
 ) -> RunFolder:
     """Explain two checkpoints on the test frames of two datasets into runs/explain/<name>.
 
-    `detector` is checkpoints/best.ckpt in the folder of its run, whose config.yaml says which craters are wanted.
-    A finished run of the same settings, datasets and checkpoints is left as it is, unless `overwrite`. Raises UserError
-    where it had others, where a dataset, a checkpoint or that file is missing or of another kind, where a network has
-    no attention, or was fitted to terrain of its test frames (unless `allow_overlap`).
+    `detector` is checkpoints/best.ckpt in the folder of its run, whose config.yaml defines the selected craters. Leaves
+    a finished run of the same settings, datasets and checkpoints unchanged, unless `overwrite`. Raises UserError if
+    these were different, if a dataset, a checkpoint or that file is missing or of another kind, or if a network has no
+    attention or was fitted to terrain of its test frames (unless `allow_overlap`).
     """
     run = RunFolder(runs / "explain" / name)
     inputs = hashes_of(
@@ -155,9 +155,9 @@ def _check_terrain(
 def detect_frames(
     settings: ExplainConfig, detector: DetectConfig, root: Path
 ) -> tuple[np.ndarray, np.ndarray, dict[str, float | int | str | None]]:
-    """Test frames (N, height, width), the paper's masks G of them, float32 (N, height, width), and their labels' rule.
+    """Test frames (N, height, width), the paper's masks G of them, float32 (N, height, width), and their selection.
 
-    G holds the craters that the detector's own run selects, so none that a frame hardly shows.
+    G holds the craters that the detector's own run selects, so none that is hardly visible in a frame.
     """
     dataset = open_dataset(root)
     if dataset.info.kind != "detect":
@@ -200,9 +200,9 @@ def _some(images: np.ndarray, masks: Masks, count: int) -> tuple[np.ndarray, Mas
 
 
 def draw_bars(path: Path, table: pd.DataFrame, measures: dict[str, str], title: str) -> None:
-    """Bars of several measures, block by block; a block without a bar was undefined in every image.
+    """Draw bars of several measures for each block; a block without a bar was undefined in every image.
 
-    Dots: the same over all pixels, where the measure is over fewer.
+    Dots show the same measure over all pixels, for measures over part of the pixels.
     """
     figure, axis = plt.subplots(figsize=(12, 4.5), constrained_layout=True)
     width = 0.8 / len(measures)

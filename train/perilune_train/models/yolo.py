@@ -38,8 +38,7 @@ class YOLOv3(nn.Module):
         attention: Attention = "none",
         strides: Sequence[int] = (8, 16, 32),
     ):
-        """Anchors are (3, 3, 2): finest stride first, width and height in pixels; None if a checkpoint provides
-        them."""
+        """Anchors are (3, 3, 2), width and height in pixels, finest stride first; None: from a checkpoint."""
         super().__init__()
         if tuple(strides) not in ((8, 16, 32), (4, 8, 16)):
             raise ValueError(f"strides are {tuple(strides)}, not (8, 16, 32) or (4, 8, 16)")

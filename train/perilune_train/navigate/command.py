@@ -28,16 +28,16 @@ def navigate(
     allow_overlap: AllowOverlap = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace runs of this name.")] = False,
 ) -> None:
-    """Train the navigation networks and judge them beside the nominal motion, mean motions and KLT tracks.
+    """Train the navigation networks and evaluate them beside the nominal motion, mean motions and KLT tracks.
 
-    Leaves runs/navigate/<name>/ (fusion warp) and runs/navigate/<name>-stack/ (fusion stack, the paper's form), each
-    with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, navigation.parquet (one row a method),
-    errors.parquet (one row a pair), descent.png, errors.png and TensorBoard events. The stack network starts from
-    the backbone of runs/detect/<name>, where that fits. The same command resumes an
-    interrupted run and leaves finished ones as they are; --overwrite replaces them.
+    Writes runs/navigate/<name>/ (fusion warp) and runs/navigate/<name>-stack/ (fusion stack, the paper's network), each
+    with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, navigation.parquet (one row per method),
+    errors.parquet (one row per pair), descent.png, errors.png and TensorBoard events. The stack network starts from the
+    backbone of runs/detect/<name>, if that fits. The same command resumes an interrupted run and leaves finished ones
+    unchanged; --overwrite replaces them.
     """
     settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
-    # Torch and Lightning take seconds to load: not for a wrong key.
+    # Importing torch and Lightning takes seconds; check the settings first.
     from perilune_train.navigate.run import navigate_run
 
     name = name or preset

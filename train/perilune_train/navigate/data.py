@@ -1,4 +1,4 @@
-"""Descents as arrays, and sequences of image pairs for the networks."""
+"""Trajectories as arrays, and sequences of image pairs for the networks."""
 
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ from perilune_train.navigate.geometry import apply_homography, pixel_index_homog
 
 @dataclass(frozen=True, slots=True)
 class Descent:
-    """One descent of n frames, with what the guidance knew before the flight."""
+    """One trajectory of n frames, with the nominal motion known before the flight."""
 
     trajectory: tuple[str, str]
     """scene_id and trajectory_id."""
@@ -26,19 +26,19 @@ class Descent:
     images: np.ndarray
     """8-bit grey frames (n, height, width)."""
     camera: Camera
-    """Intrinsics that belong to `images`."""
+    """Intrinsics of `images`."""
     position_m: Array
-    """True camera positions (n, 3), O_L."""
+    """True camera positions (n, 3), metres, O_L."""
     rotation_camera_from_site: Array
     """True attitudes (n, 3, 3)."""
     nominal_position_m: Array
-    """Positions (n, 3) on the nominal curve at the frames' times, O_L."""
+    """Positions (n, 3), metres, on the nominal curve at the frames' times, O_L."""
     nominal_rotation_camera_from_site: Array
-    """Attitude (3, 3) of the camera on a level body, the same for all frames."""
+    """Nominal attitude (3, 3): the camera on a level body, the same for all frames."""
 
     @property
     def n_pairs(self) -> int:
-        """Pairs of consecutive frames."""
+        """Number of pairs of consecutive frames."""
         return len(self.images) - 1
 
     @property
@@ -54,7 +54,7 @@ class Descent:
 
     @property
     def altitude_m(self) -> Array:
-        """Nominal altitude (n - 1,) above the ground plane at the earlier frame of each pair."""
+        """Nominal altitude (n - 1,), metres, above the ground plane at the earlier frame of each pair."""
         return self.nominal_position_m[:-1, 2]
 
     @property
@@ -63,7 +63,7 @@ class Descent:
         return -self.nominal_rotation_camera_from_site[:, 2]
 
     def shrunk(self, size_px: int) -> "Descent":
-        """The same descent with images `size_px` wide, averaged over areas; itself where they are that size."""
+        """The same trajectory with images shrunk to `size_px` wide by area averaging; itself if they have that size."""
         height, width = self.images.shape[1:]
         if width == size_px:
             return self
@@ -77,9 +77,9 @@ class Descent:
 
 
 def load_descents(dataset: Dataset) -> list[Descent]:
-    """All descents of a navigation dataset: those to train, then val, then test, each in the order of their ids.
+    """Load all trajectories of a navigation dataset: train, then val, then test, each in the order of their ids.
 
-    Raises UserError where the dataset is of another kind, its images are distorted or a frame is missing.
+    Raises UserError if the dataset is of another kind, its images are distorted or a frame is missing.
     """
     if dataset.info.kind != "nav":
         raise UserError(dataset.root, "kind", dataset.info.kind, "nav, a dataset of descents")
@@ -124,34 +124,34 @@ def _split_descents(dataset: Dataset, split: str, curves: dict[tuple[str, str], 
 
 @dataclass(frozen=True, slots=True)
 class Jitter:
-    """Sizes (standard deviations) of the extra motion drawn for each pair in training."""
+    """Standard deviations of the random extra motion of each training pair."""
 
     translation_m: Array
     """Shift of the second camera along x, y, z of O_C, metres (3,)."""
     rotation_rad: float
-    """Turn of the second camera about each axis, radians."""
+    """Rotation of the second camera about each axis, radians."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """n pairs as a network sees them, and what is to be found."""
+    """n pairs as network input, with their true motions."""
 
     first: np.ndarray
     """Earlier frames, normalised, float32 (n, height, width)."""
     second: np.ndarray
-    """Later frames, normalised; warped onto the earlier ones where asked for, 0 where nothing was seen."""
+    """Later frames, normalised; for warp resampled onto the earlier ones, 0 where the later frame has no pixels."""
     translation_m: Array
-    """True translations (n, 3)."""
+    """True translations (n, 3), metres."""
     rotation_c2_from_c1: Array
     """True rotations (n, 3, 3)."""
     nominal_translation_m: Array
-    """Nominal translations (n, 3)."""
+    """Nominal translations (n, 3), metres."""
     altitude_m: Array
-    """Nominal altitudes (n,) at the earlier frames."""
+    """Nominal altitudes (n,), metres, at the earlier frames."""
     down_c: Array
-    """Unit vector (3,) towards the ground in O_C of a level body, mirrored where the frames are."""
+    """Unit vector (3,) towards the ground in O_C of a level body, mirrored with the frames."""
     flow_px: Array | None = None
-    """Where warped: the flow that is left of the ground plane (n, height / 8, width / 8, 2), from first to second."""
+    """For warp: residual flow of the ground plane (n, height / 8, width / 8, 2), from first to second."""
 
 
 def pair_sequence(
@@ -163,15 +163,15 @@ def pair_sequence(
     rng: np.random.Generator | None = None,
     jitter: Jitter | None = None,
 ) -> Sequence:
-    """The pairs start .. start + n_pairs of a descent; with a generator, augmented.
+    """The pairs start .. start + n_pairs of a trajectory; augmented if a generator is given.
 
-    Augmentation: one of the eight turns and mirrorings of the square image for the whole sequence (four where the
-    image is not square), and, with `jitter`, a new small motion of each second camera, drawn on its own: the second
-    frame is resampled over the ground plane as the moved camera would see it, so that each pair shows ever new
-    residuals. The plane is that of the nominal altitude and attitude. The resampled frame is exact only for these, a
-    pure rotation and flat ground. Off nominal by 8 m and 0.3 degrees, a jitter of 0.3 times that is wrong by 0.04 px of
-    1.2 px (RMS over 200 to 1500 m; 0.14 px at 200 m; 128 px over 50 degrees; the error is measured in
-    tests/train/navigate/test_data.py).
+    Augmentation applies one of the eight symmetries of the square image to the whole sequence (four if the image is not
+    square). With `jitter` it also draws a small extra motion of each second camera independently: the second frame is
+    resampled over the ground plane as the moved camera would see it, so that a pair shows new residuals in every epoch.
+    The plane is that of the nominal altitude and attitude. The resampled frame is exact only if these are the true
+    ones, for a pure rotation and for flat ground. Off nominal by 8 m and 0.3 degrees, a jitter of 0.3 times that is
+    wrong by 0.04 px of 1.2 px (RMS over 200 to 1500 m; 0.14 px at 200 m; 128 px over 50 degrees; the error is measured
+    in tests/train/navigate/test_data.py).
     """
     span = slice(start, start + n_pairs)
     translation, rotation = (values[span] for values in descent.motion)
@@ -186,7 +186,7 @@ def pair_sequence(
             turn = matrix_from_rotation_vector(rng.normal(size=3) * jitter.rotation_rad)
             true = _homography(descent.camera, descent.down_c, translation[i], rotation[i], altitude[i])
             translation[i], rotation[i] = translation[i] + shift, turn @ rotation[i]
-            # Image 2 as moved: new image 2 -> image 1 over the plane -> old image 2.
+            # Second image of the moved camera: new image 2 -> image 1 over the plane -> old image 2.
             moved = _homography(descent.camera, descent.down_c, translation[i], rotation[i], altitude[i])
             change = true @ np.linalg.inv(moved)
         if warp:
@@ -209,10 +209,10 @@ def pair_sequence(
 
 
 def mirrored(sequence: Sequence, camera: Camera, rng: np.random.Generator) -> Sequence:
-    """The sequence under a random mirroring of left and right, up and down and, in a square image, x and y.
+    """Apply a random mirroring of left and right, up and down and, in a square image, x and y to a sequence.
 
-    A mirroring D of the image about its centre turns t into D t, the ground normal n into D n and R into D R D, with
-    D extended by 1 along z. Only done where the principal point is the image's centre.
+    A mirroring D of the image about its centre maps t to D t, the ground normal n to D n and R to D R D, with D
+    extended by 1 along z. Applied only if the principal point is the image's centre.
     """
     flip_x, flip_y, swap = rng.random(3) < 0.5
     if (camera.cx_px, camera.cy_px) != (camera.width_px / 2, camera.height_px / 2):
@@ -240,7 +240,7 @@ def _homography(camera: Camera, down_c: Array, translation_m: Array, rotation: A
 
 
 def _residual_flow(sequence: Sequence, camera: Camera) -> Array:
-    """Flow (n, height / 8, width / 8, 2) of the ground plane after the warp, at the places' centres."""
+    """Flow (n, height / 8, width / 8, 2), pixels, of the ground plane after the warp, at the centres of the cells."""
     height, width = sequence.first.shape[1:]
     u, v = np.meshgrid(np.arange(4, width, 8), np.arange(4, height, 8))
     centres, level, flows = np.stack([u, v], axis=-1), np.eye(3), []
@@ -258,7 +258,7 @@ def _residual_flow(sequence: Sequence, camera: Camera) -> Array:
 
 
 def _normalised(image: np.ndarray, homography: Array | None = None) -> np.ndarray:
-    """Mean 0 and standard deviation 1, float32; then resampled by a homography from the wanted to the given image."""
+    """Normalise a frame (`normalised`), then resample it by a homography from output to input image."""
     values = normalised(image)
     if homography is None or np.array_equal(homography, np.eye(3)):
         return values

@@ -1,4 +1,4 @@
-"""The order of an epoch of navigation training: batches of sequences, drawn from a key."""
+"""Batches of sequences of one epoch of navigation training, drawn from a key."""
 
 from collections.abc import Iterator
 
@@ -8,11 +8,11 @@ from perilune_train.navigate.data import Descent, Jitter, Sequence, pair_sequenc
 
 
 class EpochBatches:
-    """One epoch of batches of sequences, each pair about once, drawn from the key (seed, epoch) alone.
+    """One epoch of batches of sequences, each pair about once, drawn from the key (seed, epoch) only.
 
-    Each descent is cut into runs of `n_pairs` (of the shortest descent's length, where that is less) that begin at
-    a random offset. Iterates over lists of `batch` sequences; `augmented` ones are mirrored and, with `jitter`,
-    moved (see `pair_sequence`).
+    Each trajectory is cut into runs of `n_pairs` (at most the length of the shortest trajectory) that begin at a random
+    offset. Iterates over lists of `batch` sequences; `augmented` sequences are mirrored and, with `jitter`, moved (see
+    `pair_sequence`).
     """
 
     def __init__(

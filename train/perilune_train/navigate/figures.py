@@ -25,7 +25,7 @@ COLOURS = {
 
 
 def draw_descent(path: Path, descent: Descent, motions: dict[str, Motion], errors: dict[str, pd.DataFrame]) -> None:
-    """One descent: true path and dead-reckoned ones seen from the side and from above, errors step by step."""
+    """Draw one trajectory: true and dead-reckoned paths from the side and from above, and errors by step."""
     figure, axes = plt.subplots(2, 3, figsize=(16, 9), constrained_layout=True)
     side, top, away = axes[0]
     true = descent.position_m
@@ -59,7 +59,7 @@ def draw_descent(path: Path, descent: Descent, motions: dict[str, Motion], error
 
 
 def draw_errors(path: Path, errors: dict[str, pd.DataFrame]) -> None:
-    """The share of all test pairs whose error stays below a bound, for each method; and the errors by axis."""
+    """Draw, for each method, the fraction of test pairs with an error below a bound, and the errors by axis."""
     figure, axes = plt.subplots(1, 3, figsize=(16, 5), constrained_layout=True)
     for method, table in errors.items():
         for axis, column in ((axes[0], "position_error_m"), (axes[1], "orientation_error_deg")):

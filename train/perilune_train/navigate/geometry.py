@@ -15,9 +15,9 @@ from perilune_shared.geometry.frames import Array
 
 
 def relative_poses(position_m: ArrayLike, rotation_camera_from_site: ArrayLike) -> tuple[Array, Array]:
-    """Motions between consecutive frames of one descent.
+    """Motions between consecutive frames of one trajectory.
 
-    Takes positions (n, 3) in metres, O_L, and rotations (n, 3, 3); gives translation_m (n - 1, 3) in O_C of the
+    Takes positions (n, 3) in metres, O_L, and rotations (n, 3, 3); returns translation_m (n - 1, 3) in O_C of the
     earlier frame and rotation_c2_from_c1 (n - 1, 3, 3).
     """
     p, r = np.asarray(position_m, np.float64), np.asarray(rotation_camera_from_site, np.float64)
@@ -57,13 +57,13 @@ def plane_homography(
 
 
 def pixel_index_homography(homography: ArrayLike) -> Array:
-    """The same homography (3, 3) for OpenCV, whose coordinates are 0 at the first pixel's centre and not 0.5."""
+    """The same homography (3, 3) in OpenCV's coordinates, which are 0, not 0.5, at the first pixel's centre."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
     return np.linalg.inv(shift) @ np.asarray(homography) @ shift
 
 
 def apply_homography(homography: ArrayLike, points_px: ArrayLike) -> Array:
-    """Image points (..., 2) of points (..., 2)."""
+    """Apply a homography to image points (..., 2)."""
     p, h = np.asarray(points_px, np.float64), np.asarray(homography, np.float64)
     q = np.concatenate([p, np.ones_like(p[..., :1])], axis=-1) @ h.T
     return q[..., :2] / q[..., 2:]
@@ -102,7 +102,7 @@ def euler_from_rotation(rotation: Tensor) -> Tensor:
 def rotation_vectors(rotation: ArrayLike) -> Array:
     """Rotation vectors (..., 3) in radians of rotation matrices (..., 3, 3) well below half a turn.
 
-    The angle comes from sine and cosine together; the arc cosine alone loses small angles to rounding.
+    The angle is computed from sine and cosine; the arc cosine alone loses small angles to rounding.
     """
     r = np.asarray(rotation, np.float64)
     skew = r - np.swapaxes(r, -1, -2)

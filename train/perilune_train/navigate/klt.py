@@ -1,8 +1,8 @@
 """The classical baseline: corners tracked from frame to frame, and a robust motion fit over the ground plane.
 
 The second frame is first warped onto the first by the nominal motion, so that the tracker (Lucas & Kanade 1981,
-pyramids after Bouguet 2001, as in OpenCV) looks for a small residual only and sees the same scale. The points of
-frame 1 are put on the ground plane at the nominal altitude; the motion is fitted to them by Gauss-Newton on the
+pyramids after Bouguet 2001, as in OpenCV) only has to find a small residual at the same scale. The points of frame 1
+are projected onto the ground plane at the nominal altitude. The motion is fitted to them by Gauss-Newton on the
 reprojection error with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/00401706.1974.10489171).
 """
 
@@ -23,24 +23,24 @@ from perilune_train.navigate.geometry import (
 _N_CORNERS = 600
 _WINDOW_PX = 11
 _CONSISTENCY_PX = 0.5
-"""A track must return this close to its start when followed backwards."""
+"""Largest distance, pixels, between a track's start and its end after tracking back."""
 _TUKEY = 4.685
 _PRIOR_TURN_RAD = np.radians(0.5)
 _PRIOR_SHIFT = 0.02
-"""Weak knowledge of the motion about the nominal one, turn and shift over altitude (standard deviations): few or
-crowded corners leave tilt and sideways shift, which look alike from above, undecided."""
+"""Standard deviations of a weak prior around the nominal motion, for rotation and for shift over altitude. Few or
+crowded corners cannot separate tilt from sideways shift, which look alike from above."""
 _ITERATIONS = 15
 _LEAST_TRACKS = 8
 
 
 def klt_descent(descent: Descent) -> tuple[Array, Array]:
-    """Motions of a whole descent: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3).
+    """Motions of a whole trajectory: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3).
 
-    One pair tells the translation only over the altitude. The altitude is the true one at the first frame, carried
-    on by the motions found; the attitude is taken as level.
+    One pair gives the translation only relative to the altitude. The altitude is the true one at the first frame, then
+    updated with the estimated motions; the attitude is assumed level.
     """
     nominal_translation, nominal_rotation = descent.nominal_motion
-    # OpenCV tracks 8-bit images and rejects flat windows by a fixed threshold: dim frames are stretched first.
+    # OpenCV tracks 8-bit images and rejects flat windows by a fixed threshold, so stretch dim frames first.
     images = np.clip(110 + 45 * normalised(descent.images), 0, 255).astype(np.uint8)
     altitude_m = float(descent.position_m[0, 2])
     translations, rotations = [], []
@@ -69,9 +69,9 @@ def klt_motion(
     plane_normal_c1: Array,
     altitude_m: float,
 ) -> tuple[Array, Array, int]:
-    """Motion between two 8-bit images: translation_m (3,), rotation_c2_from_c1 (3, 3), tracks that agree.
+    """Motion between two 8-bit images: translation_m (3,), rotation_c2_from_c1 (3, 3), number of consistent tracks.
 
-    Where fewer than 8 corners can be followed the nominal motion is given back, with 0 tracks.
+    If fewer than 8 corners can be tracked, returns the nominal motion and 0 tracks.
     """
     nominal = plane_homography(
         camera.matrix, nominal_translation_m, nominal_rotation_c2_from_c1, plane_normal_c1, altitude_m
@@ -111,7 +111,7 @@ def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tupl
 def _fit(
     camera: Camera, points_c1: Array, pixels_2: Array, translation_m: Array, rotation: Array
 ) -> tuple[Array, Array, int]:
-    """Motion that carries points (N, 3) of O_C of frame 1 to pixels (N, 2) of frame 2."""
+    """Fit the motion that maps points (N, 3) of O_C of frame 1 to pixels (N, 2) of frame 2."""
     focal = np.array([camera.fx_px, camera.fy_px])
     weights = np.ones(len(points_c1))
     nominal_translation_m, nominal_rotation = translation_m, rotation
@@ -125,14 +125,14 @@ def _fit(
         weights = np.clip(1 - (distance / (_TUKEY * spread)) ** 2, 0, None) ** 2
         x, y, z = points.T
         zero = np.zeros_like(z)
-        # Derivative of the pixel by the point in camera 2, then by a turn (left) and a shift of that point.
+        # Derivative of the pixel by the point in camera 2, then of that point by a rotation (left) and a shift.
         by_point = np.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], axis=1).reshape(-1, 2, 3)
         by_point *= focal[:, None]
         cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
         jacobian = np.concatenate([by_point @ cross, by_point], axis=2)
         weighted = jacobian * weights[:, None, None]
         normal = np.einsum("nij,nik->jk", weighted, jacobian)
-        # Metres and radians differ by the altitude; a unit diagonal keeps the solution well conditioned.
+        # Metres and radians differ by the altitude; scaling to a unit diagonal keeps the system well conditioned.
         normal += np.diag(prior) * spread**2
         away = np.concatenate(
             [rotation_vectors(rotation @ nominal_rotation.T), rotation @ (nominal_translation_m - translation_m)]

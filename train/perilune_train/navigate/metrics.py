@@ -1,4 +1,4 @@
-"""Errors of estimated motions, the baselines that know no image, and the table of all of them."""
+"""Errors of estimated motions, the baselines that use no image, and the table of all methods."""
 
 import numpy as np
 import pandas as pd
@@ -9,18 +9,18 @@ from perilune_train.navigate.data import Descent
 from perilune_train.navigate.geometry import dead_reckoning, rotation_vectors
 
 Motion = tuple[Array, Array]
-"""translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one descent."""
+"""translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one trajectory."""
 
 
 def mean_motion(training: list[Descent], descent: Descent) -> Motion:
-    """The training set's mean motion, for every pair of the descent."""
+    """The training set's mean motion, for every pair of the trajectory."""
     translation = np.concatenate([d.motion[0] for d in training]).mean(0)
     rotation = _mean_rotation(np.concatenate([d.motion[1] for d in training]))
     return np.tile(translation, (descent.n_pairs, 1)), np.tile(rotation, (descent.n_pairs, 1, 1))
 
 
 def mean_motion_at_step(training: list[Descent], descent: Descent) -> Motion:
-    """The training set's mean motion at each step; beyond its longest descent, at the last step it has."""
+    """The training set's mean motion at each step; beyond its longest trajectory, that of its last step."""
     translations, rotations = [], []
     longest = max(d.n_pairs for d in training)
     for step in range(descent.n_pairs):
@@ -35,11 +35,11 @@ def mean_motion_at_step(training: list[Descent], descent: Descent) -> Motion:
 
 
 def motion_errors(descents: list[Descent], motions: list[Motion]) -> pd.DataFrame:
-    """One row a pair: errors of the motion, and of the position dead reckoned from the true first pose.
+    """Errors of the motion, and of the position dead reckoned from the true first pose; one row per pair.
 
-    Columns: scene_id, trajectory_id, step, altitude_m (nominal), position_error_m (length) with its parts
-    error_x_m, error_y_m, error_z_m in O_C of the earlier frame, orientation_error_deg (angle of the rotation left
-    over) with its parts error_x_deg ... (rotation vector, O_C of the later frame), drift_m and drift_x_m ... (O_L).
+    Columns: scene_id, trajectory_id, step, altitude_m (nominal), position_error_m (length) with its components
+    error_x_m, error_y_m, error_z_m in O_C of the earlier frame, orientation_error_deg (angle of the residual rotation)
+    with its components error_x_deg ... (rotation vector, O_C of the later frame), drift_m and drift_x_m ... (O_L).
     """
     tables = []
     for descent, (translation, rotation) in zip(descents, motions, strict=True):
@@ -64,9 +64,9 @@ def motion_errors(descents: list[Descent], motions: list[Motion]) -> pd.DataFram
 
 
 def summary(errors: pd.DataFrame) -> dict[str, float]:
-    """Root mean squares over all pairs of all descents; drift (length) over all frames and at the last ones.
+    """Root mean squares over all pairs of all trajectories; drift (length) over all frames and at the last frames.
 
-    Two forms of each RMSE, see `squared_errors`; those by axis beside them. docs/training.md has the formulas.
+    Each RMSE in two forms, see `squared_errors`, and by axis. docs/training.md has the formulas.
     """
     ends = errors.groupby(["scene_id", "trajectory_id"])["drift_m"].last()
     figures = {key: float(np.sqrt(np.mean(values))) for key, values in squared_errors(errors).items()}
@@ -78,11 +78,11 @@ def summary(errors: pd.DataFrame) -> dict[str, float]:
 
 
 def squared_errors(errors: pd.DataFrame) -> dict[str, Array]:
-    """The squares (pairs,) whose mean's root is each RMSE, by its key.
+    """Squares (pairs,) for each RMSE, by its key: the RMSE is the root of their mean.
 
-    per_component is the paper's RMSE: each of the three components of each pair is one variable. vector and angle take
-    the length of the error vector and are sqrt(3) times as large. The components of the orientation are those of
-    the rotation vector that is left over; differences of the paper's Euler angles are the same to first order.
+    per_component is the paper's RMSE: each of the three components of each pair is one variable. vector and angle use
+    the length of the error vector and are sqrt(3) times as large. The components of the orientation are those of the
+    residual rotation vector; differences of the paper's Euler angles are the same to first order.
     """
     length_2 = np.square(np.asarray(errors["position_error_m"], np.float64))
     angle_2 = np.square(np.asarray(errors["orientation_error_deg"], np.float64))
@@ -95,7 +95,7 @@ def squared_errors(errors: pd.DataFrame) -> dict[str, Array]:
 
 
 def summary_spreads(errors: pd.DataFrame, seed: int = 0) -> dict[str, Spread]:
-    """How far each RMSE of `squared_errors` varies between test scenes, or trajectories where there is one scene."""
+    """Spread of each RMSE of `squared_errors` between test scenes, or between trajectories if there is one scene."""
     scenes = errors["scene_id"].tolist()
     names = [f"{scene}/{name}" for scene, name in zip(scenes, errors["trajectory_id"], strict=True)]
     rows, squares = np.arange(len(errors)), squared_errors(errors)

@@ -1,4 +1,4 @@
-"""One navigation run: train the networks asked for, judge them beside the baselines, write tables and pictures."""
+"""One navigation run: train the selected networks, evaluate them beside the baselines, write tables and pictures."""
 
 import os
 import time
@@ -59,12 +59,12 @@ def navigate_run(
 ) -> list[RunFolder]:
     """Train `settings.fusion` on a dataset into runs/navigate/<name> (warp) and <name>-stack (stack).
 
-    Interrupted runs of the same settings, dataset and detector are resumed, finished ones left as they are; `overwrite`
+    Resumes interrupted runs of the same settings, dataset and detector, and leaves finished ones unchanged; `overwrite`
     replaces both.
 
-    `detector` is the default checkpoint for the stack network's backbone, used where it exists and fits;
-    `settings.detector` must fit. Raises UserError on bad data, a checkpoint of another architecture, a detector
-    that was fitted to terrain of the test split (unless `allow_overlap`), or under torchrun with several processes.
+    `detector` is the default checkpoint for the stack network's backbone, used if it exists and fits;
+    `settings.detector` must fit. Raises UserError on bad data, a checkpoint of another architecture, a detector that
+    was fitted to terrain of the test split (unless `allow_overlap`), or under torchrun with several processes.
     """
     processes = os.environ.get("WORLD_SIZE", "1")
     if processes != "1":
@@ -82,12 +82,12 @@ def navigate_run(
     opened = open_dataset(dataset)
     own = training_provenance(opened)
     terrain = {"warp": own, "stack": own.joined(inherited)}
-    # One check for both: the run of warp has the figures of stack in its table.
+    # One check for both, because the table of the warp run includes the metrics of stack.
     terrain_check = check_terrain(terrain["stack"], opened, "test", allow_overlap)
     descents = load_descents(opened)
     test = [descent for descent in descents if descent.split == "test"]
     motions = _baselines([descent for descent in descents if descent.split == "train"], test)
-    # stack comes first, so that the run of warp, finished last, holds the table of both.
+    # stack comes first, so that the run of warp, finished last, has the table of both.
     for fusion, run in folders.items():
         seconds = None
         if states[fusion] != "finished":
@@ -122,7 +122,7 @@ def _train(
     resume: bool,
     terrain: Provenance,
 ) -> float:
-    """The seconds that it took."""
+    """Train one network; returns the training time in seconds."""
     lightning.seed_everything(settings.seed, verbose=False)
     task = NavigationTask(settings, fusion, descents, backbone)
     task.terrain = terrain.plain()
@@ -143,9 +143,9 @@ def _train(
 def _detector_backbone(
     settings: NavigateConfig, default: Path | None
 ) -> tuple[dict[str, Tensor] | None, str, list[Provenance]]:
-    """A detector's backbone weights, where they are from and the record of its terrain.
+    """A detector's backbone weights, their source and the records of its terrain.
 
-    None where there are none that fit, why, and no record.
+    If no weights fit: None, the reason, and no record.
     """
     path = settings.detector or default
     if path is None or (settings.detector is None and not path.is_file()):

@@ -1,4 +1,4 @@
-"""Training of the navigation networks, and what their nine numbers mean."""
+"""Training of the navigation networks, and decoding of their nine outputs."""
 
 import math
 from dataclasses import dataclass
@@ -29,11 +29,11 @@ Fusion = Literal["warp", "stack"]
 
 @dataclass(frozen=True, slots=True)
 class Scales:
-    """How a network's standardised output becomes a motion.
+    """Scales that convert a network's standardised output to a motion.
 
-    stack: translation = mean_m + spread_m * y. warp: translation = nominal + spread_m * y. Both:
-    rotation_c2_from_c1 = the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y; the
-    nominal motion has none.
+    stack: translation = mean_m + spread_m * y. warp: translation = nominal + spread_m * y. Both: rotation_c2_from_c1 =
+    the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y; the nominal motion has no
+    rotation.
     """
 
     mean_m: list[float]
@@ -45,7 +45,7 @@ class Scales:
 
     @classmethod
     def measured(cls, descents: list[Descent], fusion: Fusion) -> "Scales":
-        """The scales of a training set."""
+        """Compute the scales of a training set."""
         translation = np.concatenate([descent.motion[0] for descent in descents])
         rotation = rotation_vectors(np.concatenate([descent.motion[1] for descent in descents]))
         rotation_rad = max(float(np.sqrt(np.mean(rotation**2))), 1e-6)
@@ -53,12 +53,12 @@ class Scales:
             return cls(translation.mean(0).tolist(), np.maximum(translation.std(0), 1e-3).tolist(), rotation_rad)
         residual = translation - np.concatenate([descent.nominal_motion[0] for descent in descents])
         across, along = np.sqrt(np.mean(residual[:, :2] ** 2)), np.sqrt(np.mean(residual[:, 2] ** 2))
-        # One number for x and y: a mirrored pair changes them over.
+        # One number for x and y, because a mirrored pair may exchange them.
         return cls([0.0] * 3, [max(float(value), 1e-3) for value in (across, across, along)], rotation_rad)
 
 
 def build(architecture: dict[str, Any]) -> StackNavigator | WarpNavigator:
-    """The untrained network of an architecture."""
+    """Build the untrained network of an architecture."""
     a = architecture
     if a["fusion"] == "stack":
         return StackNavigator(a["in_channels"], a["width"], a["attention"], a["hidden"])
@@ -69,7 +69,7 @@ def build(architecture: dict[str, Any]) -> StackNavigator | WarpNavigator:
 
 
 def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:
-    """A trained network and its architecture. Raises UserError where the file is of another network."""
+    """Load a trained network and its architecture. Raises UserError if the file is of another network."""
     content = load_weights(path)
     check_architecture(path, content["architecture"], {"fusion": fusion})
     network = build(content["architecture"])
@@ -78,7 +78,7 @@ def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:
 
 
 def predict(network: nn.Module, architecture: dict[str, Any], descent: Descent) -> Motion:
-    """Motions of a whole descent, in one pass of the network in evaluation mode."""
+    """Motions of a whole trajectory, in one pass of the network in evaluation mode."""
     seen = descent.shrunk(architecture["size_px"])
     sequence = pair_sequence(seen, 0, seen.n_pairs, warp=architecture["fusion"] == "warp")
     device = next(network.parameters()).device
@@ -91,7 +91,7 @@ def predict(network: nn.Module, architecture: dict[str, Any], descent: Descent) 
 
 
 def estimated(network: nn.Module, batch: list[Sequence], device: torch.device) -> tuple[Tensor, Tensor | None]:
-    """Outputs (batch, pairs, 9) and, of a warp network, the flow that it found."""
+    """Outputs (batch, pairs, 9) and, for a warp network, its estimated flow."""
     first = torch.from_numpy(np.stack([sequence.first for sequence in batch])).to(device)
     second = torch.from_numpy(np.stack([sequence.second for sequence in batch])).to(device)
     if isinstance(network, WarpNavigator):
@@ -113,12 +113,12 @@ def decoded_rotation(output: Tensor, scales: Scales) -> Tensor:
 
 
 class NavigationTask(lightning.LightningModule):
-    """One network's training: the paper's coarse, then fine stage; AdamW, short warm-up, cosine to zero.
+    """Training of one network: the paper's coarse, then fine stage; AdamW, short warm-up, cosine to zero.
 
     Errors are standardised: P over the unit of the translation, phi (Euler angles) over the spread of the rotation.
-    Coarse: L^(S1) = |dP|^2 + kappa |dphi|^2. Fine: L^(S2) = e^-s_p |dP|^2 + e^-s_phi |dphi|^2 + s_p + s_phi with
-    learnt s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles; warp's
-    pairs are mirrored and jittered (see navigate/data.py).
+    Coarse: L^(S1) = |dP|^2 + kappa |dphi|^2. Fine: L^(S2) = e^-s_p |dP|^2 + e^-s_phi |dphi|^2 + s_p + s_phi with learnt
+    s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles; warp's pairs are
+    mirrored and jittered (see navigate/data.py).
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class NavigationTask(lightning.LightningModule):
 
     @property
     def evaluated(self) -> nn.Module:
-        """The network that is judged and saved."""
+        """The network to evaluate and save."""
         return self.network
 
     @property
@@ -230,7 +230,7 @@ class NavigationTask(lightning.LightningModule):
     def configure_optimizers(self) -> Any:
         total = max(1, (self.own.coarse_epochs + self.own.fine_epochs) * len(self.train_dataloader()))
         warm = max(1, min(50, total // 10))
-        # Two loss weights have to move by about 1 within the run, whatever rate suits the network.
+        # The two loss weights have to change by about 1 within the run, whatever learning rate suits the network.
         optimizer = torch.optim.AdamW(
             [
                 {"params": list(self.network.parameters()), "lr": self.own.learning_rate, "weight_decay": 1e-3},

@@ -71,8 +71,7 @@ class KeepLast(Callback):
 
     @property
     def seconds(self) -> float:
-        """Training time until now, seconds, including earlier sessions up to the state from which the run was
-        resumed."""
+        """Training time until now in seconds, including the time before a resume."""
         return self.earlier_s + time.monotonic() - self.began
 
     def state_dict(self) -> dict[str, float]:
@@ -164,7 +163,7 @@ def fit(
 ) -> float:
     """Train `task` for a fixed number of epochs; keep the best weights and the last state in the run's folder.
 
-    Returns the training time in seconds; for a resumed run the sum over all its sessions.
+    Returns the training time in seconds, including the time before a resume.
 
     The task provides its own loaders, which are requested again before every epoch, so that order and augmentation can
     depend on seed and epoch only. With several processes each loader provides its share. The task logs `monitor` in

@@ -115,7 +115,7 @@ def read_saved(path: Path, field: str, keys: set[str], wanted: str) -> dict[str,
 
 
 def check_architecture(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise UserError naming the first setting of `wanted` in which a checkpoint's architecture differs."""
+    """Raise UserError naming the first setting of `wanted` that differs in a checkpoint's architecture."""
     for key, value in wanted.items():
         if found.get(key) != value:
             raise UserError(path, key, found.get(key), f"{value}; the checkpoint is of another architecture")

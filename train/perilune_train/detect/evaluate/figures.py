@@ -43,8 +43,10 @@ def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] |
 
 
 def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
-    """Draw AP by radius, altitude and Sun as bars with 95 % intervals or single units, label counts, and the goal 0.85
-    dashed."""
+    """Draw AP by radius, altitude and Sun as bars.
+
+    Also draws 95 % intervals or single units, label counts, and the goal 0.85 as a dashed line.
+    """
     unit = bins[0].ap50_paper_spread.unit if bins else "unit"
     drawn = [(by, title) for by, title in _PANELS.items() if any(part.by == by for part in bins)]
     figure = Figure(figsize=(4.4 * max(len(drawn), 1), 3.8), layout="constrained")

@@ -1,1 +1,1 @@
-"""Images from anywhere: read, predict, evaluate."""
+"""Images from any source: read, predict, evaluate."""

@@ -1,9 +1,9 @@
-"""A run judged on real images, with what people marked there: the same report as for a dataset.
+"""Evaluation of a run on labelled real images, with the same report as for a dataset.
 
-Wanted are boxes of at least `min_size_px` (sqrt(w h)) that are centred in their image; smaller ones, others off the
-image and those a COCO file ignores are neither wanted nor false when found, nor are detections below that size. The
-threshold is the run's own, from its validation split. The best threshold on the images themselves is told beside it, as
-an oracle: nobody who has no labels can know it.
+Boxes of at least `min_size_px` (sqrt(w h)) that are centred in their image are ground truth. Smaller boxes, boxes
+centred off the image and boxes that a COCO file ignores are neither missed nor false positives, nor are detections
+below that size. The threshold is the run's own, from its validation split. The best threshold on the images themselves
+is reported beside it as an oracle: choosing it needs labels.
 """
 
 from pathlib import Path
@@ -45,10 +45,10 @@ def evaluate_images(
     min_size_px: float = 8.0,
     threshold: float | None = None,
 ) -> dict[str, float | int | str | None]:
-    """Judge a run on labelled images (a folder or a COCO file); the figures, as written to `out`/metrics.json.
+    """Evaluate a run on labelled images (a folder or a COCO file); returns the metrics written to `out`/metrics.json.
 
-    Leaves report.md, detections.parquet, precision_recall.png, bins.png, detections.png and crops.png in `out` too.
-    Raises UserError where anything of it cannot be read; then nothing is written.
+    Also writes report.md, detections.parquet, precision_recall.png, bins.png, detections.png and crops.png into `out`.
+    Raises UserError if any input cannot be read; then nothing is written.
     """
     check_folder(out, run)
     tiling.check()
@@ -92,7 +92,7 @@ def evaluate_images(
 
 
 def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
-    """An image's boxes as labels that can be judged; its craters are the ellipses in them."""
+    """Convert an image's boxes to labels; the craters are the ellipses inscribed in the boxes."""
     centre, half = (image.boxes[:, :2] + image.boxes[:, 2:]) / 2, (image.boxes[:, 2:] - image.boxes[:, :2]) / 2
     ellipses = np.column_stack([centre, half, np.zeros(len(half))])
     every = np.ones(len(half), bool)
@@ -102,7 +102,7 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
 def judge_images(
     given: ImageSet, found: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
 ) -> Evaluation:
-    """The detections of all images against their boxes; where boxes end at the images' edges, detections do too."""
+    """Evaluate the detections of all images; clip detections at the image's edge if the labels' boxes are clipped."""
     sizes = np.array([[image.width_px, image.height_px] for image in given.images])
     if given.ends_at_edges:
         limits = np.tile(sizes, 2).astype(np.float64)
@@ -130,8 +130,11 @@ def _detect(detector: Detector, images: list[NDArray[np.uint8]], tiling: Tiling)
 
 
 def write_crops(path: Path, images: list[NDArray[np.uint8]], evaluation: Evaluation) -> None:
-    """Middles of at most 12 images, enlarged twice: left the labels (wanted red, others orange), right the detections
-    above the threshold (found cyan, false magenta; what does not count is left out)."""
+    """Draw the centres of at most 12 images, enlarged twice, with labels and detections side by side.
+
+    Left: labels (selected red, others orange). Right: detections above the threshold (matched cyan, false positives
+    magenta, ignored ones left out).
+    """
     chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), _MOST_PAIRS)).round().astype(int))
     pairs = [_crop_pair(images[index], evaluation, int(index)) for index in chosen]
     pairs += [np.zeros_like(pairs[0])] * (-len(pairs) % min(_PAIRS_A_ROW, len(pairs)))

@@ -1,7 +1,7 @@
-"""Where on the Moon an image lies, and detections as GeoJSON.
+"""Location of an image on the Moon, and detections as GeoJSON.
 
-A georeference is a GeoTIFF's own, or a world file (.pgw, .tfw, .jgw) with the projection's .prj beside the image. It
-is read by rasterio, which is wanted only for this (the extra `geo`).
+The georeference is a GeoTIFF's own, or a world file (.pgw, .tfw, .jgw) with the projection's .prj beside the image. It
+is read with rasterio, which is needed only for this (the extra `geo`).
 """
 
 import importlib.util
@@ -24,26 +24,26 @@ MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 """Longitude and latitude, degrees, on the sphere of the Moon's mean radius."""
 _CORNERS = 32
 _GRID = 17
-"""Pixels a side that tell whether an image lies on its map at all: a disc may leave its corners empty."""
+"""Number of sample pixels per side, to test whether an image is on its map; a disc may leave its corners empty."""
 _DECIMALS = 8
-"""Of degrees: 0.3 mm on the ground."""
+"""Decimals of degrees: 0.3 mm on the ground."""
 
 
 @dataclass(frozen=True)
 class Georeference:
-    """From pixels to the Moon."""
+    """Conversion from pixels to longitude and latitude on the Moon."""
 
     transform: tuple[float, float, float, float, float, float]
     """a, b, c, d, e, f: map x = a column + b row + c, map y = d column + e row + f, pixels from the outer corner."""
     projection: str
     """The map's coordinate reference system, WKT."""
     path: Path
-    """The image, for faults to name."""
+    """The image, named in error messages."""
 
     def lon_lat_deg(self, pixels: Array) -> Array:
         """East longitude and latitude (N, 2), degrees, of pixel coordinates (N, 2); infinite off the map.
 
-        Raises UserError where the projection is not one of the Moon.
+        Raises UserError if the projection is not one of the Moon.
         """
         from rasterio._err import CPLE_AppDefinedError, CPLE_BaseError
         from rasterio.errors import RasterioError
@@ -54,7 +54,7 @@ class Georeference:
         try:
             return np.stack(transform(self.projection, _MOON, x, y)[:2], axis=1)
         except CPLE_AppDefinedError:
-            # One point off the projection's domain fails them all: halved until it is alone.
+            # One point outside the projection's domain fails the whole call: bisect until it is alone.
             half = len(pixels) // 2
             if half == 0:
                 return np.full((1, 2), np.inf)
@@ -64,13 +64,13 @@ class Georeference:
 
 
 def read_georeference(path: Path) -> Georeference | None:
-    """The georeference of an image, None where it has none, or only half of one. Needs rasterio."""
+    """Read the georeference of an image; None if it has none or only half of one. Needs rasterio."""
     import rasterio
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError
 
     beside = path.with_suffix(".prj")
-    # Left to itself, GDAL would open a text that calls itself .tif and names other files; PAM files may do so too.
+    # By default GDAL would open a text file named .tif that refers to other files; PAM files can do so too.
     driver = {"TIFF": "GTiff"}.get(kind := picture_format(path), kind)
     with warnings.catch_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO"):
         warnings.simplefilter("ignore")
@@ -92,15 +92,16 @@ def read_georeference(path: Path) -> Georeference | None:
 
 
 def has_rasterio() -> bool:
-    """Whether georeferences can be read."""
+    """Whether rasterio is installed, so that georeferences can be read."""
     return importlib.util.find_spec("rasterio") is not None
 
 
 def features(name: str, found: Detections, reference: Georeference) -> list[dict[str, Any]]:
     """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with diameter_m.
 
-    Longitudes go on past 180 degrees where a polygon crosses it. A polygon around a pole is not one in longitude and
-    latitude: such a crater's corners are right, its filling is not. Detections that reach off the map are left out.
+    Longitudes continue past 180 degrees if a polygon crosses it. A polygon around a pole is not valid in longitude and
+    latitude: the corners of such a crater are right, its filling is not. Detections that reach off the map are left
+    out.
     """
     if not len(found.boxes):
         return []
@@ -137,8 +138,8 @@ def features(name: str, found: Detections, reference: Georeference) -> list[dict
 def collection(parts: list[dict[str, Any]]) -> dict[str, Any]:
     """A GeoJSON FeatureCollection in the Moon's longitude and latitude.
 
-    Deviation from RFC 7946, which knows the Earth's WGS 84 alone: the member `crs` of GeoJSON 2008 names the Moon's
-    system; GDAL and QGIS heed it, others pass it over.
+    Deviation from RFC 7946, which allows only the Earth's WGS 84: the member `crs` of GeoJSON 2008 names the Moon's
+    system. GDAL and QGIS read it, other programs ignore it.
     """
     crs = {"type": "name", "properties": {"name": MOON_CRS}}
     return {"type": "FeatureCollection", "name": "craters", "crs": crs, "features": parts}
@@ -152,7 +153,7 @@ def great_circle_m(first: Array, second: Array) -> Array:
 
 
 def _ring(corners: Array) -> list[list[float]]:
-    """A closed ring, counter-clockwise as RFC 7946 asks."""
+    """A closed ring, counter-clockwise as required by RFC 7946."""
     x, y = corners.T - corners[0][:, None]
     if x @ np.roll(y, -1) - y @ np.roll(x, -1) < 0:
         corners = corners[::-1]

@@ -1,10 +1,10 @@
-"""Labelled images that are no dataset of ours: a folder of pictures with tables of boxes beside them, or COCO.
+"""Labelled images from other sources: a folder of images with tables of boxes, or COCO.
 
 A table (`<name>.txt` beside `<name>.png`) has a header with X, Y, W and H: left, top, width and height of a box in
-pixels, separated by commas or tabs. COCO is read from annotations.json in the folder, or from a file given by name;
-its images are beside it, or where COCO has them: in the folder images next to the file's own, or in one that the file's
-name ends with (train2017 for instances_train2017.json), there or in images. Coordinates are taken to begin at the outer
-corner of the top-left pixel.
+pixels, separated by commas or tabs. COCO is read from annotations.json in the folder, or from a given file. Its images
+are beside the file or where COCO puts them: in the folder images next to the file's own, or in a folder that the file's
+name ends with (train2017 for instances_train2017.json), there or in images. Coordinates are assumed to begin at the
+outer corner of the top-left pixel.
 """
 
 import json
@@ -29,28 +29,28 @@ _LARGEST_PX = 1e6
 
 @dataclass(frozen=True)
 class LabelledImage:
-    """One image and what people marked on it; its pixels stay in the file."""
+    """One image and its labels; the pixels stay in the file."""
 
     name: str
-    """Its path within the folder, by which tables and pictures name it."""
+    """Path within the folder, used in tables and pictures."""
     path: Path
-    """The picture."""
+    """The image file."""
     width_px: int
     """Width, pixels."""
     height_px: int
     """Height, pixels."""
     boxes: Array
-    """x0, y0, x1, y1 in pixels (M, 4); they may leave the image."""
+    """x0, y0, x1, y1 in pixels (M, 4); they may extend beyond the image."""
     marked: NDArray[np.bool_]
-    """False for a box that its source wants ignored (M,)."""
+    """False for a box that its source marks as ignored (M,)."""
 
     @property
     def sizes_px(self) -> Array:
-        """Side of the square of equal area, sqrt(w h), pixels (M,): what "craters of 8 px" means here."""
+        """Side of the square of equal area, sqrt(w h), pixels (M,): the size of a crater here."""
         return np.sqrt(np.prod(self.boxes[:, 2:] - self.boxes[:, :2], axis=1))
 
     def wanted(self, min_size_px: float) -> NDArray[np.bool_]:
-        """Boxes that are to be found (M,): marked, centred in the image, and of at least this size."""
+        """Which boxes are ground truth (M,): marked, centred in the image, and of at least this size."""
         centre = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
         inside = ((centre >= 0) & (centre < [self.width_px, self.height_px])).all(axis=1)
         return self.marked & inside & (self.sizes_px >= min_size_px)
@@ -61,15 +61,16 @@ class ImageSet:
     """All labelled images of a folder or a COCO file."""
 
     images: list[LabelledImage]
-    """In the order of their names, or of the COCO file."""
+    """Sorted by name, or in the order of the COCO file."""
     ends_at_edges: bool
-    """Whether boxes end at the image's edge (COCO's habit), so that detections must too before they are compared."""
+    """Whether boxes are clipped at the image's edge (as in COCO), so that detections must be clipped before
+    matching."""
     categories: str = ""
-    """Which of a COCO file's categories were taken as craters, in words; "" where nothing had to be chosen."""
+    """Categories of a COCO file that were taken as craters, in words; "" if there was no choice."""
 
 
 def read_images(place: Path) -> ImageSet:
-    """The labelled images of a folder or of a COCO file. Raises UserError, naming file and line, on anything broken."""
+    """Read the labelled images of a folder or a COCO file. Raises UserError, naming file and line, on invalid input."""
     if place.is_file():
         return _read_coco(place)
     if not place.is_dir():
@@ -87,7 +88,7 @@ def read_images(place: Path) -> ImageSet:
 
 
 def read_table(path: Path) -> Array:
-    """Boxes (M, 4) of a table with a header. Raises UserError where a row is broken."""
+    """Boxes (M, 4) of a table with a header. Raises UserError on an invalid row."""
     rows = _lines(path)
     header = next(rows, (1, ""))[1]
     separator = "\t" if "\t" in header else ","
@@ -175,7 +176,7 @@ def _read_coco(path: Path) -> ImageSet:
 
 
 def _records(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
-    """A list of objects; no categories are as good as one."""
+    """A list of objects; a missing list of categories counts as an empty one."""
     found = content.get(name, [] if name == "categories" else None)
     if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
         raise UserError(path, name, type(found).__name__, "a list of objects, as COCO has it")
@@ -192,8 +193,8 @@ def _identity(record: dict[str, Any], name: str, field: str, path: Path) -> int 
 def _crater_categories(categories: list[dict[str, Any]], path: Path) -> tuple[list[int | str] | None, str]:
     """The ids of all categories named crater or craters, in any case, and their names in words.
 
-    Several, since Roboflow's exports have a placeholder beside the real one. With fewer than two categories in the
-    file everything is a crater: None and "".
+    There may be several, since Roboflow's exports have a placeholder category too. With fewer than two categories in
+    the file every object is a crater: None and "".
     """
     if len(categories) < 2:
         return None, ""
@@ -208,7 +209,7 @@ def _crater_categories(categories: list[dict[str, Any]], path: Path) -> tuple[li
 
 
 def _picture(path: Path, name: Any, field: str) -> Path:
-    """The picture that a COCO file names: of the folders where it may be, in the first that has it."""
+    """Path of the image that a COCO file names, in the first possible folder that contains it."""
     root = path.resolve().parent
     ending = path.stem.rpartition("_")[2]
     images = root.parent / "images"
@@ -220,7 +221,7 @@ def _picture(path: Path, name: Any, field: str) -> Path:
 
 
 def _below(folder: Path, name: Any, path: Path, field: str) -> Path:
-    """A path in a folder or below it. Raises UserError on one that leads out."""
+    """A path in a folder or below it. Raises UserError on a path that leads outside."""
     if isinstance(name, str) and name and "\0" not in name:
         try:
             picture = folder.joinpath(name).resolve()

@@ -1,4 +1,4 @@
-"""Craters in images of any size: tables, overlays and, where an image has a georeference, GeoJSON."""
+"""Detect craters in images of any size: tables, overlays and, for images with a georeference, GeoJSON."""
 
 import json
 from pathlib import Path
@@ -34,7 +34,7 @@ _SMALLEST_OVERLAY_PX = 1600
 
 
 def open_detector(root: Path, config: DetectConfig) -> Detector:
-    """The best network of a run's folder. Raises UserError where it has none."""
+    """Load the best network of a run's folder. Raises UserError if it has none."""
     device = runs.choose_device(config.device)
     network = load_detector(runs.RunFolder(root).best).to(device)
     return Detector(network, config, device, runs.choose_bf16(config.precision, device))
@@ -43,9 +43,9 @@ def open_detector(root: Path, config: DetectConfig) -> Detector:
 def predict_images(
     paths: list[Path], run: Path, config: DetectConfig, out: Path, threshold: float | None, tiling: Tiling
 ) -> int:
-    """Find craters in images; returns their number. Everything is in the new folder `out`, or nothing.
+    """Find craters in images; returns their number. Writes all output to the new folder `out`, or nothing.
 
-    Raises UserError on the first image that cannot be read, before any is searched.
+    Raises UserError on the first image that cannot be read, before detection starts.
     """
     tiling.check()
     with new_folder(out) as folder, progress_bar() as progress:
@@ -133,7 +133,7 @@ def write_overlay(path: Path, image: NDArray[np.uint8], found: Detections) -> No
 
 def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
     """Draw the ellipses of boxes (M, 4) onto an image (height, width, 3) in blue, green, red."""
-    # OpenCV takes whole numbers, here of sixteenths of a pixel, and puts 0 at a pixel's centre.
+    # OpenCV takes integers, here sixteenths of a pixel, and has its origin at a pixel's centre.
     sixteenths = np.rint(16 * np.column_stack([boxes[:, :2] + boxes[:, 2:] - 1, boxes[:, 2:] - boxes[:, :2]]) / 2)
     for x, y, a, b in sixteenths.astype(int).tolist():
         cv2.ellipse(canvas, (x, y), (a, b), 0, 0, 360, colour, 1, cv2.LINE_AA, 4)

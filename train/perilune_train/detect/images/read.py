@@ -1,7 +1,7 @@
-"""One picture of anybody's as 8-bit grey: PNG, TIFF and JPEG of any size and depth.
+"""Read an image as 8-bit grey: PNG, TIFF and JPEG of any size and depth.
 
-Pillow opens most of them. It cuts colours of 16 bits to 8, so OpenCV reads such a PNG; and TIFFs of float64, or of
-several bands deeper than 8 bits, are read by rasterio (the extra `geo`), since OpenCV takes some of them for others.
+Pillow opens most of them. It reduces colours of 16 bits to 8, so OpenCV reads such a PNG. TIFFs of float64, or of
+several bands deeper than 8 bits, are read by rasterio (the extra `geo`), since OpenCV misreads some of them.
 """
 
 import warnings
@@ -18,34 +18,36 @@ from perilune_shared.errors import UserError
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _FORMATS = ("PNG", "TIFF", "JPEG")
 _LARGEST_PIXELS = 2**29
-"""A whole Narrow Angle Camera image has half of that; a small file may claim to unpack to any size."""
+"""Limit on the pixels of an image: twice a whole Narrow Angle Camera image. A small file may claim to unpack to any
+size."""
 _STRETCH_PERCENT = (0.05, 99.95)
 _SAMPLE = 1_000_000
 _LARGEST_VALUE = 1e30
-"""Beyond it no pixel was measured: ISIS marks what it does not know by values near the end of float32's range."""
+"""Larger values are no measurements: ISIS marks missing data by values near the end of float32's range."""
 _BITS_TAG, _NODATA_TAG = 258, 42113
 _LUMA = (0.299, 0.587, 0.114)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, from the header alone. Raises UserError where it is no picture or too large."""
+    """Width and height in pixels, read from the header only. Raises UserError if it is no image or too large."""
     with _opened(path) as picture:
         return picture.width, picture.height
 
 
 def picture_format(path: Path) -> str:
-    """PNG, TIFF or JPEG, by the content. Raises UserError where it is none of these."""
+    """PNG, TIFF or JPEG, by content. Raises UserError if it is none of these."""
     with _opened(path) as picture:
         return str(picture.format) if isinstance(picture, Image.Image) else "TIFF"
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """A picture's pixels (height, width) as 8-bit grey.
+    """An image's pixels (height, width) as 8-bit grey.
 
-    8-bit grey stays as it is; colours become their luma, of other bands the first counts. Deeper pictures (16 bits and
-    more, float) are stretched so that 99.9 % of their values fall into 0..255: the network takes mean and deviation out
-    anyway, and 16-bit files often use a small part of their range. Of these, what is not finite, beyond 1e30 or the
-    file's own no-data value (GDAL_NODATA) has no part in the stretch and becomes 0. Raises UserError on a damaged file.
+    8-bit grey is not changed. Colours become their luma; of other bands the first is used. Deeper images (16 bits and
+    more, float) are stretched so that 99.9 % of their values are within 0..255: the network removes mean and deviation
+    anyway, and 16-bit files often use a small part of their range. Their values that are not finite, beyond 1e30 or
+    equal to the file's own no-data value (GDAL_NODATA) are left out of the stretch and become 0. Raises UserError on a
+    damaged file.
     """
     with _opened(path) as picture:
         try:
@@ -56,13 +58,13 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 
 
 def _opened(path: Path) -> Any:
-    """A Pillow image or, where that would not do, a dataset of rasterio; both have a width and a height."""
+    """A Pillow image, or a rasterio dataset if Pillow does not suffice; both have a width and a height."""
     if not path.is_file():
         raise UserError(path, "image", "a folder" if path.is_dir() else "no such file", "a PNG, TIFF or JPEG")
     Image.MAX_IMAGE_PIXELS = None
     picture: Any
     with warnings.catch_warnings():
-        # Faults that matter raise; remarks about metadata would stand between the user and the result.
+        # Serious errors raise; warnings about metadata would only distract the user.
         warnings.simplefilter("ignore")
         try:
             picture = Image.open(path, formats=_FORMATS)
@@ -89,7 +91,7 @@ def _opened_by_rasterio(path: Path) -> Any:
         hint = "; float64 and deep colours in TIFF need rasterio (pip install 'perilune-train[geo]')"
         raise UserError(path, "image", found, wanted + hint) from None
     try:
-        # Left to itself, GDAL would open a text that calls itself .tif and names other files; PAM files may do so too.
+        # By default GDAL would open a text file named .tif that refers to other files; PAM files can do so too.
         with rasterio.Env(GDAL_PAM_ENABLED="NO"):
             return rasterio.open(path.resolve(), driver="GTiff")
     except RasterioError:
@@ -101,7 +103,7 @@ def _by_pillow(path: Path, picture: Any) -> NDArray:
     if picture.mode.startswith(("I", "F")):
         return _known(np.asarray(picture), _nodata(picture))
     if picture.format == "PNG" and ";16" in str(picture.tile[0][3]):
-        # First by Pillow: it tells damage in words, OpenCV on standard error.
+        # Load with Pillow first: it raises an error on damage, OpenCV only prints to standard error.
         picture.load()
         deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if deep is None or deep.dtype != np.uint16 or deep.ndim != 3:
@@ -111,7 +113,7 @@ def _by_pillow(path: Path, picture: Any) -> NDArray:
 
 
 def _by_rasterio(image: Any) -> NDArray:
-    """As `_by_pillow`."""
+    """Pixels as returned by `_by_pillow`."""
     from rasterio.enums import ColorInterp
 
     colours = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)

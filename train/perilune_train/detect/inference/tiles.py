@@ -83,8 +83,10 @@ def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.int
 
 
 def padded(image: NDArray[np.uint8], tile_px: int) -> NDArray[np.uint8]:
-    """Pad the image with reflected pixels at right and bottom if a side is shorter than a tile and no multiple of
-    32."""
+    """Pad an image at right and bottom with reflected pixels.
+
+    Only sides that are shorter than a tile and no multiple of 32 are padded.
+    """
     more = [max(0, min(tile_px, -(-side // _STEP) * _STEP) - side) for side in image.shape]
     return np.pad(image, [(0, more[0]), (0, more[1])], mode="reflect") if any(more) else image
 
