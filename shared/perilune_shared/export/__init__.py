@@ -1,1 +1,1 @@
-"""Datasets in other formats, and the dataset card."""
+"""Export datasets to other formats, and write the dataset card."""

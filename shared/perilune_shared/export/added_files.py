@@ -1,4 +1,4 @@
-"""Files that are added to a finished dataset: a card, metadata for search engines. Its checksums stay right."""
+"""Add files to a complete dataset (a card, metadata for search engines) and update its checksums."""
 
 import contextlib
 from collections.abc import Iterable, Mapping
@@ -14,11 +14,11 @@ from perilune_shared.validation.expected_files import EXTRA_NAMES
 
 
 def check_sums(dataset: Dataset, paths: Iterable[Path], progress: Progress | None = None) -> dict[str, str] | None:
-    """Hashes of the dataset's other files where SHA256SUMS must be rewritten once `paths` are written, else None.
+    """Return the hashes of the dataset's other files if writing `paths` requires a new SHA256SUMS, otherwise None.
 
-    That is where one of them lies in the folder of a complete dataset. SHA256SUMS of an incomplete dataset is written
-    when it is completed. Raises UserError where the hash of another file is wrong, since new sums would hide it, or a
-    name is not one that a dataset may have (perilune_shared.validation.expected_files).
+    A new SHA256SUMS is required if one of `paths` is directly in the folder of a complete dataset; that of an
+    incomplete dataset is written on completion. Raises UserError if the hash of another file is wrong, since new sums
+    would hide it, or if a name is not allowed in a dataset (perilune_shared.validation.expected_files).
     """
     for path in paths:
         if any(path.resolve().is_relative_to((dataset.root / folder).resolve()) for folder in ("manifest", "images")):
@@ -35,7 +35,7 @@ def check_sums(dataset: Dataset, paths: Iterable[Path], progress: Progress | Non
 
 
 def add_files(dataset: Dataset, contents: Mapping[Path, bytes], known: Mapping[str, str] | None) -> None:
-    """Write files, each whole or not at all, and then SHA256SUMS where `check_sums` gave the hashes of the others."""
+    """Write files atomically, then SHA256SUMS unless `known`, the result of `check_sums`, is None."""
     with locked(dataset.root) if known is not None else contextlib.nullcontext():
         for path, content in contents.items():
             files.write_bytes(path, content)

@@ -1,7 +1,7 @@
-"""A page about a dataset, for people and for the sites that list datasets: README.md and card.png.
+"""Write the dataset card, for readers and for dataset repositories: README.md and card.png.
 
-The page is Markdown with a YAML head of the form that Hugging Face reads (https://huggingface.co/docs/hub/datasets-cards).
-A dataset may come from anybody: each text of it stands in a code span, of letters, digits and marks that mean nothing.
+The page is Markdown with a YAML head in Hugging Face's format (https://huggingface.co/docs/hub/datasets-cards).
+Datasets are untrusted: each text from a dataset is put in a code span, reduced to letters, digits and harmless marks.
 """
 
 import shlex
@@ -38,10 +38,10 @@ _IMAGES = {
 
 
 def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[Path, Path]:
-    """Write the page and the picture beside it; returns their paths. The dataset's checksums are kept right.
+    """Write the page and the picture beside it, and update the dataset's checksums; return the two paths.
 
-    `out` is README.md in the dataset unless given. Raises UserError where another's file is in the way, the dataset has
-    no frame or its checksums are wrong.
+    `out` is by default README.md in the dataset. Raises UserError if a file that no card wrote would be overwritten,
+    the dataset has no frames or its checksums are wrong.
     """
     out = out or dataset.root / CARD_NAME
     if out.suffix != ".md":
@@ -53,20 +53,20 @@ def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[
             raise UserError(path, "--out", "a file that no card wrote", "another place, or that file moved away")
     known = check_sums(dataset, (out, picture), progress)
     gathered = gather(dataset, progress)
-    # The page checks the keys, in a fraction of the time that the picture takes.
+    # Build the page first: it checks the keys and is much faster than the picture.
     page = card_of(dataset, gathered, picture.name).encode()
     add_files(dataset, {picture: draw(dataset, gathered), out: page}, known)
     return out, picture
 
 
 def code(value: object) -> str:
-    """A text of any origin as a code span that is one in Markdown, in its tables and in HTML."""
+    """Format untrusted text as a code span that is safe in Markdown, in its tables and in HTML."""
     text = "".join(c if c in _HARMLESS else "?" for c in shortened(one_line(value), 200))
     return f"`{text.strip() or 'none'}`"
 
 
 def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
-    """The page."""
+    """Return the page as Markdown."""
     info = dataset.info
     state = "" if info.complete else "\n\n**Not complete**: the renderer is still at work, or was stopped."
     parts = [
@@ -90,7 +90,7 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
 
 
 def _purpose(info: DatasetInfo) -> str:
-    """The dataset's purpose, with its numbers of trajectories and terrains."""
+    """Describe the dataset's purpose and its numbers of trajectories and terrains."""
     n_scenes, n_trajectories = info.counts.scenes, info.counts.trajectories
     terrains = f"{n_scenes:,} terrains" if n_scenes != 1 else "one terrain"
     trajectories = f"{n_trajectories:,} trajectories" if n_trajectories != 1 else "one trajectory"
@@ -165,7 +165,7 @@ def _files(dataset: Dataset) -> str:
 
 
 def _remake(key: str, recipe: Recipe) -> str:
-    """Commands that make what a recipe made; names are quoted, since they end in a shell."""
+    """Return the commands that reproduce a recipe's data; names are quoted for the shell."""
     settings = f"json.load(open('{INFO_NAME}'))['recipes']['{key}']['config']"
     unpack = f"python -c \"import json; json.dump({{'dataset': {settings}}}, open('recipe.yaml', 'w'))\""
     if recipe.developed_from is None:

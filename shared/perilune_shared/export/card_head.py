@@ -1,4 +1,4 @@
-"""The YAML head of a dataset card, as Hugging Face reads it.
+"""The YAML head of a dataset card, in Hugging Face's format.
 
 Format: https://huggingface.co/docs/hub/datasets-cards and datasets-manual-configuration.
 """
@@ -24,7 +24,7 @@ _SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000
 
 
 def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
-    """The YAML head: licence, name, tags, and which files are which split of which configuration."""
+    """Return the YAML head: licence, name, tags, and the files of each split of each configuration."""
     info = dataset.info
     single = info.licence in _HUB_LICENCES
     licence = {"license": info.licence.lower()} if single else {"license": "other", "license_name": info.licence}
@@ -40,11 +40,11 @@ def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
 
 
 def table_configs(dataset: Dataset) -> list[dict[str, Any]]:
-    """A configuration for each table that has rows, and for packed images.
+    """Return a configuration for each table that has rows, and for packed images.
 
-    Without it `datasets` takes every picture of the folder for training data. A part may hold rows of all splits, so
-    that each table is one split, `mixed`; the frames' column `split` says which. The export for Hugging Face has the
-    splits as files.
+    Without configurations `datasets` treats every image in the folder as training data. A part may contain rows of all
+    splits, so each table has the single split `mixed`; see the column `split` of frames. The Hugging Face export writes
+    separate files per split.
     """
     counts = dataset.info.counts.model_dump()
     names = ["frames", *(name for name in TABLES if name != "frames")]

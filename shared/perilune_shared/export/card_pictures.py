@@ -1,4 +1,4 @@
-"""The picture of a dataset card: frames with their labels, and histograms of what the dataset holds.
+"""The picture of a dataset card: frames with their labels, and histograms of the dataset.
 
 Needs matplotlib: `pip install "perilune-shared[pictures]"`.
 """
@@ -28,7 +28,7 @@ _N_FRAMES = 8
 _COLUMNS = 4
 _COLOURS = {"train": "#4477aa", "val": "#ee9933", "test": "#228855"}
 _LOGARITHMIC = ("radius_px", "visible_fraction", "sunlit_fraction")
-"""Measures of which most values lie in one place."""
+"""Measures with a logarithmic count axis, since most values are in few bins."""
 _CHOSEN, _OTHER = "#50dc50", "#ff8c3c"
 TITLES = {
     "radius_px": "label radius sqrt(a b), px",
@@ -42,28 +42,28 @@ TITLES = {
     "speed_mps": "speed, m/s",
     "real_ground_share": "share of real ground",
 }
-"""Measures in their order, with what stands under their histograms."""
+"""Axis title of each measure's histogram, in the order of the histograms."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gathered:
-    """What a card shows of a dataset."""
+    """Data of a dataset that the card shows."""
 
     measures: dict[str, dict[str, NDArray[np.float32]]]
-    """Measure to split to values; names and units in `TITLES`."""
+    """Values by measure and split; see `TITLES` for names and units."""
     samples: list[tuple[dict, pd.DataFrame]] = field(default_factory=list)
-    """Rows of frames to show, each with its labels and whether they are `visible` (the selection)."""
+    """Rows of the frames to show, each with its labels; their column `visible` is the selection of that name."""
 
 
 def gather(dataset: Dataset, progress: Progress) -> Gathered:
-    """Read every scene once. Raises UserError where there is no frame."""
+    """Collect the data in one pass over the scenes. Raises UserError if there are no frames."""
     ids = dataset.scene_ids()
     if not ids:
         raise UserError(dataset.root, "scenes", "none", "a dataset with frames")
     task = progress.add_task("card", total=len(ids), unit="scenes")
     collected: dict[str, dict[str, list[np.ndarray]]] = {}
     samples: list[tuple[dict, pd.DataFrame]] = []
-    # Spread over the scenes, and from the start of a descent to its end.
+    # Spread the frames over the scenes and over the length of trajectories.
     places = np.linspace(0, len(ids) - 1e-9, _N_FRAMES, endpoint=False).astype(int)
     wanted = {ids[place]: np.flatnonzero(places == place) for place in places}
     for scene in scenes_of(dataset, choose=by_selection(SELECTIONS["visible"])):
@@ -82,7 +82,7 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
 
 
 def draw(dataset: Dataset, gathered: Gathered) -> bytes:
-    """The picture as PNG. Raises UserError where matplotlib is missing or a frame is not what the manifest says."""
+    """Draw the picture as PNG. Raises UserError if matplotlib is missing or a frame does not match the manifest."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -90,7 +90,7 @@ def draw(dataset: Dataset, gathered: Gathered) -> bytes:
     except ImportError:
         raise UserError("card", "matplotlib", "not installed", 'pip install "perilune-shared[pictures]"') from None
     samples = gathered.samples if dataset.info.images in ("files", "packed") else []
-    # The last ones give way where a dataset has more than fill two rows.
+    # Show at most two rows of histograms; omit the last measures.
     measures = dict(list(gathered.measures.items())[: 2 * _COLUMNS])
     n_sample_rows = -(-len(samples) // _COLUMNS)
     heights = [1.0] * n_sample_rows + [0.72] * -(-len(measures) // _COLUMNS)
@@ -114,7 +114,7 @@ def draw(dataset: Dataset, gathered: Gathered) -> bytes:
 
 
 def _depth_ratios(dataset: Dataset, scene: SceneRows) -> NDArray[np.float64]:
-    """Depth over diameter (N,) of the craters of a scene's labels; NaN where a crater is not listed."""
+    """Return depth / diameter (N,) of the crater of each label of a scene; NaN if a crater is missing."""
     columns = ["crater_id", "diameter_m", "depth_m"]
     craters = dataset.table("craters", columns, scene_id=scene.scene_id).to_pandas().drop_duplicates("crater_id")
     ratio = (craters["depth_m"] / craters["diameter_m"]).set_axis(craters["crater_id"])
@@ -144,7 +144,7 @@ def _draw_frame(axis: "Axes", row: dict, labels: pd.DataFrame, png: bytes) -> No
 
     width, height = row["width_px"], row["height_px"]
     try:
-        # Looked at first: a small file may unpack to any size.
+        # Check the header first: a small file may decompress to any size.
         header = png_header(png)
         if (header.width_px, header.height_px) != (width, height):
             raise ValueError(f"{header.width_px} x {header.height_px} px")
@@ -179,13 +179,13 @@ def _draw_histogram(axis: "Axes", name: str, by_split: Mapping[str, np.ndarray])
         axis.text(0.5, 0.5, "no values", ha="center", va="center", transform=axis.transAxes, fontsize=8)
     else:
         low, high = float(every.min()), float(every.max())
-        # Values all alike still need a bin of some width.
+        # If all values are equal, the bins still need a width.
         edges = (
             np.linspace(low, high, 31) if high - low > 1e-6 * max(1.0, abs(high)) else np.linspace(low - 1, low + 1, 4)
         )
         colours = [_COLOURS[split] for split in finite]
         logarithmic = name in _LOGARITHMIC
-        # Heights stacked on a logarithmic axis would mislead: there they are lines from the axis.
+        # Stacked bars would mislead on a logarithmic axis: draw outlines instead.
         style = {"histtype": "step"} if logarithmic else {"stacked": True}
         axis.hist(list(finite.values()), edges.tolist(), log=logarithmic, color=colours, **style)
     axis.set_xlabel(TITLES[name], fontsize=8)

@@ -1,8 +1,8 @@
-"""COCO: boxes and ellipses as polygons, one file a split.
+"""Export to COCO: boxes, and ellipses as polygons, one file per split.
 
 Format: https://cocodataset.org/#format-data. COCO's coordinates have their origin at the outer corner of the top-left
-pixel, as ours do. After COCO's habit boxes and polygons end at the image's edge; the whole ellipse stands beside them.
-Labels that are not chosen become `iscrowd`: an evaluator then counts a detection of them neither for nor against.
+pixel, as ours do. Boxes and polygons are clipped to the image, as usual in COCO; the whole ellipse is included too.
+Labels that are not selected are marked `iscrowd`: evaluators ignore detections that match them.
 """
 
 import json
@@ -22,20 +22,20 @@ from perilune_shared.storage import files
 CATEGORY = {"id": 1, "name": "crater", "supercategory": "crater"}
 _N_CORNERS = 32
 _DECIMALS = 3
-"""Of pixels in the file; more would be below any label's truth."""
+"""Decimals of pixel coordinates in the file, finer than the accuracy of any label."""
 _ANGLES = 2 * np.pi * np.arange(_N_CORNERS) / _N_CORNERS
 _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
-# Corners on the ellipse would enclose less than it; moved out by 0.3 %, they enclose as much.
+# A polygon with corners on the ellipse has a smaller area; scaling it by 0.3 % makes the areas equal.
 _CIRCLE *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
 
 
 def export_coco(
     dataset: Dataset, out: Path, progress: Progress, split: str | None = None, choose: Choice | None = None
 ) -> int:
-    """Write `out`/instances_<split>.json for each split, or for one; returns the number of annotations.
+    """Write `out`/instances_<split>.json for each split, or for one; return the number of annotations.
 
-    `file_name` is the frame's png_path, so that the image folder is the dataset's. Raises UserError where `out` holds
-    something, the dataset is only planned, a png_path leads out of it or no frame is of the split.
+    `file_name` is the frame's png_path, so use the dataset's folder as the image folder. Raises UserError if `out` is
+    not empty, the dataset is a plan, a png_path is outside the dataset or the split has no frames.
     """
     if dataset.info.images == "planned":
         raise UserError(dataset.root, "images", "planned", "a rendered dataset: a plan has no labels")
@@ -57,7 +57,7 @@ def export_coco(
 
 
 def polygons_of(labels: pd.DataFrame) -> NDArray[np.float64]:
-    """Polygons (N, 32, 2) about the ellipses of labels, of their area, pixels; they may leave the image."""
+    """Return polygons (N, 32, 2), pixels, with the area of the labels' ellipses, not clipped to the image."""
     cos, sin = np.cos(labels["ellipse_theta_rad"].to_numpy()), np.sin(labels["ellipse_theta_rad"].to_numpy())
     along = labels["ellipse_a_px"].to_numpy()[:, None] * _CIRCLE[:, 0]
     across = labels["ellipse_b_px"].to_numpy()[:, None] * _CIRCLE[:, 1]
@@ -67,9 +67,9 @@ def polygons_of(labels: pd.DataFrame) -> NDArray[np.float64]:
 
 
 def cut_at_edges(polygon: NDArray[np.float64], width_px: float, height_px: float) -> NDArray[np.float64]:
-    """What of a convex polygon (M, 2) lies in the image, as a polygon; empty where nothing does.
+    """Clip a convex polygon (M, 2) to the image; the result is empty if they do not overlap.
 
-    One edge after the other (Sutherland & Hodgman 1974, doi 10.1145/360767.360802).
+    Clips at one edge after the other (Sutherland & Hodgman 1974, doi 10.1145/360767.360802).
     """
     for axis, edge, sign in ((0, 0.0, 1.0), (0, width_px, -1.0), (1, 0.0, 1.0), (1, height_px, -1.0)):
         if not len(polygon):
@@ -90,13 +90,13 @@ def cut_at_edges(polygon: NDArray[np.float64], width_px: float, height_px: float
 
 
 def area_of(polygon: NDArray[np.float64]) -> float:
-    """Area of a polygon (M, 2), by the shoelace formula."""
+    """Return the area of a polygon (M, 2), by the shoelace formula."""
     x, y = polygon.T
     return abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) / 2
 
 
 def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
-    """Annotations of a scene by image_id. A label of which nothing lies in its image is left out."""
+    """Return a scene's annotations by image_id. Labels wholly outside their image are omitted."""
     labels = scene.labels
     boxes, size, polygons = clipped_boxes(labels, scene.frames), sizes(labels, scene.frames), polygons_of(labels)
     boxes[:, 2:] -= boxes[:, :2]
@@ -130,7 +130,7 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
 
 
 class _SplitFile:
-    """One JSON file, whose annotations are written as they come and whose images, which are few, at the end."""
+    """Write one JSON file: annotations as they are added, and images, which are few, at the end."""
 
     def __init__(self, path: Path, dataset: Dataset):
         info = dataset.info
@@ -150,9 +150,9 @@ class _SplitFile:
         self._stream.write(json.dumps(head)[:-1] + ',\n"annotations": [')
 
     def add(self, frames: pd.DataFrame, annotations: dict[int, list[dict[str, Any]]]) -> None:
-        """Frames of this split, with the annotations of each."""
+        """Add frames of this split and their annotations."""
         for row in frames.to_dict("records"):
-            # Readers join the name to a folder: it must not lead out of it.
+            # Readers append the name to a folder: check that the path stays inside it.
             self._dataset.file(row["png_path"])
             self._images.append(
                 {
@@ -170,7 +170,7 @@ class _SplitFile:
                 self.n_annotations += 1
 
     def close(self) -> None:
-        """Write the images and end the file."""
+        """Write the images and close the file."""
         with self._stream:
             self._stream.write(
                 '\n],\n"images": [\n' + ",\n".join(json.dumps(image) for image in self._images) + "\n]}\n"

@@ -1,7 +1,7 @@
-"""Croissant: the dataset's files, tables and columns as JSON-LD that dataset search and ML tools read.
+"""Export to Croissant: describe files, tables and columns in JSON-LD for dataset search and ML tools.
 
-Format: Croissant 1.1 (https://docs.mlcommons.org/croissant/docs/croissant-spec-1.1.html). The file lies in the
-dataset's own folder, since it names files by paths from there; mlcroissant then reads records from the local files::
+Format: Croissant 1.1 (https://docs.mlcommons.org/croissant/docs/croissant-spec-1.1.html). The file must be in the
+dataset's folder, since its paths are relative. mlcroissant reads records from the local files::
 
     dataset = mlcroissant.Dataset("data/small/detect/croissant.json")
     for record in dataset.records("labels"):
@@ -26,7 +26,7 @@ from perilune_shared.export.added_files import add_files, check_sums
 from perilune_shared.storage import files
 
 CROISSANT_NAME = "croissant.json"
-# The registered name, application/vnd.apache.parquet, is one that mlcroissant does not read.
+# mlcroissant does not support the registered media type, application/vnd.apache.parquet.
 _PARQUET = "application/x-parquet"
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
@@ -75,9 +75,9 @@ _DATA_TYPES = {pa.string(): "sc:Text", pa.int64(): "cr:Int64", pa.float64(): "cr
 
 
 def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progress | None = None) -> Path:
-    """Write croissant.json, or `out`, into the dataset's folder; returns its path. The checksums are kept right.
+    """Write croissant.json, or `out`, into the dataset's folder and update the checksums; return its path.
 
-    Raises UserError where `out` lies elsewhere, the dataset is not complete or its checksums are wrong.
+    Raises UserError if `out` is elsewhere, the dataset is not complete or its checksums are wrong.
     """
     out = out or dataset.root / CROISSANT_NAME
     if out.resolve().parent != dataset.root.resolve() or out.suffix != ".json":
@@ -93,9 +93,10 @@ def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progre
 
 
 def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
-    """The JSON-LD object; `known` has hashes that need not be computed again.
+    """Return the JSON-LD object; `known` contains hashes that are not computed again.
 
-    A table of one part is a FileObject with its hash; SHA256SUMS has those of many parts.
+    A table with one part is a FileObject with its hash. A table with several parts is a FileSet; their hashes are in
+    SHA256SUMS.
     """
     info = dataset.info
     distribution = [
@@ -112,7 +113,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
     record_sets = []
     for table, schema in TABLES.items():
         distribution.append(_distribution(dataset, table, known))
-        # A file may lack optional columns, which mlcroissant would then not find.
+        # Omit optional columns that a file lacks: mlcroissant would not find them.
         missing = {
             name
             for name in OPTIONAL.get(table, ())
@@ -138,7 +139,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
         "name": info.name,
         "description": _description(dataset),
         "license": _licence(info.licence),
-        # A dataset has no version of its own: what was done to it since rendering counts.
+        # Datasets have no version number: count the edits since rendering.
         "version": f"1.0.{len(info.history)}",
         "citeAs": citation_of(dataset),
         "keywords": ["Moon", "craters", "lunar landing", "synthetic images", info.kind],
@@ -148,7 +149,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
 
 
 def citation_of(dataset: Dataset) -> str:
-    """How to name this dataset and no other, as BibTeX."""
+    """Return a BibTeX entry that identifies this dataset by a hash."""
     sha256 = files.sha256_of(dataset.root / INFO_NAME)
     key = "".join(c if c.isascii() and c.isalnum() else "-" for c in dataset.info.name).strip("-")
     note = f"Rendered lunar descents. SHA-256 of {INFO_NAME}: {sha256}"
@@ -165,7 +166,7 @@ def _description(dataset: Dataset) -> str:
 
 
 def _licence(expression: str) -> str:
-    """A page of SPDX for a single licence, the expression itself for several."""
+    """Return the SPDX page of a single licence, or the expression itself for several."""
     return f"https://spdx.org/licenses/{expression}.html" if " " not in expression else expression
 
 
@@ -224,7 +225,7 @@ def _images(*, packed: bool) -> dict[str, Any]:
 
 
 def _image_records(*, packed: bool) -> dict[str, Any]:
-    """The frames: by frame_id where packed, else by png_path."""
+    """Describe the frames: keyed by frame_id if packed, otherwise by png_path."""
     source = {"@type": "cr:FileSet", "@id": "image-files"}
     if packed:
         key, name = "frame_id", _source(source, {"column": "frame_id"})

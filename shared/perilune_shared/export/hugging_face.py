@@ -1,8 +1,8 @@
-"""Hugging Face: one row a frame with its image, pose and labels, in Parquet files for each split.
+"""Export to Hugging Face: one row per frame with its image, pose and labels, in Parquet files for each split.
 
-A dataset's own tables hold frames of all splits side by side, and labels apart from frames; `datasets` would read all
-as training data. Here `datasets.load_dataset(folder)` gives the splits, and `load_dataset(folder, split="test")`
-one of them. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
+A dataset's own tables mix frames of all splits and keep labels separate from frames; `datasets` would read all of it as
+training data. From this export, `datasets.load_dataset(folder)` loads all splits and `load_dataset(folder,
+split="test")` loads one. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
 """
 
 import json
@@ -41,10 +41,10 @@ def export_hugging_face(
     choose: Choice | None = None,
     shard_mb: float = 500,
 ) -> int:
-    """Write data/<split>/*.parquet and a README.md with the splits into `out`; returns the number of frames.
+    """Write data/<split>/*.parquet and a README.md that lists the splits into `out`; return the number of frames.
 
-    Each label says whether it is `chosen`. Raises UserError where `out` is not empty, an image is missing or no frame
-    is of the split.
+    The field `chosen` of each label states whether it is selected. Raises UserError if `out` is not empty, an image is
+    missing or the split has no frames.
     """
     task = progress.add_task("hugging face", total=dataset.info.counts.frames, unit="frames", note="")
     writers: dict[str, _Shards] = {}
@@ -81,7 +81,7 @@ test = load_dataset("FOLDER", split="test")
 
 
 def schema_of() -> pa.Schema:
-    """Columns of the files: the frame's, its image, and its labels as a list of structs."""
+    """Return the schema of the files: columns of frames, the image, and the labels as a list of structs."""
     columns = [IMAGES.field("frame_id"), IMAGES.field("image")]
     columns += [field for field in TABLES["frames"] if field.name not in ("frame_id", *_LEFT_OUT)]
     columns.append(pa.field("labels", pa.list_(_LABEL), metadata={"unit": "", "meaning": "craters in the frame"}))
@@ -90,7 +90,7 @@ def schema_of() -> pa.Schema:
 
 
 def _feature(kind: pa.DataType) -> dict[str, Any]:
-    """A type as `datasets` describes it."""
+    """Describe a type in the notation of `datasets`."""
     if pa.types.is_fixed_size_list(kind):
         return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
     if pa.types.is_list(kind):
@@ -99,7 +99,7 @@ def _feature(kind: pa.DataType) -> dict[str, Any]:
 
 
 def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]]:
-    """Split and rows of a scene's frames, some at a time."""
+    """Yield split and rows of a scene's frames, in batches."""
     schema = schema_of()
     for split, frames in scene.frames.groupby("split"):
         for start in range(0, len(frames), _FRAMES_A_GROUP):
@@ -117,7 +117,7 @@ def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]
 
 
 def _labels(labels: pd.DataFrame, frame_ids: pd.Series) -> pa.ListArray:
-    """For each frame its labels, which are sorted by frame_id as the frames are."""
+    """Return the list of labels of each frame; labels and frames are sorted by frame_id."""
     own = labels[labels["frame_id"].isin(frame_ids)]
     counts = own["frame_id"].value_counts().reindex(frame_ids, fill_value=0).to_numpy()
     offsets = pa.array(np.concatenate([[0], np.cumsum(counts)]), pa.int32())

@@ -1,4 +1,4 @@
-"""What all exports share: a dataset's rows scene by scene, and an output that appears whole or not at all.
+"""Read a dataset's rows scene by scene, for all exports.
 
 Use::
 
@@ -20,13 +20,13 @@ from perilune_shared.dataset.selection import Selection, selected
 from perilune_shared.errors import UserError
 
 Choice = Callable[[Dataset, str, pa.Table], NDArray[np.bool_]]
-"""Which labels to take: from the dataset, a scene_id and that scene's labels (N rows, every column), bool (N,)."""
+"""Select labels: takes the dataset, a scene_id and its labels (N rows, all columns); returns bool (N,)."""
 LABEL_MEASURES = ("visible_fraction", "sunlit_fraction", "contrast")
-"""Columns of labels by which users choose; an export carries those that the dataset has."""
+"""Columns of labels on which users select; exports include those that the dataset has."""
 
 
 def by_selection(selection: Selection) -> Choice:
-    """The choice of the labels that a selection takes."""
+    """Return the choice of the labels that match a selection."""
 
     def choose(dataset: Dataset, scene_id: str, labels: pa.Table) -> NDArray[np.bool_]:
         craters = dataset.table("craters", ["crater_id", "depth_m", "diameter_m"], scene_id=scene_id).to_pandas()
@@ -38,24 +38,23 @@ def by_selection(selection: Selection) -> Choice:
 
 @dataclass(frozen=True, slots=True)
 class SceneRows:
-    """Frames and labels of one scene, of the splits asked for."""
+    """Frames and labels of one scene, of the requested splits."""
 
     scene_id: str
-    """The terrain."""
+    """Id of the scene."""
     frames: pd.DataFrame
-    """Rows of the table frames, by frame_id, with `image_id`."""
+    """Rows of the table frames, sorted by frame_id, with `image_id`."""
     labels: pd.DataFrame
-    """Rows of the table labels, by frame_id and crater_id, with `label_id` and `chosen`."""
+    """Rows of the table labels, sorted by frame_id and crater_id, with `label_id` and `chosen` (selected)."""
 
 
 def scenes_of(
     dataset: Dataset, split: str | None = None, choose: Choice | None = None, *, with_labels: bool = True
 ) -> Iterator[SceneRows]:
-    """Scene by scene, in order. Memory holds one scene at a time.
+    """Yield the scenes in order, with one scene in memory at a time.
 
-    `image_id` and `label_id` count the frames and labels of the whole dataset from 1, in order, so that they are the
-    same whatever split and choice are asked for. Raises UserError where no frame is of the split, or
-    one is of an unknown split.
+    `image_id` and `label_id` number the frames and labels of the whole dataset from 1, in order, so they do not depend
+    on the requested split and choice. Raises UserError if no frame belongs to the split, or one has an unknown split.
     """
     n_frames = n_labels = n_given = 0
     for scene_id in dataset.scene_ids():
@@ -63,7 +62,7 @@ def scenes_of(
         frames = frames.sort_values("frame_id", kind="stable", ignore_index=True)
         odd = sorted(set(frames["split"]) - set(SPLITS))
         if odd:
-            # Splits name files, and a dataset may come from anybody.
+            # Split names become file names, and datasets are untrusted.
             raise UserError(dataset.root, "split", odd[0], "one of " + ", ".join(SPLITS))
         frames["image_id"] = np.arange(len(frames)) + n_frames + 1
         n_frames += len(frames)
@@ -84,13 +83,13 @@ def scenes_of(
 
 
 def clipped_boxes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
-    """Boxes (N, 4) of labels as x0, y0, x1, y1, pixels, cut at the edges of their frames."""
+    """Return the boxes (N, 4) of labels as x0, y0, x1, y1, pixels, clipped to their frames."""
     size = sizes(labels, frames)
     boxes = labels[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
     return np.clip(boxes, 0.0, np.hstack([size, size]))
 
 
 def sizes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
-    """Width and height (N, 2) of the frame of each label, pixels."""
+    """Return width and height (N, 2) of the frame of each label, pixels."""
     by_id = frames.set_index("frame_id")[["width_px", "height_px"]]
     return by_id.loc[labels["frame_id"]].to_numpy(np.float64).reshape(-1, 2)

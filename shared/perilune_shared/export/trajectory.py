@@ -1,11 +1,11 @@
-"""Trajectories: TUM and KITTI, one file a descent, as evo and the benchmarks' own tools read them.
+"""Export trajectories to TUM and KITTI, one file per trajectory, for evo and the benchmarks' own tools.
 
-A pose is the camera's: where its centre of projection is, and rotation_site_from_camera, which turns O_C's axes (x
-right, y down, z along the view) into those of the reference.
+Poses are camera poses: the position of the centre of projection, and the rotation from O_C (x right, y down, z along
+the viewing direction) to the reference frame, e.g. rotation_site_from_camera for O_L.
 
 - TUM (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): `timestamp tx ty tz qx qy qz qw`, reference O_L.
 - KITTI (https://www.cvlibs.net/datasets/kitti/eval_odometry.php): the upper 3x4 of the pose, row by row; the reference
-  is the first camera of the file, so that the first line is the identity. The times stand in a second file.
+  is the first camera of the file, so the first line is the identity. Times are in a second file.
 """
 
 from collections.abc import Iterator
@@ -28,15 +28,15 @@ _TUM_HEADER = (
 
 
 def export_tum(dataset: Dataset, out: Path, progress: Progress, split: str | None = None) -> int:
-    """Write `out`/<scene_id>/<trajectory_id>.txt for each descent in TUM's form; returns their number.
+    """Write `out`/<scene_id>/<trajectory_id>.txt for each trajectory, in TUM's format; return their number.
 
-    With a split, only frames of it. Raises UserError where `out` holds something or no frame is of the split.
+    With `split`, writes only frames of that split. Raises UserError if `out` is not empty or the split has no frames.
     """
     n_descents = 0
     task = progress.add_task("tum", total=len(dataset.scene_ids()), unit="scenes")
     with files.new_folder(out) as folder:
         for scene_id, trajectory_id, frames in _descents(dataset, progress, task, split):
-            # Conjugated, since the manifest holds rotation_camera_from_site.
+            # Conjugate: the manifest contains rotation_camera_from_site.
             w, x, y, z = np.stack(frames["rotation_wxyz"].to_list()).T
             rows = np.column_stack([frames["time_s"], np.stack(frames["position_m"].to_list()), -x, -y, -z, w])
             path = files.inside(folder, f"{scene_id}/{trajectory_id}.txt")
@@ -46,9 +46,10 @@ def export_tum(dataset: Dataset, out: Path, progress: Progress, split: str | Non
 
 
 def export_kitti(dataset: Dataset, out: Path, progress: Progress, split: str | None = None) -> int:
-    """Write `out`/<scene_id>/<trajectory_id>.txt and <trajectory_id>.times.txt in KITTI's form; returns their number.
+    """Write the poses and times of each trajectory in KITTI's format; return the number of trajectories.
 
-    With a split, only frames of it. Raises UserError where `out` holds something or no frame is of the split.
+    Files: `out`/<scene_id>/<trajectory_id>.txt and <trajectory_id>.times.txt. With `split`, writes only frames of that
+    split. Raises UserError if `out` is not empty or the split has no frames.
     """
     n_descents = 0
     task = progress.add_task("kitti", total=len(dataset.scene_ids()), unit="scenes")
@@ -64,7 +65,7 @@ def export_kitti(dataset: Dataset, out: Path, progress: Progress, split: str | N
 
 
 def poses_site_from_camera(frames: pd.DataFrame) -> Array:
-    """Homogeneous matrices (N, 4, 4) of rows of the table frames: from O_C, metres, to O_L."""
+    """Return homogeneous matrices (N, 4, 4) from O_C to O_L, metres, for rows of the table frames."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     poses[:, :3, :3] = matrix_from_quaternion(np.stack(frames["rotation_wxyz"].to_list())).swapaxes(1, 2)
     poses[:, :3, 3] = np.stack(frames["position_m"].to_list())
@@ -74,7 +75,7 @@ def poses_site_from_camera(frames: pd.DataFrame) -> Array:
 def _descents(
     dataset: Dataset, progress: Progress, task: TaskID, split: str | None
 ) -> Iterator[tuple[str, str, pd.DataFrame]]:
-    """scene_id, trajectory_id and frames in the order of time, of each descent."""
+    """Yield scene_id, trajectory_id and frames in temporal order, for each trajectory."""
     for scene in scenes_of(dataset, split, with_labels=False):
         for trajectory_id, frames in scene.frames.groupby("trajectory_id"):
             yield scene.scene_id, str(trajectory_id), frames.sort_values("frame_index")
@@ -82,5 +83,5 @@ def _descents(
 
 
 def _lines(rows: Array) -> str:
-    # The shortest text that gives the same number again; never "-0.0", which reads like a fault.
+    # repr gives the shortest text that parses to the same number; adding 0.0 avoids "-0.0".
     return "".join(" ".join(repr(float(value) + 0.0) for value in row) + "\n" for row in rows)

@@ -1,8 +1,8 @@
-"""YOLO: one text file an image, a line `class cx cy w h` a crater, in shares of the image's width and height.
+"""Export to YOLO: a text file per image, a line `class cx cy w h` per crater, as fractions of the image size.
 
-Format: https://docs.ultralytics.com/datasets/detect (what stands there is read by Darknet's descendants all alike).
-A trainer finds the labels of `images/a/b.png` in `labels/a/b.txt`. Boxes end at the image's edge. The format cannot
-ignore a crater: labels that are not chosen are left out.
+Format: https://docs.ultralytics.com/datasets/detect (read by all tools derived from Darknet). Trainers expect the
+labels of `images/a/b.png` in `labels/a/b.txt`. Boxes are clipped to the image. The format has no ignored objects:
+labels that are not selected are omitted.
 """
 
 from collections import defaultdict
@@ -30,10 +30,10 @@ def export_yolo(
     *,
     link: bool = False,
 ) -> int:
-    """Write images/, labels/, <split>.txt and data.yaml into `out`; returns the number of boxes.
+    """Write images/, labels/, <split>.txt and data.yaml into `out`; return the number of boxes.
 
-    Images are copies, or with `link` hard links where the disk allows it. An image without craters has an empty text
-    file. Raises UserError where `out` holds something, an image is missing or no frame is of the split.
+    Images are copied, or with `link` hard-linked where the file system allows it. An image without craters has an empty
+    label file. Raises UserError if `out` is not empty, an image is missing or the split has no frames.
     """
     task = progress.add_task("yolo", total=len(dataset.scene_ids()), unit="scenes")
     lists: dict[str, list[str]] = defaultdict(list)
@@ -42,7 +42,7 @@ def export_yolo(
         for scene in scenes_of(dataset, split, choose):
             labels = scene.labels[scene.labels["chosen"]]
             boxes = clipped_boxes(labels, scene.frames) / np.tile(sizes(labels, scene.frames), 2)
-            # Three decimals below the pixel of any camera.
+            # The 8 decimals below resolve 0.001 px in the widest image (100,000 px).
             size, centre = boxes[:, 2:] - boxes[:, :2], (boxes[:, 2:] + boxes[:, :2]) / 2
             seen = (size > 0).all(axis=1)
             lines: dict[str, list[str]] = defaultdict(list)
@@ -58,14 +58,14 @@ def export_yolo(
             progress.advance(task)
         for name, entries in lists.items():
             files.write_text(folder / f"{name}.txt", "".join(entries))
-        # Without `path`, the lists are looked for beside this file, wherever it is moved to.
+        # Without `path`, the lists are searched beside this file, so the folder can be moved.
         present = [f"{name}: {name}.txt\n" for name in SPLITS if name in lists]
         files.write_text(folder / "data.yaml", "".join(present) + f"names:\n  {CRATER_CLASS}: crater\n")
     return n_boxes
 
 
 def _bring_images(dataset: Dataset, frames: pd.DataFrame, folder: Path, *, link: bool) -> None:
-    """The PNGs of frames as images/<frame_id>.png."""
+    """Write the PNGs of frames as images/<frame_id>.png."""
     rows = frames[["frame_id", "png_path"]]
     if dataset.info.images == "files":
         for row in rows.to_dict("records"):
