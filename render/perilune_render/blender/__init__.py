@@ -1,4 +1,4 @@
-"""Blender as a view of a scene: the only folder that imports bpy, and where others take it from."""
+"""Rendering with Blender: the only folder that imports bpy."""
 
 try:
     import bpy  # noqa: F401

@@ -1,7 +1,7 @@
-"""Arithmetic that builds shader nodes: the same Python formula that computes with NumPy arrays draws the shader.
+"""Build shader nodes from Python arithmetic, so that one formula serves NumPy arrays and the shader.
 
-A `Symbol` answers operators and NumPy's ufuncs by adding a Math node to the tree. A sum with a product becomes one
-node, since a shader's time goes by its nodes; those that nothing reads cost nothing.
+Operators and NumPy ufuncs applied to a `Symbol` add a Math node to the tree. A sum with a product becomes one node,
+since a shader's run time grows with its number of nodes; unused nodes cost nothing.
 """
 
 import numbers
@@ -30,7 +30,7 @@ _OPERATIONS = {
 
 
 class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
-    """A float value inside a shader: the output socket of a node."""
+    """A float value in a shader: the output socket of a node."""
 
     def __init__(self, tree: bpy.types.NodeTree, socket: bpy.types.NodeSocket, factors: tuple[Any, ...] = ()):
         self.tree = tree
@@ -58,14 +58,14 @@ class Symbol(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 def at_least(value: Symbol, least: float) -> Symbol:
-    """The larger of a symbol and a number (np.maximum, whose type hints know arrays only)."""
+    """The larger of a symbol and a number (np.maximum, whose type hints accept arrays only)."""
     return value.__array_ufunc__(np.maximum, "__call__", value, least)
 
 
 def dot(
     tree: bpy.types.NodeTree, first: bpy.types.NodeSocket, second: bpy.types.NodeSocket | tuple[float, ...]
 ) -> Symbol:
-    """Dot product of two vectors, the second of which may be a constant."""
+    """Dot product of two vectors; the second may be a constant."""
     node = tree.nodes.new("ShaderNodeVectorMath")
     node.operation = "DOT_PRODUCT"
     tree.links.new(first, node.inputs[0])

@@ -1,4 +1,4 @@
-"""Cycles on the CPU: settings, and one frame at a time through a temporary EXR."""
+"""Rendering with Cycles on the CPU: settings, and one frame at a time through a temporary EXR."""
 
 import contextlib
 import errno
@@ -26,16 +26,16 @@ from perilune_shared.geometry.frames import Array
 _FAR_M = 1e9
 _LEAST_FREE_BYTES = 16_000_000
 _LIT = 1e-4
-"""Sunlight above which a pixel counts as lit: a shadow has none, and the Earth gives less."""
+"""Sunlight above which a pixel counts as sunlit: shadows have none, and earthshine gives less."""
 
 
 _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
 
 
 class Renderer:
-    """Renders frames of one scene. A context manager: it keeps a temporary folder, and Blender holds one scene only.
+    """Renders frames of one scene. Use as a context manager, since it holds a temporary folder and Blender's one scene.
 
-    Raises RuntimeError while another one is open in this process, whose scene would be lost.
+    Raises RuntimeError if another Renderer is open in this process: Blender holds only one scene.
     """
 
     def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array):
@@ -63,14 +63,15 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """Remove the temporary folder, and let another Renderer take Blender. Renders nothing any more."""
+        """Remove the temporary folder and release Blender for another Renderer. `render` then raises RuntimeError."""
         self._folder.cleanup()
         _open.discard(self)
 
     def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0) -> Radiance:
-        """One frame as the radiance factor averaged over each pixel, with the depth of the ray through its centre.
+        """Render one frame: radiance factor averaged over each pixel, and depth of the ray through its centre.
 
-        The normal is that ray's too where EXRs are asked for, else the mean over the pixel's samples.
+        With dataset.render.exr the normal is also that of this ray, else the mean over the pixel's samples. Raises
+        OSError if Blender wrote no readable frame, and RuntimeError if the Renderer is closed.
         """
         if self not in _open:
             raise RuntimeError("this Renderer is closed")
@@ -85,7 +86,7 @@ class Renderer:
                     centre = render_through(path, self.stage, seed)
                 return replace(radiance, depth_m=centre.depth_m, normal=centre.normal)
         except (UserError, RuntimeError) as error:
-            # Blender tells of a failed write only in its log; the file is then missing or cut.
+            # Blender reports a failed write only in its log; the file is then missing or truncated.
             full = shutil.disk_usage(path.parent).free < _LEAST_FREE_BYTES
             raise OSError(errno.ENOSPC if full else errno.EIO, f"no frame ({error})", str(path.parent)) from None
 
@@ -102,10 +103,11 @@ def render_through(path: Path, stage: bpy.types.Scene, seed: int) -> Radiance:
 
 @contextlib.contextmanager
 def one_ray_a_pixel(stage: bpy.types.Scene) -> Iterator[None]:
-    """Let a configured stage send a single ray through each pixel's centre, to within 1e-5 px.
+    """Configure a stage to send a single ray through each pixel's centre, to within 1e-5 px, while the block runs.
 
-    Cycles puts the first sample of a pixel into the middle of its filter, whatever the seed, but finds that middle in a
-    table: 5e-4 px off with the box of one pixel. The box's width cannot be set: the narrowest Gaussian takes its place.
+    Cycles puts the first sample of a pixel at the centre of its filter for any seed, but takes this centre from
+    a table, which is 5e-4 px off for the box filter of one pixel. The width of the box cannot be set, so the narrowest
+    Gaussian is used.
     """
     narrow = {"samples": 1, "pixel_filter_type": "GAUSSIAN", "filter_width": 0.01}
     before = {name: getattr(stage.cycles, name) for name in narrow}
@@ -119,9 +121,10 @@ def one_ray_a_pixel(stage: bpy.types.Scene) -> Iterator[None]:
 
 
 def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, light: LightConfig) -> None:
-    """Direct light and at most one bounce, linear float32, the acceleration structure kept from frame to frame.
+    """Configure Cycles: direct light and at most one bounce, linear float32.
 
-    A bounce follows one random ray from each sample: with few samples it is a sprinkle of noise in the shadows.
+    The acceleration structure is kept between frames. A bounce traces one random ray per sample: few samples give noisy
+    light in the shadows.
     """
     render, cycles = stage.render, stage.cycles
     render.engine = "CYCLES"
@@ -146,10 +149,10 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     cycles.use_denoising = False
     cycles.max_bounces = cycles.diffuse_bounces = int(light.bounce)
     cycles.use_light_tree = False
-    # Cycles would drop faint contributions at random: below 0.01 that is most of the Moon at low Sun.
+    # Cycles drops contributions below this threshold at random; at its default of 0.01 that is most ground at low Sun.
     cycles.light_sampling_threshold = 0.0
     cycles.pixel_filter_type = "BOX"
-    # A box of one pixel: the sensor's own point spread is laid on afterwards.
+    # A box of one pixel: the sensor model applies its point spread later.
     cycles.filter_width = 1.0
     stage.view_settings.view_transform = "Raw"
     layer = stage.view_layers[0]
@@ -167,17 +170,17 @@ def _radiance(path: Path) -> Radiance:
     channels = read_exr(path)
     by_pass = {name.split(".", 1)[1]: pixels for name, pixels in channels.items() if "." in name}
     depth = by_pass["Depth.Z"].astype(np.float32)
-    # Normals are averaged over the pixel's samples, which shortens them at edges; the sky has none.
+    # Cycles averages normals over the pixel's samples, which shortens them at edges; the sky has none.
     normal = np.stack([by_pass[f"Normal.{axis}"] for axis in "XYZ"], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     radiance_factor = by_pass["Combined.R"]
-    # Where light comes from elsewhere too, the pass of direct light over colour tells where the Sun reaches.
+    # With other light than the Sun's, the pass of direct light divided by colour shows where the Sun reaches.
     sunlit = by_pass.get("DiffDir.R", radiance_factor) > _LIT
     return Radiance(radiance_factor, np.where(depth > _FAR_M, np.float32(np.inf), depth), normal, sunlit)
 
 
 class quiet:
-    """Send Blender's own chatter on file descriptor 1 to nowhere."""
+    """Discard what Blender prints to file descriptor 1."""
 
     def __enter__(self) -> None:
         self._saved = os.dup(1)

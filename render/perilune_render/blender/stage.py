@@ -1,4 +1,4 @@
-"""A scene on Blender's stage: ground, boulders, Sun, camera, materials."""
+"""Build a Blender scene (the stage): ground, boulders, Sun, Earth, camera, materials."""
 
 import bpy
 import numpy as np
@@ -15,15 +15,15 @@ from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array, earth_direction
 
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
-"""Blender's camera has y up and looks along -z."""
+"""Axes of Blender's camera: y up, looking along -z."""
 _EARTH_ANGULAR_DIAMETER_DEG = 1.9
-"""The Earth's disc from the Moon's mean distance."""
+"""Angular diameter of the Earth from the Moon's mean distance."""
 _EARTHSHINE = 0.1 / 1361
-"""Irradiance of the full Earth over the Sun's, taken second hand."""
+"""Irradiance of the full Earth over that of the Sun, from a secondary source."""
 
 
 def clear() -> bpy.types.Scene:
-    """An empty file, with nothing of the last scene left in memory."""
+    """Reset Blender to an empty file, which frees the previous scene."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     return bpy.context.scene
 
@@ -46,7 +46,7 @@ def build(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> bp
 
 
 def sunlit_stage(light: LightConfig, camera: Camera, sun: Array) -> bpy.types.Scene:
-    """A black sky, the Sun in the direction `sun` (3,) and the camera; no ground yet."""
+    """A stage with a black sky, the Sun in the direction `sun` (3,) and the camera, without ground."""
     stage = clear()
     stage.world = bpy.data.worlds.new("sky")
     stage.world.use_nodes = True
@@ -58,10 +58,10 @@ def sunlit_stage(light: LightConfig, camera: Camera, sun: Array) -> bpy.types.Sc
 
 
 def mesh_from_arrays(name: str, points: np.ndarray, faces: np.ndarray) -> bpy.types.Mesh:
-    """A mesh from vertices (V, 3) and faces (F, k), without a Python loop."""
+    """A mesh from vertices (V, 3) and faces (F, k)."""
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(points))
-    # Through the attributes Blender copies whole arrays; through vertices and loops it takes a hundred times longer.
+    # Blender copies whole arrays into attributes; filling vertices and loops instead takes a hundred times longer.
     mesh.attributes["position"].data.foreach_set("vector", np.ascontiguousarray(points, np.float32).ravel())
     mesh.loops.add(faces.size)
     mesh.attributes[".corner_vert"].data.foreach_set("value", np.ascontiguousarray(faces, np.int32).ravel())
@@ -72,7 +72,7 @@ def mesh_from_arrays(name: str, points: np.ndarray, faces: np.ndarray) -> bpy.ty
 
 
 def ground_object(scene: Scene) -> bpy.types.Object:
-    """The ground as one smooth mesh with its albedo as a vertex attribute."""
+    """The ground as one smooth-shaded mesh with its albedo as a vertex attribute."""
     mesh = mesh_from_arrays("ground", vertices(scene.grid, scene.height_m), scene.grid.quads())
     albedo = mesh.attributes.new("albedo", "FLOAT", "POINT")
     albedo.data.foreach_set("value", np.ascontiguousarray(scene.albedo, np.float32))
@@ -80,7 +80,7 @@ def ground_object(scene: Scene) -> bpy.types.Object:
 
 
 def boulders_object(scene: Scene) -> bpy.types.Object:
-    """All boulders as one mesh of flat faces."""
+    """All boulders as one flat-shaded mesh."""
     mesh = mesh_from_arrays("boulders", *boulder_mesh(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed))
     mesh.shade_flat()
     return bpy.data.objects.new("boulders", mesh)
@@ -89,9 +89,9 @@ def boulders_object(scene: Scene) -> bpy.types.Object:
 def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | None = None) -> bpy.types.Material:
     """A material whose radiance under the lamp "Sun" is the radiance factor of a law.
 
-    Cycles multiplies a diffuse colour by mu0 / pi and by the Sun's irradiance, here pi: the colour that gives the
-    radiance I/F is therefore I/F over mu0, evaluated at the shading point. Approximation: other light, from the Earth
-    or from other ground, meets that same colour, the one for the Sun's direction, as a diffuse albedo.
+    Cycles multiplies a diffuse colour by mu0 / pi and by the Sun's irradiance, here pi. The colour that gives the
+    radiance I/F is therefore I/F over mu0, evaluated at the shading point. Approximation: for light from the Earth or
+    from other ground, this colour for the Sun's direction serves as the diffuse albedo.
     """
     material = bpy.data.materials.new(name)
     material.use_nodes = True
@@ -114,7 +114,7 @@ def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | No
 
 
 def lamp_object(name: str, towards: Array, angular_diameter_deg: float, suns: float = 1.0) -> bpy.types.Object:
-    """A lamp at infinity; the Sun's irradiance is pi, so that radiance is the radiance factor."""
+    """A lamp at infinity with the irradiance `suns` x pi; with pi for the Sun, radiance is the radiance factor."""
     lamp = bpy.data.lights.new(name, "SUN")
     lamp.energy = suns * np.pi
     lamp.angle = np.radians(angular_diameter_deg)
@@ -125,7 +125,7 @@ def lamp_object(name: str, towards: Array, angular_diameter_deg: float, suns: fl
 
 
 def camera_object(camera: Camera) -> bpy.types.Object:
-    """The camera's intrinsics."""
+    """A Blender camera with these intrinsics."""
     lens = bpy.data.cameras.new("camera")
     lens.sensor_fit = "HORIZONTAL"
     lens.sensor_width = 36.0
@@ -137,7 +137,7 @@ def camera_object(camera: Camera) -> bpy.types.Object:
 
 
 def aim(stage: bpy.types.Scene, position_m: Array, rotation_camera_from_site: Array) -> None:
-    """Place the camera."""
+    """Set the pose of the stage's camera."""
     rotation_site_from_blender = rotation_camera_from_site.T @ _BLENDER_FROM_OPENCV.T
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation_site_from_blender, position_m

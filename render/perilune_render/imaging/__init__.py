@@ -1,1 +1,1 @@
-"""From radiance to the image of a camera."""
+"""Camera images from rendered radiance."""

@@ -1,4 +1,4 @@
-"""EXR files: what Blender writes, and what the dataset holds."""
+"""EXR files: read those that Blender writes, and read and write those of datasets."""
 
 import errno
 from dataclasses import dataclass
@@ -17,24 +17,24 @@ CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 @dataclass(frozen=True, slots=True)
 class Radiance:
-    """What a renderer gives for one frame, before the sensor."""
+    """Rendering of one frame, before the sensor model."""
 
     radiance_factor: np.ndarray
-    """I/F (h, w) float32."""
+    """Radiance factor I/F (h, w) float32."""
     depth_m: np.ndarray
-    """Along the camera's axis, of the ray through the pixel's centre, metres; infinite where it hits nothing (h, w)
+    """Depth along the camera's axis of the ray through the pixel's centre, metres; infinite if it hits nothing (h, w)
     float32."""
     normal: np.ndarray
-    """Unit shading normal in O_L, 0 where nothing is hit; where EXRs are asked for that of the same ray, else the mean
-    direction over the pixel's samples (h, w, 3) float32."""
+    """Unit shading normal in O_L, 0 where nothing is hit (h, w, 3) float32. With dataset.render.exr it is that of the
+    ray through the pixel's centre, else the mean direction over the pixel's samples."""
     sunlit: np.ndarray
-    """Whether the Sun reaches the pixel (h, w) bool."""
+    """Whether the pixel is sunlit (h, w) bool."""
 
 
 def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:
-    """Write a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), losslessly compressed.
+    """Write a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), compressed without loss.
 
-    Returns before the file is on the disk.
+    Does not wait until the file is on the disk.
     """
     values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), radiance.sunlit, crater)
     channels = {name: np.ascontiguousarray(value, np.float32) for name, value in zip(CHANNELS, values, strict=True)}
@@ -47,9 +47,9 @@ def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:
 
 
 def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
-    """Channels (h, w) by name. Raises UserError where the file is missing, damaged or not of `size_px` (width, height).
+    """Channels (h, w) by name. Raises UserError if the file is missing, damaged or not of `size_px` (width, height).
 
-    A small file may unpack to any size: its header is looked at before its pixels.
+    A small file may decompress to any size: the header is checked before the pixels are read.
     """
     if not path.is_file():
         raise UserError(path, "exr", "no such file", "an EXR frame")
@@ -63,7 +63,7 @@ def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np
 
 
 def _check_header(path: Path, image: OpenEXR.File, size_px: tuple[int, int] | None) -> None:
-    """Raises UserError where the pixels of an EXR file should not be unpacked."""
+    """Raises UserError if the header of an EXR file is not one to decompress."""
     if len(image.parts) != 1:
         raise UserError(path, "parts", len(image.parts), "one")
     header = image.parts[0].header
@@ -81,9 +81,9 @@ def _check_header(path: Path, image: OpenEXR.File, size_px: tuple[int, int] | No
 
 
 def read_radiance(path: Path, size_px: tuple[int, int] | None = None) -> Radiance:
-    """A frame as it was before the sensor, of an expected width and height, if given.
+    """Read the rendering of a frame from its EXR; `size_px` is the expected width and height.
 
-    Raises UserError where the file is missing, damaged, of another size or lacks a channel.
+    Raises UserError if the file is missing, damaged, of another size or lacks a channel.
     """
     channels = read_exr(path, size_px)
     missing = [name for name in CHANNELS if name not in channels]

@@ -1,12 +1,12 @@
 """Reflectance laws of the lunar surface, written once for NumPy arrays and for Blender's shader.
 
-Theory: a law gives the reflectance factor, the radiance over that of a perfectly diffusing plate under the same light,
-from mu0 = cos incidence, mu = cos emission and cos of the phase angle. Times mu0 it is the radiance factor I/F, the
-radiance over that of the plate lit from the zenith. Note that the phase angle is not i + e: that holds in the
-principal plane only.
+Theory: a law gives the reflectance factor as a function of mu0 = cos incidence, mu = cos emission and the cosine of the
+phase angle. The reflectance factor is the radiance over that of a perfectly diffusing plate under the same light.
+Multiplied by mu0 it is the radiance factor I/F, the radiance over that of the plate lit from the zenith. The phase
+angle equals i + e in the principal plane only.
 
-Use: `radiance_factor("hapke_highland", mu0, mu, cos_phase)`. The functions use nothing but arithmetic and NumPy's
-ufuncs, so that `perilune_render.blender.nodes` can hand them symbols and build shader nodes from the same text.
+Use: `radiance_factor("hapke_highland", mu0, mu, cos_phase)`. The functions use only arithmetic and NumPy's ufuncs, so
+that `perilune_render.blender.nodes` can call them with symbols and build shader nodes from the same code.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ import numpy as np
 Law = Callable[[Any, Any, Any], Any]
 
 _LEAST_SINE_SQUARED = 1e-7
-"""Keeps i = 0 and e = 0 off the denominators, in float32 too; the roughness terms vanish long before."""
+"""Prevents division by 0 at i = 0 and e = 0, also in float32; the roughness terms already vanish at larger angles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,19 +36,19 @@ class HapkeParameters:
     h_s: float
     """Width of the surge, radians of tan(g/2)."""
     theta_bar_deg: float = 23.657
-    """Mean slope of the macroscopic roughness, above 0, degrees; ascribed to Sato et al. 2014, taken second hand."""
+    """Mean slope of macroscopic roughness, > 0, degrees; attributed to Sato et al. 2014, from a secondary source."""
 
 
 HIGHLAND = HapkeParameters(0.385, 0.2375, 0.325, 1.686, 0.0672)
-"""Median of latitudes within 30 degrees of the equator, 643 nm, ascribed to Sato et al. 2014, taken second hand."""
+"""Median of latitudes within 30 degrees, 643 nm, attributed to Sato et al. 2014, from a secondary source."""
 MARE = HapkeParameters(0.222, 0.254, 0.160, 1.993, 0.0597)
-"""Tranquillitatis, 643 nm, ascribed to Sato et al. 2014, taken second hand."""
+"""Mare Tranquillitatis, 643 nm, attributed to Sato et al. 2014, from a secondary source."""
 MEAN = HapkeParameters(0.2242, 0.24575, 0.2425, 1.8395, 0.06345)
-"""The mean Moon: b, c, B_S0 and h_S midway between mare and highland, w by a fit of our own.
+"""The mean Moon: b, c, B_S0 and h_S midway between mare and highland, w fitted by us.
 
-w makes the mean ratio to the published fit to NAC images 1 over incidences 5 to 80 degrees in nadir view,
-ln(I/F) = -2.98 - 0.011 g - 0.81 cos e + 1.32 cos i, taken second hand. The ratio goes from 0.92 to 1.19 up to 70
-degrees and falls to 0.63 at 80, where the law is darker than the fit.
+w makes the mean ratio of the law to a published fit to NAC images 1, over incidences of 5 to 80 degrees in nadir view.
+The published fit, from a secondary source, is ln(I/F) = -2.98 - 0.011 g - 0.81 cos e + 1.32 cos i. The ratio is 0.92 to
+1.19 up to 70 degrees and falls to 0.63 at 80 degrees, where the law is darker than the fit.
 """
 
 
@@ -56,14 +56,14 @@ def hapke(parameters: HapkeParameters, mu0: Any, mu: Any, cos_phase: Any) -> Any
     """Hapke's reflectance factor with shadow hiding, multiple scattering and macroscopic roughness.
 
     I/F = w/4 mu0e/(mu0e+mue) [p(g) (1 + B_S0 / (1 + tan(g/2)/h_S)) + H(mu0e) H(mue) - 1] S,
-    H(x) = (1+2x)/(1+2x sqrt(1-w)); mu0e, mue and S are those of `roughness`. Divided by mu0 it does not change when
-    incidence and emission are exchanged.
+    H(x) = (1+2x)/(1+2x sqrt(1-w)); mu0e, mue and S are those of `roughness`. The reflectance factor is I/F over mu0 and
+    is symmetric in incidence and emission.
     """
     p = parameters
     larger, smaller, shadowing = roughness(p.theta_bar_deg, mu0, mu, cos_phase)
     total, product = larger + smaller, larger * smaller
     gamma = float(np.sqrt(1 - p.w))
-    # H(mu0e) H(mue) - 1, multiplied out.
+    # H(mu0e) H(mue) - 1, expanded.
     multiple = (total * (2 - 2 * gamma) + product * (4 - 4 * gamma**2)) / (
         product * (4 * gamma**2) + (total * (2 * gamma) + 1)
     )
@@ -79,10 +79,10 @@ def hapke(parameters: HapkeParameters, mu0: Any, mu: Any, cos_phase: Any) -> Any
 def roughness(theta_bar_deg: float, mu0: Any, mu: Any, cos_phase: Any) -> tuple[Any, Any, Any]:
     """Hapke's correction for a surface of mean slope theta_bar (Hapke 1984, doi 10.1016/0019-1035(84)90054-X).
 
-    Gives the effective cosine of the larger of incidence and emission, that of the smaller, and S / (mu0 mue). Hapke
-    writes two cases, i <= e and e <= i, which differ only by the exchange of the two angles: named by size they are
-    one, and S / (mu0 mue) is the same in both. The formulas were taken second hand, as ascribed to Hapke's book of
-    2012, chapter 12. As they stand S passes 1 where angles are grazing: by 7 percent at most up to 85 degrees.
+    Returns the effective cosine of the larger of incidence and emission, that of the smaller, and S / (mu0 mue). Hapke
+    gives two cases, i <= e and e <= i, which differ only by exchanging the two angles. Ordered by size they are one
+    case, and S / (mu0 mue) is the same in both. The formulas come from a secondary source, which attributes them to
+    Hapke's book of 2012, chapter 12. In this form S exceeds 1 at grazing angles, by at most 7 percent up to 85 degrees.
     """
     slope = float(np.tan(np.radians(theta_bar_deg)))
     chi = float(1 / np.sqrt(1 + np.pi * slope**2))
@@ -93,17 +93,17 @@ def roughness(theta_bar_deg: float, mu0: Any, mu: Any, cos_phase: Any) -> tuple[
     open_l, open_s = 2 - e1_l, 2 - e1_s
     cos_psi = np.minimum(np.maximum((cos_phase - mu0 * mu) / (sin_l * sin_s), -1), 1)
     psi = np.arccos(cos_psi)
-    # Hapke's f; a little less than psi/2, since the tangent of 90 degrees overflows.
+    # Hapke's f; psi/2 is slightly reduced, since the tangent of 90 degrees overflows.
     seen_as_one = np.exp(np.tan(psi * 0.499999) * -2)
-    # At i = e = 90 degrees and psi = 180 this is 0, and so is what it divides.
+    # At i = e = 90 degrees and psi = 180 degrees this denominator is 0, and so are the numerators.
     per_both = slope / np.maximum(psi * e1_s * (-1 / np.pi) + open_l, 1e-4)
     common = (cos_psi * -0.5 + 0.5) * e2_s
     larger = sin_l * (e2_l - common) * per_both + cos_l
     smaller = sin_s * (cos_psi * e2_l + common) * per_both + cos_s
-    # Hapke's eta of each angle: its effective cosine alone.
+    # Hapke's eta of each angle: its effective cosine without the other angle.
     alone_l = sin_l * e2_l / open_l * slope + cos_l
     alone_s = sin_s * e2_s / open_s * slope + cos_s
-    # All four lack chi, which is left over once.
+    # All four lack the factor chi: one factor 1 / chi remains in the shadowing.
     shadowing = (1 / chi) / (alone_l * (seen_as_one * (cos_s - alone_s) + alone_s))
     return larger * chi, smaller * chi, shadowing
 
@@ -121,16 +121,16 @@ def lommel_seeliger(mu0: Any, mu: Any, cos_phase: Any) -> Any:
 
 
 LUNAR_LAMBERT_SCALE = 0.0503
-"""By the same fit of our own as `MEAN`; the ratio goes from 0.63 at 5 degrees over 1.28 to 0.89 at 80."""
+"""Fitted by us as `MEAN`; the ratio to the published fit is 0.63 at 5 degrees, rises to 1.28, and is 0.89 at 80."""
 
 
 def lunar_lambert(mu0: Any, mu: Any, cos_phase: Any) -> Any:
     """McEwen's lunar-Lambert law, I/F = scale [2 L mu0/(mu0+mu) + (1-L) mu0].
 
-    L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3, g in degrees, ascribed to McEwen 1991
-    (doi 10.1016/0019-1035(91)90053-V) and his later work, taken second hand. Valid up to g = 104 degrees, where the
-    polynomial falls below 0: L is held at 0 from there on. It tells how brightness goes over a surface at one phase
-    angle; deviation: his factor that falls with the phase angle, fitted to each image, is constant here.
+    L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3, g in degrees, attributed to McEwen 1991
+    (doi 10.1016/0019-1035(91)90053-V) and his later work, from a secondary source. Valid up to g = 104 degrees, where
+    the polynomial falls below 0; beyond, L is 0. The law describes how brightness varies over a surface at one phase
+    angle. Deviation: McEwen's factor that falls with the phase angle, fitted to each image, is constant here.
     """
     g = np.arccos(np.minimum(np.maximum(cos_phase, -1), 1)) * (180 / np.pi)
     share = np.maximum(1 + g * (-0.019 + g * (2.42e-4 + g * -1.46e-6)), 0)
@@ -138,7 +138,7 @@ def lunar_lambert(mu0: Any, mu: Any, cos_phase: Any) -> Any:
 
 
 def lambert(mu0: Any, mu: Any, cos_phase: Any) -> Any:
-    """An evenly diffusing surface of albedo 0.12, I/F = 0.12 mu0."""
+    """A Lambertian surface of albedo 0.12, I/F = 0.12 mu0."""
     return 0.12 + 0 * mu0 + 0 * mu + 0 * cos_phase
 
 
@@ -153,7 +153,7 @@ LAWS: dict[str, Law] = {
 
 
 def reflectance_factor(law: str, mu0: Any, mu: Any, cos_phase: Any) -> Any:
-    """I/F over mu0 of a named law for mu0, mu > 0: the colour of a diffuse shader that gives I/F; arrays broadcast."""
+    """I/F over mu0 of a named law for mu0, mu > 0, the colour of a diffuse shader of radiance I/F; arrays broadcast."""
     return LAWS[law](mu0, mu, cos_phase)
 
 

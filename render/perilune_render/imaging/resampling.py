@@ -1,4 +1,4 @@
-"""What one camera saw, in the pixels of another camera at the same place: lens distortion, other intrinsics."""
+"""Resample the image of one camera to another camera at the same pose: lens distortion, other intrinsics."""
 
 from dataclasses import fields, replace
 from functools import lru_cache
@@ -11,10 +11,10 @@ from perilune_shared.geometry.camera import Camera
 
 
 def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
-    """An image (h, w) of the camera `source` as `camera` sees it (Lanczos, 8 x 8 px); itself where they are the same.
+    """Resample an image (h, w) of the camera `source` to `camera` (Lanczos, 8 x 8 px); unchanged if they are the same.
 
-    `source` must cover `camera`. OpenCV places samples to 1/32 px. Where `source` is finer by a factor or more, the
-    rays of a pixel are averaged, so that nothing aliases.
+    `source` must cover the view of `camera`. OpenCV rounds sample positions to 1/32 px. If the pixels of `source` are
+    finer, several samples per pixel are averaged, to avoid aliasing.
     """
     if camera == source:
         return image
@@ -26,7 +26,7 @@ def resample(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
 
 
 def resample_nearest(image: np.ndarray, camera: Camera, source: Camera) -> np.ndarray:
-    """An image (h, w, ...) of `source` in `camera`'s pixels, each as the pixel nearest to its centre."""
+    """Resample an image (h, w, ...) of `source` to `camera` by the pixel nearest to each pixel's centre."""
     if camera == source:
         return image
     x, y = _places(camera, source)
@@ -36,7 +36,7 @@ def resample_nearest(image: np.ndarray, camera: Camera, source: Camera) -> np.nd
 
 
 def seen_by(radiance: Radiance, camera: Camera, source: Camera) -> Radiance:
-    """All of a frame of `source` in `camera`'s pixels, nearest pixel each: to look up what is seen where."""
+    """A rendering by `source` in the pixels of `camera`, by the nearest pixel."""
     if camera == source:
         return radiance
     images = {field.name: getattr(radiance, field.name) for field in fields(radiance)}
@@ -44,7 +44,7 @@ def seen_by(radiance: Radiance, camera: Camera, source: Camera) -> Radiance:
 
 
 def refined(camera: Camera, n: int) -> Camera:
-    """The same view with n x n pixels in place of each."""
+    """The same view with each pixel divided into n x n."""
     return replace(
         camera,
         width_px=n * camera.width_px,
@@ -58,6 +58,6 @@ def refined(camera: Camera, n: int) -> Camera:
 
 @lru_cache(maxsize=4)
 def _places(camera: Camera, source: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Column and row (h, w) float32 in `source` of each pixel centre; OpenCV counts from the first pixel's centre."""
+    """Column and row (h, w) float32 in `source` of each pixel centre, 0 at the first pixel's centre as in OpenCV."""
     place = source.project(camera.rays(camera.pixel_centres())) - 0.5
     return place[..., 0].astype(np.float32), place[..., 1].astype(np.float32)

@@ -1,13 +1,14 @@
-"""From radiance factor to grey values, as EMVA 1288 (release 4.0, linear) models a camera.
+"""Sensor model, from radiance factor to grey values, by EMVA 1288 (release 4.0, linear).
 
-Symbols: mu_p photons and eta mu_p electrons of a pixel in the exposure time t, here responsivity x t x I/F; mu_d and
-sigma_d mean and standard deviation of the dark signal, electrons; K grey values (DN) per electron; mu_y mean and
-sigma_y^2 variance of the grey value in time:
+Symbols: mu_p is the number of photons and eta mu_p that of electrons in a pixel during the exposure time t, here
+responsivity x t x I/F. mu_d and sigma_d are the mean and standard deviation of the dark signal, electrons. K is the
+gain, grey values (DN) per electron. mu_y and sigma_y^2 are the temporal mean and variance of the grey value:
 
     mu_y = K (eta mu_p + mu_d) + black level,    mu_d = dark current x t
     sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark),    sigma_d^2 = read noise^2 + mu_d
 
-Over the pixels, eta varies by the PRNU and mu_d by the DSNU and the hot pixels: the same in every frame of a dataset.
+Between pixels, eta varies by the PRNU, and mu_d by the DSNU and the hot pixels. This pattern is the same in every frame
+of a dataset.
 """
 
 from dataclasses import dataclass
@@ -25,20 +26,20 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 _STRETCH = 1.5
-"""Distortion may widen motion at the edges by about so much."""
+"""Approximate bound on how much distortion stretches motion at the image edge."""
 _LEAST_MOTION_PX = 0.05
-"""Motion during the exposure below which it is not worth the blurring."""
+"""Motion during the exposure below which no blur is computed, pixels."""
 _FAINT_E = 100.0
-"""Above it a rounded Gaussian stands for the Poisson law, ten times faster."""
+"""Signal above which a rounded Gaussian approximates Poisson noise, ten times faster, electrons."""
 
 
 HOT_PIXEL_S = 0.002
-"""Exposure time of the extra signal `hot_pixel_e`, seconds. It is dark current, and grows with the exposure time."""
+"""Exposure time to which `hot_pixel_e` refers, seconds; the signal is proportional to the exposure time."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixedPattern:
-    """What is the same in all frames of one sensor."""
+    """The fixed pattern noise of one sensor, the same in all its frames."""
 
     response: np.ndarray
     """Relative response of each pixel, mean 1 (h, w) float32."""
@@ -49,7 +50,7 @@ class FixedPattern:
 
     @classmethod
     def draw(cls, config: SensorConfig, camera: Camera, seed: int) -> "FixedPattern":
-        """The one sensor of a dataset with this seed."""
+        """Draw the sensor of a dataset from the dataset's seed."""
         rng = stream(seed, "sensor")
         shape = camera.height_px, camera.width_px
         response = 1 + config.gain_nonuniformity * rng.standard_normal(shape, np.float32)
@@ -61,7 +62,7 @@ class FixedPattern:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """What falls on the sensor in one frame: no noise yet, no fixed pattern."""
+    """The light on the sensor in one frame, without noise and fixed pattern."""
 
     light: np.ndarray
     """Radiance factor I/F of each pixel after point spread and motion blur (h, w) float32."""
@@ -78,17 +79,17 @@ def develop(
     pattern: FixedPattern,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """The grey image (h, w) of `camera`, in DN from 0 to 2^bits - 1: `expose`, then `read_out`."""
+    """Grey image (h, w) of `camera`, DN from 0 to 2^bits - 1: `expose`, then `read_out`."""
     return read_out(expose(radiance, config, camera, exr_camera, velocity_camera_mps), config, pattern, rng)
 
 
 def expose(
     radiance: Radiance, config: SensorConfig, camera: Camera, exr_camera: Camera, velocity_camera_mps: Array
 ) -> Exposure:
-    """What falls on the sensor of `camera`: resampling, point spread, exposure, motion blur, in this order.
+    """The light on the sensor of `camera`: resampling, point spread, exposure time, motion blur, in this order.
 
-    `radiance` is as `exr_camera` sees it, in the middle of the exposure; the velocity (3,) of the camera is along its
-    own axes O_C.
+    `radiance` is the rendering by `exr_camera` at the middle of the exposure. `velocity_camera_mps` (3,) is the
+    velocity of the camera in its own axes O_C.
     """
     light = np.maximum(resample(radiance.radiance_factor.astype(np.float32, copy=False), camera, exr_camera), 0)
     if config.psf_sigma_px > 0:
@@ -106,9 +107,9 @@ def expose(
 def psf_kernel(sigma_px: float) -> np.ndarray:
     """Weights (2 n + 1,) of the point spread along one axis: the discrete Gaussian of variance sigma_px^2.
 
-    The weight at k pixels is exp(-t) I_k(t) with t = sigma_px^2 (Lindeberg 1990, doi 10.1109/34.49051). Its variance
-    over the pixels is t for every t, while a Gaussian sampled at the pixel centres loses variance below about 0.7 px
-    (sigma 0.45 becomes 0.38). The mean over the pixel's own area is the renderer's and is not part of sigma_px.
+    The weight at k pixels is exp(-t) I_k(t) with t = sigma_px^2 (Lindeberg 1990, doi 10.1109/34.49051). Its variance is
+    t for every t, while a Gaussian sampled at the pixel centres loses variance below about 0.7 px (sigma 0.45 becomes
+    0.38). The renderer averages over the pixel's area; sigma_px does not include that.
     """
     half = int(np.ceil(6 * sigma_px + 4))
     weights = ive(np.abs(np.arange(-half, half + 1)), sigma_px**2)
@@ -116,10 +117,10 @@ def psf_kernel(sigma_px: float) -> np.ndarray:
 
 
 def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rng: np.random.Generator) -> np.ndarray:
-    """The grey image (h, w) of an exposure, in DN from 0 to 2^bits - 1: uint8, or uint16 above 8 bits.
+    """Grey image (h, w) of an exposure, DN from 0 to 2^bits - 1: uint8, or uint16 above 8 bits.
 
-    In this order: electrons with PRNU, dark current and hot pixels, Poisson noise, read noise, DSNU, full well, gain,
-    black level, rounding and clipping. `rng` draws the noise in time alone.
+    Steps, in this order: electrons with PRNU, dark current and hot pixels, Poisson noise, read noise, DSNU, full well,
+    gain, black level, rounding and clipping. `rng` draws the temporal noise only.
     """
     electrons = exposure.light * pattern.response
     electrons *= config.responsivity_e_per_s * exposure.time_s
@@ -137,11 +138,11 @@ def read_out(exposure: Exposure, config: SensorConfig, pattern: FixedPattern, rn
 
 
 def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation (h, w) float32 of each grey value, DN, over all noise and all sensors of the kind.
+    """Mean and standard deviation (h, w) float32 of each grey value, DN, over temporal noise and fixed patterns.
 
-    sigma_y^2 as above, with PRNU and DSNU, which are noise to whoever sees one frame. Hot pixels are left out. Where
-    the sensor clips, in the brightest pixels and in shadows that a black level of 0 cuts off, the deviation is that
-    without clipping: rather more than less.
+    The variance is sigma_y^2 as above plus those of PRNU and DSNU, which act as noise in a single frame. Hot pixels are
+    left out. Where the sensor clips (in the brightest pixels, and in shadows with a black level of 0) the standard
+    deviation is that without clipping, which is too large.
     """
     largest = 2**config.bits - 1
     per_e = config.gain * largest / config.full_well_e
@@ -156,8 +157,8 @@ def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.n
 def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
     """Exposure time, seconds, for a radiance factor (h, w).
 
-    Automatic exposure brings the chosen percentile to its grey level, but no pixel of it over that share of the full
-    well, and takes no longer than it may.
+    Automatic exposure brings `exposure_percentile` to the grey value `exposure_level`, but to no more than that share
+    of the full well, and is limited to `longest_exposure_s`.
     """
     if config.exposure == "fixed":
         return config.exposure_time_s
@@ -168,10 +169,10 @@ def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
 
 
 def motion_px(depth_m: np.ndarray, camera: Camera, way_camera_m: Array) -> np.ndarray:
-    """How far the ground at a depth (h, w) along the axis moves in the image, pixels (h, w, 2), float32.
+    """Motion in the image, pixels (h, w, 2) float32, of the ground at a depth (h, w) along the axis, metres.
 
-    The camera moves by `way_camera_m` (3,) along its own axes O_C, without turning. To first order in way over depth;
-    0 where nothing is hit.
+    The camera moves by `way_camera_m` (3,) in its own axes O_C, without rotation. To first order in the ratio of motion
+    to depth; 0 where nothing is hit.
     """
     rays = _rays(camera)
     way = np.asarray(way_camera_m, np.float32)
@@ -180,12 +181,12 @@ def motion_px(depth_m: np.ndarray, camera: Camera, way_camera_m: Array) -> np.nd
         return move * np.array([camera.fx_px, camera.fy_px], np.float32)
     moved = np.concatenate([rays + move, np.ones_like(depth_m)[..., None]], axis=-1)
     start = np.concatenate([rays, np.ones_like(depth_m)[..., None]], axis=-1)
-    # At the very edge of what the distortion allows, the end of the way may have no image.
+    # At the limit of the distortion model, the end of the motion may have no image.
     return np.nan_to_num(camera.project(moved) - camera.project(start)).astype(np.float32)
 
 
 def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, way_camera_m: Array) -> float:
-    """About the fastest motion of any pixel of `camera`, pixels, rather more than less; `pinhole` covers its view."""
+    """Approximate upper bound on the motion of any pixel of `camera`, pixels; `pinhole` covers its view."""
     corners = [[u, v] for u in (0, pinhole.width_px) for v in (0, pinhole.height_px)]
     widest = np.linalg.norm(pinhole.rays(corners), axis=-1).max()
     nearest_m = max(float(depth_m.min()), 1e-9)
@@ -194,16 +195,16 @@ def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, way_camera
 
 @lru_cache(maxsize=4)
 def _rays(camera: Camera) -> np.ndarray:
-    """Direction (h, w, 2) of each pixel centre over the axis, float32."""
+    """Ray (h, w, 2) float32 of each pixel centre: x and y divided by z in O_C."""
     return camera.rays(camera.pixel_centres())[..., :2].astype(np.float32)
 
 
 def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """The mean of an image over an exposure about its own time, while its content moves by `motion` (h, w, 2)."""
+    """The mean of an image over an exposure centred on its time; its content moves by `motion` (h, w, 2), pixels."""
     longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
     if longest < _LEAST_MOTION_PX:
         return light
-    # Gauss-Legendre nodes: two already give the blur of a short motion its true width.
+    # Gauss-Legendre nodes: two are enough to give the blur of a short motion its true width.
     times, weights = np.polynomial.legendre.leggauss(min(int(2 * longest) + 2, 128))
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in light.shape[::-1]))
     mean = np.zeros_like(light)

@@ -1,4 +1,4 @@
-"""Contact sheets: frames side by side, with labels drawn, for people to look at."""
+"""Contact sheets: frames side by side, with labels drawn on them."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ _CHOSEN, _OTHER = (80, 220, 80), (60, 140, 255)
 
 
 def draw_labels(image: np.ndarray, labels: Labels, chosen: np.ndarray, scale: int = 2) -> np.ndarray:
-    """A colour picture (scale h, scale w, 3) with the ellipses drawn: green where `chosen` (N,), else orange."""
+    """A colour picture (scale h, scale w, 3) with the ellipses, green where `chosen` (N,) is true, else orange."""
     picture = cv2.cvtColor(enlarge(image, scale), cv2.COLOR_GRAY2BGR)
     e = labels.ellipses
     for k in range(len(labels.crater_id)):
@@ -26,12 +26,12 @@ def draw_labels(image: np.ndarray, labels: Labels, chosen: np.ndarray, scale: in
 
 
 def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
-    """Each pixel as a square of `scale` pixels."""
+    """Enlarge an image: each pixel becomes a square with a side of `scale` pixels."""
     return np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
 
 
 def write_sheet(path: Path, pictures: list[np.ndarray], columns: int) -> None:
-    """Pictures of one size, grey or colour, row by row, with a thin gap, as one PNG."""
+    """Write pictures of one size, grey or colour, row by row with a thin gap, as one PNG."""
     colour = [p if p.ndim == 3 else cv2.cvtColor(p, cv2.COLOR_GRAY2BGR) for p in pictures]
     padded = [cv2.copyMakeBorder(p, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=(40, 40, 40)) for p in colour]
     while len(padded) % columns:

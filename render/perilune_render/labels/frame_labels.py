@@ -1,4 +1,4 @@
-"""Crater labels of a frame: ellipses, how much of each rim is seen, how much of each crater is lit, what it shows."""
+"""Crater labels of a frame: ellipse, visible share of the rim, sunlit share and contrast of each crater."""
 
 from dataclasses import dataclass, replace
 
@@ -21,17 +21,17 @@ class Labels:
     """N labelled craters of one frame."""
 
     crater_id: np.ndarray
-    """Place in the scene's craters (N,)."""
+    """Id in the table `craters` of the scene (N,)."""
     ellipses: Ellipses
     """Images of the rims."""
     visible_fraction: Array
-    """Share of the rim inside the image and not hidden (N,)."""
+    """Share of the rim that is inside the image and not hidden (N,)."""
     sunlit_fraction: Array
-    """Share of the crater's seen pixels that the Sun reaches; 0 where none is seen (N,)."""
+    """Share of the ellipse's pixels in the image that are sunlit; 0 if it has none (N,)."""
     contrast: Array
-    """The crater's own shading over its standard error, from noise and clutter; NaN where not measured (N,)."""
+    """Amplitude of the crater's shading over its standard error from noise and clutter; NaN if not measured (N,)."""
     n_above: int | None = None
-    """Craters with their centre in the image and a radius above the largest of a label; None where not counted."""
+    """Number of craters centred in the image whose radius exceeds the largest of a label; None if not counted."""
 
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "Labels":
@@ -50,7 +50,7 @@ class Labels:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What the sensor shows of a frame, whatever the noise's draw (`perilune_render.imaging.sensor.expected`)."""
+    """Mean and noise of a frame's grey values (`perilune_render.imaging.sensor.expected`), and the Sun."""
 
     grey: np.ndarray
     """Mean of each grey value, DN (h, w)."""
@@ -65,23 +65,23 @@ class RimCircles:
     """The rim circles of N craters of a scene, O_L."""
 
     crater_id: np.ndarray
-    """Unique in the scene, ascending (N,)."""
+    """Crater ids, unique in the scene, ascending (N,)."""
     centre_m: Array
-    """(N, 3)."""
+    """Centres, metres (N, 3)."""
     normal: Array
-    """Unit normals (N, 3)."""
+    """Unit normals of the rim planes (N, 3)."""
     radius_m: Array
-    """(N,)."""
+    """Radii, metres (N,)."""
 
     @classmethod
     def of_scene(cls, scene: Scene) -> "RimCircles":
-        """All craters of a scene that was grown."""
+        """All craters of a generated scene."""
         centres = np.stack([scene.craters.x_m, scene.craters.y_m, scene.rims.z_m], axis=1)
         return cls(np.arange(len(scene.craters)), centres, scene.rims.normal, scene.craters.diameter_m / 2)
 
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "RimCircles":
-        """Rows of the manifest's table `craters`, of one scene."""
+        """Craters of one scene from rows of the manifest's table `craters`."""
         rows = rows.sort_values("crater_id")
         return cls(
             rows["crater_id"].to_numpy(),
@@ -100,10 +100,11 @@ def label_frame(
     min_radius_px: float,
     max_radius_px: float,
 ) -> Labels:
-    """Labels by the paper's rule: centre in the frame, radius within bounds; visibility from the rendered depth.
+    """Labels by the paper's rule: centre in the frame, radius sqrt(a b) within the bounds in pixels.
 
-    `radiance` is in the pixels of `camera` (`perilune_render.imaging.resampling.seen_by`). The contrast depends on
-    the sensor too and is NaN here: `with_contrast` measures it.
+    Visibility is measured in the rendered depth. `radiance` is in the pixels of `camera`
+    (`perilune_render.imaging.resampling.seen_by`). The contrast also depends on the sensor and is NaN here:
+    `with_contrast` measures it.
     """
     in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
     rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
@@ -138,7 +139,7 @@ def with_contrast(
     rotation_camera_from_site: Array,
     shown: Shown,
 ) -> Labels:
-    """The labels of a frame with their contrast (`perilune_render.labels.pixels.contrasts`) in what `camera` shows."""
+    """The labels with their contrast in the image of `camera` (`perilune_render.labels.pixels.contrasts`)."""
     rows = np.searchsorted(circles.crater_id, labels.crater_id)
     centre = np.stack([labels.ellipses.cx_px, labels.ellipses.cy_px], axis=-1)
     matrices = _image_from_rim(circles, camera, position_m, rotation_camera_from_site, shown.sun, rows)
@@ -148,11 +149,11 @@ def with_contrast(
 def _image_from_rim(
     circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, sun: Array, rows: np.ndarray
 ) -> Array:
-    """Matrices (N, 2, 2) from places on the rim's plane, in radii along the Sun's direction and across, to pixels."""
+    """Matrices (N, 2, 2) from the rim's plane, in radii along and across the Sun's direction, to pixels."""
     centre, normal = circles.centre_m[rows], circles.normal[rows]
     along = sun - (normal @ sun)[:, None] * normal
     length = np.linalg.norm(along, axis=1, keepdims=True)
-    # With the Sun right above a crater no direction is towards it.
+    # With the Sun along the rim's normal, no direction in the plane points towards it: use any.
     along = np.where(length > 1e-9, along / np.maximum(length, 1e-9), plane_basis(normal)[0])
     axes = circles.radius_m[rows, None, None] * np.stack([along, np.cross(normal, along)], axis=1)
     ends = [camera.project(camera_from_site(centre[:, None] + side * axes, position_m, rotation)) for side in (1, -1)]
@@ -162,11 +163,11 @@ def _image_from_rim(
 def _visible_fraction(
     circles: RimCircles, camera: Camera, position_m: Array, rotation: Array, depth_m: np.ndarray, rows: np.ndarray
 ) -> Array:
-    """Compare the rim's depth with the rendered depth.
+    """Visible share (N,) of each rim, by comparing the rim's depth with the rendered depth.
 
-    The label circle is a plane through a rough rim, so a rim point may lie under the ground by some of the crater's own
-    height: it counts as hidden only where the ground in front is nearer by more than a tenth of the radius and
-    two pixels' width.
+    The label circle is plane and the real rim is rough, so a point of the circle may be below the ground. It counts as
+    hidden only if the ground in front of it is nearer by more than SLACK_RADII radii and by more than SLACK_PX pixel
+    widths.
     """
     if not len(rows):
         return np.empty(0)
@@ -188,11 +189,11 @@ def crater_index(
     rotation_camera_from_site: Array,
     depth_m: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Instance image (h, w) float32: the smallest crater whose visible interior holds each pixel's centre; -1 none.
+    """Instance image (h, w) float32: id of the smallest crater whose visible interior holds the pixel's centre, or -1.
 
-    The interior is the rim's disc; it is visible where the ground of `depth_m` (h, w), metres along the axis, is not
-    nearer than the disc's plane (but for a tenth of the radius and two pixels' width). Without depth all of it is.
-    Every crater of at least a pixel across counts, also those that become no labels. `camera` has no distortion.
+    The interior is the disc within the rim. It is visible where the ground, at `depth_m` (h, w) metres along the axis,
+    is not nearer than the disc's plane by more than SLACK_RADII radii and SLACK_PX pixel widths; without depth all of
+    it is visible. Every crater at least a pixel wide counts, also those without a label. `camera` has no distortion.
     """
     in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
     candidate = _reaching_in(camera, in_camera, circles.radius_m)
@@ -204,12 +205,12 @@ def crater_index(
 
 
 def _reaching_in(camera: Camera, centre_m: Array, radius_m: Array) -> np.ndarray:
-    """Rows of circles (N, 3), (N,) in O_C, in front of the camera and a pixel across, that may reach into the image."""
+    """Indices of circles (N, 3), (N,) in O_C that may reach into the image and are at least a pixel wide."""
     x, y, z = centre_m.T
     rows = np.flatnonzero((z > 0) & (2 * camera.fx_px * radius_m > z))
     x, y, z, radius = x[rows], y[rows], z[rows], radius_m[rows]
     with np.errstate(divide="ignore"):
-        # How far a sphere of that radius reaches from its centre's image.
+        # Bound on how far a sphere of that radius extends from its centre in the image.
         wide = np.where(z > radius, radius / np.abs(z - radius), np.inf)
     size = np.array([camera.width_px, camera.height_px])
     middle = np.stack([camera.fx_px * x / z + camera.cx_px, camera.fy_px * y / z + camera.cy_px], axis=-1)

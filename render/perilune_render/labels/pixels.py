@@ -1,4 +1,4 @@
-"""Loops over the pixels of labels, compiled by numba: how much is lit, what shading shows, which crater is where."""
+"""Loops over the pixels of labels, compiled by numba: sunlit share, contrast, and crater index image."""
 
 import numpy as np
 
@@ -9,14 +9,14 @@ from perilune_shared.geometry.ellipse import Ellipses
 from perilune_shared.geometry.frames import Array
 
 REACH = 1.5
-"""The surroundings that contrast is measured against, radii of the rim from its centre."""
+"""Radius of the disc in which contrast is measured, rim radii."""
 _N_FITTED = 4
 
 
 def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
-    """Share (N,) of lit pixels of `sunlit` (h, w) bool among those whose centre lies in each of N ellipses.
+    """Share (N,) of lit pixels in `sunlit` (h, w) bool among those with their centre in each of N ellipses.
 
-    0 where an ellipse holds no pixel's centre.
+    0 if an ellipse contains no pixel centre.
     """
     shape = ellipses.a_px, ellipses.b_px, ellipses.theta_rad
     return _lit(ellipses.cx_px, ellipses.cy_px, *shape, ellipses.bounding_boxes(), sunlit)
@@ -42,14 +42,16 @@ def _lit(cx, cy, a, b, theta, boxes, sunlit):
 
 
 def contrasts(centre_px: Array, image_from_rim: Array, grey: np.ndarray, noise: np.ndarray) -> Array:
-    """Shading (N,) of N craters as a bowl lit from one side, over its standard error.
+    """Contrast (N,) of N craters: fitted shading of a bowl lit from one side, over its standard error.
 
-    `centre_px` (N, 2) are the ellipses' centres; `image_from_rim` (N, 2, 2) maps a place on the crater's plane, in
-    radii along the Sun's direction and across it, to pixels from there; `grey` and `noise` (h, w) are mean and standard
-    deviation of each pixel. Within REACH radii grey is fitted by least squares as a plane plus c times the shading of
-    a bowl, -s exp(-(r / 0.8)^4) with r the distance from the centre and s its part towards the Sun: the wall that faces
-    the Sun is bright. The result is c over its standard error; a pixel's variance is that of the noise and
-    that of what the fit leaves. A bump has a negative contrast, flat ground 0. 0 also where too few pixels are in
+    `centre_px` (N, 2) are the ellipses' centres. `image_from_rim` (N, 2, 2) maps offsets from the centre on the
+    crater's plane, in radii along and across the Sun's direction, to offsets in pixels. `grey` and `noise` (h, w) are
+    the mean and standard deviation of each pixel.
+
+    Within REACH radii, grey is fitted by least squares as a plane plus c times the shading of a bowl,
+    -s exp(-(r / 0.8)^4), with r the distance from the centre and s its component towards the Sun: the wall that faces
+    the Sun is bright. The result is c over its standard error, where a pixel's variance is the sum of that of the noise
+    and that of the fit's residuals. It is negative for a bump, about 0 for flat ground, and 0 if too few pixels are in
     the image.
     """
     matrices = np.ascontiguousarray(image_from_rim, np.float64)
@@ -99,7 +101,7 @@ def _shading(centre, matrices, grey, noise):
 
 @njit()
 def _over_its_error(normal, right, squares, variance, count):
-    """The last fitted value over its standard error, by Cholesky's L L^T = normal (lower triangle given)."""
+    """The last fitted value over its standard error, by Cholesky factors L L^T = normal (lower triangle given)."""
     for i in range(_N_FITTED):
         for j in range(i + 1):
             rest = normal[i, j]
@@ -115,7 +117,7 @@ def _over_its_error(normal, right, squares, variance, count):
             right[i] -= normal[i, m] * right[m]
         right[i] /= normal[i, i]
         squares -= right[i] ** 2
-    # The last unknown is right / L with the variance 1 / L^2, both in the last place.
+    # The last unknown is right / L and its variance 1 / L^2, both with the last diagonal element of L.
     return right[-1] / np.sqrt(variance + max(squares, 0.0) / (count - _N_FITTED))
 
 
@@ -128,10 +130,11 @@ def smallest_crater(
     camera: Camera,
     depth_m: np.ndarray | None,
 ) -> np.ndarray:
-    """Index image (h, w) float32: of N craters in O_C, largest first, the last whose seen interior holds the pixel.
+    """Index image (h, w) float32: the id of the last of N craters whose visible interior holds each pixel's centre.
 
-    Centres (N, 3) and radii (N,) in metres, unit normals (N, 3), boxes of the rims' images (N, 4); `camera` has no
-    distortion; depth_m (h, w) along the axis, None where nothing hides anything. -1 where there is none.
+    The craters are in O_C, largest first: centres (N, 3) and radii (N,) in metres, unit normals (N, 3), bounding boxes
+    of the rims' images (N, 4), pixels. `camera` has no distortion. depth_m (h, w), metres along the axis, hides
+    interiors; None hides nothing. Pixels without a crater are -1.
     """
     image = np.full((camera.height_px, camera.width_px), -1, np.float32)
     depth = np.full((1, 1), np.inf) if depth_m is None else depth_m

@@ -1,1 +1,1 @@
-"""The ground as plain data: laws, populations, height field. Knows nothing of Blender."""
+"""The ground as plain data, independent of Blender: laws, populations, height field."""

@@ -1,7 +1,7 @@
-"""Albedo of the ground: patches, bright young craters with their ejecta, rays of the freshest.
+"""Albedo of the ground: patches, bright young craters with their ejecta, and rays.
 
-Fresh material is brighter than the mature soil about it and darkens as it weathers. How much, and how far, is a choice
-of ours by eye beside NAC images, since published maturity trends are for far larger craters.
+Fresh material is brighter than the mature soil around it and darkens with age. We chose amount and extent by eye, by
+comparison with NAC images, since published maturity trends are for much larger craters.
 """
 
 import numpy as np
@@ -14,10 +14,10 @@ from perilune_render.terrain.noise import add_waves
 from perilune_shared.geometry.frames import Array
 
 _PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03))
-"""Wavelengths in metres and amplitudes of the patches."""
+"""Wavelengths, metres, and relative amplitudes of the patches."""
 _RAYS_REACH = 9.0
 _RAYED_WEAR = 0.004
-"""Rays are gone where a crater has worn to this K/R^2."""
+"""Wear K/R^2 of a crater at which its rays have vanished."""
 
 
 def add_patches(albedo: Array, grid: Grid, strength: float, seed: int) -> None:
@@ -28,18 +28,21 @@ def add_patches(albedo: Array, grid: Grid, strength: float, seed: int) -> None:
 
 
 def brightness(craters: Craters) -> Array:
-    """Relative brightening (N,) of a crater and its ejecta: highest when new, gone once it has worn noticeably."""
+    """Relative brightening (N,) of craters and their ejecta: largest for new ones, falls with wear K/R^2.
+
+    0 for craters of a catalogue.
+    """
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     return 0.5 * np.exp(-wear / 0.004) * (craters.origin != 2)
 
 
 def add_rays(albedo: Array, grid: Grid, craters: Craters, n_rayed: int, strength: float, seed: int) -> None:
-    """Brighten albedo (n_vertices,) along the rays of the `n_rayed` largest among the fresh craters, in place."""
+    """Brighten albedo (n_vertices,) along the rays of the `n_rayed` largest fresh craters, in place."""
     rng = stream(seed, "rays")
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     local = grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
     able = np.flatnonzero((wear < _RAYED_WEAR) & (craters.diameter_m > 12 * local) & (craters.origin == 0))
-    # Among the fresh ones the largest: rays of a small crater are gone within few pixels.
+    # The largest ones: rays of a small crater would be only a few pixels long.
     for k in able[np.argsort(-craters.diameter_m[able], kind="stable")][:n_rayed]:
         n_rays = int(rng.integers(7, 15))
         direction = rng.uniform(0, 2 * np.pi, n_rays)

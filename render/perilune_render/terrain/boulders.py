@@ -1,9 +1,9 @@
-"""The boulder population and its set of rocks.
+"""The boulder population and the rock shapes.
 
 Shapes: convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (S/I 0.770, I/L 0.758,
-taken second hand), some cut by planes, as fractured rocks are. Deviation: near fresh craters counts above 4.4 m have
-been seen to fall more steeply (exponent -4, second hand); one exponent serves everywhere here, and no boulder is
-larger than a twentieth of its crater.
+from a secondary source); some are cut by planes, like fractured rocks. Deviation: near fresh craters, observed counts
+fall more steeply above 4.4 m (exponent -4, from a secondary source). Here one exponent is used everywhere, and
+a boulder of a crater's field is at most a twentieth of the crater's diameter.
 """
 
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ from perilune_render.terrain.size_frequency import BoulderLaw, draw_diameters, l
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 _BURIED_SHARE = 0.3
-"""Share of a boulder's height that lies below the ground."""
+"""Share of a boulder's height that is below the ground."""
 _FIELD_DECAY = 0.7
-"""Length over which a boulder field thins out from its crater's rim, radii."""
+"""Decay length of a boulder field's density beyond the crater's rim, crater radii."""
 _FULL_SPACINGS = 5.0
-"""Boulders of at least this many vertex spacings are drawn with all their faces."""
+"""Diameter, in vertex spacings, from which a boulder gets the mesh with more faces."""
 
 
 @dataclass(frozen=True, slots=True)
 class Boulders:
-    """N boulders lying on the ground."""
+    """N boulders on the ground."""
 
     x_m: Array
-    """Centre, O_L, metres (N,)."""
+    """x of the centres, O_L, metres (N,)."""
     y_m: Array
-    """Centre, O_L, metres (N,)."""
+    """y of the centres, O_L, metres (N,)."""
     diameter_m: Array
     """Mean of the three axes, metres (N,)."""
     shape_id: np.ndarray
-    """Which rock (N,)."""
+    """Index of the rock shape (N,)."""
     rotation_wxyz: Array
     """rotation_site_from_rock, unit quaternions (N, 4)."""
 
@@ -45,16 +45,16 @@ class Boulders:
         return len(self.x_m)
 
     def centre_height_m(self, ground_m: Array) -> Array:
-        """Height of the centres over O_L's plane, for the ground's height (N,) under each."""
+        """Height (N,) of the centres above O_L's plane, metres, from the ground's height (N,) below each."""
         return ground_m + (0.5 - _BURIED_SHARE) * self.diameter_m
 
 
 def draw_boulders(config: BouldersConfig, grid: Grid, craters: Craters, seed: int) -> Boulders:
-    """The population of a scene: some everywhere on the plain, more around young craters.
+    """Draw the boulders of a scene: a uniform density on the plain, and fields around young craters.
 
-    Around a crater of at least ten metres the density is `field_density` times the plain's at the rim of a newly formed
-    one and falls as exp(-(x - 1) / 0.7), x = r/R, and with age as (1 - age / 4 Gyr)^3, both taken second hand; a field
-    goes under with its crater, as exp(-K / 0.05 R^2), which is a choice of ours.
+    Fields surround primary craters of at least 10 m. At the rim of a newly formed crater the density of its field is
+    `field_density` times that of the plain. It falls with distance as exp(-(x - 1) / 0.7), x = r/R, and with age as
+    (1 - age / 4 Gyr)^3, both from a secondary source, and with the crater's wear as exp(-K / 0.05 R^2), our choice.
     """
     rng = stream(seed, "boulders")
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
@@ -84,7 +84,7 @@ def _fields(
     young = np.clip(1 - age / 4000, 0, 1) ** 3 * np.exp(-craters.wear_m2 / (0.05 * radius**2))
     young = np.where((craters.diameter_m >= 10) & (craters.origin == 0), young, 0.0)
     local = config.min_diameter_spacings * grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
-    # No boulder is larger than a twentieth of its crater.
+    # The boulders of a field are at most a twentieth of its crater.
     largest = np.minimum(config.max_diameter_m, craters.diameter_m / 20)
     per_area = np.where(largest > local, law.csfd(local) - law.csfd(np.maximum(largest, local)), 0.0)
     # The integral of exp(-(x - 1) / a) over the plane outside the rim is 2 pi R^2 (a + a^2).
@@ -94,7 +94,7 @@ def _fields(
     n_small, n_large = law.csfd(local[host]), law.csfd(largest[host])
     share = rng.random(len(host))
     diameter = ((n_small - share * (n_small - n_large)) / law.csfd(1.0)) ** (1 / -2.482)
-    # Density exp(-(x - 1) / a) per area: x - 1 is a mixture of Gamma laws of orders 1 and 2.
+    # With a density of exp(-(x - 1) / a) per area, x - 1 is a mixture of Gamma distributions of orders 1 and 2.
     order = np.where(rng.random(len(host)) < 1 / (1 + _FIELD_DECAY), 1, 2)
     distance = radius[host] * (1 + _FIELD_DECAY * rng.gamma(order))
     angle = rng.uniform(0, 2 * np.pi, len(host))
@@ -105,9 +105,9 @@ def _fields(
 
 
 def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:
-    """A rock of mean diameter 1 centred on the origin: convex, every third one with fracture faces.
+    """A convex rock of mean diameter 1 centred on the origin; every third one has fracture faces.
 
-    Fewer points make the same kind of rock with fewer faces, for boulders that are but a few pixels wide.
+    Fewer points make the same kind of rock with fewer faces, for boulders only a few pixels wide.
     """
     rng = stream(seed, "rock", shape_id)
     points = rng.normal(size=(60, 3))[:n_points]
@@ -132,8 +132,8 @@ def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:
 def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """All boulders as one mesh: vertices (V, 3) float32 in O_L, metres, and triangles (F, 3) int32.
 
-    Every boulder is an instance of one of the seed's rocks; small ones (beside the vertex spacing where they lie) take
-    the rock with fewer faces. One mesh, since Cycles pays for every object in every frame.
+    Every boulder is a copy of one of the seed's rocks; boulders below _FULL_SPACINGS local vertex spacings use the rock
+    with fewer faces. All are one mesh, since Cycles needs time for every object in every frame.
     """
     local = grid.spacing_at(np.maximum(np.abs(boulders.x_m), np.abs(boulders.y_m)))
     full = boulders.diameter_m >= _FULL_SPACINGS * local

@@ -1,8 +1,8 @@
-"""Grown scenes kept by content, so that a second descent over the same ground starts at once.
+"""Cache of generated scenes, so that another run over the same ground starts at once.
 
-A scene's file is named by the hash of everything that it follows from. The folder is `$PERILUNE_CACHE`, or
-`perilune/scenes` in the user's cache folder; the least recently used files go first once it grows too large. A cache
-that cannot be written, or a damaged file in it, only costs the time to grow the scene.
+A scene's file is named by the hash of everything that determines it. The folder is `$PERILUNE_CACHE`, or
+`perilune/scenes` in the user's cache folder. Above the size limit the least recently used files are removed. If the
+cache cannot be written or a file is damaged, the scene is generated again.
 """
 
 import contextlib
@@ -31,19 +31,19 @@ _PARTS: dict[str, type] = {"grid": Grid, "craters": Craters, "rims": Rims, "boul
 
 
 def cache_folder() -> Path:
-    """Where scenes are kept."""
+    """The folder of the cached scenes."""
     if "PERILUNE_CACHE" in os.environ:
         return Path(os.environ["PERILUNE_CACHE"])
     return cache_home() / "scenes"
 
 
 def scene_key(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> str:
-    """Hash of all that a scene follows from: code, libraries, settings of the ground, view, seed, files it reads."""
+    """Hash of all that determines a scene: code, libraries, terrain settings, camera, flight, seed, input files."""
     terrain = config.terrain.model_dump(mode="json")
     for name in ("dem", "catalogue"):
         if terrain[name] is not None and Path(terrain[name]).is_file():
             terrain[name] = [Path(terrain[name]).name, sha256_of(Path(terrain[name]))]
-    terrain.pop("max_vertices")  # a bound that changes no vertex
+    terrain.pop("max_vertices")  # a limit, which changes no vertex
     versions = ground_versions(with_dem=config.terrain.dem is not None)
     content = {
         "versions": {name: version for name, version in versions.items() if not name.startswith("perilune")},
@@ -57,7 +57,7 @@ def scene_key(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed:
 
 
 def cached_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> Scene:
-    """The scene of a seed, read from the cache or grown and kept there."""
+    """The scene of a seed, read from the cache, or generated and stored there."""
     if config.render.cache_gib == 0:
         return grow_scene(config, camera, flight, seed)
     path = cache_folder() / f"{scene_key(config, camera, flight, seed)}.npz"
@@ -104,6 +104,6 @@ def _make_room(folder: Path, most_bytes: float) -> None:
     total = 0
     for place, path in enumerate(kept):
         total += path.stat().st_size
-        # The newest stays, however large.
+        # Keep the newest file, however large.
         if total > most_bytes and place > 0:
             path.unlink(missing_ok=True)

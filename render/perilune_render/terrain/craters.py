@@ -1,13 +1,13 @@
-"""The crater population of a scene: where, how large, how old, how worn. Plain data, before any height is known.
+"""The crater population of a scene: places, sizes, ages and wear, as plain data without heights.
 
-Each crater's age is uniform between now and the time in which production fills the equilibrium of its size, so that
-fresh, worn and nearly erased craters stand together, as in real images; where production has not filled it yet,
-between now and the age of the surface (our simplification: production before 3 Gyr ago fell fast). Equilibrium
-densities are counts of craters that people could still see, so no crater in equilibrium is drawn more worn than
-`_LAST_SEEN_WEAR`.
+A crater's age is drawn uniformly from 0 to the time in which production reaches the equilibrium density of its size,
+so that fresh, worn and nearly erased craters occur together, as in real images. If production has not reached
+equilibrium, the age is drawn from 0 to the age of the surface (our simplification: production fell fast before 3 Gyr
+ago). Equilibrium densities are counts of craters that are still visible, so no crater in equilibrium is drawn with more
+wear than `_LAST_SEEN_WEAR`.
 
-Craters are ordered by age. As diffusivity grows with size as D^0.9, an order by wear would differ: it would lay a large
-young crater before a small old one, which it has in truth removed.
+Craters are ordered by age, not by wear: diffusivity grows with size as D^0.9, so an order by wear could place a large
+young crater before a small old one that it has removed.
 """
 
 import dataclasses
@@ -30,37 +30,37 @@ from perilune_render.terrain.size_frequency import (
 from perilune_shared.geometry.frames import Array
 
 ORIGINS = ("primary", "secondary", "elevation model")
-"""What `Craters.origin` counts: drawn alone, drawn in a cluster, or read from a catalogue of real ground."""
+"""Values of `Craters.origin`: drawn alone, drawn in a cluster, or read from a catalogue of real ground."""
 _LAST_SEEN_WEAR = 0.11
-"""K/R^2 at which a crater has lost three quarters of its depth and is hardly counted any more."""
+"""Wear K/R^2 at which a crater has lost three quarters of its depth and is rarely counted."""
 _LARGEST_SECONDARY_M = 30.0
 _PER_CLUSTER = 40
 
 
 @dataclass(frozen=True, slots=True)
 class Craters:
-    """N craters, oldest first: the order in which they are laid on the ground."""
+    """N craters, oldest first: the order in which they are stamped on the ground."""
 
     x_m: Array
-    """Centre, O_L, metres (N,)."""
+    """x of the centres, O_L, metres (N,)."""
     y_m: Array
-    """Centre, O_L, metres (N,)."""
+    """y of the centres, O_L, metres (N,)."""
     diameter_m: Array
-    """Rim to rim, metres (N,)."""
+    """Diameters from rim to rim, metres (N,)."""
     fresh_depth_m: Array
-    """Rim to floor when it formed, metres (N,); NaN where not known."""
+    """Depths from rim to floor at formation, metres (N,); NaN if unknown."""
     rim_height_m: Array
-    """Crest over the plain when it formed, metres (N,)."""
+    """Heights of the rim crest above the plain at formation, metres (N,)."""
     age_myr: Array
-    """Time since it formed, Myr (N,); NaN where not known."""
+    """Times since formation, Myr (N,); NaN if unknown."""
     wear_m2: Array
-    """Topographic diffusivity times age, K, square metres (N,)."""
+    """Wear K, topographic diffusivity times age, square metres (N,)."""
     flat_floor: np.ndarray
-    """Whether it formed with a flat floor (N,)."""
+    """Whether the crater formed with a flat floor (N,)."""
     outline: Array
-    """Cosine and sine parts of waves 2 to 4 in the rim's radius, over the radius (N, 6)."""
+    """Cosine and sine coefficients of harmonics 2 to 4 of the rim's radius, relative to the radius (N, 6)."""
     crest: Array
-    """Cosine and sine parts of waves 1 to 3 in the rim's height, over that height (N, 6)."""
+    """Cosine and sine coefficients of harmonics 1 to 3 of the rim's height, relative to the height (N, 6)."""
     origin: np.ndarray
     """Index into ORIGINS (N,)."""
 
@@ -68,11 +68,11 @@ class Craters:
         return len(self.x_m)
 
     def chosen(self, which: np.ndarray) -> "Craters":
-        """The craters at some places, or where a mask is true."""
+        """The craters selected by indices or by a mask."""
         return Craters(*(getattr(self, field.name)[which] for field in dataclasses.fields(self)))
 
     def joined(self, other: "Craters") -> "Craters":
-        """These craters, then others."""
+        """These craters followed by `other`."""
         names = [field.name for field in dataclasses.fields(self)]
         return Craters(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
@@ -88,7 +88,7 @@ class Craters:
         profile: str = "fassett_thomson",
         origin: str = "primary",
     ) -> "Craters":
-        """Perfectly round craters with rounded floors, in the order given; arrays (N,)."""
+        """Circular craters with bowl-shaped floors, in the given order; arrays (N,)."""
         n = len(x_m)
         rim = fresh_rim_height_m(diameter_m, fresh_depth_m, profile)
         still = np.zeros((n, 6))
@@ -100,17 +100,17 @@ class Craters:
 def diffusivity_m2_per_myr(diameter_m: Array) -> Array:
     """Topographic diffusivity at the scale of a crater, m^2/Myr.
 
-    5.5 m^2/Myr at 1 km (Fassett & Thomson 2014, doi 10.1002/2014JE004698); its fall with size as D^0.9 is taken second
-    hand, without a primary source.
+    5.5 m^2/Myr at 1 km (Fassett & Thomson 2014, doi 10.1002/2014JE004698). The dependence on size as D^0.9 is
+    from a secondary source, without a primary source.
     """
     return 5.5 * (np.asarray(diameter_m) / 1000) ** 0.9
 
 
 def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: float | None = None) -> Craters:
-    """The population of a scene with seed `seed`.
+    """Draw the crater population of a scene from the random seed `seed`.
 
-    Each size is laid only where the grid is fine enough to hold it. `max_diameter_m` leaves out what a real elevation
-    model already shows.
+    A crater is placed only where the grid is fine enough for its size. `max_diameter_m` excludes the sizes that a real
+    elevation model already shows.
     """
     rng = stream(seed, "craters")
     largest = min(config.max_diameter_m, max_diameter_m or np.inf, grid.extent_m / 3)
@@ -126,7 +126,7 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
     n = len(diameter)
     reach = half_m[np.clip(np.searchsorted(edges, diameter, side="right") - 1, 0, len(half_m) - 1)]
     x, y = rng.uniform(-1, 1, (2, n)) * reach
-    # Linear production over the last 3 Gyr: the rate is that of the last billion years.
+    # Production was linear over the last 3 Gyr: use the rate of the last 1 Gyr.
     to_equilibrium = 1000 * _in_bin(equilibrium, diameter) / _in_bin(NeukumProduction(age_gyr=1.0), diameter)
     to_unseen = _LAST_SEEN_WEAR * (diameter / 2) ** 2 / diffusivity_m2_per_myr(diameter)
     surface_myr = 1000 * config.surface_age_gyr
@@ -136,7 +136,7 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
     depth = np.maximum(fresh + 0.02 * diameter * np.clip(rng.normal(size=n), -2, 2), 0.08 * diameter)
     x, y, age, clustered = _cluster(x, y, age, oldest, diameter, reach, config.secondary_share, rng)
     flat_floor = rng.random(n) < config.flat_floor_share
-    # Slow impacts and floors of rock make shallower craters; by how much is a choice of ours.
+    # Secondaries (slow impacts) and craters with floors of rock are shallower; the factor is our choice.
     depth = np.where(clustered | flat_floor, 0.75 * depth, depth)
     craters = Craters(
         x,
@@ -164,17 +164,18 @@ def _cluster(
     share: float,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, Array, np.ndarray]:
-    """Move a share of the small craters into elongated clusters of one age each, as secondaries lie.
+    """Move a share of the small craters into elongated clusters like those of secondaries, each of a single age.
 
-    The size-frequency law stays as it is. Sizes and shapes of the clusters are a choice of ours, by eye beside NAC
-    images. A crater that would leave the part of the grid that can hold it stays where it was.
+    Returns x, y, age and whether each crater was moved (N,). The size-frequency law does not change. We chose sizes and
+    shapes of the clusters by eye, by comparison with NAC images. A crater that would leave the part of the grid that is
+    fine enough for it is not moved.
     """
     chosen = np.flatnonzero((rng.random(len(x)) < share) & (diameter < _LARGEST_SECONDARY_M))
     clustered = np.zeros(len(x), bool)
     if not len(chosen):
         return x, y, age, clustered
     n_clusters = max(len(chosen) // _PER_CLUSTER, 1)
-    # A cluster's size goes with that of its craters: sorted by size, neighbours go together.
+    # Craters sorted by (randomised) size form a cluster with their neighbours, since a cluster scales with its craters.
     chosen = chosen[np.argsort(diameter[chosen] * rng.uniform(0.5, 2, len(chosen)), kind="stable")]
     cluster = np.minimum(np.arange(len(chosen)) * n_clusters // len(chosen), n_clusters - 1)
     first = np.searchsorted(cluster, np.arange(n_clusters))
@@ -188,7 +189,7 @@ def _cluster(
     moved = chosen[held]
     x, y, age = x.copy(), y.copy(), age.copy()
     x[moved], y[moved] = new_x[held], new_y[held]
-    # One age for all, at which the smallest of them is not yet gone.
+    # One age for the whole cluster, at which even the shortest-lived of its craters is still visible.
     youngest = np.minimum.reduceat(oldest[chosen], first) * rng.random(n_clusters)
     age[moved] = youngest[cluster][held]
     clustered[moved] = True
@@ -196,5 +197,5 @@ def _cluster(
 
 
 def _in_bin(law: SizeFrequency, diameter_m: Array) -> Array:
-    """Number in a bin of a tenth of a decade."""
+    """Number per square metre in a bin of a tenth of a decade above a diameter."""
     return law.csfd(diameter_m) - law.csfd(diameter_m * 10**0.1)

@@ -1,4 +1,4 @@
-"""Gradient noise: smooth random waves of one scale on the graded grid (compiled by numba)."""
+"""Gradient noise: smooth random waves of one wavelength on the graded grid (compiled by numba)."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from perilune_render.terrain.grid import Grid, lines_in
 from perilune_shared.geometry.frames import Array
 
 RMS_SLOPE = 0.87
-"""Root mean square slope times wavelength of `add_waves` with amplitude 1, measured over 4 million places."""
+"""RMS slope times wavelength of `add_waves` with amplitude 1, measured at 4 million places."""
 
 
 def add_waves(
@@ -15,14 +15,14 @@ def add_waves(
 ) -> None:
     """Add amplitude times gradient noise of a wavelength to field (n_vertices,), in place.
 
-    Where the grid is too wide to hold the wave it fades out: whole up to a spacing of a sixth of it, half at a third,
-    gone at a half. `finest_m` widens every spacing to at least itself.
+    The wave fades where the grid is too coarse for it: full amplitude up to a spacing of a sixth of the wavelength,
+    half at a third, none from a half. Spacings below `finest_m` count as `finest_m`.
     """
     held = np.clip(1.5 - 3 * np.maximum(grid.spacings_m, finest_m) / wavelength_m, 0, 1)
     if not held.any():
         return
     half = float(grid.half_widths_m[held > 0].max())
-    # The lattice is shifted by a random part of a cell, since gradient noise is zero on its own lattice.
+    # Shift the lattice by a random part of a cell, since gradient noise is 0 at the points of its lattice.
     shift = rng.uniform(0, 1, 2)
     n_cells = int(np.ceil(2 * half / wavelength_m)) + 3
     angle = rng.uniform(0, 2 * np.pi, (n_cells, n_cells))

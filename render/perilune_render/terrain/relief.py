@@ -1,8 +1,9 @@
-"""Self-affine relief beside the craters.
+"""Self-affine relief, in addition to the craters.
 
-A self-affine surface of Hurst exponent H has slopes that fall with wavelength as L^(H-1) (Cai & Fa 2020,
-doi 10.1029/2020JE006429, find H about 0.9 down to metres on the Moon). It is built here as a sum of gradient noise in
-octaves whose amplitudes fall as L^H, from the longest wave down to the shortest that the grid holds at each place.
+The slopes of a self-affine surface with Hurst exponent H vary with wavelength as L^(H-1); Cai & Fa 2020
+(doi 10.1029/2020JE006429) find H about 0.9 down to metres on the Moon. The relief is a sum of octaves of gradient noise
+with amplitudes proportional to L^H, from the longest wavelength down to the shortest that the grid resolves at each
+place.
 """
 
 import numpy as np
@@ -16,12 +17,12 @@ from perilune_shared.geometry.frames import Array
 
 
 def finest_wave_m(grid: Grid) -> float:
-    """The shortest wave that a grid holds anywhere, metres: three vertex spacings."""
+    """The shortest wavelength of a grid, metres: three of its smallest vertex spacings."""
     return 3 * float(grid.spacings_m.min())
 
 
 def check_waves(config: ReliefConfig, grid: Grid) -> None:
-    """Raise UserError where the longest wave is too short for the grid or for the slope's definition (1 m)."""
+    """Raise UserError if the longest wavelength is too short for the grid, or below 1 m, down to which slopes count."""
     least_m = max(finest_wave_m(grid), 1.0)
     if config.longest_wavelength_m < least_m:
         raise UserError(
@@ -37,8 +38,9 @@ def add_relief(
 ) -> None:
     """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
-    `config.rms_slope_deg`, of which the seed draws one value, is that of all octaves down to a metre. Long waves are
-    laid before the craters, which cut them; short ones after, since a worn crater is as rough as the ground about it.
+    The RMS slope, drawn from `config.rms_slope_deg` by the seed, is that of all octaves down to 1 m. Long waves are
+    added before the craters, which cut them. Short ones are added after, since a worn crater is as rough as the ground
+    around it.
     """
     finest = finest_wave_m(grid)
     check_waves(config, grid)
