@@ -31,7 +31,7 @@ _MOST_ROWS = 50_000_000
 _MOST_GROUP_ROWS = 2**21
 _LONGEST_TEXT = 1000
 _MOST_BYTES = 8 * 2**30
-# Limit of the lists in a footer: a schema nested much deeper crashes the process.
+# Limit of the length of lists in a footer: a schema nested deeper than this can crash the process.
 _LONGEST_LIST = 10_000
 _LONGEST_FOOTER_TEXT = 10_000_000
 # Bounds on compression: no row of any table takes fewer bytes, and no data compresses by a larger factor.

@@ -33,7 +33,7 @@ def merge(
     Equal scenes (recipe, seed, Sun, craters) are merged; different scenes with the same name are renamed. The same
     holds for trajectories. A frame in several sources is taken from the first, with its split and labels. Counts,
     splits and the split unit are recomputed from the rows. Raises UserError if kinds, cameras or EXR cameras differ, a
-    licence is not an SPDX expression, or two copies of a frame differ.
+    licence is not an SPDX expression, or two copies of a frame were rendered differently.
     """
     if len(sources) < 2:
         raise UserError("merge", "datasets", len(sources), "at least two")

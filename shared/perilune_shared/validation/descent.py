@@ -107,7 +107,7 @@ def _labels(
             row = int(known[wrong[0]])
             wanted = f"{values[wrong[0]]}, projected from crater and pose"
             yield Fault.of(where, row, name, labels[name][row].as_py(), wanted)
-    # If single labels of a frame are wrong, report the labels; if all are wrong, report the pose.
+    # If all labels of a frame with several labels are wrong, the pose is probably wrong: report it too.
     labelled = np.bincount(frame_of[known], minlength=len(frames))
     lost = np.bincount(frame_of[known[misfit]], minlength=len(frames))
     odd = np.flatnonzero((labelled > 1) & (lost == labelled))
