@@ -105,8 +105,8 @@ def crater_masks(
 ) -> list[CraterMask]:
     """Compute the masks of N rim circles in O_C: centres (N, 3) and radii (N,) in metres, unit normals (N, 3).
 
-    Masks and depth_m (h, w) are in the pixels of `camera`; depth is along its optical axis. A mask has no
-    pixels if the rim is outside the image or not wholly in front of the camera.
+    Masks and depth_m (h, w) are in the pixels of `camera`; depth is along its optical axis. A mask has no pixels
+    if the rim is outside the image or not wholly in front of the camera.
     """
     rays = camera.rays(camera.pixel_centres())
     size = np.array([camera.width_px, camera.height_px])

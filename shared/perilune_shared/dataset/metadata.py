@@ -30,7 +30,7 @@ _Row = tuple[float, float, float]
 
 
 def _printable(text: str) -> str:
-    """Return `text` unchanged. Raises ValueError on unprintable characters: controls, bidirectional marks, line breaks."""
+    """Return `text` unchanged. Raises ValueError on unprintable characters, e.g. controls and bidirectional marks."""
     if not text.isprintable():
         raise ValueError("text should be printable")
     return text

@@ -1,4 +1,4 @@
-"""SHA256SUMS: the hashes of all files of a dataset except frames, whose hashes are in the manifest.
+"""SHA256SUMS: the hashes of all files of a dataset except frame files, whose hashes are in the manifest.
 
 The file has the format of `sha256sum`; check it with `sha256sum -c SHA256SUMS`.
 """
