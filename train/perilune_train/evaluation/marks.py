@@ -18,7 +18,7 @@ _CHARACTER_PX, _LINE_PX = 9, 22
 def mark_files(folder: Path, names: Iterable[str], mark: str) -> None:
     """Write `mark` on pictures (a red band above), Markdown pages and Parquet tables (metadata) of a folder.
 
-    Skips files that do not exist. Does nothing where `mark` is empty.
+    Skips files that do not exist. Does nothing if `mark` is empty.
     """
     for path in (folder / name for name in names) if mark else ():
         if not path.is_file():
@@ -40,7 +40,7 @@ def mark_table(path: Path, mark: str) -> None:
 
 
 def mark_picture(path: Path, mark: str) -> None:
-    """Put `mark` in white on a red band above a PNG. Raises OSError where it cannot be read or written."""
+    """Put `mark` in white on a red band above a PNG. Raises OSError if it cannot be read or written."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise OSError(f"{path}: not read")

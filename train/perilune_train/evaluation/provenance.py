@@ -172,7 +172,7 @@ def check_terrain(
 def check_calibration(
     provenance: Provenance, calibrated: frozenset[TerrainUse], dataset: Dataset, allow_overlap: bool = False
 ) -> TerrainCheck:
-    """Compare the ground of a calibration on `dataset` with the test ground of the dataset and of the run itself.
+    """Compare the terrain of a calibration on `dataset` with the test terrain of the dataset and of the run.
 
     Raises UserError naming the scenes of any overlap, like `check_terrain`, unless `allow_overlap`.
     """
@@ -189,7 +189,7 @@ def _compared(
     known: bool,
     allow_overlap: bool,
 ) -> TerrainCheck:
-    """The check of two sets of ground; `by_design`: scenes of one protocol may be in both."""
+    """Check two sets of terrain for overlap; `by_design`: scenes of one protocol may be in both."""
     used: dict[str, list[TerrainUse]] = {}
     for use in sorted(fitted):
         used.setdefault(use.sha256, []).append(use)

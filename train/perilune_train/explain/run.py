@@ -108,7 +108,7 @@ def explain_run(
     draw_bars(run.root / "pcc_detect.png", table, _DETECT_BARS, _DETECT_TITLE)
     draw_bars(run.root / "pcc_navigate.png", table, _NAVIGATE_BARS, _NAVIGATE_TITLE)
     console.print(PCC1_SIGN, markup=False)
-    once = table[table["measure"] != "pcc1_craterness"]  # It is undefined where pcc1_background is.
+    once = table[table["measure"] != "pcc1_craterness"]  # Undefined whenever pcc1_background is.
     undefined = int(once["undefined"].sum())
     if undefined:
         console.print(f"{undefined} of {int(once['count'].sum())} correlations undefined: a mask was constant")
@@ -139,7 +139,7 @@ def _check_terrain(
 ) -> tuple[dict[str, str], dict[str, float | int | str | None]]:
     """Marks and entries of metrics.json by network, from each network's checkpoint and dataset.
 
-    Raises UserError where a network was fitted to terrain of its dataset's test frames, unless `allow_overlap`.
+    Raises UserError if a network was fitted to terrain of its dataset's test frames, unless `allow_overlap`.
     """
     marks: dict[str, str] = {}
     metrics: dict[str, float | int | str | None] = {}

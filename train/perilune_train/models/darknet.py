@@ -14,7 +14,7 @@ _STEM_CHANNELS = 32
 
 
 def scaled(channels: int, width: float) -> int:
-    """Number of channels at a width factor: a multiple of 8, at least 8; at width 1 the number itself."""
+    """Number of channels at a width factor: a multiple of 8, at least 8; unchanged at width 1."""
     return max(8, round(channels * width / 8) * 8)
 
 

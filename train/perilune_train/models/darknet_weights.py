@@ -47,7 +47,7 @@ class Slot:
     """A place in the file, and the tensor of a network that belongs there."""
 
     name: str
-    """For messages: number of the convolution, from 0, and which of its tensors."""
+    """Number of the convolution, from 0, and which of its tensors; for messages."""
     tensor: Tensor
     """The network's own tensor."""
     floats: int
@@ -55,15 +55,15 @@ class Slot:
 
 
 def backbone_slots(backbone: AttentionDarknet53) -> list[Slot]:
-    """The backbone's tensors in the order of darknet53.conv.74; attention gates have no place in it."""
+    """The backbone's tensors in the order of darknet53.conv.74, without attention gates."""
     return _numbered(_backbone_blocks(backbone))
 
 
 def network_slots(network: YOLOv3, filters: int = _FILTERS) -> list[Slot]:
     """All tensors of a network with strides 8, 16, 32 in the order of yolov3.cfg, its output layers `filters` wide.
 
-    The order is that of execution: after the backbone, for strides 32, 16 and 8, the branch, the head and, but for
-    the last, the lateral convolution to the next. Raises ValueError for other strides.
+    The order is that of execution: the backbone, then for strides 32, 16 and 8 the branch, the head and, except for
+    the last, the lateral convolution to the next stride. Raises ValueError for other strides.
     """
     if network.strides != (8, 16, 32):
         raise ValueError(f"strides are {network.strides}, not (8, 16, 32)")

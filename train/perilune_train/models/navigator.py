@@ -156,9 +156,9 @@ def blurred(images: Tensor, size_px: int) -> Tensor:
 def local_shift(pair: Tensor, window_px: int = 25) -> Tensor:
     """Shift from the first to the second of two images (N, 2, H, W): (N, 2, H, W), pixels along x and y.
 
-    For a square window around each pixel, one least-squares step (Lucas & Kanade 1981) that explains the change of
-    brightness by the slope, damped where slopes are weak. Valid for shifts below the width of the images' finest
-    features.
+    Computes, for a square window around each pixel, one least-squares step (Lucas & Kanade 1981) that explains the
+    change of brightness by the slope, damped where slopes are weak. Valid for shifts below the width of the images'
+    finest features.
     """
     slope_y, slope_x = torch.gradient(pair.mean(1, keepdim=True), dim=(2, 3))
     lost = pair[:, :1] - pair[:, 1:]

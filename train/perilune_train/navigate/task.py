@@ -183,7 +183,7 @@ class NavigationTask(lightning.LightningModule):
         return DataLoader(self.validation_descents, batch_size=None)  # type: ignore[arg-type]
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
-        return batch  # sequences are NumPy arrays; the steps move what they need
+        return batch  # Sequences are NumPy arrays; the steps move what they need.
 
     def on_train_epoch_start(self) -> None:
         for name, parameter in self.network.backbone.named_parameters():

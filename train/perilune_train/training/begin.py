@@ -18,7 +18,7 @@ from perilune_train.training.runs import RunFolder, is_first_process
 
 State = Literal["new", "resume", "finished"]
 Hashes = Mapping[str, str | None]
-"""SHA-256 of each input of a run; None where it is missing."""
+"""SHA-256 of each input of a run; None if it is missing."""
 
 _NO_RESULT = {"detect.workers", "detect.checkpoint_minutes"}
 """Settings that change how a run proceeds, but not its result."""
@@ -27,7 +27,7 @@ _AGREEMENT = "perilune/run"
 
 
 def hashes_of(inputs: Mapping[str, Path | None]) -> dict[str, str | None]:
-    """Hash of each input: of a dataset (a folder) that of its SHA256SUMS, of a file its own."""
+    """Hash of each input: of the SHA256SUMS of a dataset (a folder), or of the file itself."""
     files = {name: path / SUMS_NAME if path is not None and path.is_dir() else path for name, path in inputs.items()}
     return {name: sha256_of(file) if file is not None and file.is_file() else None for name, file in files.items()}
 
@@ -125,7 +125,7 @@ def check_settings(run: RunFolder, task: str, config: Section) -> None:
 def _check_inputs(run: RunFolder, inputs: Hashes, missing_is_fine: bool) -> None:
     """Raise UserError naming the first input that is not the one the run began with.
 
-    With `missing_is_fine` an input that is missing now, or was missing then, is not compared.
+    With `missing_is_fine` an input that is missing now, or was missing at the start of the run, is not compared.
     """
     if not run.inputs.is_file():
         return

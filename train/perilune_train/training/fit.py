@@ -62,7 +62,7 @@ class KeepBest(Callback):
 class KeepLast(Callback):
     """Save the whole state after every epoch and, with `minutes`, within an epoch at this interval.
 
-    If a run is resumed within an epoch, call its `on_train_epoch_start`, which Lightning does not.
+    If a run is resumed within an epoch, call the task's `on_train_epoch_start`, which Lightning does not.
     """
 
     def __init__(self, run: RunFolder, minutes: float | None):

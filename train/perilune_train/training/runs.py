@@ -42,7 +42,7 @@ class RunFolder:
 
     @property
     def best(self) -> Path:
-        """Weights with the best validation figure, as `save_weights` writes them."""
+        """Weights with the best validation metric, as `save_weights` writes them."""
         return self.root / "checkpoints" / "best.ckpt"
 
     @property

@@ -57,7 +57,7 @@ class Trained:
     """A finished detection run."""
 
     network: YOLOv3
-    """Its best weights, in evaluation mode, on the CPU."""
+    """Network with the run's best weights, in evaluation mode, on the CPU."""
     config: DetectConfig
     """Its settings."""
     threshold: float

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Curve:
-    """Precision and recall as the score threshold falls."""
+    """Precision and recall at falling score thresholds."""
 
     scores: Array
     """Thresholds, falling (K,)."""
@@ -49,7 +49,7 @@ class Curve:
         return np.append(np.diff(self.scores) != 0, True)[: len(self.scores)]
 
     def best_threshold(self) -> float:
-        """The score at which F1 is highest, 1 without detections."""
+        """The score threshold of highest F1; 1 without detections."""
         if not len(self.scores):
             return 1.0
         return float(self.scores[int(f1_score(self.precision, self.recall).argmax())])

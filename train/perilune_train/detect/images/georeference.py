@@ -24,7 +24,7 @@ MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 """Longitude and latitude, degrees, on the sphere of the Moon's mean radius."""
 _CORNERS = 32
 _GRID = 17
-"""Number of sample pixels per side, to test whether an image is on its map; a disc may leave its corners empty."""
+"""Number of sample points per side, to test whether an image is on its map; a disc may leave its corners empty."""
 _DECIMALS = 8
 """Decimals of degrees: 0.3 mm on the ground."""
 
