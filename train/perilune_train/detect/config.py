@@ -135,7 +135,7 @@ class DetectConfig(Section):
     """best.ckpt of a detect run, usually wider, to distil from in addition to the labels. The strides and in_channels
     must be the same; its anchors are used."""
     batch_size: Count = 8
-    """Frames in a training step."""
+    """Frames of each process in a training step."""
     learning_rate: Positive = 1e-3
     """Peak learning rate of AdamW: linear warm-up, then a cosine down to a hundredth."""
     warmup_steps: Annotated[int, Field(ge=0)] = 100

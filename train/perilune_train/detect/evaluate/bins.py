@@ -40,7 +40,7 @@ class BinFigures:
     low: float
     """Lower limit, included."""
     high: float
-    """Upper limit; included in the last bin only."""
+    """Upper limit; included only in the last bin and in the paper's largest radius bin (up to 50 px)."""
     frames: int
     """Number of frames with a selected label in the bin."""
     labels: int
