@@ -29,14 +29,14 @@ def vertices(grid: Grid, height_m: np.ndarray) -> np.ndarray:
 
 
 def coarser(grid: Grid, step: int) -> Grid:
-    """A grid with every `step`-th ring of about 1 / step as many vertices each, over the same ground."""
+    """A grid over the same ground with every `step`-th ring and about 1 / step of the vertices per ring."""
     n_half = max(grid.n_half // step, 1)
     rings = grid.half_widths_m[::-step][::-1] if len(grid.half_widths_m) > 1 else grid.half_widths_m
     return Grid(n_half, np.unique(np.concatenate([grid.half_widths_m[:1], rings])))
 
 
 def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = True) -> None:
-    """Write ground and boulders, in O_L and metres; `step` widens the ground's spacing by so much."""
+    """Write a mesh of ground and boulders in O_L, metres; `step` multiplies the ground's vertex spacing."""
     grid = scene.grid if step == 1 else coarser(scene.grid, step)
     height = scene.height_m if step == 1 else value_at(scene.height_m, scene.grid, *grid.vertices_xy())
     faces = grid.quads()
@@ -50,9 +50,9 @@ def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = Tru
 
 
 def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
-    """Write the heights as a float32 GeoTIFF of square pixels, north up, azimuthal equidistant about the site.
+    """Write heights, metres, as a float32 GeoTIFF: square pixels, north up, azimuthal equidistant about the site.
 
-    The site is at height 0. Raises UserError where that makes more than 20,000 pixels a side.
+    The site is at height 0. Raises UserError unless a side has 1 to 20,000 pixels.
     """
     n = int(np.floor(scene.grid.extent_m / pixel_m))
     if not 1 <= n <= _LARGEST_SIDE:

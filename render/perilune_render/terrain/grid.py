@@ -1,12 +1,12 @@
-"""The graded grid: an even square about the site, and square rings about it that widen with distance.
+"""The graded grid: an even square around the site, and square rings around it whose spacing grows with distance.
 
-Every ring has as many vertices as the inner square's edge, so that a ring of twice the half-width has twice the
-spacing; the rings' distances grow with it. Ring after ring joins vertex to vertex: the mesh has no hanging vertex and
-is watertight. Each place gets the spacing that the lowest altitude needs from which any descent can see it.
+Every ring has as many vertices as the inner square's border, so a ring of twice the half-width has twice the spacing;
+the distance between rings grows likewise. Neighbouring rings are joined vertex to vertex, so the mesh has no hanging
+vertices and no gaps. The spacing at each place is set by the lowest altitude from which a trajectory can see it.
 
-Vertices are kept in one list: the inner square row by row (y, then x), then ring by ring, each from its corner at -x,
--y counter-clockwise. `lines_in` finds those in a window as straight lines of evenly spaced vertices, which is all that
-laying craters and waves needs to know.
+Vertices are stored in one list: the inner square row by row (y, then x), then ring by ring, each counter-clockwise from
+its corner at -x, -y. `lines_in` returns the vertices in a window as straight lines of evenly spaced vertices, which
+stamping craters and adding waves are based on.
 """
 
 from dataclasses import dataclass
@@ -25,16 +25,16 @@ _WIDEST_RAD = np.radians(80)
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Where the vertices stand in O_L."""
+    """Positions of the vertices in O_L."""
 
     n_half: int
-    """Steps from the middle of the inner square to its edge."""
+    """Number of vertex spacings from the centre of the inner square to its border."""
     half_widths_m: Array
-    """Half-widths of the inner square and of every ring, ascending, metres (n_rings + 1,)."""
+    """Half-widths of the inner square and of the rings, ascending, metres (n_rings + 1,)."""
 
     @classmethod
     def even(cls, half_width_m: float, n_half: int) -> "Grid":
-        """A grid of one spacing, without rings."""
+        """A grid of uniform spacing, without rings."""
         return cls(n_half, np.array([half_width_m]))
 
     @property
@@ -44,27 +44,27 @@ class Grid:
 
     @property
     def n_vertices(self) -> int:
-        """Vertices of inner square and rings."""
+        """Number of vertices."""
         return (2 * self.n_half + 1) ** 2 + 8 * self.n_half * (len(self.half_widths_m) - 1)
 
     @property
     def spacings_m(self) -> Array:
-        """Larger of the spacings along and across, of the inner square and of every ring, metres (n_rings + 1,)."""
+        """Spacing of the inner square and each ring, the larger of along and across, metres (n_rings + 1,)."""
         across = np.diff(self.half_widths_m, prepend=self.half_widths_m[0] * (1 - 1 / self.n_half))
         return np.maximum(self.half_widths_m / self.n_half, across)
 
     def spacing_at(self, distance_m: Array | float) -> Array:
-        """Vertex spacing in metres at distances max(|x|, |y|) from the site."""
+        """Vertex spacing, metres, at distances max(|x|, |y|) from the site, metres."""
         ring = np.searchsorted(self.half_widths_m, distance_m)
         return self.spacings_m[np.minimum(ring, len(self.half_widths_m) - 1)]
 
     def half_width_for(self, spacing_m: float) -> float:
-        """Half side in metres of the square in which the spacing is at most `spacing_m`; 0 where it nowhere is."""
+        """Half side, metres, of the square in which the spacing is at most `spacing_m`; 0 if there is none."""
         fine = self.spacings_m <= spacing_m * (1 + 1e-9)
         return float(self.half_widths_m[fine].max()) if fine.any() else 0.0
 
     def vertices_xy(self) -> tuple[Array, Array]:
-        """x and y of all vertices in metres (n_vertices,) each."""
+        """x and y of all vertices, metres, (n_vertices,) each."""
         even = np.linspace(-1, 1, 2 * self.n_half + 1) * self.half_widths_m[0]
         up = -1 + np.arange(2 * self.n_half) / self.n_half
         one = np.ones_like(up)
@@ -76,7 +76,7 @@ class Grid:
         return x, y
 
     def quads(self) -> np.ndarray:
-        """Faces (n_faces, 4) int32, counter-clockwise from above."""
+        """Vertex indices of the faces (n_faces, 4) int32, counter-clockwise from above."""
         side = 2 * self.n_half + 1
         index = np.arange(side * side, dtype=np.int32).reshape(side, side)
         inner = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
@@ -90,7 +90,7 @@ class Grid:
 
 
 def view_angle(camera: Camera, flight: FlightConfig) -> float:
-    """Largest angle from straight down, along either axis, under which a frame sees the ground, radians."""
+    """Largest angle from straight down, along either image axis, at which a frame shows the ground, radians."""
     half_view = max(
         max(camera.cx_px, camera.width_px - camera.cx_px) / camera.fx_px,
         max(camera.cy_px, camera.height_px - camera.cy_px) / camera.fy_px,
@@ -99,10 +99,10 @@ def view_angle(camera: Camera, flight: FlightConfig) -> float:
 
 
 def reach_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
-    """Largest |x| or |y| from the site that a frame at this nominal altitude can see, metres.
+    """Largest |x| or |y| from the site that a frame at this nominal altitude can show, metres.
 
-    The camera's axes follow those of O_L up to its small turns, so that a frame covers a square along the axes. Counts
-    three standard deviations of tilt, of turn and of position, and a twentieth for relief.
+    The camera's axes are parallel to those of O_L except for small rotations, so a frame covers a square along the
+    axes. Includes three standard deviations of tilt, rotation and position, and a margin of a twentieth for relief.
     """
     turn = min(3 * np.radians(flight.attitude_sigma_deg), np.pi / 4)
     share = (altitude_m - flight.end_altitude_m) / (flight.start_altitude_m - flight.end_altitude_m)
@@ -112,9 +112,9 @@ def reach_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
 
 
 def graded_grid(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> Grid:
-    """The grid for a camera and a flight: spacing at most `terrain.spacing_px` of the smallest pixel at every place.
+    """The grid for a camera and a flight: at every place the spacing is at most `terrain.spacing_px` smallest pixels.
 
-    Raises UserError where that needs more than `terrain.max_vertices`, or where frames could see the horizon.
+    Raises UserError if that needs more than `terrain.max_vertices`, or if frames could show the horizon.
     """
     if view_angle(camera, flight) > _WIDEST_RAD:
         wide = f"frames reach {np.degrees(view_angle(camera, flight)):.0f} degrees from straight down"
@@ -132,9 +132,9 @@ def graded_grid(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> 
 
 
 def _wider(spacing_px: float, n_vertices: int, most: int, camera: Camera, flight: FlightConfig) -> str:
-    """What to set where a spacing needs more than `most` vertices: the least allowed spacing, to 0.01."""
+    """The advice if a spacing needs more than `most` vertices: the smallest spacing allowed, rounded up to 0.01."""
     hundredths = int(np.ceil(100 * spacing_px * np.sqrt(n_vertices / most)))
-    # The number of vertices falls a little slower or faster than the square of the spacing.
+    # The number of vertices is only roughly proportional to 1 / spacing^2.
     while hundredths > 1 and _grid_of((hundredths - 1) / 100, camera, flight).n_vertices <= most:
         hundredths -= 1
     while hundredths <= 100 * LARGEST_SPACING_PX:
@@ -145,10 +145,10 @@ def _wider(spacing_px: float, n_vertices: int, most: int, camera: Camera, flight
 
 
 def _grid_of(spacing_px: float, camera: Camera, flight: FlightConfig) -> Grid:
-    """The grid of a spacing in pixels, whatever its number of vertices."""
+    """The grid of a spacing in pixels, with any number of vertices."""
     altitude = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, 400)
     reach = np.maximum.accumulate(reach_m(camera, flight, altitude))
-    # The ground may rise towards the camera by a twentieth of the altitude too.
+    # The ground may also rise towards the camera by a twentieth of the altitude.
     lowest = np.maximum(0.95 * altitude - 3 * flight.position_sigma_m, 0.2 * altitude)
     spacing = spacing_px * lowest / max(camera.fx_px, camera.fy_px)
     n_half = int(np.ceil((reach / spacing).max()))
@@ -168,10 +168,10 @@ def _put(lines, row, x, y, dx, dy, first, number, ring):
 
 @njit()
 def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
-    """Write the vertices within a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns their number.
+    """Write the vertices in a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns the number of lines.
 
-    A line is x, y of its first vertex, the step in x and in y, the first vertex, their number, and the ring (0 is the
-    inner square).
+    A line is: x and y of its first vertex, steps in x and y, index of its first vertex, number of vertices, and ring (0
+    is the inner square).
     """
     count = 0
     n = n_half
@@ -214,7 +214,7 @@ def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
 
 @njit()
 def place_in_ring(x, y, n_half):
-    """Place along the square ring through (x, y), counted in vertices from the corner at -x, -y, with fractions."""
+    """Position along the square ring through (x, y), in vertices from the corner at -x, -y, fractional."""
     distance = max(abs(x), abs(y))
     if y <= -distance:
         side, along = 0, x
@@ -229,7 +229,7 @@ def place_in_ring(x, y, n_half):
 
 @njit()
 def vertex_of_ring(ring, place, n_half):
-    """Index of a vertex by its ring (0 is the inner square's edge) and its place in it from the corner at -x, -y."""
+    """Index of a vertex from its ring (0 is the inner square's border) and position from the corner at -x, -y."""
     n = n_half
     place %= 8 * n
     if ring > 0:

@@ -1,4 +1,4 @@
-"""What became of each crater on the finished ground: rim plane and depth."""
+"""Measure each crater on the finished ground: rim plane and depth."""
 
 from dataclasses import dataclass
 
@@ -14,18 +14,18 @@ _N_RIM = 16
 
 @dataclass(frozen=True, slots=True)
 class Rims:
-    """The rims of N craters as they are found on the ground."""
+    """Measured rims of N craters."""
 
     z_m: Array
     """Mean height of the rim, O_L, metres (N,)."""
     normal: Array
     """Unit normal of the plane through the rim, O_L (N, 3)."""
     depth_m: Array
-    """Mean height of the rim less that of the floor (the inner fifth), less the older ground's sag, at least 0 (N,)."""
+    """Mean height of the rim minus that of the floor (inner fifth) and minus `Laid.sag_m`, at least 0, metres (N,)."""
 
 
 def value_at(field: Array, grid: Grid, x_m: Array | float, y_m: Array | float) -> Array:
-    """Values of a field (n_vertices,) at places of any shape, bilinear between vertices; the edge's value outside."""
+    """Values of a field (n_vertices,) at places of any shape, interpolated bilinearly; outside, the border's value."""
     x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
     found = _values_at(field, grid.n_half, grid.half_widths_m, np.ravel(x), np.ravel(y))
     return found.reshape(x.shape)
@@ -34,7 +34,8 @@ def value_at(field: Array, grid: Grid, x_m: Array | float, y_m: Array | float) -
 def measure_rims(height_m: Array, grid: Grid, craters: Craters, sag_m: Array | float = 0.0) -> Rims:
     """Fit a plane to 16 points of each rim by least squares, and measure the depth below it.
 
-    `sag_m` (N,) is taken off the depth: a worn crater on the floor of a large one is not as deep as that one's bowl.
+    `sag_m` (N,) is subtracted from the depth: the bowl of a large old crater does not count as depth of a worn small
+    crater on its floor.
     """
     angle = 2 * np.pi * np.arange(_N_RIM) / _N_RIM
     cos, sin = np.cos(angle), np.sin(angle)

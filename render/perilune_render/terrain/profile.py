@@ -1,23 +1,23 @@
 """Crater profiles, fresh and worn, as tables over distance and wear.
 
-With x = r/R a fresh profile is h = h_rim rim(x) + d bowl(x): rim and ejecta of height 1 at the crest, and a bowl of
-depth 1 below it. Both parts are smooth to first order everywhere: a kink at the crest or at the blanket's end renders
-as a ring.
+With x = r/R a fresh profile is h = h_rim rim(x) + d bowl(x). `rim` holds rim and ejecta, of height 1 at the crest;
+`bowl` is a bowl of depth 1 below the crest. Both have continuous slopes everywhere, since a kink at the crest or at the
+end of the ejecta blanket would render as a ring.
 
 - `fassett_thomson`: Fassett & Thomson 2014, eq. 4 (doi 10.1002/2014JE004698). Deviations: the outer polynomial is
-  scaled by 13 % so that it meets the crest (as printed it leaves a step of 0.004 D); crest and blanket's end are
-  rounded by cubics, where the source has a flat crest and ends at x = 1.5 with a slope; the bowl is scaled to the
-  wanted depth and its floor rounded by a soft minimum, where the source cuts it flat. `flat` keeps that cut, softened.
-- `pangu`: a parabolic bowl, a cubic flank and ejecta that thin as x^-3, as the simulator PANGU has it (Martin, Parkes
-  & Dunstan 2014, doi 10.1109/TAES.2014.120282, taken second hand). Deviations: its printed constants beta and h3 are
-  not used, since they give unrealistic shapes; the crest is rounded, and the ejecta end at REACH.
+  scaled by 13 % to meet the crest (as printed it leaves a step of 0.004 D). Cubics round the crest and the end of the
+  blanket, where the source has a flat crest and ends at x = 1.5 with a slope. The bowl is scaled to the given depth,
+  and a soft minimum rounds its floor, where the source cuts it flat. `flat` keeps that cut, softened.
+- `pangu`: a parabolic bowl, a cubic flank and ejecta that thin as x^-3, as in the simulator PANGU (Martin, Parkes
+  & Dunstan 2014, doi 10.1109/TAES.2014.120282, from a secondary source). Deviations: its printed constants beta and h3
+  are not used, since they give unrealistic shapes; the crest is rounded, and the ejecta end at REACH.
 
-Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solved exactly on a radial grid; with x =
-r/R it depends on K/R^2 alone, K = kappa t. The profile is linear in h_rim and d and diffusion is linear too, so that a
-table for each part serves all craters. One more holds how much of the older ground the crater has removed, diffused
-likewise: its edge widens with wear and leaves no ridge. As a bowl is steeper than its flank, wear drives the crest
-outwards: `crest` says how far, so that a crater can be laid with its crest, as it is today, on the circle that its
-label says.
+Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solved exactly on a radial grid. With x = r/R
+it depends on K/R^2 alone, K = kappa t. The profile is linear in h_rim and d, and diffusion is linear, so one table for
+each part serves all craters. Another table holds the share of the older ground that the crater has removed. It is
+diffused likewise, so that its edge widens with wear and leaves no ridge. A bowl is steeper than its flank, so wear
+moves the crest outwards. `crest` holds how far, so that a crater is stamped with its current crest on its label's
+circle.
 """
 
 import functools
@@ -30,9 +30,9 @@ from scipy import ndimage
 from perilune_shared.geometry.frames import Array
 
 REACH = 3.0
-"""Profiles are cut at this distance over the radius."""
+"""Distance at which profiles end, crater radii."""
 DEPTH_OVER_RIM = np.linspace(1.5, 9.0, 16)
-"""Fresh depths over the fresh rim's height for which the crest's place is tabulated."""
+"""Ratios of fresh depth to fresh rim height for which the crest's radius is tabulated."""
 _FARTHEST_CREST = 1.5
 _DOMAIN, _N_RADIAL = 6.0, 600
 _CREST = 0.036822
@@ -41,22 +41,22 @@ LEAST_WEAR, MOST_WEAR, N_WEAR = 2e-4, 0.6, 56
 
 @dataclass(frozen=True, slots=True)
 class ProfileTables:
-    """Tables over wear (rows, even in log K/R^2) and distance (columns, even in x from 0 to REACH)."""
+    """Tables over wear (rows, evenly spaced in log K/R^2) and distance (columns, evenly spaced in x, 0 to REACH)."""
 
     rim: Array
-    """Rim and ejecta over the fresh rim's height (N_WEAR, n_x)."""
+    """Height of rim and ejecta relative to the fresh rim height (N_WEAR, n_x)."""
     bowl: Array
-    """Bowl over the fresh depth (N_WEAR, n_x)."""
+    """Height of the bowl, at most 0, relative to the fresh depth (N_WEAR, n_x)."""
     flat_bowl: Array
-    """The same of a crater with a flat floor (N_WEAR, n_x)."""
+    """As `bowl`, for a crater with a flat floor (N_WEAR, n_x)."""
     removed: Array
-    """Share of the older ground that is gone (N_WEAR, n_x)."""
+    """Share of the older ground that is removed (N_WEAR, n_x)."""
     crest: Array
-    """Where the crest has moved to, over the first radius, for DEPTH_OVER_RIM (N_WEAR, len(DEPTH_OVER_RIM))."""
+    """Radius of the crest relative to the fresh one, for each DEPTH_OVER_RIM (N_WEAR, len(DEPTH_OVER_RIM))."""
 
 
 def fresh_rim(x: Array, profile: str = "fassett_thomson") -> Array:
-    """Rim and ejecta at x = r/R over the crest's height; inside the crest 1."""
+    """Fresh rim and ejecta at x = r/R, relative to the crest's height; 1 inside the crest."""
     x = np.asarray(x, np.float64)
     if profile == "pangu":
         flank = _cubic(x, 1.0, 1.5, 1.0, 0.0, 1.5**-3, -3 * 1.5**-4)
@@ -69,7 +69,7 @@ def fresh_rim(x: Array, profile: str = "fassett_thomson") -> Array:
 
 
 def fresh_bowl(x: Array, profile: str = "fassett_thomson", *, flat: bool = False) -> Array:
-    """Depth below the crest at x = r/R for a depth of 1: -1 at the centre, 0 from the crest on."""
+    """Fresh bowl at x = r/R, relative to the depth: -1 at the centre, 0 from the crest outwards."""
     x = np.asarray(x, np.float64)
     deepest = _sunk(np.zeros(1), profile, flat)
     inside = -_sunk(x, profile, flat) / deepest
@@ -88,7 +88,7 @@ def _outer_slope(x: float) -> float:
 
 
 def _cubic(x: Array, low: float, high: float, y0: float, slope0: float, y1: float, slope1: float) -> Array:
-    """The cubic with given values and slopes at both ends (Hermite)."""
+    """The Hermite cubic with the given values and slopes at both ends."""
     width = high - low
     t = np.clip((x - low) / width, 0, 1)
     return (
@@ -100,7 +100,7 @@ def _cubic(x: Array, low: float, high: float, y0: float, slope0: float, y1: floa
 
 
 def _sunk(x: Array, profile: str, flat: bool) -> Array:
-    """Depth below the crest, not yet scaled to 1 at the centre."""
+    """Depth below the crest, before scaling to 1 at the centre."""
     inner = np.clip(x, 0, 0.98)
     if profile == "pangu":
         shape = 1 - inner**2
@@ -114,11 +114,11 @@ def _sunk(x: Array, profile: str, flat: bool) -> Array:
 
 
 def fresh_depth_m(diameter_m: Array, law: str = "stopar") -> Array:
-    """Rim to floor of a newly formed crater, metres.
+    """Depth of a newly formed crater from rim to floor, metres.
 
-    `stopar`: Stopar et al. 2017, taken second hand; their steps of d/D (0.21 from 400 m, 0.17, 0.15, 0.13 from 40 m;
-    extrapolated to 0.11 and 0.10 below) are joined by lines in log D through the middles of their ranges.
-    `pike`: Pike 1977, taken second hand, 0.196 D^1.01 km with D in km; made for larger craters.
+    `stopar`: Stopar et al. 2017, from a secondary source. Their steps of d/D (0.21 from 400 m, 0.17, 0.15, 0.13 from
+    40 m; extrapolated to 0.11 and 0.10 below) are interpolated linearly in log D between the middles of their ranges.
+    `pike`: Pike 1977, from a secondary source, 0.196 D^1.01 km with D in km; derived for larger craters.
     """
     d = np.asarray(diameter_m, np.float64)
     if law == "pike":
@@ -127,12 +127,12 @@ def fresh_depth_m(diameter_m: Array, law: str = "stopar") -> Array:
 
 
 def fresh_rim_height_m(diameter_m: Array, depth_m: Array, profile: str = "fassett_thomson") -> Array:
-    """Crest over the plain around a newly formed crater, metres.
+    """Height of the crest above the plain around a newly formed crater, metres.
 
-    `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to his depth, which at 1 km is the source's
-    0.0368 D; the source gives that share of D for craters of a kilometre, and with it shallow small craters would be
-    all rim. `pangu`: the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), where that is below
-    Pike's rim height, 0.036 D^1.014 km with D in km; both taken second hand.
+    `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to Pike's depth. At 1 km this is 0.0368 D, the
+    value of the source, which is for craters of 1 km; with that share of D, small shallow craters would be mostly rim.
+    `pangu`: the smaller of the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), and Pike's rim
+    height, 0.036 D^1.014 km with D in km; both from secondary sources.
     """
     if profile == "pangu":
         d = np.asarray(diameter_m, np.float64)
@@ -142,11 +142,11 @@ def fresh_rim_height_m(diameter_m: Array, depth_m: Array, profile: str = "fasset
 
 @functools.cache
 def profile_tables(profile: str = "fassett_thomson") -> ProfileTables:
-    """The tables of a profile, computed once."""
+    """The tables of a profile; cached."""
     step = _DOMAIN / _N_RADIAL
     x = (np.arange(_N_RADIAL) + 0.5) * step
     edges = np.arange(1, _N_RADIAL) * step
-    # Finite volumes: the operator becomes symmetric once scaled by the square root of each ring's area.
+    # Finite volumes: scaling by the square root of each ring's area makes the operator symmetric.
     flow = edges / step
     diagonal = np.zeros(_N_RADIAL)
     diagonal[:-1] -= flow
@@ -181,7 +181,7 @@ def profile_tables(profile: str = "fassett_thomson") -> ProfileTables:
 
 
 def _crests(x: Array, rim: Array, bowl: Array) -> Array:
-    """Highest place of rim + depth bowl for every wear and depth, refined by a parabola through three columns."""
+    """Radius of the maximum of rim + depth x bowl for each wear and depth, refined by a parabola through 3 columns."""
     shape = rim[:, None] + DEPTH_OVER_RIM[None, :, None] * bowl[:, None]
     top = np.clip(shape.argmax(axis=2), 1, len(x) - 2)
     left, here, right = (np.take_along_axis(shape, (top + k)[..., None], axis=2)[..., 0] for k in (-1, 0, 1))
@@ -191,9 +191,8 @@ def _crests(x: Array, rim: Array, bowl: Array) -> Array:
 
 
 def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_thomson") -> Array:
-    """Where the crest of craters (N,) has moved to, over their first radius, for their wear K/R^2 and fresh shape.
-
-    At most 1.5: beyond that there is hardly a crest left.
+    """Radius (N,) of the crest of craters over their fresh radius, from wear K/R^2 and fresh depth over rim height.
+    At most 1.5: with more wear hardly any crest is left.
     """
     tables = profile_tables(profile)
     row = wear_row(wear)
@@ -202,6 +201,6 @@ def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_tho
 
 
 def wear_row(wear: Array) -> Array:
-    """Place of wears K/R^2 among the tables' rows, with fractions."""
+    """Fractional row in the tables of wears K/R^2."""
     within = np.clip(wear, LEAST_WEAR, MOST_WEAR)
     return np.log(within / LEAST_WEAR) / np.log(MOST_WEAR / LEAST_WEAR) * (N_WEAR - 1)

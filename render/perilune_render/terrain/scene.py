@@ -1,4 +1,4 @@
-"""A scene: the whole ground of one site as plain data."""
+"""A scene: ground, craters and boulders of one site as plain data."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,9 +32,9 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.progress import console
 
 _ROUGHNESS_M = 100.0
-"""Shorter waves lie on top of the craters."""
+"""Wavelength below which relief is added on top of the craters, metres."""
 _LEAST_RIM = 0.3
-"""A crater of whose rim younger craters have left less than this share is no crater any more."""
+"""Share of a crater's rim that younger craters must leave; with less, the crater is no longer counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,58 +42,58 @@ class Scene:
     """Ground, craters and boulders of one site, in O_L."""
 
     seed: int
-    """Of the scene's own streams."""
+    """Random seed of the scene."""
     latitude_deg: float
-    """Of the site, degrees."""
+    """Latitude of the site, degrees."""
     longitude_deg: float
-    """Of the site, degrees."""
+    """Longitude of the site, degrees."""
     grid: Grid
-    """Where the vertices stand."""
+    """Positions of the vertices."""
     height_m: np.ndarray
-    """Height of the vertices (n_vertices,) float32, metres; the site is at 0."""
+    """Heights of the vertices (n_vertices,) float32, metres; the site is at 0."""
     albedo: np.ndarray
     """Factor on the reflectance (n_vertices,) float32, about 1."""
     craters: Craters
-    """Real ones of a catalogue, then those that younger ones have not removed, oldest first; crater_id is the place."""
+    """Craters of a catalogue, then generated ones that are still visible, oldest first; crater_id is the index."""
     rims: Rims
-    """The same craters as found on the finished ground."""
+    """Rims of the same craters, measured on the finished ground."""
     boulders: Boulders
-    """Boulders; the boulder_id is the place in this order."""
+    """Boulders; boulder_id is the index."""
     boulder_z_m: Array
-    """Height of the boulders' centres, metres."""
+    """Heights of the boulders' centres, metres."""
     dem_source: str
-    """Elevation model, or 'procedural'."""
+    """Name and hash of the elevation model, or 'procedural'."""
     real: np.ndarray
-    """Whether each vertex (n_vertices,) lies on known ground of the elevation model; false on procedural ground."""
+    """Whether each vertex (n_vertices,) is on known ground of the elevation model; false on procedural ground."""
 
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    """The ground before craters: flat, or an elevation model and what surrounds it."""
+    """The ground before craters: flat, or an elevation model and its surroundings."""
 
     height_m: Array
     """Heights (n_vertices,), metres, changed in place."""
     beyond_m: Array
-    """Distance (n_vertices,) from known ground of the model, metres; infinite without a model."""
+    """Distances (n_vertices,) from known ground of the model, metres; infinite without a model."""
     model: ElevationModel | None
-    """The elevation model."""
+    """The elevation model, if any."""
     around: FittedRelief | None
-    """Relief of procedural ground beyond the model."""
+    """Relief of the procedural ground beyond the model, if there is such ground."""
 
     @property
     def largest_m(self) -> float | None:
-        """Largest diameter to draw, metres; None for that of the configuration."""
+        """Largest diameter of generated craters, metres; None for that of the configuration."""
         return None if self.model is None or self.around is not None else resolved_m(self.model)
 
     def add_waves(self, grid: Grid, relief: ReliefConfig, seed: int, shortest_m: float, longest_m: float) -> None:
-        """Add relief: on a model what it does not resolve, beyond it all wavelengths."""
+        """Add relief: on a model the wavelengths that it does not resolve, beyond it all wavelengths."""
         resolved = np.inf if self.model is None else resolved_m(self.model)
         add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved))
         if self.around is not None:
             add_fitted_relief(self.height_m, grid, self.around, self.beyond_m, seed, shortest_m, longest_m)
 
     def permitted(self, craters: Craters) -> Craters:
-        """The craters that may be laid: those that a model resolves only where they leave its ground as it is."""
+        """The craters that may be added: of sizes that a model resolves, only those that do not change its ground."""
         if self.model is None or self.around is None:
             return craters
         large = craters.diameter_m > resolved_m(self.model)
@@ -104,7 +104,7 @@ class Base:
 
 
 def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, seed: int) -> Base:
-    """Ground of an elevation model and its surroundings, or flat ground."""
+    """The base: an elevation model and its surroundings, or flat ground."""
     if model is None:
         return Base(np.zeros(grid.n_vertices), np.full(grid.n_vertices, np.inf), None, None)
     height, beyond = base_heights(model, grid, terrain.elevation.outside)
@@ -114,7 +114,7 @@ def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, se
 
 
 def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> Scene:
-    """Grow the scene of a seed: base, relief, craters from the oldest to the youngest, boulders."""
+    """Generate the scene of a seed: base, relief, craters from oldest to youngest, boulders."""
     terrain = config.terrain
     grid = graded_grid(config, camera, flight)
     model = read_elevation(Path(terrain.dem)) if terrain.dem is not None else None
@@ -152,9 +152,9 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
 
 
 def check_ground(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> None:
-    """Check grid, waves and the files that the ground is made from, before the work begins. Raises UserError.
+    """Check grid, relief and input files before the ground is generated. Raises UserError.
 
-    Prints what a user should know of an elevation model.
+    Prints remarks on the elevation model.
     """
     grid = graded_grid(config, camera, flight)
     check_waves(config.terrain.relief, grid)

@@ -1,8 +1,8 @@
 """Size-frequency laws of craters and boulders: one class for each published law.
 
-A law gives the cumulative number per square metre of at least a diameter. Like a scipy `rv_continuous` it is also a
-distribution over its support, from `min_diameter_m` to `max_diameter_m`: `count(area)` is the expected number there,
-`rvs(area, rng)` a population of a Poisson number of diameters, `cdf` and `ppf` those of one diameter.
+`csfd` is the cumulative number per square metre of objects of at least a diameter. Like a scipy `rv_continuous`, a law
+is also a distribution over its support, `min_diameter_m` to `max_diameter_m`: `count(area)` is the expected number,
+`rvs(area, rng)` draws a population with a Poisson number of diameters, `cdf` and `ppf` are those of one diameter.
 """
 
 from abc import ABC, abstractmethod
@@ -30,7 +30,7 @@ _NEUKUM_2001 = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SizeFrequency(ABC):
-    """A law over its support."""
+    """A size-frequency law over its support."""
 
     min_diameter_m: float
     """Smallest diameter drawn, metres."""
@@ -39,22 +39,22 @@ class SizeFrequency(ABC):
 
     @abstractmethod
     def csfd(self, diameter_m: ArrayLike) -> Array:
-        """Number per square metre of at least this diameter (metres), whatever the support."""
+        """Number per square metre of at least this diameter (metres), also outside the support."""
 
     def count(self, area_m2: float) -> float:
         """Expected number on an area (square metres) with diameters in the support."""
         return float(area_m2 * (self.csfd(self.min_diameter_m) - self.csfd(self.max_diameter_m)))
 
     def cdf(self, diameter_m: ArrayLike) -> Array:
-        """Share of the population below a diameter (metres)."""
+        """Share of the population of the support below a diameter (metres)."""
         most, least = self.csfd(self.min_diameter_m), self.csfd(self.max_diameter_m)
         inside = np.clip(np.asarray(diameter_m, np.float64), self.min_diameter_m, self.max_diameter_m)
         return (most - self.csfd(inside)) / (most - least)
 
     def ppf(self, share: ArrayLike) -> Array:
-        """Diameter (metres) below which a share of the population lies: the inverse of `cdf`.
+        """Diameter (metres) of a quantile `share`: the inverse of `cdf`.
 
-        By interpolation in logarithms on 2000 nodes, which is exact for power laws and within 1e-5 for the others.
+        Interpolated in logarithms between 2000 nodes, which is exact for power laws and within 1e-5 for the others.
         """
         nodes = np.geomspace(self.max_diameter_m, self.min_diameter_m, 2000)
         numbers = self.csfd(nodes)
@@ -63,7 +63,7 @@ class SizeFrequency(ABC):
         return np.clip(found, self.min_diameter_m, self.max_diameter_m)
 
     def rvs(self, area_m2: float, rng: np.random.Generator) -> Array:
-        """Diameters (N,) in metres of one population on an area (square metres), N from Poisson's law."""
+        """Diameters (N,), metres, of one population on an area (square metres); N has a Poisson distribution."""
         return self.ppf(rng.random(rng.poisson(self.count(area_m2))))
 
 
@@ -71,7 +71,7 @@ class SizeFrequency(ABC):
 class NeukumProduction(SizeFrequency):
     """Lunar production function: Neukum, Ivanov & Hartmann 2001, doi 10.1023/A:1011989004263.
 
-    Valid for 10 m to 100 km; below 10 m the slope at 10 m is carried on (our extension).
+    Valid for 10 m to 100 km; below 10 m it is extrapolated with the slope at 10 m (our extension).
     """
 
     age_gyr: float
@@ -99,7 +99,7 @@ class PowerLaw(SizeFrequency):
     coefficient: float
     """Number per square metre of at least 1 m."""
     exponent: float
-    """Negative."""
+    """Exponent, negative."""
 
     def csfd(self, diameter_m: ArrayLike) -> Array:
         return self.coefficient * np.asarray(diameter_m, np.float64) ** self.exponent
@@ -109,12 +109,11 @@ class PowerLaw(SizeFrequency):
 class TraskEquilibrium(SizeFrequency):
     """Empirical equilibrium of small craters, N(>D) = 10^-1.1 D^-2 per square metre: Trask 1966 (JPL TR 32-800).
 
-    Seen on mare surfaces for some metres to some hundreds of metres; the support goes to a kilometre and down to a
-    metre (our extension).
+    Observed on mare surfaces from some metres to some hundreds of metres; the support is 1 m to 1 km (our extension).
     """
 
     share: float = 1.0
-    """Density over the law's: counts on other ground lie below it."""
+    """Density relative to the law; counts on other ground are lower."""
     min_diameter_m: float = 1.0
     max_diameter_m: float = 1000.0
 
@@ -126,11 +125,12 @@ class TraskEquilibrium(SizeFrequency):
 class MintonEquilibrium(SizeFrequency):
     """Equilibrium of small craters on a mare, N(>D) = 0.0336 D^-2 per square metre.
 
-    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021, the constant taken second hand. Support as for Trask's law.
+    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021, with the constant from a secondary source. The support is that
+    of Trask's law.
     """
 
     share: float = 1.0
-    """Density over the law's."""
+    """Density relative to the law."""
     min_diameter_m: float = 1.0
     max_diameter_m: float = 1000.0
 
@@ -140,13 +140,13 @@ class MintonEquilibrium(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViperEquilibrium(SizeFrequency):
-    """Craters of the VIPER landing area, N(>D) = 29174 D^-1.92 per square kilometre up to 80 m, taken second hand.
+    """Craters of the VIPER landing area, N(>D) = 29174 D^-1.92 per km^2 up to 80 m, from a secondary source.
 
-    Above 80 m the law is carried on (our extension); there production lies below it for most ages.
+    Above 80 m the law is extrapolated (our extension); there production is below it for most ages.
     """
 
     share: float = 1.0
-    """Density over the law's."""
+    """Density relative to the law."""
     min_diameter_m: float = 1.0
     max_diameter_m: float = 80.0
 
@@ -156,16 +156,16 @@ class ViperEquilibrium(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangE4Equilibrium(SizeFrequency):
-    """Craters that people marked in 12 Narrow Angle Camera images of the Chang'e-4 site, counted by us.
+    """Craters marked by people in 12 Narrow Angle Camera images of the Chang'e-4 site, counted by us.
 
-    Over Trask's law 1.22 up to 6 m, 0.57 from 24 m, a power law between, from marks of 6 to 50 m; carried on beyond
-    (our extension). The marks are those published with Yang et al., CraterDANet (IEEE TGRS); the ground sampling of
-    each image is not recorded and was taken as 0.75 m. People leave out what is nearly erased: a population that holds
-    such craters too needs a `share` of about 1.3.
+    Relative to Trask's law the density is 1.22 up to 6 m and 0.57 from 24 m, with a power law between. This follows
+    from marks of 6 to 50 m and is extrapolated beyond (our extension). The marks were published with Yang et al.,
+    CraterDANet (IEEE TGRS); the ground sampling of the images is not recorded and was assumed to be 0.75 m. People do
+    not mark nearly erased craters: a population that includes them needs a `share` of about 1.3.
     """
 
     share: float = 1.0
-    """Density over the law's."""
+    """Density relative to the law."""
     min_diameter_m: float = 1.0
     max_diameter_m: float = 1000.0
 
@@ -177,10 +177,10 @@ class ChangE4Equilibrium(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoulderLaw(SizeFrequency):
-    """Boulders, N(>D) = 3e-4 D^-2.482 per square metre, in use for the VIPER landing area, taken second hand."""
+    """Boulders, N(>D) = 3e-4 D^-2.482 per square metre, used for the VIPER landing area, from a secondary source."""
 
     density: float = 1.0
-    """Times the published law."""
+    """Density relative to the published law."""
     min_diameter_m: float = 0.2
     max_diameter_m: float = 5.0
 
@@ -190,12 +190,12 @@ class BoulderLaw(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, init=False)
 class Minimum(SizeFrequency):
-    """The smaller of two laws at each diameter, over the common support: production until equilibrium takes over."""
+    """The smaller of two laws at each diameter, over their common support, such as production and equilibrium."""
 
     first: SizeFrequency
-    """A law."""
+    """First law."""
     second: SizeFrequency
-    """Another law."""
+    """Second law."""
 
     def __init__(self, first: SizeFrequency, second: SizeFrequency):
         object.__setattr__(self, "first", first)
@@ -217,15 +217,15 @@ EQUILIBRIA: dict[str, type[Equilibrium]] = {
 
 
 def log_bins(min_diameter_m: float, max_diameter_m: float, per_decade: int = 50) -> Array:
-    """Edges of diameter bins, evenly spaced in the logarithm (metres)."""
+    """Edges (B + 1,) of diameter bins, metres, evenly spaced in the logarithm."""
     decades = np.log10(max_diameter_m / min_diameter_m)
     return np.geomspace(min_diameter_m, max_diameter_m, max(2, int(np.ceil(per_decade * decades)) + 1))
 
 
 def draw_diameters(law: SizeFrequency, edges_m: Array, areas_m2: Array, rng: np.random.Generator) -> Array:
-    """Diameters (N,) in metres, largest bin first: Poisson numbers in each bin over that bin's own area.
+    """Draw diameters (N,), metres, largest bin first, with a Poisson number in each bin for that bin's area.
 
-    edges_m (B + 1,) ascending, areas_m2 (B,). Within a bin the law is taken as a power law.
+    edges_m (B + 1,) ascending, areas_m2 (B,). Within a bin the law is approximated by a power law.
     """
     cumulative = law.csfd(edges_m)
     numbers = rng.poisson(np.maximum(cumulative[:-1] - cumulative[1:], 0) * areas_m2)[::-1]

@@ -1,4 +1,4 @@
-"""Laying craters on the ground, each in its own window, strictly oldest first (compiled by numba)."""
+"""Stamp craters on the ground, oldest first, each in its own window (compiled by numba)."""
 
 from dataclasses import dataclass
 
@@ -15,26 +15,26 @@ _N_RIM = 16
 
 @dataclass(frozen=True, slots=True)
 class Laid:
-    """What laying N craters did."""
+    """Results of stamping N craters."""
 
     sag_m: Array
-    """How much lower the older ground that shows through each crater is left at its centre than at its rim, which is no
-    depth of its own, metres (N,)."""
+    """Height difference from rim to centre of the older ground that remains under each crater, metres (N,). It is not
+    depth of the crater itself."""
     rim_left: Array
-    """Share of each crater's rim that no younger crater has removed (N,)."""
+    """Share of each crater's rim that younger craters have not removed (N,)."""
 
 
 def stamp_craters(
     height_m: Array, albedo: Array, grid: Grid, craters: Craters, brightness: Array, profile: str = "fassett_thomson"
 ) -> Laid:
-    """Lay `craters` on height_m (n_vertices,) and brighten albedo (n_vertices,), both in place.
+    """Stamp `craters` on height_m (n_vertices,) and brighten albedo (n_vertices,), both in place.
 
-    A crater first replaces what it overlies by the plane through it (as far as its wear has left that removal
-    visible), then adds its own profile. `brightness` (N,) is the relative brightening within the rim.
+    A crater first replaces the ground below it by a plane fitted to it, to a degree that falls with the crater's wear,
+    and then adds its own profile. `brightness` (N,) is the relative brightening within the rim.
     """
     tables = profile_tables(profile)
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
-    # The label's circle is the crest as it is today; the profile is laid about the one that it began with.
+    # The label's circle is the current crest; the profile is scaled by the fresh crest's radius.
     grown = crest_radius(wear, craters.fresh_depth_m / craters.rim_height_m, profile)
     sag, rim_left = _stamp(
         height_m,
@@ -61,7 +61,7 @@ def stamp_craters(
 
 @njit()
 def _nearest(x, y, n_half, half_widths):
-    """Index of a vertex near a place; -1 outside the grid."""
+    """Index of a vertex near a place, or -1 outside the grid."""
     n = n_half
     distance = max(abs(x), abs(y))
     if distance > half_widths[-1]:
@@ -74,7 +74,11 @@ def _nearest(x, y, n_half, half_widths):
 
 @njit()
 def _chord(lines, line, x, y, reach):
-    """The part of a line within `reach` of (x, y): its start from there, its steps, its first vertex, from and to."""
+    """The part of a line within `reach` of (x, y).
+
+    Returns the line's start relative to (x, y), its steps in x and y, the index of its first vertex, and the range of
+    positions on the line (start, stop).
+    """
     dx, dy = lines[line, 0] - x, lines[line, 1] - y
     step_x, step_y = lines[line, 2], lines[line, 3]
     along, across = (dx, dy) if step_y == 0 else (dy, dx)
@@ -113,8 +117,8 @@ def _stamp(
     own_rim, own_bowl, gone = np.empty(columns), np.empty(columns), np.empty(columns)
     lines = np.empty((2 * n_half + 1 + 4 * len(half_widths), 7))
     sag = np.zeros(len(x))
-    # Logarithm of the share of the first ground that is left, vertex by vertex: what a rim has lost since it was laid
-    # is the difference of two readings.
+    # Logarithm of the share of the initial ground that is left at each vertex. The difference of two values is the loss
+    # of a rim since it was stamped.
     log_left = np.zeros(len(height))
     rim_vertex = np.full((len(x), _N_RIM), -1)
     rim_before = np.zeros((len(x), _N_RIM))
@@ -128,7 +132,7 @@ def _stamp(
             gone[c] = removed[upper, c] * (1 - share) + removed[upper + 1, c] * share
         reach = REACH * radius[k]
         count = lines_in(x[k] - reach, x[k] + reach, y[k] - reach, y[k] + reach, n_half, half_widths, lines)
-        # The plane through the ground within 1.3 radii: least squares about the crater's centre.
+        # Least-squares plane of the ground within 1.3 radii, about the crater's centre.
         s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
         n_rim = n_floor = h_rim = h_floor = 0.0
         square_r = radius[k] ** 2
@@ -159,13 +163,13 @@ def _stamp(
         cxh, cyh = sxh - sx * sh / s0, syh - sy * sh / s0
         determinant = cxx * cyy - cxy * cxy
         slope_x = slope_y = 0.0
-        # A few vertices nearly in line say nothing of the slope across: the plane would stand up as a spike.
+        # A few nearly collinear vertices do not determine the slope across them: the plane would become a spike.
         if s0 >= 6 and determinant > 0.05 * cxx * cyy:
             slope_x = (cxh * cyy - cyh * cxy) / determinant
             slope_y = (cyh * cxx - cxh * cxy) / determinant
         level = (sh - slope_x * sx - slope_y * sy) / s0
         if n_rim > 0 and n_floor > 0:
-            # What is left of the older ground at the rim and at the centre, over the plane that replaced the rest.
+            # Height of the remaining older ground at rim and centre, above the plane that replaced the rest.
             rim_share, floor_share = 1 - gone[int(per_radius)], 1 - gone[0]
             sag[k] = max((h_rim / n_rim - level) * rim_share - (h_floor / n_floor - level) * floor_share, 0.0)
         for line in range(count):
@@ -190,7 +194,7 @@ def _stamp(
                 if c >= columns - 1:
                     continue
                 f = position - c
-                # The rim is uneven, the floor within is not.
+                # The rim is uneven, the floor is not.
                 inner = min(r, 1.0)
                 uneven *= inner * inner * (3 - 2 * inner)
                 lost = gone[c] * (1 - f) + gone[c + 1] * f

@@ -1,1 +1,1 @@
-"""Real ground: an elevation model, its craters, and the ground beyond its edge."""
+"""Real ground: an elevation model, its craters, and the ground around it."""

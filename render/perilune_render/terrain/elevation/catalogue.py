@@ -1,4 +1,4 @@
-"""Craters that a real elevation model itself shows, from a catalogue in CSV: they become labels like all others."""
+"""Craters of a real elevation model, read from a CSV catalogue; they become labels like generated craters."""
 
 import csv
 from pathlib import Path
@@ -19,11 +19,11 @@ _COLUMNS = {"longitude_deg": (-180.0, 360.0), "latitude_deg": (-90.0, 90.0), "di
 def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: CratersConfig, smallest_m: float) -> Craters:
     """The catalogue's craters that the model shows, largest first, with origin 'elevation model'.
 
-    Those are the ones whose centre and rim lie on the grid and on measured pixels of the model, and which are larger
-    than `smallest_m`: smaller ones the generator draws itself.
+    These are the craters larger than `smallest_m` with centre and rim on the grid and on measured pixels of the model;
+    smaller craters are generated.
 
     The file needs a header with longitude_deg (east), latitude_deg (north) and diameter_m; other columns are ignored.
-    Age and fresh depth are not known (NaN), wear is 0. Raises UserError with the line of a fault.
+    Age and fresh depth are unknown (NaN), wear is 0. Raises UserError with the line of an error.
     """
     if not path.is_file():
         raise UserError(path, "catalogue", "no such file", "a CSV file of craters")
@@ -60,7 +60,7 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Crater
 
 
 def _measured(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) -> np.ndarray:
-    """Whether centre and 16 points of each rim (N,) lie on pixels whose height the model knows."""
+    """Whether the centre and 16 rim points of each crater (N,) are on pixels with a measured height."""
     angle = np.append(2 * np.pi * np.arange(16) / 16, 0)
     reach = np.append(np.ones(16), 0) * diameter_m[:, None] / 2
     column, row = raster_places(model, x_m[:, None] + reach * np.cos(angle), y_m[:, None] + reach * np.sin(angle))

@@ -1,9 +1,9 @@
-"""Ground beyond the edge of an elevation model: level and slope continue and fade.
+"""Smooth continuation of the ground beyond the edge of an elevation model.
 
-Each scale of the model's relief is continued by point reflection, which keeps level and slope, and fades within about a
-third of its own wavelength, so that nothing of the model is repeated; its mean slope fades over the model's own
-size. What is left is smooth: `perilune_render.terrain.elevation.surroundings` adds relief and craters as each scale
-fades.
+Each scale of the model's relief continues by point reflection, which keeps height and slope at the edge. It fades
+within about a third of its wavelength, so that the model's features do not repeat. The model's mean slope fades over
+a distance of the model's size. The result is smooth; `perilune_render.terrain.elevation.surroundings` adds relief and
+craters where each scale fades.
 """
 
 import numpy as np
@@ -12,33 +12,33 @@ from scipy import fft, ndimage
 from perilune_shared.geometry.frames import Array
 
 _COARSEST = 1 / 8
-"""Standard deviation of the widest low-pass over the model's shorter side."""
+"""Standard deviation of the widest low-pass filter, relative to the model's shorter side."""
 _FADE = 1.5
-"""Distance over which a band fades, over the standard deviation of its low-pass."""
+"""Distance over which a band fades, in standard deviations of its low-pass filter."""
 _WAVES = 5.0
-"""Wavelength of most of a band over the standard deviation of its low-pass."""
+"""Main wavelength of a band, in standard deviations of its low-pass filter."""
 _GONE = 2.5
-"""Fade distances at which a band is taken as gone."""
+"""Distance at which a band counts as faded out, in fade distances."""
 
 
 def margin_m(sides_m: tuple[float, float]) -> float:
-    """Distance in metres from a model of these sides at which only its mean slope is left."""
+    """Distance, metres, from a model of these sides beyond which only its mean slope remains."""
     return _GONE * _FADE * _COARSEST * min(sides_m)
 
 
 def fade(distance_m: Array, wavelength_m: float) -> Array:
-    """Share of the model's relief of one wavelength that is left at distances (...) from its known ground.
+    """Share of the model's relief of one wavelength that remains at distances (...) from its known ground, metres.
 
-    exp(-(d / 0.3 L)^2), without slope at the edge.
+    exp(-(d / 0.3 L)^2), whose slope at the edge is 0.
     """
     return np.exp(-((distance_m * _WAVES / (_FADE * wavelength_m)) ** 2))
 
 
 def continued(height_m: Array, beyond_m: Array, margin: int, pixel_m: tuple[float, float]) -> Array:
-    """Heights (rows, columns) with `margin` more pixels on each side, less their mean slope (`mean_slope`).
+    """Heights (rows, columns), extended by `margin` pixels on each side, minus their mean slope (`mean_slope`).
 
-    beyond_m (rows + 2 margin, columns + 2 margin) is the distance from known ground; where it is 0 nothing changes.
-    pixel_m is the size of a pixel along rows and columns, metres.
+    beyond_m (rows + 2 margin, columns + 2 margin) is the distance from known ground, metres; where it is 0 the heights
+    do not fade. pixel_m is the size of a pixel from row to row and from column to column, metres.
     """
     row, column = (np.arange(n, dtype=np.float64) for n in height_m.shape)
     rest = height_m - plane(height_m, row[:, None], column)
@@ -57,7 +57,7 @@ def continued(height_m: Array, beyond_m: Array, margin: int, pixel_m: tuple[floa
 
 
 def plane(height_m: Array, row: Array, column: Array) -> Array:
-    """The least-squares plane through heights (rows, columns), at places counted from the first pixel's centre."""
+    """The least-squares plane through heights (rows, columns); row and column are 0 at the first pixel's centre."""
     n_rows, n_columns = height_m.shape
     i, j = np.arange(n_rows) - (n_rows - 1) / 2, np.arange(n_columns) - (n_columns - 1) / 2
     mean = height_m.mean()
@@ -67,14 +67,14 @@ def plane(height_m: Array, row: Array, column: Array) -> Array:
 
 
 def mean_slope(height_m: Array, row: Array, column: Array, beyond_m: Array, side_m: float) -> Array:
-    """`plane`, whose departure from the mean fades beyond the model.
+    """The mean plus the deviation of `plane` from it, which fades beyond the model.
 
-    It fades as 1 / (1 + (d / side)^2), `side_m` being the model's shorter side.
+    It fades as 1 / (1 + (d / side)^2), where `side_m` is the model's shorter side.
     """
     mean = height_m.mean()
     return mean + (plane(height_m, row, column) - mean) / (1 + (beyond_m / side_m) ** 2)
 
 
 def distance_in_holes_m(known: np.ndarray, pixel_m: tuple[float, float]) -> Array | None:
-    """Distance in metres of each pixel (rows, columns) from the nearest known one; None where all are known."""
+    """Distance, metres, of each pixel (rows, columns) from the nearest known one; None if all are known."""
     return None if known.all() else ndimage.distance_transform_edt(~known, sampling=pixel_m)

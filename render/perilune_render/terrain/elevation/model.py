@@ -1,4 +1,4 @@
-"""A real elevation model as the base of a scene: any projection, any pixel size, holes."""
+"""Use a real elevation model as the base of a scene: any projection and pixel size, holes allowed."""
 
 import re
 from dataclasses import dataclass
@@ -23,9 +23,9 @@ _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
 _LARGEST_PIXELS = 100_000_000
 _RESOLVED_PIXELS = 4.0
 _SWELL_M = 120.0
-"""Waves longer than about four times this keep their slope beyond the edge of a mirrored model."""
+"""Standard deviation of the low-pass for a mirrored model, metres; long waves are above about four times this."""
 _SEAM_M = 100.0
-"""Width of the band along the edge in which short waves keep their slope too."""
+"""Width of the band along a mirrored model's edge in which short waves are point-reflected too, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,39 +33,40 @@ class ElevationModel:
     """An elevation model in memory."""
 
     height_m: Array
-    """Rows from the raster's top (rows, columns), metres, holes filled."""
+    """Heights (rows, columns) from the raster's top, metres, with holes filled."""
     known: np.ndarray
-    """Where the raster has a height of its own (rows, columns)."""
+    """Whether a pixel has a height in the raster (rows, columns)."""
     transform: rasterio.Affine
-    """Projected coordinates from (column, row), raster corners."""
+    """Projected coordinates from (column, row), which are 0 at the raster's top left corner."""
     crs: rasterio.crs.CRS
-    """The projection."""
+    """Coordinate reference system of the raster."""
     latitude_deg: float
-    """Of the raster's middle, which becomes the site."""
+    """Latitude of the raster's middle, which becomes the site, degrees."""
     longitude_deg: float
-    """Of the raster's middle."""
+    """Longitude of the raster's middle, degrees."""
     pixel_m: float
-    """Ground size of a pixel, mean of both directions, metres."""
+    """Ground size of a pixel, the mean of both directions, metres."""
     pixel_sides_m: tuple[float, float]
     """Ground size of a pixel from row to row and from column to column, metres."""
     step_m: float
-    """Step in which the raster holds its heights, metres, where that makes terraces; 0 otherwise."""
+    """Quantisation step of the raster's heights if it makes terraces, metres; otherwise 0."""
     hole_m: Array | None
     """Distance of each pixel (rows, columns) from the nearest known one, metres; None without holes."""
     source: str
-    """File name and SHA-256."""
+    """File name (without folder and special characters) and SHA-256."""
 
     def selenographic(self, column: Array, row: Array) -> tuple[Array, Array]:
-        """Latitude and longitude in degrees of places (N,) counted from the raster's top left corner."""
+        """Latitude and longitude, degrees, of raster coordinates (N,) that are 0 at the raster's top left corner."""
         longitude, latitude = rasterio.warp.transform(self.crs, _MOON, *(self.transform @ (column, row)))
         return np.array(latitude), np.array(longitude)
 
 
 def read_elevation(path: Path) -> ElevationModel:
-    """Read a GeoTIFF. Raises UserError where it is missing, no raster, without projection or pixel size, or empty.
+    """Read a GeoTIFF elevation model.
 
-    Holes (nodata, NaN) are filled from the nearest known height. Heights may be elevations or radii: only differences
-    count, since the site is put at height 0. Heights in steps are smoothed within half a step
+    Raises UserError if it is missing, unreadable, too large, empty, or has no pixel size or no projection of the Moon.
+    Holes (nodata, NaN) are filled with the nearest known height. Heights may be elevations or radii: only differences
+    matter, since the site is set to height 0. Quantised heights are smoothed within half a step
     (`perilune_render.terrain.elevation.quantisation`).
     """
     if not path.is_file():
@@ -75,7 +76,7 @@ def read_elevation(path: Path) -> ElevationModel:
             if raster.width * raster.height > _LARGEST_PIXELS:
                 raise UserError(path, "size", f"{raster.width} x {raster.height}", f"at most {_LARGEST_PIXELS} pixels")
             height = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-            # Some products hold integers and say what they stand for.
+            # Some products store integers with a scale and an offset.
             height = height * raster.scales[0] + raster.offsets[0]
             transform, crs = raster.transform, raster.crs
     except RasterioError as error:
@@ -108,9 +109,9 @@ def read_elevation(path: Path) -> ElevationModel:
 
 
 def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
-    """Raises UserError where a coordinate system's ellipsoid is missing, or not the Moon's within one percent.
+    """Raises UserError if a coordinate system has no ellipsoid or not the Moon's, within one percent.
 
-    PROJ refuses to transform between bodies, with an error that says neither.
+    PROJ refuses to transform between bodies, but its error message states neither body.
     """
     found = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
     radius = float(found[2]) if found else 0.0
@@ -122,11 +123,11 @@ def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
 
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
-    """Column and row, counted from the raster's top left corner, of places (...) of O_L's plane."""
+    """Column and row, 0 at the raster's top left corner, of places (...) of O_L's plane, metres."""
     lat, lon = selenographic_from_site(x_m, y_m, model.latitude_deg, model.longitude_deg)
     east, north = (np.array(v) for v in rasterio.warp.transform(_MOON, model.crs, np.ravel(lon), np.ravel(lat)))
     if model.crs.is_geographic:
-        # A raster may count longitudes from 0 or from -180, and may lie across either.
+        # A raster may count longitudes from 0 or from -180, and may extend across either.
         middle = (model.transform @ (model.height_m.shape[1] / 2, model.height_m.shape[0] / 2))[0]
         east += 360 * np.round((middle - east) / 360)
     column, row = ~model.transform @ (east, north)
@@ -134,12 +135,12 @@ def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array,
 
 
 def resolved_m(model: ElevationModel) -> float:
-    """Diameter in metres from which an elevation model shows a crater: four pixels. Smaller ones are added."""
+    """Diameter, metres, from which an elevation model shows a crater: four pixels. Smaller craters are generated."""
     return _RESOLVED_PIXELS * model.pixel_m
 
 
 def beyond_m(model: ElevationModel, column: Array, row: Array) -> Array:
-    """Distance in metres of raster places (...) from the model's known ground: 0 on it, more in holes and outside."""
+    """Distance, metres, of raster places (...) from the model's known ground: 0 on it, above 0 in holes and outside."""
     rows, columns = model.height_m.shape
     down = np.maximum(np.maximum(-row, row - rows), 0) * model.pixel_sides_m[0]
     across = np.maximum(np.maximum(-column, column - columns), 0) * model.pixel_sides_m[1]
@@ -150,7 +151,7 @@ def beyond_m(model: ElevationModel, column: Array, row: Array) -> Array:
 
 
 def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
-    """Raises UserError where `outside` is "refuse" and the ground reaches beyond the model's raster."""
+    """Raises UserError if `outside` is "refuse" and the ground extends beyond the model's raster."""
     if outside != "refuse":
         return
     edge = grid.extent_m / 2 * np.linspace(-1, 1, 33)
@@ -168,7 +169,7 @@ def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
 
 
 def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
-    """What a user should know of a model before the ground is made from it, a line each."""
+    """Lines that inform the user about a model before the ground is made from it."""
     lines = []
     name = model.source.split(" sha256:")[0]
     if model.step_m:
@@ -183,15 +184,13 @@ def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
 
 
 def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedural") -> tuple[Array, Array]:
-    """Heights (n_vertices,) of the model on the grid in metres, site at 0, and the distance (n_vertices,) beyond it.
-
-    Bicubic inside. Beyond the model the ground continues smoothly
-    (`perilune_render.terrain.elevation.continuation`); relief and craters are added later. With `outside` "mirror" it
-    is the model's mirror image. The distance is that from known ground (`beyond_m`). Raises UserError where the ground
-    reaches beyond the model and `outside` is "refuse".
+    """Heights (n_vertices,) of the model on the grid, and distances (n_vertices,) from known ground, both in metres.
+    The site is at height 0. Heights are interpolated bicubically. Beyond the model the ground continues smoothly
+    (`perilune_render.terrain.elevation.continuation`), and relief and craters are added later; with `outside` "mirror"
+    it is the model's mirror image. Raises UserError if the ground extends beyond the model and `outside` is "refuse".
     """
     rows, columns = model.height_m.shape
-    # Pixel coordinates vary slowly over a site: project a coarse net and interpolate.
+    # Pixel coordinates vary slowly over a site: project a coarse lattice and interpolate.
     net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 65)
     column, row = raster_places(model, *np.meshgrid(net, net))
     x, y = grid.vertices_xy()
@@ -224,10 +223,10 @@ def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedur
 
 
 def _mirrored(height_m: Array, margin: int, pixel_m: float) -> Array:
-    """Heights with `margin` more pixels on each side, without a crease at the old edge.
+    """Heights extended by `margin` pixels on each side, without a crease at the model's edge.
 
-    Long waves go on by point reflection, which keeps the slope across the edge; short ones by mirroring, so that
-    craters stay craters, and by point reflection too in a narrow band along the edge.
+    Long waves continue by point reflection, which keeps the slope across the edge. Short waves are mirrored, so that
+    craters remain craters; in a narrow band along the edge they continue by point reflection too.
     """
     point_reflected = np.pad(height_m, margin, mode="reflect", reflect_type="odd")
     swell = ndimage.gaussian_filter(point_reflected, _SWELL_M / pixel_m, mode="nearest")

@@ -1,4 +1,4 @@
-"""Heights stored in steps: find the step, and smooth its terraces without leaving any height's interval."""
+"""Quantised heights: find the step, and smooth the terraces within each height's rounding interval."""
 
 import numpy as np
 from scipy import ndimage
@@ -6,18 +6,18 @@ from scipy import ndimage
 from perilune_shared.geometry.frames import Array
 
 _LEAST_SLOPE = 1e-3
-"""Steps below this share of a pixel make no visible terraces."""
+"""Largest step that makes no visible terraces, in pixel sizes."""
 _FEWEST_REPEATS = 4
-"""Pixels per distinct height, on average, from which heights may be in steps."""
+"""Mean number of pixels per distinct height from which heights may be quantised."""
 _WIDEST_TERRACE_PX = 64
 _GENTLE = 3.5
-"""Steps from the lowest to the highest of nine pixels up to which rounding, rather than the ground, makes roughness."""
+"""Range of heights over 3 x 3 pixels, in steps, below which roughness is attributed to rounding, not to the ground."""
 
 
 def step_of(height_m: Array, pixel_m: float) -> float:
-    """The step in metres of which known heights (N,) are whole multiples apart; 0 where there is none that matters.
+    """The quantisation step, metres, of known heights (N,); 0 if there is none or it makes no visible terraces.
 
-    A step is reported where heights repeat and all lie within a twentieth of a step of its multiples.
+    A step is found if heights repeat and all are within a twentieth of a step of its multiples.
     """
     distinct = np.unique(height_m)
     if len(distinct) < 3 or len(height_m) < _FEWEST_REPEATS * len(distinct):
@@ -29,7 +29,7 @@ def step_of(height_m: Array, pixel_m: float) -> float:
     step = float(np.median(gaps[(gaps > rounding) & (gaps <= 1.5 * smallest)])) if np.isfinite(smallest) else 0.0
     if step <= max(_LEAST_SLOPE * pixel_m, 8 * rounding):
         return 0.0
-    # The step gets sharper the longer the range over which multiples of it are counted.
+    # A longer range of multiples gives a more accurate step.
     for count in np.geomspace(10, max(offset[-1] / step, 10), 8):
         near = offset[offset <= (count + 0.5) * step]
         multiple = np.rint(near / step)
@@ -40,10 +40,10 @@ def step_of(height_m: Array, pixel_m: float) -> float:
 
 
 def smoothed(height_m: Array, step_m: float) -> Array:
-    """Heights (rows, columns) without terraces, each within half a step of what was given.
+    """Heights (rows, columns) without terraces, each within half a step of the given height.
 
-    Each terrace is smoothed over about its own width, wide ones first, and cut to the interval that rounding leaves;
-    steep ground stays as it is.
+    Each terrace is smoothed over about its own width, wide ones first, and clipped to the rounding interval. Steep
+    ground is not changed.
     """
     edge = np.zeros(height_m.shape, bool)
     for view, steps in ((edge, np.diff(height_m, axis=0) != 0), (edge.T, (np.diff(height_m, axis=1) != 0).T)):
@@ -63,7 +63,7 @@ def smoothed(height_m: Array, step_m: float) -> Array:
 
 
 def _blurred(height_m: Array, half_px: int) -> Array:
-    """A mean over three boxes in turn, near a Gaussian; the edge keeps its slope."""
+    """Three successive box filters, which approximate a Gaussian; the slope at the edge is kept."""
     margin = min(3 * half_px, min(height_m.shape) - 1)
     padded = np.pad(height_m, margin, mode="reflect", reflect_type="odd")
     for _ in range(3):

@@ -1,8 +1,8 @@
-"""Relief of procedural ground about an elevation model, with the model's own statistics.
+"""Relief of the procedural ground around an elevation model, with the model's statistics.
 
-Measured is the robust deviation (median over 0.6745, so that one pit does not count) of second differences of height
-over a range of baselines, on the model and on ground with the configured craters alone. A self-affine relief is
-fitted to what the craters leave.
+The statistic is the robust deviation (median over 0.6745, insensitive to single pits) of second differences of height
+over a range of baselines. It is measured on the model and on ground with the configured craters alone. A self-affine
+relief is fitted to the part that the craters do not explain.
 """
 
 import functools
@@ -21,26 +21,26 @@ from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.geometry.frames import Array
 
 _NORMAL = 0.6745
-"""Median of the absolute value over the standard deviation of a normal law."""
+"""Median of the absolute value over the standard deviation, for a normal distribution."""
 _HURST = np.arange(0.4, 1.01, 0.05)
 _LARGEST_TRIAL = 384
-"""Pixels along a side of the trial ground with craters alone."""
+"""Largest number of pixels along a side of the trial ground with craters alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class FittedRelief:
-    """Self-affine waves: amplitude coefficient times wavelength^hurst, in octaves."""
+    """Self-affine waves in octaves; amplitudes are a coefficient times wavelength^hurst_exponent."""
 
     wavelength_m: Array
-    """Octaves that the model resolves and longer ones, metres (N,)."""
+    """Wavelengths, from the shortest that the model resolves, metres (N,)."""
     amplitude_m: Array
-    """Of gradient noise (`perilune_render.terrain.noise.add_waves`), metres (N,)."""
+    """Amplitudes of gradient noise (`perilune_render.terrain.noise.add_waves`), metres (N,)."""
     hurst_exponent: float
-    """Fitted."""
+    """Fitted Hurst exponent."""
 
 
 def fitted_relief(model: ElevationModel, relief: ReliefConfig, craters: CratersConfig, seed: int) -> FittedRelief:
-    """Waves from what the model resolves to the configured longest one, fitted to the model."""
+    """Waves fitted to the model, from the shortest wavelength that it resolves to the longest configured one."""
     n_octaves = int(np.floor(np.log2(relief.longest_wavelength_m / resolved_m(model)))) + 1
     wavelength = relief.longest_wavelength_m / 2.0 ** np.arange(max(n_octaves, 0))
     baselines = 2 ** np.arange(1, max(int(np.log2(min(model.height_m.shape) / 4)), 1) + 1)
@@ -63,7 +63,7 @@ def add_fitted_relief(
 ) -> None:
     """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
-    They lie beyond the model only. Each begins where the model's own relief of its wavelength fades
+    They are added beyond the model only. Each grows as the model's relief of its wavelength fades
     (`continuation.fade`).
     """
     outside = np.flatnonzero(beyond_m > 0)
@@ -77,7 +77,7 @@ def add_fitted_relief(
 def second_differences(height_m: Array, baselines: np.ndarray) -> Array:
     """Robust deviation (B,) of h(x - b) - 2 h(x) + h(x + b) along both axes of heights (rows, columns), b in pixels.
 
-    NaN are left out; 0 where nothing is left.
+    NaN are ignored; 0 if there are no other values.
     """
     found = []
     for b in baselines:
@@ -91,7 +91,7 @@ def second_differences(height_m: Array, baselines: np.ndarray) -> Array:
 
 
 def _cratered(model: ElevationModel, config: CratersConfig, seed: int) -> Array:
-    """Heights of flat ground with the configured craters, in the model's pixels."""
+    """Heights (rows, columns), metres, of flat ground with the configured craters, at the model's pixel size."""
     n_half = min(*model.height_m.shape, _LARGEST_TRIAL) // 2
     grid = Grid.even(n_half * model.pixel_m, n_half)
     height = np.zeros(grid.n_vertices)
@@ -101,7 +101,7 @@ def _cratered(model: ElevationModel, config: CratersConfig, seed: int) -> Array:
 
 
 def _response(share: Array) -> Array:
-    """Deviation of second differences of gradient noise of amplitude 1, at baselines (...) over the wavelength."""
+    """Deviation of second differences of gradient noise of amplitude 1, for ratios (...) of baseline to wavelength."""
     baselines, deviations = _measured_response()
     return np.interp(share, baselines, deviations)
 
@@ -114,7 +114,7 @@ def _measured_response() -> tuple[Array, Array]:
     add_waves(field, grid, float(wavelength), 1.0, np.random.default_rng(1))
     baselines = np.array([1, 2, 4, 6, 8, 11, 16, 22, 32, 45, 64])
     deviations = second_differences(field.reshape(2 * n_half + 1, -1), baselines)
-    # Second differences of a smooth wave fall with the square of the baseline.
+    # Second differences of a smooth wave are proportional to the square of the baseline.
     low = np.array([1 / 64, 1 / 16, 1 / 4])
     return np.concatenate([low / wavelength, baselines / wavelength]), np.concatenate(
         [deviations[0] * low**2, deviations]
