@@ -98,9 +98,9 @@ class KindConfig(Section):
     split_by: Literal["scene", "trajectory", "frame"]
     """Unit of the split: each scene, trajectory or frame belongs to one split as a whole."""
     val_share: Share = 0.1
-    """Share of the units in the validation split."""
+    """Share of these units in the validation split."""
     test_share: Share = 0.1
-    """Share of the units in the test split."""
+    """Share of these units in the test split."""
     flight: FlightConfig = FlightConfig()
     """Trajectories."""
     sun: SunConfig = SunConfig()

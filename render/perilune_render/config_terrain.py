@@ -8,7 +8,7 @@ from perilune_render.config_values import NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
 
 LARGEST_SPACING_PX = 4.0
-"""Largest allowed vertex spacing, in smallest ground pixels."""
+"""Largest allowed value of `spacing_px`."""
 
 
 class CratersConfig(Section):
@@ -88,7 +88,7 @@ class TerrainConfig(Section):
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
     """Longitude of the site, degrees; an elevation model overrides it."""
     spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
-    """Vertex spacing at each place, in units of the smallest ground pixel in which a frame shows the place."""
+    """Vertex spacing at each place, relative to the smallest ground size of a pixel there."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
     """Largest number of ground vertices; a camera and flight that need more are an error."""
     craters: CratersConfig = CratersConfig()

@@ -78,9 +78,9 @@ def regenerate(
 ) -> list[Outcome]:
     """Make frames again as `out`/frames/<frame_id>.png and .exr, and compare them with the manifest.
 
-    `dem` and `catalogue` are the user's copies of the files that the recipes name; file names in the manifest are never
-    opened. Raises UserError on frames that are not in the manifest, on recipes that this version does not support, and
-    if `out` holds a dataset.
+    `dem` and `catalogue` are the user's copies of the files that the recipes name; a path in a recipe is never opened.
+    Raises UserError on frames that are not in the manifest, on recipes that this version does not support, and if `out`
+    holds a dataset.
     """
     if (out / "dataset.json").exists():
         raise UserError(out, "--out", "a dataset, whose frames would be replaced", "another folder")

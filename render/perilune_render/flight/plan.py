@@ -20,7 +20,7 @@ _LARGEST_COVER = 9
 
 @dataclass(frozen=True, slots=True)
 class ScenePlan:
-    """One terrain under one Sun."""
+    """A scene: one terrain with one direction of the Sun."""
 
     scene_id: str
     """Unique in the dataset."""
@@ -80,8 +80,8 @@ class Plan:
 def camera_of(config: CameraConfig) -> Camera:
     """The camera of a configuration. Raises UserError if its distortion is too strong.
 
-    That is: it folds back within the image, or the pinhole that covers the view needs more than _LARGEST_COVER times
-    the pixels.
+    Too strong means that it folds back within the image, or that the pinhole that covers the view has more than
+    _LARGEST_COVER times the camera's pixels.
     """
     width, height, lens = config.width_px, config.height_px, config.distortion
     focal = config.focal_length_px or width / 2 / np.tan(np.radians(config.horizontal_fov_deg) / 2)

@@ -1,4 +1,4 @@
-"""Cache of generated scenes, so that another run over the same ground starts at once.
+"""Cache of generated scenes, so that another run over the same ground starts immediately.
 
 A scene's file is named by the hash of everything that determines it. The folder is `$PERILUNE_CACHE`, or
 `perilune/scenes` in the user's cache folder. Above the size limit the least recently used files are removed. If the
