@@ -46,6 +46,9 @@ def main(folder: Path) -> None:
         ["navigate", *common, "--dataset", str(folder / "nav"), "--set", "navigate.warp.fine_epochs=0"],
     ):
         subprocess.run([program, *command], check=True)
+    picture = next((folder / "detect" / "frames").rglob("*.png"))
+    run = ["--run", str(folder / "runs" / "detect" / "tiny")]
+    subprocess.run([program, "detect", "predict", str(picture), *run, "--out", str(folder / "craters")], check=True)
 
 
 if __name__ == "__main__":
