@@ -90,8 +90,8 @@ def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, repla
     ("module", "pattern", "replacement"),
     [
         ("perilune_render.terrain.scene", '^"""', '"""Another docstring. '),
-        ("perilune_render.imaging.sensor", '    """The grey image', '    """Another docstring'),
-        ("perilune_render.terrain.scene", '"""A crater of whose rim', '"""Another text'),
+        ("perilune_render.imaging.sensor", '    """Grey image', '    """Another docstring'),
+        ("perilune_render.terrain.scene", '"""Share of a crater', '"""Another text'),
         ("perilune_render.terrain.stamp", r"^_N_RIM = 16", "# Why.\n_N_RIM = (\n    16\n)  # another comment"),
         ("perilune_render.terrain.grid", r"raise UserError\(", "raise UserError('more', "),
         ("perilune_render.cli", '"Folder', '"Another folder'),
