@@ -33,7 +33,7 @@ def test_frames_that_are_not_there(crowded):
     with pytest.raises(KeyError, match="scene-9"):
         dataset["scene-9/trajectory-0/000000"]
     with pytest.raises(AttributeError, match="open_datasets"):
-        ps.open_datasets  # noqa: B018
+        _ = ps.open_datasets
 
 
 def huge(png):
@@ -47,7 +47,7 @@ def test_a_frame_that_is_no_picture_is_named(victim, damage):
     path = victim / dataset.frames["png_path"][0]
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(UserError, match=dataset.frames["frame_id"][0]):
-        dataset[0].image  # noqa: B018
+        _ = dataset[0].image
 
 
 def test_deep_frames_have_all_their_bits(victim):

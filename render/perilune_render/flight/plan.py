@@ -115,7 +115,7 @@ def camera_of(config: CameraConfig) -> Camera:
 def make_plan(config: DatasetConfig, kind: str) -> Plan:
     """The plan of the dataset `detect` or `nav`. Raises UserError on an impossible camera.
 
-    Seeds are derived from the configuration's seed, its name and the kind, so that no two presets share terrain. The
+    Seeds are derived from the configuration's seed, its name and the kind. Presets therefore share no terrain. The
     two kinds of one preset share it only with `shared_terrain`.
     """
     settings = config.kind(kind)

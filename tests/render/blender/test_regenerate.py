@@ -234,7 +234,7 @@ def test_ctrl_c_in_a_plan_leaves_nothing(tmp_path):
     """At any moment, growing included, where code that Numba compiled must not be torn."""
     out = tmp_path / "p"
     for seed, seconds in enumerate((0.0, 0.4, 0.8)):
-        # A seed of its own each time, so that no scene comes from the cache.
+        # Another seed each time: no scene may come from the cache.
         settings = (f"--set=dataset.seed={seed}", "--set=dataset.detect.n_scenes=30")
         command = [RENDER, "plan", "--preset", "tiny", *settings, "--out", str(out)]
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)

@@ -35,7 +35,7 @@ class KeepBest(Callback):
     """Save the weights whenever the validation metric `monitor` improves (NaN never does).
 
     The task has `architecture` (plain settings) and `evaluated` (the network to evaluate and save), and may have
-    `terrain` (the plain record of the terrain that it is fitted to).
+    `terrain` (the record of its training terrain, as plain data).
     """
 
     def __init__(self, run: RunFolder, monitor: str, mode: Literal["min", "max"]):

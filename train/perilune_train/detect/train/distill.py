@@ -15,7 +15,7 @@ _SURE = 0.1
 
 @dataclass(frozen=True)
 class Teacher:
-    """A trained network. A plain class, so that it is not part of the student's weights or checkpoints."""
+    """A trained network. Not an nn.Module: the student's weights and checkpoints must not contain it."""
 
     network: YOLOv3
     """In evaluation mode."""
