@@ -128,8 +128,8 @@ bench-manifest: setup ## reads of 100,000 frames and 5 million labels; writes ru
 bench-develop: setup ## frames a second of developing on one core; writes runs/bench/develop.json
 	@$(BIN)/python benchmarks/develop.py
 
-bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/labels.json and docs/labels_histogram.png
-	@$(BIN)/python benchmarks/labels.py --picture docs/labels_histogram.png
+bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
+	@$(BIN)/python benchmarks/labels.py --picture docs/pictures/labels_histogram.png
 
 bench-contrast: setup ## how well contrast tells craters that the detector finds; writes runs/bench/contrast.json
 	@$(BIN)/python benchmarks/contrast.py "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"

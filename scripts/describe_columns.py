@@ -1,4 +1,4 @@
-"""Write the column tables of docs/manifest.md, between its marks: `describe_columns.py DATASET`.
+"""Write the column tables of docs/reference/manifest.md, between its marks: `describe_columns.py DATASET`.
 
 Types, units and meanings come from the schema, examples from the dataset's first row.
 """
@@ -12,7 +12,7 @@ from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.storage.files import write_text
 
-PAGE = Path(__file__).parent.parent / "docs" / "manifest.md"
+PAGE = Path(__file__).parent.parent / "docs/reference/manifest.md"
 BEGIN, END = "<!-- columns -->", "<!-- end of columns -->"
 
 

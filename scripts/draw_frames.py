@@ -1,4 +1,4 @@
-"""Draw docs/frames.png: the five frames of reference of docs/frames.md."""
+"""Draw docs/pictures/frames.png: the five frames of reference of docs/reference/frames.md."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ def axes(ax, origin, vectors, names, colour, length):
 
 
 def main() -> None:
-    """Write docs/frames.png."""
+    """Write docs/pictures/frames.png."""
     figure = plt.figure(figsize=(10, 8))
     ax = figure.add_subplot(projection="3d", computed_zorder=False)
     descent = NominalDescent.parabola(1500, 200, 1100, 300.0, 65.0)
@@ -53,7 +53,7 @@ def main() -> None:
     ax.set_zlim(0, 1900)
     ax.view_init(elev=16, azim=-68)
     ax.set_axis_off()
-    figure.savefig(Path(__file__).parent.parent / "docs" / "frames.png", dpi=80, bbox_inches="tight")
+    figure.savefig(Path(__file__).parent.parent / "docs/pictures/frames.png", dpi=80, bbox_inches="tight")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""Draw the pictures of docs/terrain.md into a folder: profiles, altitudes, Suns, regions, a real elevation model.
+"""Draw the pictures of docs/explanation/terrain.md: profiles, altitudes, Suns, regions, a real elevation model.
 
-`python scripts/draw_terrain.py docs/terrain [--dem file.tif]`. The package itself generates and renders everything.
+`python scripts/draw_terrain.py docs/pictures/terrain [--dem file.tif]` writes them into that folder.
+The package itself generates and renders everything.
 """
 
 import argparse

@@ -7,10 +7,12 @@ import pytest
 
 from perilune_shared.dataset.schema import TABLES
 
-DOCS = Path(__file__).parent.parent / "docs"
+TOP = Path(__file__).parent.parent
+DOCS = TOP / "docs"
+PAGES = [*sorted(DOCS.rglob("*.md")), *sorted(TOP.glob("*.md")), TOP / "data_manifests/README.md"]
 BLOCKS = [
-    (page.name, block)
-    for page in sorted(DOCS.glob("*.md"))
+    (page.relative_to(TOP).as_posix(), block)
+    for page in sorted(DOCS.rglob("*.md"))
     for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 ]
 
@@ -25,17 +27,17 @@ def test_example_runs(page, block, tiny, tmp_path, monkeypatch):
 
 
 def test_there_are_examples():
-    assert any(page == "frames.md" for page, _ in BLOCKS)
+    assert any(page == "docs/reference/frames.md" for page, _ in BLOCKS)
 
 
 def test_links_between_pages_lead_somewhere():
-    for page in [*DOCS.glob("*.md"), DOCS.parent / "README.md"]:
+    for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
-            assert (page.parent / target).exists(), f"{page.name}: {target}"
+            assert (page.parent / target).exists(), f"{page.relative_to(TOP)}: {target}"
 
 
 def test_the_manifest_page_has_every_column_as_the_schema_has_it():
-    page = (DOCS / "manifest.md").read_text(encoding="utf-8")
+    page = (DOCS / "reference/manifest.md").read_text(encoding="utf-8")
     rows = {}
     for name, part in re.findall(r"### (\w+)\n(.*?)(?=\n##)", page, re.DOTALL):
         rows[name] = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", part, re.MULTILINE)

@@ -15,7 +15,7 @@ from perilune_train.data.frames import decode, load_frames
 
 @pytest.mark.parametrize("bits", [10, 12, 16])
 def test_a_16_bit_frame_has_the_range_of_an_8_bit_one(tmp_path, bits):
-    """A grey value of more than 8 bits stands in the upper bits of 16 (docs/dataset.md)."""
+    """A grey value of more than 8 bits stands in the upper bits of 16 (docs/reference/dataset.md)."""
     grey = np.arange(256, dtype=np.uint16).reshape(16, 16)
     cv2.imwrite(str(tmp_path / "8.png"), grey.astype(np.uint8))
     fine = grey * 2 ** (bits - 8) + 2 ** (bits - 8) - 1

@@ -62,7 +62,7 @@ def export(
     ] = "all",
     link: LinkOption = False,
 ) -> None:
-    """Write labels, trajectories or metadata in the form of another field's tools. See docs/export.md."""
+    """Write labels, trajectories or metadata in the form of another field's tools. See docs/how-to/export.md."""
     from perilune_shared.export.coco import export_coco
     from perilune_shared.export.croissant import export_croissant
     from perilune_shared.export.hugging_face import export_hugging_face
