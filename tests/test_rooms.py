@@ -1,6 +1,7 @@
 """The order of the rooms: a file imports from its own room and from rooms before it, never from one after it."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -57,11 +58,19 @@ def test_imports_flow_one_way(folder):
 
 def test_no_folder_is_crowded():
     counts: dict[Path, int] = {}
-    for package in ("shared/perilune_shared", "render/perilune_render", "train/perilune_train"):
-        for path in (ROOT / package).rglob("*.py"):
+    for folder in ("shared/perilune_shared", "render/perilune_render", "train/perilune_train", "tests"):
+        for path in (ROOT / folder).rglob("*.py"):
             counts[path.parent] = counts.get(path.parent, 0) + 1
     assert len(counts) > 20
     assert {folder: count for folder, count in counts.items() if count > MOST_FILES} == {}
+
+
+def test_every_test_named_in_a_page_or_a_docstring_exists():
+    files = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+    files += [path for house in ("shared", "render", "train", "benchmarks") for path in (ROOT / house).rglob("*.py")]
+    named = {name for path in files for name in re.findall(r"tests/[\w/*]+\.py", path.read_text(encoding="utf-8"))}
+    assert len(named) > 5
+    assert [name for name in sorted(named) if not list(ROOT.glob(name))] == []
 
 
 BLOCKED = """

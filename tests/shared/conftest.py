@@ -4,11 +4,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from tests.helpers.drawn_dataset import build_dataset
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import read_info
 from perilune_shared.dataset.writer import written
-from tests.drawn_dataset import build_dataset
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.drawn_dataset import build_dataset
+from tests.helpers.drawn_dataset import build_dataset
 
 DRAWING = {
     "perilune_train.detect.evaluate.report": ("draw_bins", "draw_curves", "draw_frames"),

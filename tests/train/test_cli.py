@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests import in_process
+from tests.helpers import in_process
 from typer.testing import CliRunner
 
 from perilune_train.cli import app, main

@@ -7,6 +7,7 @@ import threading
 
 import numpy as np
 import pytest
+from tests.helpers.scenes import config_with, flat_scene, round_craters
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig
@@ -18,7 +19,6 @@ from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
-from tests.render.conftest import config_with, flat_scene, round_craters
 
 CAMERA = Camera(96, 64, 110.0, 110.0, 50.0, 30.0)
 TILTED = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector(np.radians([12, -20, 30]))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import trimesh
+from tests.helpers.scenes import config_with
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from perilune_render.blender.renderer import Renderer
@@ -22,7 +23,6 @@ from perilune_render.terrain.scene import grow_scene
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
-from tests.render.conftest import config_with
 
 CAMERA = Camera.from_field_of_view(160, 128, 50.0)
 CENTRES = CAMERA.pixel_centres().reshape(-1, 2)

@@ -3,12 +3,12 @@ import time
 
 import numpy as np
 import pytest
+from tests.helpers.scenes import config_with
 
 from perilune_render.config import FlightConfig
 from perilune_render.terrain import cache
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.geometry.camera import Camera
-from tests.render.conftest import config_with
 
 CAMERA = Camera.from_field_of_view(32, 32, 50.0)
 FLIGHT = FlightConfig()

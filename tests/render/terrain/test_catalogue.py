@@ -3,6 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 import rasterio
+from tests.helpers.elevation_models import POLAR, write
+from tests.helpers.scenes import config_with
 
 from perilune_render.terrain.craters import ORIGINS
 from perilune_render.terrain.elevation.catalogue import read_catalogue
@@ -11,8 +13,6 @@ from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
-from tests.render.conftest import config_with
-from tests.render.terrain.test_elevation import POLAR, write
 
 PIXEL_M = 5.0
 CRATERS = [(120.0, -80.0, 160.0), (-200.0, 150.0, 90.0)]

@@ -1,34 +1,17 @@
 import numpy as np
 import pytest
 import rasterio
+from tests.helpers.elevation_models import POLAR, write
+from tests.helpers.scenes import config_with
 
 from perilune_render.terrain.elevation.model import base_heights, read_elevation
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.errors import UserError
-from tests.render.conftest import config_with
 
-POLAR = "+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m"
 LONLAT = "+proj=longlat +R=1737400"
 UTM = rasterio.Affine(5, 0, 5e5, 0, -5, 5e6)
 METRES_PER_DEGREE = np.pi * 1737400 / 180
-
-
-def write(path, height, crs, transform):
-    with rasterio.open(
-        path,
-        "w",
-        driver="GTiff",
-        height=height.shape[0],
-        width=height.shape[1],
-        count=1,
-        dtype="float32",
-        crs=crs,
-        transform=transform,
-        nodata=-9999,
-    ) as raster:
-        raster.write(height.astype(np.float32), 1)
-    return path
 
 
 def ramp_to_the_north(path, crs=LONLAT):

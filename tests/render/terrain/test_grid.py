@@ -2,6 +2,7 @@ import re
 
 import numpy as np
 import pytest
+from tests.helpers.scenes import config_with
 
 from perilune_render.config import FlightConfig
 from perilune_render.flight.trajectories import fly
@@ -9,7 +10,6 @@ from perilune_render.terrain.grid import Grid, graded_grid, lines_in, reach_m
 from perilune_render.terrain.measure import value_at
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
-from tests.render.conftest import config_with
 
 CAMERA = Camera.from_field_of_view(256, 256, 50.0)
 FLIGHT = FlightConfig(azimuth_deg={"low": 0.0, "high": 360.0}, attitude_sigma_deg=1.0)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from tests.helpers.scenes import config_with
 
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import CratersConfig
@@ -17,7 +18,6 @@ from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_render.terrain.size_frequency import EQUILIBRIA, Minimum, NeukumProduction
 from perilune_shared.config import resolve
 from perilune_shared.geometry.camera import Camera
-from tests.render.conftest import config_with
 
 EVEN = Grid.even(1500, 1500)
 

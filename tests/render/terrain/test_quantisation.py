@@ -1,21 +1,11 @@
 import numpy as np
 import pytest
-import rasterio
+from tests.helpers.elevation_models import PLACED, POLAR, rough, write
 
 from perilune_render.terrain.elevation.model import read_elevation
 from perilune_render.terrain.elevation.quantisation import smoothed, step_of
-from tests.render.terrain.test_elevation import POLAR, write
 
-PLACED = rasterio.Affine(5, 0, 1e5, 0, -5, 0)
 SLOPE = np.add.outer(0.07 * np.arange(150), 0.03 * np.arange(150))
-
-
-def rough(seed=1, n=150):
-    """Smooth random ground, some metres high."""
-    rng = np.random.default_rng(seed)
-    i, j = np.mgrid[:n, :n]
-    waves = [(rng.uniform(0, 6.3), rng.uniform(0, 6.3), 2.0**k) for k in range(5, 9)]
-    return sum(w / 20 * np.sin(2 * np.pi * (i * np.cos(a) + j * np.sin(a)) / w + b) for a, b, w in waves)
 
 
 def in_8_bits(height):

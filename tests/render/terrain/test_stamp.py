@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from tests.helpers.scenes import config_with, round_craters
 
 from perilune_render.terrain.craters import ORIGINS, draw_craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.measure import measure_rims, value_at
 from perilune_render.terrain.stamp import stamp_craters
-from tests.render.conftest import config_with, round_craters
 
 GRID = Grid.even(200, 400)
 WIDE = Grid.even(1000, 2000)

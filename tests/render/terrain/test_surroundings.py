@@ -3,6 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 import rasterio
+from tests.helpers.elevation_models import POLAR, write
+from tests.helpers.scenes import config_with
 
 from perilune_render.config_terrain import CratersConfig, ReliefConfig
 from perilune_render.terrain.craters import draw_craters
@@ -13,8 +15,6 @@ from perilune_render.terrain.relief import add_relief
 from perilune_render.terrain.scene import base_of, check_ground, grow_scene
 from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.errors import UserError
-from tests.render.conftest import config_with
-from tests.render.terrain.test_elevation import POLAR, write
 
 PIXEL_M = 4.0
 N = 129

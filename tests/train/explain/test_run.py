@@ -6,8 +6,8 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import torch
-from tests.stored_run import store_run
-from tests.terrain_record import store_record, uses_of
+from tests.helpers.stored_run import store_run
+from tests.helpers.terrain_record import store_record, uses_of
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.selection import read_labels

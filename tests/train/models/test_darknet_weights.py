@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 import torch
-from tests.train.models import darknet_by_hand as by_hand
+from tests.helpers import darknet_by_hand as by_hand
 
 from perilune_shared.errors import UserError
 from perilune_train.models.darknet import AttentionDarknet53

@@ -1,0 +1,142 @@
+"""What a rendering may go on with, and what it must not touch. Nothing is rendered here."""
+
+import os
+from dataclasses import replace
+
+import pytest
+from rich.progress import Progress
+from tests.helpers.drawn_dataset import build_dataset
+from tests.helpers.scenes import config_with
+
+from perilune_render.config import KindConfig
+from perilune_render.config_terrain import TerrainConfig
+from perilune_render.dataset import tables
+from perilune_render.dataset.develop import develop_dataset
+from perilune_render.dataset.output import begin_or_go_on, check_begun, info_of, open_finished
+from perilune_render.dataset.regenerate import png_far, regenerate
+from perilune_render.dataset.render import render_plan
+from perilune_render.flight.plan import make_plan
+from perilune_render.provenance.recipe import config_of, recipe_of, same_source
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import write_info
+from perilune_shared.dataset.parts import write_part
+from perilune_shared.editing.subset import subset
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import sun_direction
+from perilune_shared.storage.checksums import SUMS_NAME
+from perilune_shared.storage.locks import locked
+from perilune_shared.validation.validate import validate
+
+
+@pytest.fixture
+def drawn(tmp_path):
+    return build_dataset(tmp_path / "drawn", "detect", side_px=32, splits={"train": 1}, n_frames=2, craters=30)
+
+
+@pytest.fixture
+def begun(tmp_path):
+    """A plan of one descent, and a folder in which it is rendered, but for pictures."""
+    plan = make_plan(config_with(), "detect")
+    (descent,) = plan.trajectories
+    paths = [{"png_path": f"frames/{descent.frame_id(i)}.png"} for i in range(len(descent.splits))]
+    frames = tables.frame_table(descent, plan.camera, sun_direction(0.0, 30.0), paths)
+    write_part(tmp_path, "frames", f"{descent.scene_id}.{descent.trajectory_id}", frames)
+    write_part(tmp_path, "trajectories", descent.scene_id, tables.trajectory_table([descent]))
+    return plan, tmp_path
+
+
+def test_a_rendering_goes_on_with_its_own_plan_alone(begun):
+    plan, out = begun
+    check_begun(out, plan)
+    (descent,) = plan.trajectories
+    moved = replace(descent.flight, position_m=descent.flight.position_m + 1.0)
+    for other in (
+        replace(descent, flight=moved),
+        replace(descent, splits=("test",) * len(descent.splits)),
+        replace(descent, frame_index=tuple(i + 1 for i in descent.frame_index)),
+        replace(descent, trajectory_id="trajectory-0009"),
+        replace(descent, seed=descent.seed + 1),
+    ):
+        with pytest.raises(UserError, match="another plan"):
+            check_begun(out, replace(plan, trajectories=(other,)))
+
+
+def test_a_manifest_is_not_rendered_into_itself(tmp_path):
+    config = config_with()
+    info = info_of(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
+    write_info(tmp_path, info.model_copy(update={"images": "planned", "complete": True}))
+    with pytest.raises(UserError, match="planned"):
+        begin_or_go_on(tmp_path, info)
+
+
+def test_checksums_that_a_stop_left_out_are_written(drawn):
+    (drawn / SUMS_NAME).unlink()
+    assert validate(open_finished(drawn)) == []
+
+
+def test_a_folder_that_another_process_writes_is_left_alone(begun):
+    plan, out = begun
+    config = config_with()
+    info = info_of(config, plan, recipe_of(config, "detect", "tiny"))
+    before = sorted(out.rglob("*"))
+    with locked(out), pytest.raises(UserError, match=f"locked by PID {os.getpid()} "):
+        render_plan(plan, config, info, out, Progress(), "configuration")
+    assert sorted(out.rglob("*")) == before
+
+
+def test_frames_are_not_made_again_over_a_dataset(drawn):
+    with pytest.raises(UserError, match="would be replaced"):
+        regenerate(open_dataset(drawn), ["s000/t000/000000"], drawn, Progress())
+
+
+def test_what_has_no_exrs_is_not_developed(drawn, tmp_path):
+    with pytest.raises(UserError, match="exr"):
+        develop_dataset(open_dataset(drawn), tmp_path / "out", Progress())
+    subset(open_dataset(drawn), tmp_path / "plan", images="plan")
+    with pytest.raises(UserError, match="exr"):
+        develop_dataset(open_dataset(tmp_path / "plan"), tmp_path / "out", Progress())
+    assert not (tmp_path / "out").exists()
+
+
+def test_settings_that_change_no_byte_are_no_part_of_the_recipe():
+    recipe = recipe_of(config_with(), "detect", "tiny")
+    nav = {**config_with().nav.model_dump(), "n_frames": 77}
+    assert recipe_of(config_with(render={"threads": 3, "cache_gib": 1.0}, nav=nav), "detect", "tiny").key == recipe.key
+    assert recipe_of(config_with(render={"samples": 9}), "detect", "tiny").key != recipe.key
+    assert config_of(recipe, "dataset.json") == config_with()
+
+
+def test_another_release_with_the_same_code_resumes(tmp_path):
+    config = config_with()
+    recipe = recipe_of(config, "detect", "tiny")
+    old = recipe.model_copy(update={"versions": {**recipe.versions, "perilune_render": "0.0.1"}})
+    plan = make_plan(config, "detect")
+    write_info(tmp_path, info_of(config, plan, old))
+    assert begin_or_go_on(tmp_path, info_of(config, plan, recipe)).recipe() == old
+    other = recipe.model_copy(update={"versions": {**recipe.versions, "opencv": "0.0.1"}})
+    with pytest.raises(UserError, match="opencv"):
+        begin_or_go_on(tmp_path, info_of(config, plan, other))
+
+
+def test_settings_that_are_none_are_refused(drawn):
+    recipe = open_dataset(drawn).info.recipe().model_copy(update={"config": {"terrain": 5}})
+    with pytest.raises(UserError, match="terrain"):
+        config_of(recipe, "dataset.json")
+
+
+def test_an_elevation_model_goes_by_its_content():
+    assert same_source("a.tif sha256:12", "b.tif sha256:12")
+    assert not same_source("a.tif sha256:12", "a.tif sha256:13") and not same_source("procedural", "a.tif sha256:12")
+
+
+def test_what_is_no_picture_is_far_from_one(drawn):
+    png = (drawn / "frames/s000/t000/000000.png").read_bytes()
+    assert png_far(png, png) == 0 and png_far(b"no picture", png) == 1
+
+
+def test_scenes_over_one_elevation_model_share_terrain():
+    scenes = KindConfig(n_scenes=3, trajectories_per_scene=1, n_frames=4, split_by="scene")
+    for dem, told in ((None, "scene"), ("a.tif", "trajectory")):
+        config = config_with(detect=scenes, terrain=TerrainConfig(dem=dem))
+        info = info_of(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
+        assert info.split_by == told

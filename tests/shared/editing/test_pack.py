@@ -1,0 +1,204 @@
+"""Packed datasets, unpacked, old ones migrated, and what differs."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from tests.helpers.hostile import rewrite
+
+from perilune_shared.dataset import parts
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.schema import OPTIONAL, TABLES
+from perilune_shared.editing.attach import attach
+from perilune_shared.editing.diff import differences
+from perilune_shared.editing.migrate import migrate
+from perilune_shared.editing.pack import pack, unpack
+from perilune_shared.editing.split import split_dataset
+from perilune_shared.editing.subset import subset
+from perilune_shared.errors import UserError
+from perilune_shared.export.croissant import metadata_of
+from perilune_shared.validation.validate import validate
+
+OLD = Path(__file__).parents[1] / "old"
+
+
+@pytest.fixture(scope="module")
+def packed(drawn, tmp_path_factory):
+    out = tmp_path_factory.mktemp("packed") / "p"
+    pack(open_dataset(drawn), out, shard_mb=0.1)
+    return out
+
+
+def test_packed_and_unpacked_it_is_the_same(drawn, packed, tmp_path):
+    source, made = open_dataset(drawn), open_dataset(packed)
+    assert validate(made) == [] and made.info.images == "packed" and len(made.shards()) > 1
+    assert not (packed / "frames").exists() and len(list(packed.rglob("*.parquet"))) == 6 + len(made.shards())
+    unpack(made, tmp_path / "u")
+    again = open_dataset(tmp_path / "u")
+    assert validate(again) == []
+    assert [each.column for each in differences(source, again)] == ["history"]
+    for path in source.table("frames", ["png_path"])["png_path"].to_pylist():
+        assert again.file(path).read_bytes() == source.file(path).read_bytes()
+
+
+def test_large_tables_become_several_parts_that_the_reader_accepts(little, tmp_path, monkeypatch):
+    source = open_dataset(little)
+    assert source.info.counts.craters == 600
+    pack(source, tmp_path / "p", most_rows=100, most_images=2)
+    original = parts._MOST_ROWS
+    monkeypatch.setattr(parts, "_MOST_ROWS", 100)
+    with pytest.raises(UserError, match="rows"):
+        source.table("craters")
+    made = open_dataset(tmp_path / "p")
+    assert validate(made) == []
+    assert len(made.parts("craters")) == 6 and len(made.parts("labels")) == 1 and len(made.shards()) == 3
+    assert [part.stem for part in made.parts("craters")][:2] == ["all", "all.0001"]
+    monkeypatch.setattr(parts, "_MOST_ROWS", original)
+    assert made.table("craters").equals(source.table("craters"))
+    for scene_id in source.scene_ids():
+        assert made.table("craters", scene_id=scene_id).equals(source.table("craters", scene_id=scene_id))
+    assert [each.column for each in differences(source, made)] == ["history"]
+
+
+def test_files_without_optional_columns_read_as_null(little, tmp_path, monkeypatch):
+    """A column that came later is null in older files, and is written by every tool; see the list in schema.py."""
+    later = pa.field("later_share", pa.float64(), metadata={"unit": "", "meaning": "a later column"})
+    schema = TABLES["frames"].append(later)
+    monkeypatch.setitem(TABLES, "frames", schema)
+    with pytest.raises(UserError, match="no later_share"):
+        open_dataset(little).table("frames")
+    monkeypatch.setitem(OPTIONAL, "frames", (*OPTIONAL.get("frames", ()), "later_share"))
+    source = open_dataset(little)
+    assert validate(source) == []
+    frames = source.table("frames", ["later_share", "frame_id"], split="val")
+    assert frames["later_share"].null_count == len(frames) == 3
+    assert source.table("frames", ["later_share"]).num_rows == 6
+    subset(source, tmp_path / "s", images="none")
+    part = open_dataset(tmp_path / "s").parts("frames")[0]
+    assert "later_share" in pq.read_schema(part).names
+    assert metadata_of(open_dataset(tmp_path / "s"))["recordSet"][4]["field"][-1]["name"] == "later_share"
+    assert metadata_of(source)["recordSet"][4]["field"][-1]["name"] != "later_share"
+
+
+def test_packed_frames_are_found_by_their_ids(drawn, packed):
+    source, made = open_dataset(drawn), open_dataset(packed)
+    frames = made.table("frames", split="test")
+    found = dict(made.pngs(frames))
+    assert found == dict(source.pngs(source.table("frames", split="test"))) and len(found) == 8
+
+
+def test_one_descent_of_a_packed_table(drawn, packed):
+    source, made = open_dataset(drawn), open_dataset(packed)
+    for name in ("frames", "labels", "trajectories"):
+        theirs = source.table(name, scene_id="s003", trajectory_id="t003")
+        assert len(theirs) and made.table(name, scene_id="s003", trajectory_id="t003").equals(theirs)
+    assert made.table("craters", ["x_m"], scene_id="s002").equals(source.table("craters", ["x_m"], scene_id="s002"))
+
+
+def test_a_packed_dataset_can_be_cut(packed, tmp_path):
+    subset(open_dataset(packed), tmp_path / "s", ["split == 'val'"])
+    made = open_dataset(tmp_path / "s")
+    assert validate(made) == [] and made.info.images == "files" and made.info.counts.frames == 8
+
+
+def test_a_shard_is_an_image_dataset_by_its_own_metadata(packed):
+    schema = pq.read_schema(open_dataset(packed).shards()[0])
+    features = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
+    assert features["image"] == {"_type": "Image"} and schema.names == ["frame_id", "image"]
+
+
+@pytest.mark.parametrize("version", ["1", "2"])
+def test_old_datasets_are_migrated(version, tmp_path):
+    """Each was rendered by the release that wrote its version, then cut to the craters with labels."""
+    with pytest.raises(UserError, match="migrate"):
+        open_dataset(OLD / version)
+    migrate(OLD / version, tmp_path / "new")
+    made = open_dataset(tmp_path / "new")
+    assert validate(made) == []
+    assert made.info.history == (f"migrated from schema version {version}",)
+    assert made.info.recipe().config["camera"]["width_px"] == 64 and made.info.recipe().seed == 20240117
+    old = pq.read_table(next((OLD / version / "manifest/labels").glob("*.parquet")))
+    assert made.table("labels", ["ellipse_cx_px"])["ellipse_cx_px"].to_pylist() == old["ellipse_cx_px"].to_pylist()
+    assert made.table("labels")["contrast"].null_count == len(old)
+    origins = set(made.table("craters")["origin"].to_pylist())
+    assert origins == {"primary"} if version == "1" else "primary" in origins
+    with pytest.raises(UserError, match="nothing to migrate"):
+        migrate(tmp_path / "new", tmp_path / "newer")
+
+
+def test_damaged_old_datasets_are_refused(tmp_path):
+    old = shutil.copytree(OLD / "2", tmp_path / "old")
+    info = json.loads((old / "dataset.json").read_text())
+
+    def told(match, **changes):
+        (old / "dataset.json").write_text(json.dumps({**info, **changes}))
+        with pytest.raises(UserError, match=match):
+            migrate(old, tmp_path / "new")
+        assert not (tmp_path / "new").exists()
+
+    told("schema_version", schema_version="0")
+    told("schema_version", schema_version=["2"])
+    told("complete", complete=False)
+    told("config", config=3)
+    told("camera", camera={})
+    (old / "dataset.json").write_text(json.dumps({k: v for k, v in info.items() if k != "seed"}))
+    with pytest.raises(UserError, match="seed"):
+        migrate(old, tmp_path / "new")
+    (old / "dataset.json").write_text(json.dumps(info))
+    part = next((old / "manifest/labels").glob("*.parquet"))
+    part.write_bytes(part.read_bytes()[:-30])
+    with pytest.raises(UserError, match="whole Parquet"):
+        migrate(old, tmp_path / "new")
+
+
+def test_differences_are_named(drawn, tmp_path):
+    source = open_dataset(drawn)
+    assert differences(source, source) == []
+    subset(source, tmp_path / "s", ["split != 'val'", "radius_px > 4"])
+    split_dataset(open_dataset(tmp_path / "s"), tmp_path / "t", by="frame")
+    found = {(each.place, each.column): each for each in differences(source, open_dataset(tmp_path / "t"))}
+    assert found["scenes", ""].rows == 1 and found["scenes", ""].second == "-"
+    n_small = source.table("labels", ["radius_px"], split="train").to_pandas()["radius_px"].le(4).sum()
+    n_small += source.table("labels", ["radius_px"], split="test").to_pandas()["radius_px"].le(4).sum()
+    assert found["labels", ""].rows == n_small
+    assert found["frames", "split"].rows > 0 and found["dataset.json", "split_by"].second == "frame"
+    assert ("frames", "position_m") not in found and ("craters", "") not in found
+
+
+def test_rows_twice_are_a_difference(little, tmp_path):
+    """Once with the same content, once with another."""
+    twice = shutil.copytree(little, tmp_path / "twice")
+    rewrite(twice, "labels", lambda rows: rows.append(dict(rows[2])))
+    found = differences(open_dataset(little), open_dataset(twice))
+    assert [(each.place, each.rows, each.first, each.second) for each in found] == [("labels", 1, "-", "present")]
+    other = shutil.copytree(twice, tmp_path / "other")
+    rewrite(other, "labels", lambda rows: rows[-1].update(radius_px=rows[-1]["radius_px"] + 1))
+    found = differences(open_dataset(twice), open_dataset(other))
+    assert [(each.place, each.column, each.rows) for each in found] == [("labels", "radius_px", 1)]
+    assert differences(open_dataset(other), open_dataset(other)) == []
+
+
+def test_a_manifest_and_its_frames_become_a_dataset(drawn, tmp_path):
+    source = open_dataset(drawn)
+    subset(source, tmp_path / "m", ["split == 'val'"], images="none")
+    manifest = open_dataset(tmp_path / "m")
+    attach(manifest, drawn, tmp_path / "whole")
+    whole = open_dataset(tmp_path / "whole")
+    assert validate(whole) == [] and whole.info.images == "files"
+    assert whole.table("frames").equals(source.table("frames", split="val"))
+    other = shutil.copytree(drawn / "frames", tmp_path / "other/frames").parent
+    path = other / whole.table("frames")["png_path"][3].as_py()
+    path.write_bytes(path.read_bytes() + b"more")
+    with pytest.raises(UserError, match="--rehash"):
+        attach(manifest, other, tmp_path / "w")
+    attach(manifest, other, tmp_path / "w", rehash=True)
+    assert validate(open_dataset(tmp_path / "w")) == []
+    path.unlink()
+    with pytest.raises(UserError, match=path.name):
+        attach(manifest, other, tmp_path / "w2")
+    with pytest.raises(UserError, match="images"):
+        attach(whole, drawn, tmp_path / "w2")
+    assert not (tmp_path / "w2").exists()

@@ -1,0 +1,205 @@
+"""The card tells what the dataset holds, can be followed, and is harmless whatever the dataset says of itself."""
+
+import io
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from markdown_it import MarkdownIt
+from PIL import Image
+from rich.progress import Progress
+from tests.helpers.drawn_dataset import build_dataset
+from typer.testing import CliRunner
+
+from perilune_shared.cli.main import app
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.metadata import write_info
+from perilune_shared.dataset.parts import read_part
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.errors import UserError
+from perilune_shared.export.card import code, write_card
+from perilune_shared.storage import checksums
+from perilune_shared.validation.validate import validate
+
+EVIL = '`</code><script>alert(1)</script> ![x](http://evil) [y](javascript:z) | $(rm) &lt; "\n# owned\n<img src=x>'
+
+
+def carded(root, out=None):
+    with Progress(disable=True) as progress:
+        return write_card(open_dataset(root), out, progress)
+
+
+def rendered(page: Path) -> str:
+    """The page as HTML, with raw HTML let through as careless sites do."""
+    _, _, body = page.read_text().split("---\n", 2)
+    return MarkdownIt("commonmark", {"html": True}).enable("table").render(body)
+
+
+@pytest.fixture(scope="module")
+def card(crowded, tmp_path_factory):
+    root = Path(shutil.copytree(crowded, tmp_path_factory.mktemp("card") / "set"))
+    page, picture = carded(root)
+    assert (page.name, picture.name) == ("README.md", "card.png")
+    return root
+
+
+def test_the_head_is_of_the_hubs_form(card):
+    head = yaml.safe_load((card / "README.md").read_text().split("---\n")[1])
+    assert head["license"] == "cc0-1.0" and head["task_categories"] == ["object-detection"]
+    assert head["pretty_name"] == "test" and head["size_categories"] == ["n<1K"]
+
+
+def test_the_page_tells_what_is_there(card):
+    html, dataset = rendered(card / "README.md"), open_dataset(card)
+    counts = dataset.info.counts
+    assert f"{counts.frames} frames, {counts.labels:,} labels" in html
+    assert html.count("<table>") == 3 and '<img src="card.png"' in html
+    radius = dataset.table("labels", ["radius_px"])["radius_px"].to_numpy()
+    row = re.search(r"label radius.*?</tr>", html, re.DOTALL)[0]
+    cells = [float(value) for value in re.findall(r">([\d.]+)</td>", row)]
+    assert np.allclose(cells, np.quantile(radius, [0, 0.05, 0.5, 0.95, 1]), rtol=1e-3)
+    assert "Crater detection: 4 trajectories over 4 terrains." in html
+    assert "30 to 30" in html and "No terrain is in two splits." in html and "CC0-1.0" in html
+
+
+def test_the_picture_shows_frames_with_labels(card):
+    picture = np.asarray(Image.open(card / "card.png").convert("RGB")).astype(int)
+    assert picture.shape[0] > 600 and picture.shape[1] > 800
+    green = (picture[..., 1] > 180) & (picture[..., 0] < 120) & (picture[..., 2] < 120)
+    orange = (picture[..., 0] > 220) & (abs(picture[..., 1] - 140) < 40) & (picture[..., 2] < 110)
+    blue = (picture == [0x44, 0x77, 0xAA]).all(axis=-1)
+    assert green.sum() > 500 and orange.sum() > 50 and blue.sum() > 1000
+    assert blue[: len(blue) // 2].sum() == 0
+
+
+def test_the_dataset_stays_valid_and_the_card_the_same(card):
+    assert validate(open_dataset(card)) == []
+    before = {path.name: path.read_bytes() for path in card.iterdir() if path.is_file()}
+    carded(card)
+    assert {path.name: path.read_bytes() for path in card.iterdir() if path.is_file()} == before
+
+
+def test_terrain_in_two_splits_is_told(tmp_path):
+    splits = {"train": 1, "test": 1}
+    root = build_dataset(tmp_path / "nav", "nav", splits=splits, scenes=1, n_frames=2, side_px=32)
+    html = rendered(carded(root)[0])
+    assert "1 of 1 terrains are in more than one split" in html and "Split by trajectory" in html
+
+
+def test_what_a_dataset_says_is_harmless(crowded, card, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
+    part = root / "manifest/scenes/all.parquet"
+    rows = read_part(part, "scenes").to_pylist()
+    rows = [{**row, "photometry": EVIL, "dem_source": EVIL[::-1]} for row in rows]
+    pq.write_table(pa.Table.from_pylist(rows, schema=TABLES["scenes"]), part)
+    dataset = open_dataset(root)
+    info = dataset.info.changed("merged " + EVIL).changed("[y](javascript:z) ![x](http://evil) | **b**")
+    write_info(root, info)
+    checksums.seal(root)
+    clean, hostile = rendered(card / "README.md"), rendered(carded(root)[0])
+    tags = [re.findall(r"<(\w+)", html) for html in (clean, hostile)]
+    history = ["ul", "li", "code", "li", "code"]
+    # Scenes of one dem_source are one terrain, here in three splits: that is told in bold.
+    assert sorted([*tags[0], *history, "strong"]) == sorted([*tags[1], "p"])
+    assert "owned" in hostile and "<script" not in hostile and "href" not in hostile
+
+
+@pytest.mark.parametrize("text", [EVIL, "", "`", " a ", "é\x1b[31m", "\u202eabc"])
+def test_code_is_a_code_span(text):
+    html = MarkdownIt().render(code(text))
+    assert re.fullmatch(r"<p><code>[A-Za-z0-9 ._+,:()/%=?-]+</code></p>\n", html)
+
+
+def test_the_recipe_can_be_followed(card, tmp_path):
+    """The card's first command, pasted into a shell, gives the configuration that the second reads."""
+    page = (card / "README.md").read_text()
+    unpack, make = re.search(r"```sh\n(.*?)\n```", page, re.DOTALL)[1].splitlines()
+    shutil.copy(card / "dataset.json", tmp_path)
+    subprocess.run(unpack.replace("python", shlex.quote(sys.executable), 1), shell=True, check=True, cwd=tmp_path)
+    recipe = open_dataset(card).info.recipe()
+    assert yaml.safe_load((tmp_path / "recipe.yaml").read_text()) == {"dataset": recipe.config}
+    assert shlex.split(make)[2:] == [
+        "--preset",
+        "tiny",
+        "--kind",
+        "detect",
+        "--config",
+        "recipe.yaml",
+        "--out",
+        "again",
+    ]
+
+
+def test_packed_and_absent_frames(crowded_packed, crowded, card, tmp_path):
+    from_packed = carded(crowded_packed, tmp_path / "packed.md")[1].read_bytes()
+    assert np.array_equal(
+        *(np.asarray(Image.open(io.BytesIO(b))) for b in (from_packed, (card / "card.png").read_bytes()))
+    )
+    dataset = open_dataset(crowded)
+    dataset.info = dataset.info.model_copy(update={"images": "absent"})
+    with Progress(disable=True) as progress:
+        page, picture = write_card(dataset, tmp_path / "absent.md", progress)
+    assert Image.open(picture).height < 500 and "the manifest alone" in page.read_text()
+
+
+def test_files_of_others_stay(crowded, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
+    (root / "README.md").write_text("mine")
+    with pytest.raises(UserError, match="no card wrote"):
+        carded(root)
+    (root / "README.md").unlink()
+    info = json.loads((root / "dataset.json").read_text())
+    (root / "dataset.json").write_text(json.dumps(info))
+    with pytest.raises(UserError, match="another content"):
+        carded(root)
+    assert not (root / "README.md").exists() and not (root / "card.png").exists()
+
+
+def test_a_frame_of_another_size_is_refused(crowded, tmp_path):
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
+    for path in root.rglob("*.png"):
+        Image.new("L", (4000, 4000)).save(path)
+    with pytest.raises(UserError, match="4000 x 4000 px"):
+        carded(root)
+
+
+def test_frames_of_16_bits_and_no_labels(crowded, card, tmp_path):
+    """The upper eight bits are the picture; a dataset without labels has a card too."""
+    root = Path(shutil.copytree(crowded, tmp_path / "set"))
+    for path in root.rglob("*.png"):
+        grey = np.asarray(Image.open(path)).astype(np.uint16)
+        Image.fromarray(grey * 257).save(path)
+    pages = [carded(root, tmp_path / "deep.md")]
+    part = root / "manifest/labels/all.parquet"
+    pq.write_table(TABLES["labels"].empty_table(), part)
+    pages.append(carded(root, tmp_path / "bare.md"))
+    plain, deep, bare = (np.asarray(Image.open(p)) for p in (card / "card.png", *(picture for _, picture in pages)))
+    assert np.array_equal(plain, deep)
+    assert bare.shape == plain.shape and not np.array_equal(bare, plain)
+    assert "label radius" in pages[0][0].read_text() and "label radius" not in pages[1][0].read_text()
+
+
+def test_command_line(crowded, tmp_path):
+    done = CliRunner().invoke(app, ["card", str(crowded), "--out", str(tmp_path / "about.md")])
+    assert done.exit_code == 0 and (tmp_path / "about.png").is_file()
+    assert "](about.png)" in (tmp_path / "about.md").read_text()
+    without = "import sys; sys.modules['matplotlib'] = None; from perilune_shared.cli.main import main; main()"
+    command = [sys.executable, "-c", without, "card", str(crowded), "--out", str(tmp_path / "b.md")]
+    bare = subprocess.run(command, capture_output=True, text=True)
+    assert bare.returncode == 2 and "perilune-shared[pictures]" in bare.stderr
+    assert not (tmp_path / "b.md").exists()
+
+
+def test_one_terrain_is_called_one(tmp_path):
+    root = build_dataset(tmp_path / "d", "detect", splits={"train": 1}, n_frames=1, side_px=32, craters=40)
+    page = carded(root)[0].read_text()
+    assert "Crater detection: one trajectory over one terrain." in page and "many" not in page

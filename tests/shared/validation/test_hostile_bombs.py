@@ -1,0 +1,120 @@
+"""A dataset is untrusted: small files that would unpack into much memory, or take for ever."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from tests.helpers import hostile_parquet as forged
+from tests.helpers.hostile import edit, part_of, sealed, told_within
+
+from perilune_shared.dataset.parts import Part
+from perilune_shared.dataset.schema import IMAGES, TABLES
+from perilune_shared.errors import UserError
+
+
+def constant(n, **cells):
+    """Rows of `scenes` that hardly take room."""
+    values = {"string": "a", "int64": 1, "double": 1.0}
+    columns = [pa.array([values[str(field.type)]] * n, field.type) for field in TABLES["scenes"]]
+    rows = pa.table(columns, schema=TABLES["scenes"])
+    for name, value in cells.items():
+        rows = rows.set_column(rows.schema.get_field_index(name), TABLES["scenes"].field(name), value)
+    return rows
+
+
+def scenes(rows, change=None, **options):
+    """The part of `scenes` from other rows, and then with its footer changed."""
+
+    def damage(root):
+        path = part_of(root, "scenes")
+        pq.write_table(rows(), path, **options)
+        if change is not None:
+            forged.forge(path, change)
+
+    return damage
+
+
+def thousandfold(found):
+    """Each group a thousand times, with the sums that go with it."""
+    forged.groups(found)[:] = forged.groups(found) * 1000
+    forged.put(found, 3, found[3][1] * 1000)
+
+
+def small(found):
+    """A footer that says that all columns are small, and without dictionaries."""
+    for group in forged.groups(found):
+        forged.put(group, 2, 1000)
+        for each in forged.columns(group):
+            forged.put(each, 6, 100)
+            each.pop(11, None)
+
+
+def long_text(n, length):
+    return lambda: constant(n, photometry=pa.array(["x" * length + str(i) for i in range(n)]))
+
+
+def repeated_text():
+    return constant(40, photometry=pa.array(["x" * 10_000_000] * 40))
+
+
+def long_list(root):
+    """10^8 numbers in one row of a vector."""
+    path = part_of(root, "trajectories")
+    rows = pq.read_table(path)
+    place = rows.schema.get_field_index("nominal_position_m")
+    flat = pa.array(np.zeros(20_000_000))
+    cells = pa.ListArray.from_arrays(pa.array([0, len(flat), len(flat)], pa.int32()), flat)
+    pq.write_table(rows.set_column(place, pa.field("nominal_position_m", cells.type), cells), path)
+
+
+def one_image_repeated(root):
+    rows = pq.read_table(part_of(root, "frames"), columns=["frame_id"])
+    image = pa.array([b"\x89PNG" + bytes(40_000_000)])
+    images = pa.StructArray.from_arrays([image, pa.array(["a"])], fields=list(IMAGES.field("image").type))
+    (root / "images").mkdir()
+    with pq.ParquetWriter(root / "images/00000.parquet", IMAGES, compression="zstd") as writer:
+        for k in range(6):
+            writer.write_table(pa.table([rows["frame_id"].combine_chunks()[k : k + 1], images], schema=IMAGES))
+    edit(lambda found: found.update(images="packed"))(root)
+
+
+BOMBS = {
+    "10^9 rows": (scenes(lambda: constant(1_000_000), thousandfold), "rows"),
+    "10^6 rows in 20 kB": (scenes(lambda: constant(1_000_000)), "rows"),
+    "text of 100 MB in 20 kB": (scenes(long_text(10, 10_000_000), compression="zstd", use_dictionary=False), "size"),
+    "the same with gzip": (scenes(long_text(10, 10_000_000), compression="gzip", use_dictionary=False), "size"),
+    "the same with a footer that hides it": (
+        scenes(long_text(10, 10_000_000), small, compression="zstd", use_dictionary=False),
+        "manifest/scenes",
+    ),
+    "text of 10 MB in 40 rows": (scenes(repeated_text, dictionary_pagesize_limit=2**30), "photometry"),
+    "the same with a footer that hides it, by its dictionary": (
+        scenes(repeated_text, small, dictionary_pagesize_limit=2**30),
+        "manifest/scenes",
+    ),
+    "2 x 10^7 numbers in a row": (long_list, "nominal_position_m"),
+    "images of 240 MB in 60 kB": (one_image_repeated, "size"),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_bombs_do_not_go_off(name, victim):
+    damage, told = BOMBS[name]
+    sealed(damage)(victim)
+    assert sum(path.stat().st_size for path in victim.rglob("*") if path.is_file()) < 3_000_000
+    assert told in told_within(victim, 80)
+
+
+def test_a_part_as_large_as_they_come_is_read(tmp_path):
+    """The limits leave room for what the renderer writes: rows of numbers that hardly shrink."""
+    rng = np.random.default_rng(1)
+    columns = [
+        pa.array([f"s000/t000/{i % 1000:06d}" for i in range(300_000)])
+        if field.name == "frame_id"
+        else pa.array(rng.integers(0, 2**40, 300_000) if field.type == pa.int64() else rng.random(300_000))
+        for field in TABLES["labels"]
+    ]
+    pq.write_table(pa.table(columns, schema=TABLES["labels"]), tmp_path / "all.parquet", compression="zstd")
+    assert len(Part(tmp_path / "all.parquet", "labels").read()) == 300_000
+    with pytest.raises(UserError, match=r"perilune\.table"):
+        Part(tmp_path / "all.parquet", "frames")

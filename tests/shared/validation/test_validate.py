@@ -1,0 +1,180 @@
+"""Every damage to a dataset is found, and named by file and column."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from tests.helpers import in_process
+
+from perilune_shared.cli.main import main
+from perilune_shared.dataset import manifest
+from perilune_shared.dataset.manifest import count_rows, open_dataset
+from perilune_shared.dataset.parts import read_part, write_part
+from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.dataset.stats import summary
+from perilune_shared.errors import UserError
+from perilune_shared.validation.validate import validate
+
+MANIFEST = str(Path(sys.executable).parent / "perilune-manifest")
+
+
+def rewrite(root, table, change, part=0):
+    """Apply `change` to one part's rows as a pandas frame."""
+    path = sorted((root / "manifest" / table).glob("*.parquet"))[part]
+    frame = pq.read_table(path).to_pandas()
+    change(frame)
+    pq.write_table(pa.Table.from_pandas(frame, schema=TABLES[table], preserve_index=False), path)
+
+
+def put(column, value, row=0):
+    def change(frame):
+        frame.at[row, column] = value
+
+    return change
+
+
+DAMAGES = {
+    "NaN pose": ("frames", put("position_m", np.array([np.nan, 0, 1])), "position_m"),
+    "long quaternion": ("frames", put("rotation_wxyz", np.array([1.0, 0.1, 0, 0])), "rotation_wxyz"),
+    "unknown split": ("frames", put("split", "training"), "split"),
+    "double frame": ("frames", put("frame_id", "scene-0000/trajectory-0000/000001"), "frame_id"),
+    "climbing path": ("frames", put("png_path", "../../etc/passwd"), "png_path"),
+    "absolute path": ("frames", put("png_path", "/etc/passwd"), "png_path"),
+    "missing file": ("frames", put("png_path", "frames/none.png"), "png_path"),
+    "wrong size": ("frames", put("png_bytes", 17), "png_bytes"),
+    "wrong hash": ("frames", put("png_sha256", "0" * 64), "png_sha256"),
+    "moved ellipse": ("labels", put("ellipse_cx_px", 12.0), "ellipse_cx_px"),
+    "grown box": ("labels", put("bbox_x1_px", 500.0), "bbox_x1_px"),
+    "negative radius": ("labels", put("radius_px", -1.0), "radius_px"),
+    "fraction above one": ("labels", put("visible_fraction", 1.2), "visible_fraction"),
+    "unknown crater": ("labels", put("crater_id", 999_999), "crater_id"),
+    "unknown frame": ("labels", put("frame_id", "scene-0000/none/000000"), "frame_id"),
+    "latitude": ("scenes", put("latitude_deg", 95.0), "latitude_deg"),
+    "double crater": ("craters", put("crater_id", 1), "scene_id+crater_id"),
+    "infinite depth": ("craters", put("depth_m", np.inf), "depth_m"),
+    "more frames planned": ("trajectories", put("n_frames", 9), "n_frames"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damage_is_found(tiny_detect, name):
+    table, change, column = DAMAGES[name]
+    rewrite(tiny_detect, table, change)
+    faults = validate(open_dataset(tiny_detect))
+    assert any(column in fault.column for fault in faults), faults
+
+
+def test_a_terrain_in_two_splits_is_found(tiny_detect):
+    rewrite(tiny_detect, "frames", put("split", "val", 2))
+    rewrite(tiny_detect, "frames", put("split", "test", 3))
+    assert any("one split for each scene" in fault.wanted for fault in validate(open_dataset(tiny_detect)))
+
+
+def test_a_flipped_byte_in_any_kind_of_file_is_found(tiny_detect):
+    rng = np.random.default_rng(1)
+    for path in [
+        *tiny_detect.glob("manifest/*/scene-0000*.parquet"),
+        next(tiny_detect.rglob("000000.png")),
+        next(tiny_detect.rglob("000000.exr")),
+    ]:
+        whole = path.read_bytes()
+        spot = len(whole) // 2 if path.suffix != ".parquet" else int(rng.integers(10, len(whole) // 2))
+        path.write_bytes(whole[:spot] + bytes([whole[spot] ^ 0x10]) + whole[spot + 1 :])
+        if path.suffix != ".parquet":
+            assert validate(open_dataset(tiny_detect)), path
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_truncated_part_is_found(tiny_detect, table):
+    path = sorted((tiny_detect / "manifest" / table).glob("*.parquet"))[0]
+    path.write_bytes(path.read_bytes()[:-20])
+    faults = validate(open_dataset(tiny_detect))
+    assert any(path.name in fault.file for fault in faults)
+    with pytest.raises(UserError, match="whole Parquet file"):
+        open_dataset(tiny_detect).table(table)
+
+
+def test_a_missing_part_is_found(tiny_detect):
+    sorted((tiny_detect / "manifest/labels").glob("*.parquet"))[1].unlink()
+    assert any(fault.column == "counts.labels" for fault in validate(open_dataset(tiny_detect)))
+
+
+def test_a_link_out_of_the_dataset_is_found(tiny_detect):
+    frame = next(tiny_detect.rglob("000003.png"))
+    outside = tiny_detect.parent / "outside.png"
+    frame.rename(outside)
+    frame.symlink_to(outside)
+    assert any(fault.column == "png_path" for fault in validate(open_dataset(tiny_detect)))
+
+
+def test_another_schema_version_is_refused(tiny_detect):
+    path = sorted((tiny_detect / "manifest/frames").glob("*.parquet"))[0]
+    table = pq.read_table(path)
+    pq.write_table(table.replace_schema_metadata({"perilune.table": "frames", "perilune.schema_version": "0"}), path)
+    with pytest.raises(UserError, match="migrate"):
+        read_part(path, "frames")
+
+
+def test_parts_are_never_rewritten(tiny_detect):
+    rows = read_part(sorted((tiny_detect / "manifest/scenes").glob("*.parquet"))[0], "scenes")
+    with pytest.raises(FileExistsError):
+        write_part(tiny_detect, "scenes", "scene-0000", rows)
+    write_part(tiny_detect, "scenes", "scene-0009", rows)
+    assert count_rows(open_dataset(tiny_detect)).scenes == 4
+
+
+def test_units_stand_in_the_file(tiny):
+    part = sorted((tiny / "detect/manifest/craters").glob("*.parquet"))[0]
+    schema = pq.read_schema(part)
+    assert schema.field("diameter_m").metadata[b"unit"] == b"m" and schema.metadata[b"perilune.table"] == b"craters"
+
+
+def test_chosen_rows_and_columns(tiny):
+    dataset = open_dataset(tiny / "detect")
+    one = dataset.table("craters", columns=["diameter_m"], scene_id="scene-0001")
+    assert one.column_names == ["diameter_m"] and 0 < one.num_rows < dataset.table("craters").num_rows
+    splits = {s: dataset.table("frames", split=s).num_rows for s in ("train", "val", "test")}
+    assert splits == {"train": 8, "val": 8, "test": 8}
+
+
+def test_summary_counts_what_is_there(tiny):
+    dataset = open_dataset(tiny / "nav")
+    frame = summary(dataset).set_index("split")
+    assert frame["frames"].sum() == 45 and frame.loc["train", "trajectories"] == 3
+    assert frame["labels"].sum() == dataset.table("labels").num_rows == dataset.info.counts.labels
+
+
+def test_every_part_is_opened_once(little, monkeypatch):
+    opened = []
+
+    class Counted(manifest.Part):
+        def __init__(self, path, *arguments):
+            opened.append(path)
+            super().__init__(path, *arguments)
+
+    monkeypatch.setattr(manifest, "Part", Counted)
+    dataset = open_dataset(little)
+    assert validate(dataset) == []
+    assert sorted(opened) == sorted(part for name in TABLES for part in dataset.parts(name))
+    # Only as long as it is validated: a part is read as it is now.
+    dataset.table("frames")
+    assert len(opened) == len(set(opened)) + 1
+
+
+def test_command_line(tiny, tiny_detect):
+    whole = in_process.call(main, "validate", tiny / "nav")
+    assert whole.returncode == 0 and "no fault" in whole.stdout
+    shown = in_process.call(main, "stats", tiny / "nav")
+    assert shown.returncode == 0 and "45 frames" in shown.stdout
+    next(tiny_detect.rglob("000000.png")).write_bytes(b"")
+    broken = subprocess.run([MANIFEST, "validate", str(tiny_detect)], capture_output=True, text=True)
+    assert broken.returncode == 2 and "png_bytes" in broken.stdout
+    (tiny_detect / "dataset.json").write_text(json.dumps({"schema_version": SCHEMA_VERSION}))
+    bad = in_process.call(main, "stats", tiny_detect)
+    assert bad.returncode == 2 and len(bad.stderr.strip().splitlines()) == 1 and "name" in bad.stderr

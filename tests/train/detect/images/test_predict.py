@@ -1,0 +1,178 @@
+"""Predictions: what is written, in which coordinates, and that a fault leaves nothing."""
+
+import json
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+from rasterio.crs import CRS
+from rasterio.transform import from_origin
+from tests.helpers.stored_run import THRESHOLD, settings_of, store_run
+from typer.testing import CliRunner
+
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import MOON_RADIUS_M
+from perilune_train.cli import app
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.images.georeference import MOON_CRS, features, read_georeference
+from perilune_train.detect.images.predict import predict_images
+from perilune_train.detect.inference.tiles import Tiling
+
+EARTH = CRS.from_epsg(4326)
+POLAR = CRS.from_proj4(f"+proj=stere +lat_0=-90 +R={MOON_RADIUS_M:.0f} +units=m +no_defs")
+LONGITUDES = CRS.from_proj4(f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs")
+COLUMNS = ["image", "x0_px", "y0_px", "x1_px", "y1_px", "centre_x_px", "centre_y_px", "radius_px", "score"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return store_run(tmp_path_factory.mktemp("runs"))
+
+
+def noise(height, width):
+    return np.random.default_rng(5).integers(0, 256, (height, width), np.uint8)
+
+
+def geotiff(path, crs, transform, height=90, width=130):
+    with rasterio.open(
+        path, "w", driver="GTiff", height=height, width=width, count=1, dtype="uint8", crs=crs, transform=transform
+    ) as image:
+        image.write(noise(height, width), 1)
+    return path
+
+
+def test_everything_is_written(run, tmp_path):
+    paths = [geotiff(tmp_path / "g.tif", POLAR, from_origin(1000, 3000, 2, 2)), tmp_path / "a.png", tmp_path / "b.jpg"]
+    for path in paths[1:]:
+        assert cv2.imwrite(str(path), noise(70, 300))
+    count = predict_images(paths, run, settings_of(run), tmp_path / "out", None, Tiling(tile_px=96, overlap_px=32))
+    names = ["a.png.overlay.png", "b.jpg.overlay.png", "detections.csv", "detections.geojson", "detections.parquet"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [*names, "g.tif.overlay.png"]
+    table = pd.read_parquet(tmp_path / "out" / "detections.parquet")
+    assert list(table.columns) == COLUMNS
+    assert len(table) == count and set(table["image"]) == {"g.tif", "a.png", "b.jpg"}
+    assert (table["score"] >= THRESHOLD).all()
+    values = {name: table[name].to_numpy() for name in COLUMNS[1:]}
+    assert values["centre_x_px"] == pytest.approx((values["x0_px"] + values["x1_px"]) / 2)
+    area = (values["x1_px"] - values["x0_px"]) * (values["y1_px"] - values["y0_px"])
+    assert (2 * values["radius_px"]) ** 2 == pytest.approx(area)
+    written = pd.read_csv(tmp_path / "out" / "detections.csv")
+    assert list(written.columns) == COLUMNS
+    assert written["x0_px"].to_numpy() == pytest.approx(values["x0_px"], abs=1e-4)
+    overlay = cv2.imread(str(tmp_path / "out" / "a.png.overlay.png"))
+    assert overlay.shape == (280, 1200, 3)
+    assert (overlay[..., 0] > overlay[..., 2].astype(int) + 100).any()
+    shapes = json.loads((tmp_path / "out" / "detections.geojson").read_text())
+    assert len(shapes["features"]) == (table["image"] == "g.tif").sum()
+    assert shapes["crs"]["properties"]["name"] == MOON_CRS
+
+
+def test_the_named_system_is_the_moons():
+    assert CRS.from_user_input(MOON_CRS).to_dict()["R"] == MOON_RADIUS_M
+
+
+@pytest.mark.parametrize(
+    ("crs", "transform", "place", "diameter_m"),
+    [
+        # A polar map is true to scale at the pole: 20 px of 2 m; the middle lies 600 m from it, towards 90 E.
+        (POLAR, from_origin(560, 40, 2, 2), (90.0, -90 + np.degrees(600 / MOON_RADIUS_M)), 40.0),
+        # 0.001 degree a pixel at latitude 60: half as long from west to east as from south to north.
+        (LONGITUDES, from_origin(179.98, 60.02, 0.001, 0.001), (180.0, 60.0), 20e-3 * 30323.35 * np.sqrt(0.5)),
+    ],
+)
+def test_places_and_diameters_on_the_moon(tmp_path, crs, transform, place, diameter_m):
+    reference = read_georeference(geotiff(tmp_path / "g.tif", crs, transform))
+    (feature,) = features("g.tif", Detections(np.array([[10.0, 10, 30, 30]]), np.array([0.5])), reference)
+    told = feature["properties"]
+    assert (told["longitude_deg"] % 360, told["latitude_deg"]) == pytest.approx(place, abs=1e-6)
+    assert told["diameter_m"] == pytest.approx(diameter_m, rel=1e-4)
+    ring = np.array(feature["geometry"]["coordinates"][0])
+    assert np.ptp(ring[:, 0]) < 5.0, "torn at 180 degrees"
+    x, y = ring.T - ring[0][:, None]
+    assert (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() > 0, "clockwise"
+
+
+def test_a_world_file_needs_its_projection(tmp_path):
+    path = tmp_path / "w.png"
+    assert cv2.imwrite(str(path), noise(60, 60))
+    assert read_georeference(path) is None
+    (tmp_path / "w.pgw").write_text("2\n0\n0\n-2\n561\n39\n")
+    assert read_georeference(path) is None
+    (tmp_path / "w.prj").write_text(POLAR.to_wkt(version="WKT1_ESRI"))
+    # A world file names the middle of the first pixel.
+    assert read_georeference(path).transform == pytest.approx((2, 0, 560, 0, -2, 40))
+    (tmp_path / "w.prj").write_text("nonsense")
+    with pytest.raises(UserError, match=r"w\.prj: georeference"):
+        read_georeference(path)
+
+
+def test_an_image_of_the_earth_is_refused(tmp_path):
+    with pytest.raises(UserError, match="a coordinate reference system of the Moon"):
+        read_georeference(geotiff(tmp_path / "g.tif", EARTH, from_origin(10, 50, 0.1, 0.1)))
+
+
+ORTHOGRAPHIC = CRS.from_proj4(f"+proj=ortho +lat_0=0 +lon_0=0 +R={MOON_RADIUS_M:.0f} +units=m +no_defs")
+WHOLE_DISC = from_origin(-2e6, 2e6, 4e6 / 128, 4e6 / 128)
+
+
+def test_what_lies_off_the_map_is_left_out_and_told(run, tmp_path, capsys):
+    path = geotiff(tmp_path / "disc[b].tif", ORTHOGRAPHIC, WHOLE_DISC, 128, 128)
+    middles = np.array([[2.0, 2], [64, 64], [64, 126], [119, 64], [100, 64]])
+    boxes = np.concatenate([middles - 2, middles + 2], axis=1)
+    kept = features("disc[b].tif", Detections(boxes, np.linspace(0.9, 0.5, 5)), read_georeference(path))
+    # The middle of the image and one well inside the disc; at 119 the ellipse reaches over the limb.
+    assert [feature["properties"]["score"] for feature in kept] == [0.8, 0.5]
+    assert kept[0]["properties"]["longitude_deg"] == pytest.approx(0, abs=1e-6)
+    count = predict_images([path], run, settings_of(run), tmp_path / "out", None, Tiling(tile_px=128))
+    shapes = json.loads((tmp_path / "out" / "detections.geojson").read_text())["features"]
+    assert 0 < len(shapes) < count == len(pd.read_parquet(tmp_path / "out" / "detections.parquet"))
+    assert f"disc[b].tif: {count - len(shapes)} craters lie off its map" in " ".join(capsys.readouterr().err.split())
+
+
+def test_an_image_wholly_off_its_map_is_refused(tmp_path):
+    path = geotiff(tmp_path / "sky.tif", ORTHOGRAPHIC, from_origin(5e6, 5e6, 1000, 1000))
+    with pytest.raises(UserError, match=r"sky\.tif: projection: got none of its pixels on the map"):
+        read_georeference(path)
+
+
+def test_one_faulty_image_among_several_leaves_nothing(run, tmp_path):
+    good, bad = tmp_path / "good.png", tmp_path / "bad.png"
+    assert cv2.imwrite(str(good), noise(64, 64))
+    bad.write_bytes(good.read_bytes()[:2000])
+    with pytest.raises(UserError, match=r"bad\.png: image"):
+        predict_images([good, bad], run, settings_of(run), tmp_path / "out", None, Tiling())
+    (tmp_path / "more").mkdir()
+    twin = tmp_path / "more" / "good.png"
+    twin.write_bytes(good.read_bytes())
+    with pytest.raises(UserError, match=r"more/good\.png: name: got a second image"):
+        predict_images([good, twin], run, settings_of(run), tmp_path / "out", None, Tiling())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bad.png", "good.png", "more"]
+
+
+def test_a_run_that_is_not_finished(run, tmp_path):
+    assert cv2.imwrite(str(tmp_path / "a.png"), noise(64, 64))
+    with pytest.raises(UserError, match=r"metrics\.json: metrics: got no such file"):
+        predict_images([tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", None, Tiling())
+    with pytest.raises(UserError, match=r"best\.ckpt: checkpoint: got no such file"):
+        predict_images([tmp_path / "a.png"], tmp_path / "absent", settings_of(run), tmp_path / "out", 0.5, Tiling())
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_the_command(run, tmp_path):
+    assert cv2.imwrite(str(tmp_path / "a.png"), noise(64, 64))
+    arguments = ["detect", "predict", str(tmp_path / "a.png"), "--run", str(run), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, [*arguments, "--scale", "1", "--scale", "2", "--threshold", "0.9"])
+    assert result.exit_code == 0, result.output
+    assert "geojson" not in result.output
+    placed = geotiff(tmp_path / "g.tif", POLAR, from_origin(1000, 3000, 2, 2))
+    result = CliRunner().invoke(
+        app, ["detect", "predict", str(placed), "--run", str(run), "--out", str(tmp_path / "placed")]
+    )
+    assert "detections.csv, detections.geojson, *.overlay.png" in " ".join(result.output.split())
+    table = pd.read_parquet(tmp_path / "out" / "detections.parquet")
+    assert len(table) == 0 and list(table.columns) == COLUMNS
+    for options in (["--threshold", "2"], ["--scale", "0"], ["--tile", "100"], ["--overlap", "-1"], []):
+        refused = CliRunner().invoke(app, [*arguments, *options])
+        assert isinstance(refused.exception, UserError), options

@@ -1,0 +1,108 @@
+"""Frames looked at enlarged: the same craters at the same places, small ones too."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tests.helpers.stored_run import settings_of, store_run
+
+from perilune_shared.config import resolve
+from perilune_shared.errors import UserError
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.evaluate.boxes import suppress
+from perilune_train.detect.images.predict import open_detector
+from perilune_train.detect.inference.scales import detect_at_scales, multiply_adds_of_a_frame, resized, scaled_size
+from perilune_train.models.size import multiply_adds
+
+
+def config_with(*settings):
+    return resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
+
+
+class OneSpot(torch.nn.Module):
+    """Finds the bright part of each image, if it is 8 pixels wide or more, and remembers what it looked at."""
+
+    def __init__(self):
+        super().__init__()
+        self.shapes = []
+
+    def detect(self, images):
+        self.shapes.append(tuple(images.shape))
+        boxes = []
+        for image in images[:, 0].numpy():
+            y, x = np.nonzero(image > (image.max() + image.min()) / 2)
+            boxes.append([[x.min(), y.min(), x.max() + 1, y.max() + 1]])
+        wide = torch.tensor(boxes, dtype=torch.float32)
+        return wide, ((wide[..., 2] - wide[..., 0]) >= 8).float() * 0.9
+
+
+def spot(height, width, box):
+    image = np.full((height, width), 10, np.uint8)
+    image[box[1] : box[3], box[0] : box[2]] = 200
+    return image
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.3, 2.0, 3.0])
+@pytest.mark.parametrize("size", [(256, 256), (96, 160)])
+def test_boxes_come_back_in_pixels_of_the_frame(factor, size):
+    boxes = np.array([[40, 20, 72, 60], [8, 36, 60, 76]])
+    frames = np.stack([spot(*size, box) for box in boxes])
+    network = OneSpot()
+    found = detect_at_scales(network, frames, config_with(f"detect.evaluation.scales=[{factor}]"), "cpu", False)
+    assert network.shapes == [(2, 1, *scaled_size(*size, factor))]
+    for part, box in zip(found, boxes, strict=True):
+        assert part.boxes == pytest.approx(box[None], abs=1 / factor)
+
+
+def test_a_small_crater_is_seen_at_the_scale_that_enlarges_it_and_a_large_one_once():
+    frames = np.stack([spot(128, 128, (60, 60, 65, 65)), spot(128, 128, (30, 30, 60, 60))])
+    plain = detect_at_scales(OneSpot(), frames, config_with(), "cpu", False)
+    both = detect_at_scales(OneSpot(), frames, config_with("detect.evaluation.scales=[1,2]"), "cpu", False)
+    assert [len(part.scores) for part in plain] == [0, 1]
+    assert [len(part.scores) for part in both] == [1, 1]
+    assert both[0].boxes[0] == pytest.approx([60, 60, 65, 65], abs=0.6)
+
+
+def test_several_scales_go_through_one_suppression(tmp_path):
+    """Of a real network: the same as both looks put together by hand."""
+    run = store_run(tmp_path)
+    detector = open_detector(run, settings_of(run))
+    frames = np.random.default_rng(5).integers(0, 256, (2, 128, 128), np.uint8)
+    one, two, both = (
+        detect_at_scales(
+            detector.network,
+            frames,
+            detector.config.model_copy(
+                update={"evaluation": detector.config.evaluation.model_copy(update={"scales": scales})}
+            ),
+            "cpu",
+            False,
+        )
+        for scales in ((1.0,), (2.0,), (1.0, 2.0))
+    )
+    for a, b, merged in zip(one, two, both, strict=True):
+        assert len(a.scores) > 20 and len(b.scores) > 20
+        boxes, scores = np.concatenate([a.boxes, b.boxes]), np.concatenate([a.scores, b.scores])
+        kept = suppress(boxes, scores, detector.config.evaluation.nms_iou, len(scores))
+        # Boxes suppressed within one scale alone may come back only through those that the other scale suppresses.
+        assert set(np.round(scores[kept], 6)) <= set(np.round(merged.scores, 6))
+        assert merged.scores.max() == max(a.scores.max(), b.scores.max())
+    work = multiply_adds(detector.network, (1, detector.config.in_channels, 128, 128))
+    assert multiply_adds_of_a_frame(detector.network, detector.config, 128, 128) == work
+
+
+def test_resizing_keeps_means_and_leaves_the_same_size_alone():
+    image = cv2.GaussianBlur(np.random.default_rng(6).integers(0, 256, (64, 96), np.uint8), (0, 0), 3)
+    assert resized(image, 96, 64) is image
+    for factor in (0.5, 2):
+        other = resized(image, round(96 * factor), round(64 * factor))
+        assert other.shape == (64 * factor, 96 * factor)
+        assert other.mean() == pytest.approx(image.mean(), abs=0.6)
+    assert scaled_size(256, 256, 1) == (256, 256) and scaled_size(250, 100, 1) == (250, 100)
+    assert scaled_size(256, 100, 1.5) == (384, 160) and scaled_size(40, 40, 0.25) == (32, 32)
+
+
+@pytest.mark.parametrize("scales", ["[]", "[0]", "[1,9]", "2", "[1,1,1,1,1]"])
+def test_scales_that_nothing_can_look_at_are_refused(scales):
+    with pytest.raises(UserError, match=r"evaluation\.scales"):
+        config_with(f"detect.evaluation.scales={scales}")

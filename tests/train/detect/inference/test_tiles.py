@@ -1,0 +1,144 @@
+"""Tiling: every crater once, whole, wherever the borders of the tiles run."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tests.helpers.stored_run import settings_of, store_run
+
+from perilune_shared.errors import UserError
+from perilune_train.detect.evaluate.boxes import iou_matrix, suppress
+from perilune_train.detect.images.predict import open_detector
+from perilune_train.detect.inference.scales import detect_at_scales
+from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.detect.inference.tiles import (
+    Detector,
+    Tiling,
+    count_tiles,
+    detect_image,
+    padded,
+    suppress_in_blocks,
+    tile_starts,
+)
+
+
+class Blobs(torch.nn.Module):
+    """Finds bright patches as far as the tile shows them: at a border, only the part that is seen."""
+
+    def detect(self, images):
+        boxes, scores = [], []
+        for image in images[:, 0].numpy():
+            bright = (image > (image.max() + image.min()) / 2).astype(np.uint8)
+            stats = cv2.connectedComponentsWithStats(bright)[2][1:]
+            x, y, w, h, area = stats.T[:5]
+            boxes.append(np.stack([x, y, x + w, y + h], axis=1))
+            # Half a crater with a better score than a whole one: only the rule against halves can remove it.
+            scores.append(1 - area / 1e5)
+        most = max(len(part) for part in scores)
+        fill = [np.pad(b, [(0, most - len(b)), (0, 0)]) for b in boxes]
+        return torch.tensor(np.stack(fill)), torch.tensor(np.stack([np.pad(s, (0, most - len(s))) for s in scores]))
+
+
+@pytest.fixture(scope="module")
+def detector(tmp_path_factory):
+    run = store_run(tmp_path_factory.mktemp("runs"))
+    return open_detector(run, settings_of(run))
+
+
+def discs(height, width, spacing, radius):
+    image = np.full((height, width), 20, np.uint8)
+    middles = [
+        (x + (y * 13 // spacing) % 17, y)
+        for y in range(radius + 2, height - radius - 2, spacing)
+        for x in range(radius + 2, width - radius - 20, spacing)
+    ]
+    for middle in middles:
+        cv2.circle(image, middle, radius, 220, -1)
+    boxes = np.array([[x - radius, y - radius, x + radius + 1, y + radius + 1] for x, y in middles], float)
+    return image, boxes
+
+
+@pytest.mark.parametrize(("scales", "least"), [((1.0,), 0.999), ((2.0,), 0.85), ((1.0, 0.5), 0.8)])
+@pytest.mark.parametrize(("size", "radius"), [((700, 900), 12), ((256, 411), 28)])
+def test_each_crater_is_found_once_and_whole(detector, scales, least, size, radius):
+    blobs = Detector(Blobs(), detector.config, "cpu", False)
+    image, truth = discs(*size, 2 * radius + 15, radius)
+    counted = []
+    tiling = Tiling(scales=scales, overlap_px=96 if 2 in scales else 64)
+    if 2 in scales and 2 * 2 * radius > 96:
+        tiling = Tiling(scales=scales, overlap_px=128)
+    found = detect_image(blobs, image, tiling, counted.append)
+    assert sum(counted) == count_tiles(*size, tiling)
+    overlap = iou_matrix(found.boxes, truth)
+    assert len(found.boxes) == len(truth)
+    assert (overlap.max(axis=0) >= least).all()
+    assert (np.diff(found.scores) <= 0).all()
+
+
+def test_boxes_can_get_a_margin(detector):
+    blobs = Detector(Blobs(), detector.config, "cpu", False)
+    image, _ = discs(300, 400, 40, 10)
+    plain, larger = (detect_image(blobs, image, Tiling(box_margin_px=margin)) for margin in (0.0, 1.5))
+    assert len(plain.boxes) > 20
+    assert larger.boxes == pytest.approx(plain.boxes + np.array([-1.5, -1.5, 1.5, 1.5]))
+    with pytest.raises(UserError, match=r"--box-margin: pixels: got -1, expected 0 to 10"):
+        Tiling(box_margin_px=-1).check()
+
+
+def test_an_image_of_one_tile_gets_what_frames_get(detector):
+    images = np.random.default_rng(3).integers(0, 256, (2, 128, 128), np.uint8)
+    frames = detect_at_scales(detector.network, images, detector.config, "cpu", False)
+    assert min(len(part.scores) for part in frames) > 20
+    for image, wanted in zip(images, frames, strict=True):
+        found = detect_image(detector, image, Tiling(tile_px=128))
+        assert found.scores == pytest.approx(wanted.scores, abs=1e-6)
+        # One image or two in a batch round differently, so that nearly equal scores may change places.
+        apart_px = np.abs(found.boxes[:, None] - wanted.boxes).max(axis=2)
+        assert apart_px.min(axis=0).max() < 1e-3 and apart_px.min(axis=1).max() < 1e-3
+        assert found.scores[apart_px.argmin(axis=0)] == pytest.approx(wanted.scores, abs=1e-6)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 300), (100, 64), (33, 257)])
+def test_small_images_are_padded_and_nothing_is_found_in_the_padding(detector, size):
+    image = np.random.default_rng(4).integers(0, 256, size, np.uint8)
+    assert all(side % 32 == 0 or side > 256 for side in padded(image, 256).shape)
+    found = detect_image(detector, image, Tiling())
+    middle = (found.boxes[:, :2] + found.boxes[:, 2:]) / 2
+    assert (middle < size[::-1]).all()
+
+
+@pytest.mark.parametrize("length", [1, 256, 257, 300, 448, 449, 800, 5064])
+def test_tiles_cover_a_side_with_enough_overlap(length):
+    starts = tile_starts(length, 256, 64)
+    assert starts[0] == 0 and (length <= 256 or starts[-1] == length - 256)
+    assert (np.diff(starts) <= 256 - 64).all() and (np.diff(starts) > 0).all()
+
+
+@pytest.mark.parametrize(
+    "tiling",
+    [Tiling(tile_px=100), Tiling(tile_px=0), Tiling(overlap_px=256), Tiling(overlap_px=-1), Tiling(scales=(0.0,)),
+     Tiling(scales=()), Tiling(scales=(float("nan"),)), Tiling(scales=(9.0,))],
+)  # fmt: skip
+def test_what_cannot_be_cut_is_refused(tiling):
+    with pytest.raises(UserError):
+        tiling.check()
+
+
+def test_many_boxes_are_suppressed_as_few_are():
+    rng = np.random.default_rng(6)
+    corner = rng.uniform(-5, 1600, (6_000, 2))
+    boxes = np.concatenate([corner, corner + rng.uniform(4, 60, (6_000, 1))], axis=1)
+    scores = rng.permutation(6_000) / 6_000 + 1e-5
+    kept = suppress_in_blocks(boxes, scores, 0.3)
+    wanted = suppress(boxes, scores, 0.3, len(boxes))
+    assert 1000 < len(wanted) < 5_500
+    assert np.array_equal(kept, wanted)
+
+
+def test_long_boxes_go_before_suppression(detector):
+    boxes = torch.tensor([[[0.0, 0, 20, 10], [0, 0, 12, 10], [50, 50, 60, 75]]])
+    scores = torch.tensor([[0.9, 0.8, 0.7]])
+    settings = detector.config.evaluation
+    assert detections_of(boxes, scores, settings)[0].scores == pytest.approx([0.9, 0.7])
+    (short,) = detections_of(boxes, scores, settings.model_copy(update={"max_aspect": 1.5}))
+    assert short.scores == pytest.approx([0.8])

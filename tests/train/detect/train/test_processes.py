@@ -1,0 +1,116 @@
+"""Killed and resumed; two processes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from tests.helpers import in_process
+
+from perilune_shared.config import resolve
+from perilune_shared.errors import UserError
+from perilune_train.cli import main
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.batches import Share
+from perilune_train.detect.train.run import run_detect
+
+SETTINGS = ("detect.precision=float32", "detect.device=cpu", "detect.checkpoint_minutes=0")
+BATCHES = 6
+ALONE = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+
+def state(path: Path) -> dict:
+    return torch.load(path, weights_only=True)
+
+
+def quick(path: Path) -> dict:
+    """As `state`, without its checks, which take longer than a batch."""
+    return torch.load(path, weights_only=False, mmap=True)
+
+
+def assert_equal_tensors(first: dict, second: dict) -> None:
+    assert first.keys() == second.keys()
+    different = [key for key, value in first.items() if not torch.equal(value, second[key])]
+    assert not different
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_killed_within_an_epoch_and_resumed_gives_the_same_weights(few, tmp_path):
+    one = "detect.batch_size=1"
+    # Only the run that is killed writes a checkpoint after every batch.
+    config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, (*SETTINGS[:2], one))
+    whole = run_detect(config, few, tmp_path, "whole")
+    command = ["detect", "train", "--preset", "tiny", "--name", "killed"]
+    command += ["--dataset", str(few), "--out", str(tmp_path)]
+    command += [part for setting in (*SETTINGS, one) for part in ("--set", setting)]
+    program = [sys.executable, "-m", "perilune_train.cli"]
+    checkpoint = tmp_path / "detect" / "killed" / "checkpoints" / "last.ckpt"
+    with subprocess.Popen([*program, *command], env=ALONE, stderr=subprocess.PIPE, text=True) as process:
+        while not (checkpoint.is_file() and quick(checkpoint)["epoch_and_batches"] >= [1, 2]):
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    epoch, batches = state(checkpoint)["epoch_and_batches"]
+    assert epoch == 1 and 2 <= batches < BATCHES
+    done = in_process.call(main, *command)
+    assert done.returncode == 0, done.stderr
+    resumed, uninterrupted = state(checkpoint), state(whole.last)
+    assert resumed["global_step"] == uninterrupted["global_step"] == 2 * BATCHES
+    assert_equal_tensors(resumed["state_dict"], uninterrupted["state_dict"])
+    moments = [s["optimizer_states"][0]["state"] for s in (resumed, uninterrupted)]
+    for first, second in zip(moments[0].values(), moments[1].values(), strict=True):
+        assert_equal_tensors(first, second)
+    assert_equal_tensors(state(checkpoint.with_name("best.ckpt"))["state_dict"], state(whole.best)["state_dict"])
+
+
+def test_two_processes_share_the_frames_and_end_with_equal_weights(few, tmp_path):
+    settings = (*SETTINGS[:2], "detect.batch_size=2")
+    run = tmp_path / "detect" / "two"
+    # The second process has a folder of its own, as on another machine: what lies there does not make it resume alone.
+    stale = tmp_path / "other" / "detect" / "two" / "checkpoints" / "last.ckpt"
+    stale.parent.mkdir(parents=True)
+    stale.write_text("of an older run")
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    script = [str(Path(__file__).with_name("two_processes.py")), str(few), str(tmp_path), *settings]
+    done = subprocess.run([*torchrun, *script], env=ALONE, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    first, second = (torch.load(tmp_path / f"{process}.pt", weights_only=True) for process in (0, 1))
+    seen = [state.pop("seen") for state in (first, second)]
+    assert len(seen[0]) == len(seen[1]) == 6
+    assert sorted(seen[0] + seen[1]) == [(epoch, frame) for epoch in range(2) for frame in range(6)]
+    assert_equal_tensors(
+        {key: value for key, value in first.items() if not key.startswith("network.") or is_weight(key)},
+        {key: value for key, value in second.items() if not key.startswith("network.") or is_weight(key)},
+    )
+    saved = state(run.joinpath("checkpoints", "last.ckpt"))["state_dict"]
+    assert_equal_tensors(saved, {key: first[key] for key in saved})
+    assert (run / "metrics.json").is_file() and len(list(run.glob("events*"))) == 1
+    assert done.stderr.count("load train") == done.stderr.count("train detector") == 1
+    assert stale.read_text() == "of an older run"
+    # Position and schedule of the state are those of two processes.
+    (run / "metrics.json").unlink()
+    config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
+    with pytest.raises(UserError, match=r"last.ckpt: processes: got 1, expected 2, with which the run began"):
+        run_detect(config, few, tmp_path, "two")
+
+
+def is_weight(key: str) -> bool:
+    return not key.endswith(("running_mean", "running_var"))
+
+
+@pytest.mark.parametrize(("count", "size", "processes"), [(24, 4, 2), (25, 4, 2), (27, 4, 2), (10, 4, 1), (7, 2, 3)])
+def test_shares_are_disjoint_and_of_equal_number(count, size, processes):
+    shares = [list(Share(count, size, process, processes)) for process in range(processes)]
+    assert {len(share) for share in shares} == {len(Share(count, size, 0, processes))}
+    taken = sorted(place for share in shares for batch in share for place in batch)
+    left = count - len(taken)
+    assert taken == list(range(count - left)) and left < processes
+    assert all(1 <= len(batch) <= size for share in shares for batch in share)
+    for process, share in enumerate(shares):
+        again = Share(count, size, process, processes, start=2)
+        assert list(again) == share[2:] and len(again) == len(share)
