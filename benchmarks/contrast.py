@@ -20,11 +20,11 @@ import pyarrow.parquet as pq
 import typer
 from numpy.typing import NDArray
 
+from figures import write_figures
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.selection import SELECTIONS, read_labels, selected
 from perilune_shared.errors import run_command_line
 from perilune_shared.geometry.frames import Array
-from perilune_shared.storage.files import write_text
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.bins import RADIUS_BINS_PX
@@ -140,9 +140,7 @@ def main(
     }
     threshold = json.loads((run / "metrics.json").read_text())["test/threshold"]
     result = {**measure(opened, detections, threshold), "judged": judge(opened, detections, threshold)}
-    text = json.dumps(result, indent=1)
-    write_text(out / "contrast.json", text + "\n")
-    print(text)
+    write_figures(out / "contrast.json", result)
     if picture:
         draw(opened, picture, out / "contrast.jpg")
 

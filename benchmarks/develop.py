@@ -5,19 +5,18 @@ a minute). Then develops it in this process on one core, with unchanged settings
 labels are computed again. Writes runs/bench/develop.json.
 """
 
-import json
 import os
 import statistics
 import tempfile
 import time
 from pathlib import Path
 
+from figures import write_figures
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.develop import develop_dataset
 from perilune_render.dataset.render import make_dataset
 from perilune_shared.config import resolve
 from perilune_shared.progress import progress_bar
-from perilune_shared.storage.files import write_text
 
 SETTINGS = (
     "dataset.render.exr=true",
@@ -65,9 +64,7 @@ def main() -> None:
         "exr_bytes": float(exr_bytes.mean()),
         "png_bytes": float(png_bytes.mean()),
     }
-    path = Path("runs/bench/develop.json")
-    write_text(path, json.dumps(figures, indent=2) + "\n")
-    print(path, json.dumps(figures, indent=2))
+    write_figures(Path("runs/bench/develop.json"), figures)
 
 
 if __name__ == "__main__":

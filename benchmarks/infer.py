@@ -6,7 +6,6 @@ is warmed up, then all are called in turn, so that other load on the machine aff
 runs/bench/infer.json.
 """
 
-import json
 import os
 import statistics
 import tempfile
@@ -18,9 +17,9 @@ import numpy as np
 import torch
 import typer
 
+from figures import write_figures
 from perilune_shared.errors import run_command_line
 from perilune_shared.progress import progress_bar
-from perilune_shared.storage.files import write_text
 from perilune_train.detect.deploy.engines import Engine, has_bf16, onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.deploy.export import load_trained, write_onnx
 from perilune_train.detect.deploy.flight_detector import FlightDetector
@@ -134,12 +133,10 @@ def main(
             goal = GOALS_S.get(factor)
             rows.append({**row, "goal_s": goal, "reached": None if goal is None else row["best_s"] <= goal})
             bar.advance(task)
-    load = os.getloadavg()[0]
-    figures = {"cores": CORES, "size_px": SIZE_PX, "rounds": rounds, "load_average": load, "networks": rows}
+    figures = {"cores": CORES, "size_px": SIZE_PX, "rounds": rounds, "networks": rows}
     path = out / ("infer.json" if run is None else f"infer-{run.name}.json")
-    write_text(path, json.dumps(figures, indent=1) + "\n")
+    write_figures(path, figures)
     print_table(rows)
-    print(path)
 
 
 def print_table(rows: list[dict]) -> None:

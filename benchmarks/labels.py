@@ -8,7 +8,6 @@ runs/bench/labels.json and, with `--picture FILE`, a histogram.
 """
 
 import argparse
-import json
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import rings
+from figures import write_figures
 from perilune_render.config import DatasetConfig
 from perilune_render.flight.plan import make_plan
 from perilune_render.imaging.resampling import refined, resample
@@ -33,7 +33,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_shared.progress import progress_bar
-from perilune_shared.storage.files import write_text, written_aside
+from perilune_shared.storage.files import written_aside
 
 ALTITUDES_M = (200.0, 400.0, 800.0, 1500.0)
 TILTS_DEG = (0.0, 15.0, 30.0, 45.0)
@@ -111,10 +111,8 @@ def main() -> None:
         **{f"native_{name}": value for name, value in summary(native).items()},
         "time_s": time.perf_counter() - start,
     }
-    path = Path("runs/bench/labels.json")
-    write_text(path, json.dumps(figures, indent=2) + "\n")
+    write_figures(Path("runs/bench/labels.json"), figures)
     draw_histogram(picture, main_run)
-    print(path, json.dumps(figures, indent=2))
 
 
 def view(scene: Scene, altitude_m: float, tilt_deg: float, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -4,7 +4,6 @@ The tables are filled with numbers of the right types and sizes; nothing is rend
 in a separate process, measured from opening the dataset. Writes runs/bench/manifest.json.
 """
 
-import json
 import subprocess
 import sys
 import tempfile
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from figures import write_figures
 from perilune_shared.dataset.manifest import count_rows, open_dataset
 from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.dataset.parts import write_part
@@ -21,7 +21,6 @@ from perilune_shared.editing.pack import pack
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.progress import progress_bar
 from perilune_shared.storage.checksums import seal
-from perilune_shared.storage.files import write_text
 
 N_SCENES, N_FRAMES, N_LABELS, N_CRATERS = 1000, 100, 50, 2000
 """Scenes of one trajectory each, frames per scene, labels per frame, craters per scene."""
@@ -67,8 +66,7 @@ def main() -> None:
                 figures[f"{name}_{layout}_s"], figures[f"{name}_{layout}_peak_gib"] = best[:2]
         figures["imports_gib"] = best[2]
         figures["manifest_mb"] = sum(path.stat().st_size for path in parts.rglob("*") if path.is_file()) / 1e6
-    write_text(Path("runs/bench/manifest.json"), json.dumps(figures, indent=2) + "\n")
-    print(json.dumps(figures, indent=2))
+    write_figures(Path("runs/bench/manifest.json"), figures)
 
 
 def _measured(root: Path, work: str) -> tuple[float, float, float]:

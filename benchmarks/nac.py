@@ -6,7 +6,6 @@ nadir view of several scenes of the configuration. Writes to runs/nac/: nac.json
 gradients, brightness, counts) and sheet.png, which contains real pixels and must not be published.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +15,7 @@ import numpy as np
 import typer
 
 import nac_statistics as st
+from figures import write_figures
 from nac_plots import draw_curves
 from nac_sun import sun_over, time_of
 from perilune_render.blender.renderer import Renderer
@@ -32,7 +32,6 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import Array, sun_direction
 from perilune_shared.progress import progress_bar
-from perilune_shared.storage.files import write_text
 
 FRAME_PX, FOV_DEG = 400, 12.0
 THRESHOLDS_PX = (8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)
@@ -258,11 +257,10 @@ def main(
     frames = take_frames(resolved, crops, scenes, sampling)
     figures = {"preset": preset, "settings": setting or [], "sampling_m": sampling, "n_scenes": scenes}
     figures |= compare(crops, frames)
-    write_text(out / "nac.json", json.dumps(figures, indent=1) + "\n")
+    write_figures(out / "nac.json", figures)
     draw_curves(out, figures, [crop.image for crop in crops], [f.image for taken in frames for f in taken])
     draw_sheet(out / "sheet.png", crops, frames)
-    print(json.dumps({key: figures[key] for key in ("distances", "crater_log_ratio")}, indent=1))
-    print(f"{out}: nac.json, curves, and sheet.png, which holds real pixels: keep it out of the project")
+    print(f"{out}: curves, and sheet.png, which holds real pixels: keep it out of the project")
 
 
 if __name__ == "__main__":

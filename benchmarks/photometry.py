@@ -6,13 +6,13 @@ at the angles of that pixel. The planes cast no shadows, and the Sun is a point:
 law over directions, which is physically correct but differs from the formula. Writes runs/bench/photometry.json.
 """
 
-import json
 import tempfile
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
+from figures import write_figures
 from perilune_render.blender import bpy
 from perilune_render.blender.renderer import configure, render_through
 from perilune_render.blender.stage import aim, mesh_from_arrays, sunlit_stage, surface_material
@@ -22,7 +22,6 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array, sun_direction
 from perilune_shared.progress import progress_bar
-from perilune_shared.storage.files import write_text
 
 PHASE_DEG = (0, 0.5, 1, 2, 5, 10, 20, 30, 45, 60, 75, 90, 105, 120, 135, 140)
 EMISSION_DEG = np.arange(0, 61, 5)
@@ -65,9 +64,7 @@ def main() -> None:
         "pixels": len(both),
         "geometries": n_geometries,
     }
-    path = Path("runs/bench/photometry.json")
-    write_text(path, json.dumps(figures, indent=2) + "\n")
-    print(path, json.dumps(figures, indent=2))
+    write_figures(Path("runs/bench/photometry.json"), figures)
 
 
 def tilted_normals(sun: Array) -> Array:

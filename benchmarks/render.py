@@ -6,7 +6,6 @@ process with frames alternating, so that other load on the machine affects both 
 and normals at the pixel centres) is timed separately. Writes runs/bench/render.json.
 """
 
-import json
 import statistics
 import tempfile
 import time
@@ -15,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from figures import write_figures
 from perilune_render.blender import bpy
 from perilune_render.blender.renderer import Renderer, one_ray_a_pixel, quiet, render_through
 from perilune_render.blender.stage import aim
@@ -29,7 +29,6 @@ from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import resolve
 from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.progress import progress_bar
-from perilune_shared.storage.files import write_text
 
 N_FRAMES = 38
 
@@ -90,9 +89,7 @@ def main() -> None:
         "craters": len(scene.craters),
         "boulders": len(scene.boulders),
     }
-    path = Path("runs/bench/render.json")
-    write_text(path, json.dumps(figures, indent=2) + "\n")
-    print(path, json.dumps(figures, indent=2))
+    write_figures(Path("runs/bench/render.json"), figures)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 A frame has 8,000 candidates, about fifteen per crater. Both keep the same boxes. Writes runs/bench/suppress.json.
 """
 
-import json
 import statistics
 import time
 from collections.abc import Callable
@@ -13,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from perilune_shared.storage.files import write_text
+from figures import write_figures
 from perilune_train.detect.evaluate.boxes import suppress
 from perilune_train.detect.inference.suppression import suppress_batch
 
@@ -61,7 +60,7 @@ def main() -> None:
         opencv_s, batch_s = median_s(by_frame), median_s(whole)
         result[f"frames_{n_frames}"] = {"opencv_s": opencv_s, "batch_s": batch_s, "ratio": batch_s / opencv_s}
         print(f"{n_frames} frames: OpenCV {opencv_s:.3f} s, batch on {device} {batch_s:.3f} s")
-    write_text(Path("runs/bench/suppress.json"), json.dumps(result, indent=2) + "\n")
+    write_figures(Path("runs/bench/suppress.json"), result)
 
 
 if __name__ == "__main__":

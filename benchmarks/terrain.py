@@ -5,7 +5,6 @@ others). Compilation by numba is done once and cached, so a small scene warms ev
 runs/bench/terrain.json.
 """
 
-import json
 import os
 import resource
 import tempfile
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from figures import write_figures
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import CratersConfig
@@ -30,7 +30,6 @@ from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.config import resolve
 from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.progress import progress_bar
-from perilune_shared.storage.files import write_text
 
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000)
 
@@ -98,9 +97,7 @@ def main() -> None:
         "laying_s": dict(zip(map(str, COUNTS), times, strict=True)),
         **second_descent(config),
     }
-    path = Path("runs/bench/terrain.json")
-    write_text(path, json.dumps(figures, indent=2) + "\n")
-    print(path, json.dumps(figures, indent=2))
+    write_figures(Path("runs/bench/terrain.json"), figures)
 
 
 def second_descent(config: DatasetConfig) -> dict[str, float]:

@@ -11,7 +11,6 @@ same weights on the same batches; the first steps of a turn are not counted. Wri
 """
 
 import copy
-import json
 import statistics
 import tempfile
 import time
@@ -24,10 +23,10 @@ import typer
 from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
+from figures import write_figures
 from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import run_command_line
-from perilune_shared.storage.files import write_text
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import TrainingFrames, loader
 from perilune_train.detect.data.split import DetectSplit, load_split
@@ -148,9 +147,7 @@ def main(
         "device": device,
         "bf16": bf16,
     }
-    text = json.dumps(result, indent=1)
-    write_text(out / "train.json", text + "\n")
-    print(text)
+    write_figures(out / "train.json", result)
 
 
 if __name__ == "__main__":

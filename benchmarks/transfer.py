@@ -15,7 +15,6 @@ mode. Writes runs/bench/transfer.json.
 """
 
 import argparse
-import json
 import statistics
 from collections.abc import Iterator
 from itertools import islice
@@ -25,8 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from figures import write_figures
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.storage.files import write_text
 from perilune_train.config import Attention
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import Batch, EvaluationFrames, TrainingFrames, loader
@@ -162,7 +161,7 @@ def main() -> None:
         sizes = " ".join(f"{value:.0e}" for value in size)
         print(f"{choice:12} {shown[0]:30} {sizes:30} {shown[1]:>18} {shown[2]:>18}")
     settings = {"width": given.width, "steps": given.steps, "before": given.before, "frames": len(splits[0])}
-    write_text(given.out, json.dumps(settings | {"choices": result}, indent=2) + "\n")
+    write_figures(given.out, settings | {"choices": result})
 
 
 if __name__ == "__main__":

@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
-        "errors progress content yaml_text config_errors config config_page storage geometry dataset validation "
-        "editing export cli"
+        "errors run_record progress content yaml_text config_errors config config_page storage geometry dataset "
+        "validation editing export cli"
     ),
     "render/perilune_render": (
         "config_values config_terrain config streams interrupts provenance terrain flight imaging labels blender "

@@ -13,6 +13,7 @@ from torch import nn
 
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError
+from perilune_shared.run_record import run_record
 from perilune_train.training import fit as fitting
 from perilune_train.training import runs
 from perilune_train.training.begin import start_run
@@ -40,7 +41,12 @@ def test_a_process_that_lightning_starts_knows_at_once_that_it_is_not_the_first(
 def test_metrics_are_plain_json(tmp_path):
     run = runs.RunFolder(tmp_path)
     runs.write_metrics(run, {"a": 1, "b": float("nan"), "c": "text", "d": 0.5})
-    assert json.loads(run.metrics.read_text()) == {"a": 1, "b": None, "c": "text", "d": 0.5}
+    found = json.loads(run.metrics.read_text())
+    assert {key: found[key] for key in "abcd"} == {"a": 1, "b": None, "c": "text", "d": 0.5}
+    assert found["run/commit"] == run_record().commit
+    assert {key for key in found if len(key) > 1} == {
+        f"run/{key}" for key in ("commit", "hardware", "load", "command", "date", "gpu")
+    }
 
 
 def test_weights_come_back(tmp_path):

@@ -12,6 +12,7 @@ import torch
 from perilune_shared.config import Section, read_config_file, to_yaml
 from perilune_shared.errors import UserError
 from perilune_shared.progress import console
+from perilune_shared.run_record import run_record
 from perilune_shared.storage.checksums import SUMS_NAME
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.training.runs import RunFolder, is_first_process
@@ -65,6 +66,8 @@ def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state:
 
     Of several processes only the first changes the folder. Raises UserError on a folder that is no run of this task.
     """
+    # Recorded before the training: the checkout may change while it runs.
+    run_record()
     if not is_first_process() or state != "new":
         return
     if _is_used(run):

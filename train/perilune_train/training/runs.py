@@ -5,7 +5,7 @@ import json
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from perilune_shared.errors import UserError
+from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import write_bytes, write_text
 from perilune_train.config import Precision
 from perilune_train.evaluation.provenance import RECORD
@@ -68,10 +69,12 @@ def is_first_process() -> bool:
 
 
 def write_metrics(run: RunFolder, metrics: Mapping[str, float | int | str | None]) -> None:
-    """Write metrics.json: flat keys; values that are not finite become null."""
+    """Write metrics.json: flat keys; values that are not finite become null. Adds the record of the run (run/...)."""
     plain = {
         key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in metrics.items()
     }
+    plain |= {f"run/{key}": value for key, value in asdict(run_record()).items()}
+    plain["run/gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
     write_text(run.metrics, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 

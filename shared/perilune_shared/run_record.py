@@ -1,0 +1,80 @@
+"""What a run or a benchmark records about itself: commit, hardware, command, date."""
+
+import functools
+import os
+import platform
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+_CHECKOUT = Path(__file__).resolve().parents[2]
+_MODEL, _BFLOAT16 = re.compile(r"^model name\s*:\s*(.+)$", re.MULTILINE), "avx512_bf16"
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """How the figures of a run were made."""
+
+    commit: str
+    """Commit of this repository, 40 digits; with " modified" after it if tracked files differ; else "unknown"."""
+    hardware: str
+    """Number of cores, processor, memory."""
+    load: float
+    """Load average of the last minute when the program started: other work beside it."""
+    command: str
+    """The command line."""
+    date: str
+    """When it started, UTC, for example 2026-01-31."""
+
+
+@functools.cache
+def run_record() -> RunRecord:
+    """The record of this process; the first call decides, so make it at the start."""
+    return RunRecord(_commit(), _hardware(), round(_load(), 1), _command(), f"{datetime.now(UTC):%Y-%m-%d}")
+
+
+def _commit() -> str:
+    # An installed package may lie inside the repository of another project.
+    if not (_CHECKOUT / ".git").exists():
+        return "unknown"
+    try:
+        commit = _git("rev-parse", "HEAD")
+        return f"{commit} modified" if _git("status", "--porcelain", "--untracked-files=no") else commit
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(_CHECKOUT), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def _hardware() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    model = _MODEL.search(text)
+    name = model.group(1).strip() if model else platform.processor() or platform.machine()
+    bfloat16 = ["AVX512-BF16"] if _BFLOAT16 in text else []
+    return ", ".join([f"{os.cpu_count() or 1} cores {name}", *bfloat16, *_memory()])
+
+
+def _memory() -> list[str]:
+    try:
+        return [f"{os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30:.0f} GiB"]
+    except (AttributeError, OSError, ValueError):
+        return []
+
+
+def _load() -> float:
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+
+
+def _command() -> str:
+    program = Path(sys.argv[0])
+    name = f"python {program.parent.name}/{program.name}" if program.suffix == ".py" else program.name
+    return " ".join([name, *sys.argv[1:]])

@@ -1,0 +1,61 @@
+"""The record of a run names the commit of this repository, and no other."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from perilune_shared import run_record as module
+
+ASK = "from perilune_shared.run_record import run_record; print(run_record().commit)"
+
+
+def git(root: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(root), "-c", "user.name=a", "-c", "user.email=a@example.org", *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def commit_by(path: Path) -> str:
+    """The commit that the package in a folder records."""
+    own = {**os.environ, "PYTHONPATH": str(path)}
+    done = subprocess.run([sys.executable, "-c", ASK], env=own, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@pytest.fixture
+def checkout(tmp_path) -> Path:
+    """A repository with shared/perilune_shared in it, as this one has it."""
+    target = tmp_path / "checkout/shared/perilune_shared"
+    target.mkdir(parents=True)
+    (target / "run_record.py").write_bytes(Path(module.__file__).read_bytes())
+    (target / "__init__.py").touch()
+    root = tmp_path / "checkout"
+    git(root, "init", "-q")
+    git(root, "add", ".")
+    git(root, "commit", "-q", "-m", "one")
+    return root
+
+
+def test_the_commit_is_the_checkouts_and_says_if_files_differ(checkout):
+    head = git(checkout, "rev-parse", "HEAD")
+    (checkout / "untracked").touch()
+    assert commit_by(checkout / "shared") == head
+    (checkout / "shared/perilune_shared/__init__.py").write_text("changed = True\n")
+    assert commit_by(checkout / "shared") == f"{head} modified"
+
+
+def test_an_installed_package_does_not_take_the_commit_of_the_repository_around_it(checkout):
+    installed = checkout / "env/lib/site-packages"
+    shutil.copytree(checkout / "shared/perilune_shared", installed / "perilune_shared")
+    assert commit_by(installed) == "unknown"
+
+
+def test_the_record_has_hardware_and_command():
+    record = module.run_record()
+    assert "cores" in record.hardware
+    assert record.command
+    assert len(record.date) == 10
