@@ -14,7 +14,7 @@ from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import EXIT_USER_ERROR, UserError, run_command_line
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 
 app = typer.Typer(
     help="Grow lunar terrain, fly descents over it and render labelled frames with Blender.",

@@ -1,44 +1,53 @@
-"""The progress bar of all long tasks: name, progress, rate, remaining time."""
+"""Progress of long tasks, reported to any progress bar or to none.
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
+Use: `task = progress.add_task("merging", total=n, unit="scenes")`, then `progress.advance(task)` after each step.
+Command lines pass `terminal.progress_bar()`. Other callers pass nothing, and Rich is not imported.
+"""
 
-console = Console(stderr=True)
+from typing import Any, Protocol
 
 
-class _Rate(ProgressColumn):
-    """Column with the completed steps per second."""
+class Progress(Protocol):
+    """The methods of a progress bar that long tasks call; rich.progress.Progress has them."""
 
-    def render(self, task) -> Text:
-        speed = task.finished_speed or task.speed
-        unit = task.fields.get("unit", "steps")
-        return Text("" if speed is None else f"{speed:.1f} {unit}/s")
+    def add_task(self, description: str, *, total: float | None, **fields: Any) -> Any:
+        """Start a task of `total` steps and return its id. `unit` is the plural name of a step."""
 
+    def advance(self, task_id: Any, advance: float = 1) -> None:
+        """Add completed steps to a task."""
 
-class _Note(ProgressColumn):
-    """Column with the task's current note, if it has one."""
-
-    def render(self, task) -> Text:
-        return Text(task.fields.get("note", ""))
+    def update(self, task_id: Any, **fields: Any) -> None:
+        """Set fields of a task: `completed`, or a `note` on the current step."""
 
 
-def progress_bar() -> Progress:
-    """Create a progress bar on standard error; set e.g. `unit="frames"` in each task to show its rate."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _Rate(),
-        TimeRemainingColumn(),
-        _Note(),
-        console=console,
-        refresh_per_second=2,
-    )
+class _NoProgress:
+    """Ignores all reports."""
+
+    def add_task(self, description: str, *, total: float | None, **fields: Any) -> None:
+        pass
+
+    def advance(self, task_id: Any, advance: float = 1) -> None:
+        pass
+
+    def update(self, task_id: Any, **fields: Any) -> None:
+        pass
+
+
+NO_PROGRESS: Progress = _NoProgress()
+"""Default of functions that report progress."""
+
+
+def say(line: str, style: str | None = None) -> None:
+    """Print a line on standard error, above the progress bar if one is shown; `style` is a style of Rich."""
+    from perilune_shared.terminal import console
+
+    console.print(line, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def __getattr__(name: str) -> Any:
+    """Import `console` and `progress_bar` from their new place."""
+    if name in ("console", "progress_bar"):
+        from perilune_shared import terminal
+
+        return getattr(terminal, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
@@ -35,6 +34,7 @@ from perilune_shared.dataset.parts import write_part
 from perilune_shared.dataset.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
+from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.checksums import seal
 
@@ -99,7 +99,7 @@ def _develop(
     info = begin_or_go_on(out, info)
     if info.complete:
         return open_finished(out)
-    task = progress.add_task("develop", total=source.info.counts.frames, unit="frames", note="")
+    task = progress.add_task("develop", total=source.info.counts.frames, unit="frames")
     pattern = FixedPattern.draw(config.sensor, camera, config.seed)
     for scene_id in source.scene_ids():
         _copy_scene(source, out, scene_id, info.recipe())

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.progress import Progress
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig
@@ -33,6 +32,7 @@ from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.errors import UserError
+from perilune_shared.progress import Progress
 from perilune_shared.storage.files import sha256_of
 from perilune_shared.storage.locks import locked
 from perilune_shared.storage.png import png_header
@@ -90,7 +90,7 @@ def regenerate(
         if frame_id not in known:
             raise UserError(dataset.root, "frame_id", frame_id, f"a frame of the manifest, such as {min(known)}")
     frames = frames.filter(pc.is_in(frames["frame_id"], pa.array(list(frame_ids), pa.string())))
-    task = progress.add_task("regenerate", total=len(frames), unit="frames", note="")
+    task = progress.add_task("regenerate", total=len(frames), unit="frames")
     outcomes = []
     with locked(out):
         for scene in dataset.table("scenes").sort_by("scene_id").to_pylist():

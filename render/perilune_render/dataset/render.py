@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
@@ -42,6 +41,7 @@ from perilune_shared.dataset.parts import read_part, write_part
 from perilune_shared.dataset.schema import Kind
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import sun_direction
+from perilune_shared.progress import Progress
 from perilune_shared.storage.checksums import seal
 
 _GROUND = ("craters", "boulders")
@@ -84,9 +84,7 @@ def _render(
     if info.complete:
         return open_finished(out)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
-    task = progress.add_task(
-        f"{kind} frames", total=sum(len(t.splits) for t in plan.trajectories), unit="frames", note=""
-    )
+    task = progress.add_task(f"{kind} frames", total=sum(len(t.splits) for t in plan.trajectories), unit="frames")
     for scene_plan in plan.scenes:
         trajectories = plan.of_scene(scene_plan.scene_id)
         waiting = [t for t in trajectories if not _frames_part(out, t).exists()]

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
@@ -17,6 +16,7 @@ from perilune_render.terrain.scene import check_ground, grow_scene
 from perilune_shared.dataset.schema import TABLES, Kind
 from perilune_shared.dataset.writer import written
 from perilune_shared.geometry.frames import sun_direction
+from perilune_shared.progress import Progress
 
 
 def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> None:
@@ -30,7 +30,7 @@ def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progre
     check_plan(plan, graded_grid(config, plan.exr_camera, config.ground_flight(kind)), where)
     recipe = recipe_of(config, kind, preset, planned=True)
     info = info_of(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
-    task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes", note="")
+    task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes")
     with written(out, info, whole_tables=True) as writer:
         for scene_plan in plan.scenes:
             with interrupts_held():

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from perilune_render.imaging.exr import Radiance
-from perilune_shared.progress import console
+from perilune_shared.progress import say
 
 _LEAST_SUNLIT = 0.01
 
@@ -20,4 +20,4 @@ def warn_of_dark_frames(scene_id: str, dark: Sequence[str], n_frames: int, sun_e
             f"warning: {scene_id}: {len(dark)} of {n_frames} frames are dark (less than {_LEAST_SUNLIT:.0%} of the "
             f"picture is sunlit), first {dark[0]}; the Sun is {sun_elevation_deg:.1f} degrees high"
         )
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        say(line)

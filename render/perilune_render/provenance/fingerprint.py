@@ -24,9 +24,10 @@ _NO_EFFECT = (
     "perilune_render.interrupts",
     "perilune_shared.config",
     "perilune_shared.errors",
+    "perilune_shared.progress",
     "perilune_shared.storage.files",
 )
-"""Modules that read settings, store results or report errors, and so change no result."""
+"""Modules that read settings, store results, or report errors and progress, and so change no result."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from perilune_render.terrain.relief import add_relief, check_waves
 from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
-from perilune_shared.progress import console
+from perilune_shared.progress import say
 
 _ROUGHNESS_M = 100.0
 """Wavelength below which relief is added on top of the craters, metres."""
@@ -162,7 +162,7 @@ def check_ground(config: DatasetConfig, camera: Camera, flight: FlightConfig) ->
         model = read_elevation(Path(config.terrain.dem))
         refuse_beyond(model, grid, config.terrain.elevation.outside)
         for line in remarks(model, grid, config.terrain.elevation.outside):
-            console.print(line, style="yellow", markup=False, highlight=False, soft_wrap=True)
+            say(line, style="yellow")
         if config.terrain.catalogue is not None:
             read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters, resolved_m(model))
 

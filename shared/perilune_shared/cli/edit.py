@@ -19,7 +19,7 @@ from perilune_shared.editing.rewrite import ImageMode
 from perilune_shared.editing.split import split_dataset
 from perilune_shared.editing.subset import subset as choose
 from perilune_shared.errors import UserError
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 
 EXIT_DIFFERENT = 1
 

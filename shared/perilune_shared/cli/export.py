@@ -15,8 +15,8 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.schema import SPLITS
 from perilune_shared.dataset.selection import SELECTIONS
 from perilune_shared.errors import UserError
-from perilune_shared.progress import progress_bar
 from perilune_shared.storage.files import check_free
+from perilune_shared.terminal import progress_bar
 
 
 class ExportFormat(StrEnum):

@@ -12,7 +12,7 @@ from perilune_shared.cli.edit import DatasetArgument
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.stats import summary
 from perilune_shared.errors import EXIT_USER_ERROR, one_line, run_command_line, shortened
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 from perilune_shared.validation.validate import validate as find_faults
 
 app = typer.Typer(

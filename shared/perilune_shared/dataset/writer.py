@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from rich.progress import Progress
 
 from perilune_shared.content import terrain_of
 from perilune_shared.dataset.manifest import Dataset
@@ -21,6 +20,7 @@ from perilune_shared.dataset.metadata import Counts, DatasetInfo, checked_info, 
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WHOLE_TABLE, write_part
 from perilune_shared.dataset.schema import IMAGES, TABLES, SplitUnit, complete
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums, files
 
 SceneTables = dict[str, pa.Table]
@@ -149,7 +149,7 @@ class DatasetWriter:
         if writer is not None:
             writer.close()
 
-    def finish(self, out: Path, progress: Progress | None = None) -> None:
+    def finish(self, out: Path, progress: Progress = NO_PROGRESS) -> None:
         """Write buffered rows, dataset.json and the checksums. Raises UserError about `out` if there are no frames."""
         if not self._rows["frames"]:
             raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
@@ -176,7 +176,7 @@ def written(
     *,
     whole_tables: bool = False,
     most_rows: int = MOST_ROWS_WRITTEN,
-    progress: Progress | None = None,
+    progress: Progress = NO_PROGRESS,
 ) -> Iterator[DatasetWriter]:
     """Give a writer for a new dataset; it appears at `out` only when the block succeeds.
 

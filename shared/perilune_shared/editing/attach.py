@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.writer import with_column, written
 from perilune_shared.editing.rewrite import check_source
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.png import png_header
 
@@ -18,7 +18,7 @@ def attach(
     frames_root: Path,
     out: Path,
     rehash: bool = False,
-    progress: Progress | None = None,
+    progress: Progress = NO_PROGRESS,
     *,
     link: bool = False,
 ) -> None:
@@ -37,17 +37,14 @@ def attach(
     line = "frames attached" + (", hashed anew" if rehash else "")
     info = manifest.info.changed(line, images="files")
     scene_ids = manifest.scene_ids()
-    task = (
-        progress.add_task("attaching", total=manifest.info.counts.frames, unit="frames", note="") if progress else None
-    )
+    task = progress.add_task("attaching", total=manifest.info.counts.frames, unit="frames")
     with written(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = manifest.scene(scene_id)
             frames = _checked(source, tables["frames"], rehash)
             writer.add_scene({**tables, "frames": frames})
             writer.add_images(source, frames, {name: name for name in frames["frame_id"].to_pylist()}, link=link)
-            if progress is not None and task is not None:
-                progress.advance(task, len(frames))
+            progress.advance(task, len(frames))
 
 
 def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import CameraInfo, DatasetInfo
@@ -13,6 +12,7 @@ from perilune_shared.dataset.writer import SceneTables, check_scene, with_column
 from perilune_shared.editing.licence import joined_licence
 from perilune_shared.editing.rewrite import ImageMode, bare, check_source, state_of
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 
 _GROUND = ("scenes", "craters", "boulders")
 _CHANGING = ("scene_id", "trajectory_id", "n_frames", "split")
@@ -26,7 +26,7 @@ def merge(
     out: Path,
     name: str = "merged",
     images: ImageMode = "copy",
-    progress: Progress | None = None,
+    progress: Progress = NO_PROGRESS,
 ) -> None:
     """Write the frames of all sources, each once, as one dataset.
 
@@ -41,7 +41,7 @@ def merge(
         check_source(source, out, progress)
     info = _joined_info(sources, name, state_of(list(sources), images))
     groups = _same_scenes(sources, planned=info.images == "planned")
-    task = progress.add_task("merging", total=len(groups), unit="scenes", note="") if progress else None
+    task = progress.add_task("merging", total=len(groups), unit="scenes")
     with written(out, info, progress=progress) as writer:
         for scene_id, members in groups.items():
             tables, brought = _join(scene_id, [(sources[i], own) for i, own in members])
@@ -49,8 +49,7 @@ def merge(
             for source, frames, names in brought:
                 if info.images == "files" and len(frames):
                     writer.add_images(source, frames, names, link=images == "link")
-            if progress is not None and task is not None:
-                progress.advance(task)
+            progress.advance(task)
 
 
 def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetInfo:

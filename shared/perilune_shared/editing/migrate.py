@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset
@@ -18,6 +17,7 @@ from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.dataset.writer import written
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 
 _ADDED_IN_3 = {"scenes": ("recipe", "content_sha256"), "labels": ("contrast",)}
 _ADDED_IN_2 = {"craters": ("origin",)}
@@ -35,7 +35,7 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
 """Schemas of the tables in older versions."""
 
 
-def migrate(root: Path, out: Path, progress: Progress | None = None, *, link: bool = False) -> None:
+def migrate(root: Path, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Convert a dataset of schema version 1 or 2 to the current version; frames are copied, or hard-linked with `link`.
 
     The contrast of labels, which older versions did not record, becomes null. Raises UserError if the dataset has the
@@ -53,15 +53,14 @@ def migrate(root: Path, out: Path, progress: Progress | None = None, *, link: bo
     info = _info(content, path)
     source = _Old(root, info, version)
     scene_ids = sorted(source.rows("scenes")["scene_id"].to_pylist())
-    task = progress.add_task("migrating", total=len(scene_ids), unit="scenes", note="") if progress else None
+    task = progress.add_task("migrating", total=len(scene_ids), unit="scenes")
     with written(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = {name: source.rows(name, scene_id) for name in TABLES}
             writer.add_scene(tables)
             names = {name: name for name in tables["frames"]["frame_id"].to_pylist()}
             writer.add_images(source, tables["frames"], names, link=link)
-            if progress is not None and task is not None:
-                progress.advance(task)
+            progress.advance(task)
 
 
 def _info(content: dict[str, Any], path: Path) -> DatasetInfo:

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
@@ -12,6 +11,7 @@ from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
 from perilune_shared.dataset.writer import MOST_IMAGES_WRITTEN, frame_path, with_column, written
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 
 _EXR = ("exr_path", "exr_sha256", "exr_bytes")
 _LARGEST_SHARD_MB = 8000
@@ -23,7 +23,7 @@ def pack(
     source: Dataset,
     out: Path,
     shard_mb: float = 1000,
-    progress: Progress | None = None,
+    progress: Progress = NO_PROGRESS,
     *,
     most_rows: int = MOST_ROWS_WRITTEN,
     most_images: int = MOST_IMAGES_WRITTEN,
@@ -42,23 +42,22 @@ def pack(
     if packed:
         info = info.changed("packed", images="packed", exr_camera=None)
     frames = source.table("frames").sort_by(_ORDER)
-    task = progress.add_task("packing", total=len(frames), unit="frames", note="") if progress and packed else None
     with written(out, info, whole_tables=True, most_rows=most_rows, progress=progress) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
             writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
         if packed:
-            writer.pack_images(_images(source, frames, progress, task), round(shard_mb * 1e6), most_images)
+            writer.pack_images(_images(source, frames, progress), round(shard_mb * 1e6), most_images)
 
 
-def _images(source: Dataset, frames: pa.Table, progress: Progress | None, task) -> Iterator[tuple[str, str, bytes]]:
+def _images(source: Dataset, frames: pa.Table, progress: Progress) -> Iterator[tuple[str, str, bytes]]:
+    task = progress.add_task("packing", total=len(frames), unit="frames")
     for frame_id, png in source.pngs(frames):
         yield frame_id, frame_path(frame_id, "png"), png
-        if progress is not None:
-            progress.advance(task)
+        progress.advance(task)
 
 
-def unpack(source: Dataset, out: Path, progress: Progress | None = None, *, link: bool = False) -> None:
+def unpack(source: Dataset, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Write a dataset with a part for each scene and trajectory, and frames as files.
 
     Frames that already are files are copied, or hard-linked with `link`.

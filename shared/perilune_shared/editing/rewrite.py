@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Literal
 
 import pyarrow.compute as pc
-from rich.progress import Progress
 
 from perilune_shared.dataset.keys import check_keys
 from perilune_shared.dataset.manifest import Dataset
@@ -13,6 +12,7 @@ from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.schema import ImageState
 from perilune_shared.dataset.writer import SceneTables, written
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums
 
 ImageMode = Literal["copy", "link", "none", "plan"]
@@ -28,7 +28,7 @@ def rewrite(
     info: DatasetInfo,
     change: Callable[[SceneTables], SceneTables],
     images: ImageMode,
-    progress: Progress | None = None,
+    progress: Progress = NO_PROGRESS,
     scene_ids: Sequence[str] | None = None,
 ) -> None:
     """Write the scenes of `source`, by default all, after applying `change` to the tables of each.
@@ -37,7 +37,7 @@ def rewrite(
     """
     info = info.model_copy(update={"images": state_of([source], images)})
     scene_ids = source.scene_ids() if scene_ids is None else scene_ids
-    task = progress.add_task("writing", total=len(scene_ids), unit="scenes", note="") if progress else None
+    task = progress.add_task("writing", total=len(scene_ids), unit="scenes")
     with written(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = change(source.scene(scene_id))
@@ -49,11 +49,10 @@ def rewrite(
                 if info.images == "files":
                     names = {name: name for name in frames["frame_id"].to_pylist()}
                     writer.add_images(source, frames, names, link=images == "link")
-            if progress is not None and task is not None:
-                progress.advance(task)
+            progress.advance(task)
 
 
-def check_source(source: Dataset, out: Path, progress: Progress | None = None) -> None:
+def check_source(source: Dataset, out: Path, progress: Progress = NO_PROGRESS) -> None:
     """Raise UserError if a dataset must not be rewritten into `out`.
 
     That is if the dataset is not complete, if its files do not match SHA256SUMS (new sums would hide the damage), if

@@ -5,13 +5,13 @@ from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.writer import SceneTables, with_column
 from perilune_shared.editing.flights import terrains_and_flights
 from perilune_shared.editing.rewrite import ImageMode, check_source, rewrite
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 
 SplitBy = Literal["scene", "trajectory", "frame"]
 
@@ -24,7 +24,7 @@ def split_dataset(
     test_share: float = 0.1,
     seed: int = 0,
     images: ImageMode = "copy",
-    progress: Progress | None = None,
+    progress: Progress = NO_PROGRESS,
 ) -> None:
     """Write a dataset whose whole scenes, trajectories or single frames are assigned to train, val and test at random.
 

@@ -7,13 +7,13 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.progress import Progress
 
 from perilune_shared.dataset.expression import Condition, columns_of
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.writer import SceneTables
 from perilune_shared.editing.rewrite import ImageMode, check_source, rewrite
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 
 
 def subset(
@@ -23,7 +23,7 @@ def subset(
     n_frames: int | None = None,
     megabytes: float | None = None,
     images: ImageMode = "copy",
-    progress: Progress | None = None,
+    progress: Progress = NO_PROGRESS,
 ) -> None:
     """Write the frames and labels that fulfil all conditions, up to a number of frames or a size of the PNGs.
 

@@ -4,16 +4,15 @@ import contextlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from rich.progress import Progress
-
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums, files
 from perilune_shared.storage.locks import locked
 from perilune_shared.validation.expected_files import EXTRA_NAMES
 
 
-def check_sums(dataset: Dataset, paths: Iterable[Path], progress: Progress | None = None) -> dict[str, str] | None:
+def check_sums(dataset: Dataset, paths: Iterable[Path], progress: Progress = NO_PROGRESS) -> dict[str, str] | None:
     """Return the hashes of the dataset's other files if writing `paths` requires a new SHA256SUMS, otherwise None.
 
     A new SHA256SUMS is required if one of `paths` is directly in the folder of a complete dataset; that of an

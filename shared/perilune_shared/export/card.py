@@ -12,7 +12,6 @@ from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
-from rich.progress import Progress
 
 from perilune_shared.content import terrain_of
 from perilune_shared.dataset.manifest import Dataset
@@ -23,6 +22,7 @@ from perilune_shared.export.added_files import add_files, check_sums
 from perilune_shared.export.card_head import head_of, table_configs
 from perilune_shared.export.card_pictures import TITLES, Gathered, draw, gather
 from perilune_shared.export.croissant import citation_of
+from perilune_shared.progress import Progress
 
 CARD_NAME = "README.md"
 _PICTURE_NAME = "card.png"

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_shared.export.rows import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, scenes_of, sizes
+from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
 CATEGORY = {"id": 1, "name": "crater", "supercategory": "crater"}

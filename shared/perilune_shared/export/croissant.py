@@ -15,7 +15,6 @@ from types import MappingProxyType
 from typing import Any
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import INFO_NAME
@@ -23,6 +22,7 @@ from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import KEYS, OPTIONAL, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.added_files import add_files, check_sums
+from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import files
 
 CROISSANT_NAME = "croissant.json"
@@ -74,7 +74,7 @@ _CONTEXT: dict[str, Any] = {
 _DATA_TYPES = {pa.string(): "sc:Text", pa.int64(): "cr:Int64", pa.float64(): "cr:Float64"}
 
 
-def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progress | None = None) -> Path:
+def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progress = NO_PROGRESS) -> Path:
     """Write croissant.json, or `out`, into the dataset's folder and update the checksums; return its path.
 
     Raises UserError if `out` is elsewhere, the dataset is not complete or its checksums are wrong.

@@ -14,12 +14,12 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.schema import IMAGES, SPLITS, TABLES
 from perilune_shared.export.card_head import head_of
 from perilune_shared.export.rows import Choice, SceneRows, scenes_of
+from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
 _LEFT_OUT = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
@@ -46,7 +46,7 @@ def export_hugging_face(
     The field `chosen` of each label states whether it is selected. Raises UserError if `out` is not empty, an image is
     missing or the split has no frames.
     """
-    task = progress.add_task("hugging face", total=dataset.info.counts.frames, unit="frames", note="")
+    task = progress.add_task("hugging face", total=dataset.info.counts.frames, unit="frames")
     writers: dict[str, _Shards] = {}
     n_frames = 0
     with files.new_folder(out) as folder:

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from rich.progress import Progress, TaskID
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.export.rows import scenes_of
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
 _TUM_HEADER = (
@@ -32,17 +32,16 @@ def export_tum(dataset: Dataset, out: Path, progress: Progress, split: str | Non
 
     With `split`, writes only frames of that split. Raises UserError if `out` is not empty or the split has no frames.
     """
-    n_descents = 0
-    task = progress.add_task("tum", total=len(dataset.scene_ids()), unit="scenes")
+    n_trajectories = 0
     with files.new_folder(out) as folder:
-        for scene_id, trajectory_id, frames in _descents(dataset, progress, task, split):
+        for scene_id, trajectory_id, frames in _trajectories(dataset, progress, "tum", split):
             # Conjugate: the manifest contains rotation_camera_from_site.
             w, x, y, z = np.stack(frames["rotation_wxyz"].to_list()).T
             rows = np.column_stack([frames["time_s"], np.stack(frames["position_m"].to_list()), -x, -y, -z, w])
             path = files.inside(folder, f"{scene_id}/{trajectory_id}.txt")
             files.write_text(path, _TUM_HEADER + _lines(rows))
-            n_descents += 1
-    return n_descents
+            n_trajectories += 1
+    return n_trajectories
 
 
 def export_kitti(dataset: Dataset, out: Path, progress: Progress, split: str | None = None) -> int:
@@ -51,17 +50,16 @@ def export_kitti(dataset: Dataset, out: Path, progress: Progress, split: str | N
     Files: `out`/<scene_id>/<trajectory_id>.txt and <trajectory_id>.times.txt. With `split`, writes only frames of that
     split. Raises UserError if `out` is not empty or the split has no frames.
     """
-    n_descents = 0
-    task = progress.add_task("kitti", total=len(dataset.scene_ids()), unit="scenes")
+    n_trajectories = 0
     with files.new_folder(out) as folder:
-        for scene_id, trajectory_id, frames in _descents(dataset, progress, task, split):
+        for scene_id, trajectory_id, frames in _trajectories(dataset, progress, "kitti", split):
             poses = poses_site_from_camera(frames)
             relative = np.linalg.inv(poses[0]) @ poses
             path = files.inside(folder, f"{scene_id}/{trajectory_id}.txt")
             files.write_text(path, _lines(relative[:, :3].reshape(-1, 12)))
             files.write_text(path.with_suffix(".times.txt"), _lines(frames["time_s"].to_numpy()[:, None]))
-            n_descents += 1
-    return n_descents
+            n_trajectories += 1
+    return n_trajectories
 
 
 def poses_site_from_camera(frames: pd.DataFrame) -> Array:
@@ -72,10 +70,11 @@ def poses_site_from_camera(frames: pd.DataFrame) -> Array:
     return poses
 
 
-def _descents(
-    dataset: Dataset, progress: Progress, task: TaskID, split: str | None
+def _trajectories(
+    dataset: Dataset, progress: Progress, task_name: str, split: str | None
 ) -> Iterator[tuple[str, str, pd.DataFrame]]:
     """Yield scene_id, trajectory_id and frames in temporal order, for each trajectory."""
+    task = progress.add_task(task_name, total=len(dataset.scene_ids()), unit="scenes")
     for scene in scenes_of(dataset, split, with_labels=False):
         for trajectory_id, frames in scene.frames.groupby("trajectory_id"):
             yield scene.scene_id, str(trajectory_id), frames.sort_values("frame_index")

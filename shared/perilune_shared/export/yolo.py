@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.schema import SPLITS
 from perilune_shared.export.rows import Choice, clipped_boxes, scenes_of, sizes
+from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
 CRATER_CLASS = 0

@@ -8,9 +8,8 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from rich.progress import Progress
-
 from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import files
 
 SUMS_NAME = "SHA256SUMS"
@@ -20,7 +19,7 @@ _LINE = re.compile(r"([0-9a-f]{64})  (\S+)")
 _OWN_FOLDERS = ("manifest", "images")
 
 
-def seal(root: Path, progress: Progress | None = None, known: Mapping[str, str] | None = None) -> None:
+def seal(root: Path, progress: Progress = NO_PROGRESS, known: Mapping[str, str] | None = None) -> None:
     """Write SHA256SUMS for all files of the dataset, except links and invalid names, which are faults.
 
     `known` contains hashes computed earlier in this run; these files are not read again.
@@ -40,7 +39,7 @@ def sums_of(root: Path) -> dict[str, str]:
     return {line[2]: line[1] for line in lines if line is not None}
 
 
-def faults_of(root: Path, progress: Progress | None = None) -> Iterator[tuple[str, str, str]]:
+def faults_of(root: Path, progress: Progress = NO_PROGRESS) -> Iterator[tuple[str, str, str]]:
     """Yield file, value found and value expected for each difference from SHA256SUMS."""
     path = root / SUMS_NAME
     if not path.is_file() or path.is_symlink():
@@ -76,13 +75,10 @@ def faults_of(root: Path, progress: Progress | None = None) -> Iterator[tuple[st
 
 
 @contextlib.contextmanager
-def _hashing(root: Path, names: list[str], progress: Progress | None) -> Iterator[Callable[[int], object]]:
+def _hashing(root: Path, names: list[str], progress: Progress) -> Iterator[Callable[[int], object]]:
     """Give a function that advances the progress bar by a number of bytes read."""
-    if progress is None:
-        yield lambda n_bytes: None
-        return
     total = sum((root / name).stat().st_size for name in names if (root / name).is_file())
-    task = progress.add_task("hashing", total=total / 1e6, unit="MB", note="")
+    task = progress.add_task("hashing", total=total / 1e6, unit="MB")
     yield lambda n_bytes: progress.advance(task, n_bytes / 1e6)
     progress.update(task, completed=total / 1e6)
 

@@ -6,23 +6,23 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow as pa
-from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import IMAGES
 from perilune_shared.errors import UserError
+from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.png import png_header
 from perilune_shared.validation.faults import Fault
 
 
-def image_faults(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
+def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     """Yield missing frames and faults in size, header and hash of every frame's files or packed bytes."""
     info = dataset.info
     if info.images in ("absent", "planned"):
         return
-    task = progress.add_task("hashing", total=info.counts.frames, unit="frames", note="") if progress else None
+    task = progress.add_task("hashing", total=info.counts.frames, unit="frames")
     columns = ["frame_id", *(f"{kind}_{name}" for kind in ("png", "exr") for name in ("path", "bytes", "sha256"))]
     for part in dataset.parts("frames"):
         where = part.relative_to(dataset.root).as_posix()
@@ -34,8 +34,7 @@ def image_faults(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]
                 for kind in ("png", "exr") if info.images == "files" else ():
                     if frame[f"{kind}_path"] is not None:
                         yield from _file(dataset, frame, kind, row, where)
-                if progress is not None and task is not None:
-                    progress.advance(task)
+                progress.advance(task)
             if info.images == "packed":
                 try:
                     for frame_id, png in dataset.pngs(rows):

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.progress import Progress
 
 from perilune_shared.content import content_sha256, terrain_of
 from perilune_shared.dataset.manifest import Dataset, count_rows
@@ -18,6 +17,7 @@ from perilune_shared.dataset.parts import is_whole
 from perilune_shared.dataset.schema import KEYS, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
+from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums
 from perilune_shared.validation.descent import descent_faults
 from perilune_shared.validation.expected_files import unexpected
@@ -28,7 +28,7 @@ _DEGREES = 1e-9
 _NOT_PLANNED = ("craters", "boulders", "labels")
 
 
-def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
+def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
     """Return all faults of a dataset; an empty list means that all checks passed.
 
     Faults of the same file and column are reported once, at their first row. All labels are projected again.
@@ -38,7 +38,7 @@ def validate(dataset: Dataset, progress: Progress | None = None) -> list[Fault]:
         return _faults(dataset, progress)
 
 
-def _faults(dataset: Dataset, progress: Progress | None) -> list[Fault]:
+def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
     faults = [
         Fault.of(file, None, "SHA-256", found, wanted)
         for file, found, wanted in checksums.faults_of(dataset.root, progress)
@@ -67,7 +67,7 @@ def _faults(dataset: Dataset, progress: Progress | None) -> list[Fault]:
     return list({(fault.file, fault.column, fault.row is None): fault for fault in reversed(faults)}.values())[::-1]
 
 
-def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
+def _tables(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     """Check rows of several tables against each other."""
     counts = count_rows(dataset).model_dump()
     for name, present in counts.items():
@@ -83,7 +83,7 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
     seen = dict.fromkeys(TABLES, 0)
     splits_of_terrain: dict[str, set[str]] = defaultdict(set)
     splits_of_descent: dict[tuple[str, object], set[str]] = defaultdict(set)
-    task = progress.add_task("checking", total=len(scene_ids), unit="scenes", note="") if progress else None
+    task = progress.add_task("checking", total=len(scene_ids), unit="scenes")
     for scene_id in dict.fromkeys(scene_ids):
         scene = dataset.table("scenes", scene_id=scene_id)
         if not len(scene):
@@ -101,8 +101,7 @@ def _tables(dataset: Dataset, progress: Progress | None) -> Iterator[Fault]:
             splits_of_descent[terrain, seed_of.get(trajectory_id, trajectory_id)].add(split)
         seen["scenes"] += len(scene)
         yield from _scene(dataset, scene_id, scene, seen, told)
-        if progress is not None and task is not None:
-            progress.advance(task)
+        progress.advance(task)
     for name, present in counts.items():
         if seen[name] != present:
             wanted = f"{seen[name]}: those of the scenes and descents listed"

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
-from perilune_shared.progress import progress_bar
 from perilune_shared.storage.png import png_header
+from perilune_shared.terminal import progress_bar
 
 _AT_ONCE = 256
 """Number of compressed frames that may wait for a free thread."""

@@ -16,7 +16,7 @@ from perilune_shared.content import terrain_of
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console
+from perilune_shared.progress import say
 
 RECORD = "terrain"
 """Key of the record in a checkpoint."""
@@ -213,5 +213,5 @@ def _compared(
 
 
 def _reported(check: TerrainCheck) -> TerrainCheck:
-    console.print(check.mark, markup=False, soft_wrap=True)
+    say(check.mark)
     return check

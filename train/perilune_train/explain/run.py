@@ -12,8 +12,8 @@ import pandas as pd
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console, progress_bar
 from perilune_shared.storage.files import written_aside
+from perilune_shared.terminal import console, progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.split_evaluation import selection_entries

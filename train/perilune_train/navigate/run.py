@@ -11,8 +11,8 @@ from torch import Tensor
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console, progress_bar
 from perilune_shared.storage.files import written_aside
+from perilune_shared.terminal import console, progress_bar
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import (
     Provenance,

@@ -11,10 +11,10 @@ import torch
 
 from perilune_shared.config import Section, read_config_file, to_yaml
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.checksums import SUMS_NAME
 from perilune_shared.storage.files import sha256_of, write_text
+from perilune_shared.terminal import console
 from perilune_train.training.runs import RunFolder, is_first_process
 
 State = Literal["new", "resume", "finished"]

@@ -13,7 +13,7 @@ from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from perilune_shared.errors import UserError
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 from perilune_train.config import Precision
 from perilune_train.training.runs import (
     RunFolder,

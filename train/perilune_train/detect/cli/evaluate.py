@@ -8,7 +8,7 @@ import typer
 from perilune_shared.config import parse_setting, resolve_over
 from perilune_shared.dataset.schema import SPLITS
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console
+from perilune_shared.terminal import console
 from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.run_config import config_of_run

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console
+from perilune_shared.terminal import console
 from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
 from perilune_train.detect.run_config import config_of_run
 

@@ -11,8 +11,8 @@ import torch
 
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console
 from perilune_shared.storage.files import new_folder, sha256_of, write_text
+from perilune_shared.terminal import console
 from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input

@@ -14,8 +14,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
-from perilune_shared.progress import progress_bar
 from perilune_shared.storage.files import written_aside
+from perilune_shared.terminal import progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import unknown_facts
 from perilune_train.detect.data.split import FrameLabels

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console
+from perilune_shared.terminal import console
 from perilune_train.detect.images.read import SUFFIXES, picture_size
 
 Array = NDArray[np.float64]

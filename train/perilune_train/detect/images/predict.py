@@ -10,8 +10,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console, progress_bar
 from perilune_shared.storage.files import new_folder
+from perilune_shared.terminal import console, progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.evaluate_run import read_metrics, threshold_of

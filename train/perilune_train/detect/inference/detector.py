@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from perilune_shared.errors import UserError
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections

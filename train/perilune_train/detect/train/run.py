@@ -5,7 +5,7 @@ from pathlib import Path
 
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.progress import console
+from perilune_shared.terminal import console
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.matching import EDGE
