@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from figures import write_figures
 from perilune_shared.dataset.manifest import Dataset, open_dataset
-from perilune_shared.dataset.selection import SELECTIONS, read_labels, selected
+from perilune_shared.dataset.selection import read_labels, selected
+from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.errors import run_command_line
 from perilune_shared.geometry.frames import Array
 from perilune_train.detect.config import LabelSettings

@@ -7,17 +7,16 @@ from typing import Annotated, Literal, get_args
 import typer
 from rich.console import Console
 
+import perilune_shared as ps
 from perilune_render.cli_options import Catalogue, Config, Dem, Kind, Preset, Setting, first_kind, one_kind
 from perilune_render.config import DatasetConfig
-from perilune_render.flight.plan import make_plan
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
-from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import EXIT_USER_ERROR, UserError, run_command_line
 from perilune_shared.terminal import progress_bar
 
 app = typer.Typer(
-    help="Grow lunar terrain, fly descents over it and render labelled frames with Blender.",
+    help="Generate lunar terrain and trajectories, and render labelled frames with Blender.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -75,10 +74,10 @@ def dataset(
     ] = None,
     manifest: Annotated[
         Path | None,
-        typer.Option(help="Render somebody's manifest or plan into --out, in place of a preset."),
+        typer.Option(help="Render a manifest or plan into --out instead of a preset."),
     ] = None,
 ) -> None:
-    """Render a preset's datasets, or a manifest's. Run the same command again to resume."""
+    """Render the datasets of a preset or a manifest. Run the same command again to resume."""
     if manifest is not None:
         given = [name for name in ("preset", "config", "setting", "kind") if _was_given(context, name)]
         _render_manifest(manifest, out, dem, catalogue, given)
@@ -87,9 +86,8 @@ def dataset(
     if kind is not Kind.NAV:
         _warn_of_size(resolved)
     folder = out or Path("data") / preset
-    from perilune_render.dataset.render import (
-        make_dataset,
-    )  # imports Blender: only after the settings were checked
+    # Importing Blender takes seconds; check the settings first.
+    from perilune_render.dataset.render import make_dataset
 
     names: tuple[Literal["detect", "nav"], ...] = ("detect", "nav")
     for name in names if kind is Kind.BOTH else (first_kind(kind),):
@@ -115,7 +113,7 @@ def _render_manifest(
         found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
         wanted = "--out, and --dem and --catalogue where its recipe names them; the rest is the manifest's"
         raise UserError("--manifest", "options", found, wanted)
-    given = open_dataset(manifest)
+    given = ps.open_dataset(manifest)
     from perilune_render.dataset.read_plan import as_before, plan_of
     from perilune_render.dataset.render import render_plan
 
@@ -137,11 +135,11 @@ def develop(
     ] = None,
     setting: Setting = None,
 ) -> None:
-    """Make a dataset from another one's EXRs, with another sensor or camera, without Blender."""
+    """Make a dataset from the EXRs of another one, with another sensor or camera, without Blender."""
     from perilune_render.dataset.develop import develop_dataset
 
     with progress_bar() as progress:
-        made = develop_dataset(open_dataset(dataset), out, progress, config, tuple(setting or ()))
+        made = develop_dataset(ps.open_dataset(dataset), out, progress, config, tuple(setting or ()))
     counts = made.info.counts
     Console().print(
         f"{out}: {counts.frames} frames, {counts.labels} labels; look at {out / 'overview.png'}", soft_wrap=True
@@ -158,7 +156,7 @@ def plan(
     catalogue: Catalogue = None,
     kind: Annotated[Kind, typer.Option(help="Crater detection or navigation (detect or nav).")] = Kind.DETECT,
 ) -> None:
-    """Write a dataset's plan as a manifest without frames, for others to render. Grows every scene for its hash."""
+    """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
     if kind is not Kind.NAV:
         _warn_of_size(resolved)
@@ -166,7 +164,7 @@ def plan(
 
     with progress_bar() as progress:
         write_plan(resolved, one_kind(kind), preset, out, progress)
-    counts = open_dataset(out).info.counts
+    counts = ps.open_dataset(out).info.counts
     Console().print(f"{out}: {counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames planned")
 
 
@@ -177,7 +175,8 @@ def regenerate(
         list[str] | None, typer.Option(help="A frame_id, as scene-0000/trajectory-0000/000003; may be repeated.")
     ] = None,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Only tell how the frames compare; without --frames, of a sample.")
+        bool,
+        typer.Option("--verify", help="Compare the frames without keeping them; without --frames, a sample of them."),
     ] = False,
     sample: Annotated[int, typer.Option(min=1, help="Frames of the sample, evenly spread.")] = 12,
     everything: Annotated[bool, typer.Option("--all", help="All frames of the manifest.")] = False,
@@ -185,10 +184,10 @@ def regenerate(
     dem: Annotated[Path | None, typer.Option(help="This machine's copy of the elevation model.")] = None,
     catalogue: Annotated[Path | None, typer.Option(help="This machine's copy of the crater catalogue.")] = None,
 ) -> None:
-    """Make frames again from a manifest alone, and compare them with its hashes. Exit code 2 where one differs."""
+    """Render frames from a manifest alone and compare them with its hashes. Exit code 2 if one differs."""
     if not verify and (out is None or not (frames or everything)):
         raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
-    dataset = open_dataset(manifest)
+    dataset = ps.open_dataset(manifest)
     from perilune_render.dataset.regenerate import State, spread
     from perilune_render.dataset.regenerate import regenerate as make_again
 
@@ -218,9 +217,9 @@ def preview(
     dem: Dem = None,
     catalogue: Catalogue = None,
     kind: Annotated[Kind, typer.Option(help="Whose first scene and descent (detect or nav).")] = Kind.DETECT,
-    out: Annotated[Path, typer.Option(help="Where the picture goes.")] = Path("preview.png"),
+    out: Annotated[Path, typer.Option(help="File of the picture.")] = Path("preview.png"),
 ) -> None:
-    """Make one contact sheet of a configuration, with and without labels, in seconds."""
+    """Render a contact sheet of a configuration, with and without labels, in seconds."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
     from perilune_render.dataset.preview import write_preview
 
@@ -244,6 +243,7 @@ def export(
 ) -> None:
     """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
+    from perilune_render.flight.plan import make_plan
     from perilune_render.terrain.cache import cached_scene
     from perilune_render.terrain.export import MESH_SUFFIXES, RASTER_SUFFIXES, export_mesh, export_raster
 

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
-from perilune_shared.dataset.selection import default_label_bound_px
+from perilune_shared.dataset.thresholds import default_label_bound_px
 
 
 class DistortionConfig(Section):

@@ -15,7 +15,8 @@ from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION
-from perilune_shared.dataset.selection import SELECTIONS, selected
+from perilune_shared.dataset.selection import selected
+from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.checksums import SUMS_NAME, seal

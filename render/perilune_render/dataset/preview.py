@@ -18,7 +18,8 @@ from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation.model import read_elevation
 from perilune_render.terrain.scene import check_ground
-from perilune_shared.dataset.selection import SELECTIONS, selected
+from perilune_shared.dataset.selection import selected
+from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.geometry.frames import sun_direction
 
 

@@ -2,24 +2,19 @@
 
 import enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.editing import attach as attaching
-from perilune_shared.editing import diff as differing
-from perilune_shared.editing import merge as merging
-from perilune_shared.editing import migrate as migrating
-from perilune_shared.editing import pack as packing
-from perilune_shared.editing.rewrite import ImageMode
-from perilune_shared.editing.split import split_dataset
-from perilune_shared.editing.subset import subset as choose
+import perilune_shared as ps
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import progress_bar
+
+if TYPE_CHECKING:
+    from perilune_shared.editing.rewrite import ImageMode
 
 EXIT_DIFFERENT = 1
 
@@ -40,7 +35,7 @@ class Unit(enum.StrEnum):
     FRAME = "frame"
 
 
-DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, the one that holds dataset.json.")]
+DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, which holds dataset.json.")]
 OutOption = Annotated[Path, typer.Option(help="New folder for the result.")]
 ImagesOption = Annotated[
     Images,
@@ -53,7 +48,7 @@ LinkOption = Annotated[
 ]
 
 
-def _mode(images: Images, link: bool) -> ImageMode:
+def _mode(images: Images, link: bool) -> "ImageMode":
     if link and images is not Images.COPY:
         raise UserError("--link", "--images", images.value, "copy: the others leave frames out")
     return "link" if link else images.value
@@ -67,7 +62,7 @@ def add_to(app: typer.Typer) -> None:
 
 def _tell(out: Path) -> None:
     """Print the counts of the new dataset and whether its splits share terrain."""
-    info = open_dataset(out).info
+    info = ps.open_dataset(out).info
     counts = info.counts
     told = f"{counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames, {counts.labels} labels"
     line = f"{out}: {told}, frames {info.images}, split by {info.split_by}{info.leak}"
@@ -75,15 +70,19 @@ def _tell(out: Path) -> None:
 
 
 def merge(
-    datasets: Annotated[list[Path], typer.Argument(help="Folders of two datasets or more, of one kind and camera.")],
+    datasets: Annotated[
+        list[Path], typer.Argument(help="Folders of two or more datasets of the same kind and camera.")
+    ],
     out: OutOption,
     name: Annotated[str, typer.Option(help="Name of the result.")] = "merged",
     images: ImagesOption = Images.COPY,
     link: LinkOption = False,
 ) -> None:
-    """Make one dataset of several. The same scene or frame in two of them comes once."""
+    """Merge several datasets into one. A scene or frame that is in two of them is written once."""
+    from perilune_shared.editing.merge import merge as merge_datasets
+
     with progress_bar() as progress:
-        merging.merge([open_dataset(path) for path in datasets], out, name, _mode(images, link), progress)
+        merge_datasets([ps.open_dataset(path) for path in datasets], out, name, _mode(images, link), progress)
     _tell(out)
 
 
@@ -99,9 +98,11 @@ def subset(
     images: ImagesOption = Images.COPY,
     link: LinkOption = False,
 ) -> None:
-    """Take part of a dataset: frames or labels for which conditions hold, so many frames, so many megabytes."""
+    """Copy part of a dataset: by conditions on columns, number of frames or size."""
+    from perilune_shared.editing.subset import subset as choose
+
     with progress_bar() as progress:
-        choose(open_dataset(dataset), out, tuple(where or ()), frames, mb, _mode(images, link), progress)
+        choose(ps.open_dataset(dataset), out, tuple(where or ()), frames, mb, _mode(images, link), progress)
     _tell(out)
 
 
@@ -109,7 +110,7 @@ def split(
     dataset: DatasetArgument,
     out: OutOption,
     by: Annotated[
-        Unit, typer.Option(help="What goes together; frame is the paper's protocol, which leaks terrain.")
+        Unit, typer.Option(help="What stays in one split; frame is the paper's protocol, which leaks terrain.")
     ] = Unit.SCENE,
     val: Annotated[float, typer.Option(help="Share for validation.")] = 0.1,
     test: Annotated[float, typer.Option(help="Share for the test.")] = 0.1,
@@ -117,15 +118,19 @@ def split(
     images: ImagesOption = Images.COPY,
     link: LinkOption = False,
 ) -> None:
-    """Assign scenes, trajectories or frames to another train, val and test split."""
+    """Split a dataset anew into train, val and test, by scene, trajectory or frame."""
+    from perilune_shared.editing.split import split_dataset
+
     with progress_bar() as progress:
-        split_dataset(open_dataset(dataset), out, by.value, val, test, seed, _mode(images, link), progress)
+        split_dataset(ps.open_dataset(dataset), out, by.value, val, test, seed, _mode(images, link), progress)
     _tell(out)
 
 
 def diff(first: DatasetArgument, second: DatasetArgument) -> None:
-    """Show what differs between two datasets. Exit code 1 where something does."""
-    found = differing.differences(open_dataset(first), open_dataset(second))
+    """Show the differences between two datasets. Exit code 1 if there are any."""
+    from perilune_shared.editing.diff import differences
+
+    found = differences(ps.open_dataset(first), ps.open_dataset(second))
     if not found:
         Console().print("no difference")
         return
@@ -138,9 +143,11 @@ def diff(first: DatasetArgument, second: DatasetArgument) -> None:
 
 
 def migrate(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
-    """Bring a dataset of an older schema version to the present one."""
+    """Convert a dataset of an older schema version to the current one."""
+    from perilune_shared.editing.migrate import migrate as migrate_dataset
+
     with progress_bar() as progress:
-        migrating.migrate(dataset, out, progress, link=link)
+        migrate_dataset(dataset, out, progress, link=link)
     _tell(out)
 
 
@@ -149,16 +156,20 @@ def pack(
     out: OutOption,
     shard_mb: Annotated[float, typer.Option(help="Size of an image shard, megabytes.")] = 1000,
 ) -> None:
-    """Put frames into few large Parquet files and each table into one, to move or to stream them."""
+    """Pack all frames into a few large Parquet files and each table into one, for transfer or streaming."""
+    from perilune_shared.editing.pack import pack as pack_dataset
+
     with progress_bar() as progress:
-        packing.pack(open_dataset(dataset), out, shard_mb, progress)
+        pack_dataset(ps.open_dataset(dataset), out, shard_mb, progress)
     _tell(out)
 
 
 def unpack(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
-    """Make files of packed frames again."""
+    """Unpack frames from Parquet into one PNG file per frame."""
+    from perilune_shared.editing.pack import unpack as unpack_dataset
+
     with progress_bar() as progress:
-        packing.unpack(open_dataset(dataset), out, progress, link=link)
+        unpack_dataset(ps.open_dataset(dataset), out, progress, link=link)
     _tell(out)
 
 
@@ -167,11 +178,13 @@ def attach(
     frames: Annotated[Path, typer.Option(help="Folder that `perilune-render regenerate --out` filled.")],
     out: OutOption,
     rehash: Annotated[
-        bool, typer.Option("--rehash", help="Take frames of other hashes, and write theirs down.")
+        bool, typer.Option("--rehash", help="Accept frames with other hashes, and record these.")
     ] = False,
     link: LinkOption = False,
 ) -> None:
-    """Make a dataset of a manifest without frames and the frames that were made from it."""
+    """Combine a manifest without frames and the frames regenerated from it into a dataset."""
+    from perilune_shared.editing.attach import attach as attach_frames
+
     with progress_bar() as progress:
-        attaching.attach(open_dataset(manifest), frames, out, rehash, progress, link=link)
+        attach_frames(ps.open_dataset(manifest), frames, out, rehash, progress, link=link)
     _tell(out)

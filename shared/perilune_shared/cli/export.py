@@ -8,14 +8,9 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+import perilune_shared as ps
 from perilune_shared.cli.edit import DatasetArgument, LinkOption
-from perilune_shared.config_errors import nearest
-from perilune_shared.dataset.keys import check_keys
-from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.schema import SPLITS
-from perilune_shared.dataset.selection import SELECTIONS
 from perilune_shared.errors import UserError
-from perilune_shared.storage.files import check_free
 from perilune_shared.terminal import progress_bar
 
 
@@ -62,15 +57,20 @@ def export(
     ] = "all",
     link: LinkOption = False,
 ) -> None:
-    """Write labels, trajectories or metadata in the form of another field's tools. See docs/how-to/export.md."""
+    """Write labels, trajectories or metadata in the format of other tools."""
+    from perilune_shared.config_errors import nearest
+    from perilune_shared.dataset.keys import check_keys
+    from perilune_shared.dataset.schema import SPLITS
+    from perilune_shared.dataset.thresholds import SELECTIONS
     from perilune_shared.export.coco import export_coco
     from perilune_shared.export.croissant import export_croissant
     from perilune_shared.export.hugging_face import export_hugging_face
     from perilune_shared.export.rows import by_selection
     from perilune_shared.export.trajectory import export_kitti, export_tum
     from perilune_shared.export.yolo import export_yolo
+    from perilune_shared.storage.files import check_free
 
-    opened = open_dataset(dataset)
+    opened = ps.open_dataset(dataset)
     check_keys(opened)
     if split is not None and split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
@@ -114,11 +114,11 @@ def card(
         Path | None, typer.Option(help="Markdown file, its picture beside it; README.md in the dataset unless given.")
     ] = None,
 ) -> None:
-    """Write a page about the dataset: counts, histograms, labelled frames, licence, how to make it again."""
+    """Write a dataset card: counts, histograms, labelled frames, licence and the command that makes the dataset."""
     from perilune_shared.export.card import write_card
 
     with progress_bar() as progress:
-        page, picture = write_card(open_dataset(dataset), out, progress)
+        page, picture = write_card(ps.open_dataset(dataset), out, progress)
     _say(f"{page}, {picture}: written")
 
 

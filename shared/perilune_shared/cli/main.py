@@ -1,4 +1,7 @@
-"""`perilune-manifest`: validate, inspect, edit and export datasets, without Blender and without torch."""
+"""`perilune-manifest`: validate, inspect, edit and export datasets, without Blender and without torch.
+
+Commands import what they run with, so that `--help` does not wait for pandas and pyarrow.
+"""
 
 from typing import Annotated
 
@@ -7,16 +10,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+import perilune_shared as ps
 from perilune_shared.cli import edit, export
 from perilune_shared.cli.edit import DatasetArgument
-from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.stats import summary
 from perilune_shared.errors import EXIT_USER_ERROR, one_line, run_command_line, shortened
 from perilune_shared.terminal import progress_bar
-from perilune_shared.validation.validate import validate as find_faults
 
 app = typer.Typer(
-    help="Look after perilune datasets: Parquet manifests and their frames.",
+    help="Validate, inspect, edit and export perilune datasets.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -28,8 +29,10 @@ def validate(
     dataset: DatasetArgument, most: Annotated[int, typer.Option(min=1, help="Show at most this many faults.")] = 50
 ) -> None:
     """Check schema, ranges, keys, splits, labels against poses, and the hash of every file. Exit code 2 on a fault."""
+    from perilune_shared.validation.validate import validate as find_faults
+
     with progress_bar() as progress:
-        faults = find_faults(open_dataset(dataset), progress)
+        faults = find_faults(ps.open_dataset(dataset), progress)
     console = Console()
     if not faults:
         console.print(Text(f"{one_line(dataset)}: no fault"))
@@ -48,7 +51,9 @@ def validate(
 @app.command()
 def stats(dataset: DatasetArgument) -> None:
     """Print counts, labels per frame and crater radii for each split."""
-    opened = open_dataset(dataset)
+    from perilune_shared.dataset.stats import summary
+
+    opened = ps.open_dataset(dataset)
     frame = summary(opened)
     info = opened.info
     state = "" if info.complete else ", not complete"

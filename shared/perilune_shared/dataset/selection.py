@@ -1,4 +1,4 @@
-"""Select labels by named sets of thresholds: from all craters in the frame to those visible in the image.
+"""Read labels and select them by the thresholds of `perilune_shared.dataset.thresholds`.
 
 Use::
 
@@ -7,50 +7,16 @@ Use::
 """
 
 from collections.abc import Sequence
-from typing import Annotated
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import Field
 
-from perilune_shared.config import Section
 from perilune_shared.dataset.keys import FRAME_COLUMNS, KeyCheck
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.thresholds import Selection, default_label_bound_px
 
-Share = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0)]
-
-
-class Selection(Section):
-    """Thresholds; a selected label fulfils all of them. null sets no threshold."""
-
-    radius_px: tuple[Positive, Positive | None] | None = None
-    """Minimum and maximum radius sqrt(a b), pixels; null as the maximum sets no upper limit."""
-    min_visible_fraction: Share | None = None
-    """Minimum fraction of the rim that is inside the image and not hidden."""
-    min_sunlit_fraction: Share | None = None
-    """Minimum fraction of the crater's visible pixels that are in sunlight."""
-    min_depth_ratio: Share | None = None
-    """Minimum ratio of depth to diameter on the finished terrain; lower ratios mean an eroded crater."""
-    min_contrast: float | None = None
-    """Minimum contrast: the crater's own shading in the frame divided by its standard error, from noise and clutter."""
-
-
-SELECTIONS: dict[str, Selection] = {
-    "all": Selection(),
-    "paper": Selection(radius_px=(2.0, 50.0)),
-    "visible": Selection(
-        radius_px=(2.0, None),
-        min_visible_fraction=0.3,
-        min_sunlit_fraction=0.1,
-        min_depth_ratio=0.04,
-        min_contrast=4.0,
-    ),
-}
-"""`all`: every label. `paper`: the paper's rule, radius 2 to 50 px and centre in the frame (true of every label).
-`visible`: craters that a person can see in the frame, for training and evaluation."""
 _JUDGED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
 _CRATER = ["scene_id", "crater_id", "depth_m", "diameter_m"]
 
@@ -73,11 +39,6 @@ def selected(labels: pd.DataFrame, selection: Selection) -> NDArray[np.bool_]:
     if selection.min_depth_ratio is not None:
         chosen &= labels["depth_m"].to_numpy() >= selection.min_depth_ratio * labels["diameter_m"].to_numpy()
     return chosen
-
-
-def default_label_bound_px(width_px: int) -> float:
-    """Default maximum radius of a label, pixels: 50, and proportional to the width in images wider than 256 px."""
-    return max(50.0, width_px * 50 / 256)
 
 
 def label_bound_px(info: DatasetInfo) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.schema import SPLITS, TABLES
-from perilune_shared.dataset.selection import SELECTIONS
+from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.errors import UserError
 from perilune_shared.export.rows import SceneRows, by_selection, scenes_of
 from perilune_shared.progress import Progress

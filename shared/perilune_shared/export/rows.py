@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.schema import SPLITS, TABLES
-from perilune_shared.dataset.selection import Selection, selected
+from perilune_shared.dataset.selection import selected
+from perilune_shared.dataset.thresholds import Selection
 from perilune_shared.errors import UserError
 
 Choice = Callable[[Dataset, str, pa.Table], NDArray[np.bool_]]

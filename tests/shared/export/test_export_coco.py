@@ -20,7 +20,8 @@ from perilune_shared.cli.main import app
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.dataset.selection import SELECTIONS, read_labels, selected
+from perilune_shared.dataset.selection import read_labels, selected
+from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.errors import UserError
 from perilune_shared.export.coco import area_of, cut_at_edges, export_coco
 

@@ -9,7 +9,8 @@ import pytest
 
 import contrast
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.selection import SELECTIONS, read_labels, selected
+from perilune_shared.dataset.selection import read_labels, selected
+from perilune_shared.dataset.thresholds import SELECTIONS
 
 
 def test_auc_by_hand():

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from perilune_shared.config import parse_setting, resolve_over
-from perilune_shared.dataset.schema import SPLITS
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
 from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
@@ -38,7 +37,7 @@ def evaluate(
         bool,
         typer.Option(
             "--choose-threshold",
-            help="Choose the threshold anew, on the dataset's val: for other settings than the run was judged with.",
+            help="Choose a new threshold on the validation split, for settings other than those of the run.",
         ),
     ] = False,
     out: Annotated[
@@ -49,7 +48,9 @@ def evaluate(
         Path | None,
         typer.Option(help="Real images with boxes in place of a dataset: a folder of pictures and tables, or COCO."),
     ] = None,
-    min_size: Annotated[float, typer.Option(help="With --images: least crater wanted, sqrt(w h), pixels.")] = 8.0,
+    min_size: Annotated[
+        float, typer.Option(help="With --images: minimum size sqrt(w h) of a crater to find, pixels.")
+    ] = 8.0,
     scale: Scales = None,
     tile: TileSide = 256,
     overlap: Overlap = 64,
@@ -60,6 +61,8 @@ def evaluate(
     The threshold is the run's own, chosen on the validation split of its training dataset, unless --threshold sets one
     or --choose-threshold chooses a new one.
     """
+    from perilune_shared.dataset.schema import SPLITS
+
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     if threshold is not None and not 0 <= threshold <= 1:

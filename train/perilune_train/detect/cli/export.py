@@ -31,7 +31,7 @@ def export(
     if size_px <= 0 or size_px % 32:
         raise UserError("options", "--size-px", size_px, "a multiple of 32")
     if int8 and dataset is None:
-        raise UserError("options", "--int8", "no --dataset", "a dataset to calibrate and to judge on")
+        raise UserError("options", "--int8", "no --dataset", "a dataset to calibrate and to evaluate on")
     # Importing torch takes seconds; check the options first.
     from perilune_train.detect.deploy.export import export_run
 

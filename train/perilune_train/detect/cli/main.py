@@ -10,7 +10,7 @@ from perilune_train.detect.cli.train import train
 from perilune_train.detect.cli.weights import weights
 
 app = typer.Typer(
-    help="Crater detection: train, judge, find craters in images, export for flight.",
+    help="Crater detection: train, evaluate, find craters in images, export for flight.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )

@@ -16,7 +16,7 @@ def predict(
     run: Annotated[Path, typer.Option(help="Folder of a detect run.")] = Path("runs/detect/small"),
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("predictions"),
     threshold: Annotated[
-        float | None, typer.Option(help="Least score. [default: the best on the run's validation split]")
+        float | None, typer.Option(help="Minimum score. [default: the run's, chosen on its validation split]")
     ] = None,
     scale: Scales = None,
     tile: TileSide = 256,

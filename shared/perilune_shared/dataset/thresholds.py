@@ -1,0 +1,49 @@
+"""Named sets of label thresholds: from all craters in the frame to those visible in the image.
+
+Without pandas and pyarrow, so that configurations and `--help` load without them. `perilune_shared.dataset.selection`
+applies the thresholds.
+"""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from perilune_shared.config import Section
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class Selection(Section):
+    """Thresholds; a selected label fulfils all of them. null sets no threshold."""
+
+    radius_px: tuple[Positive, Positive | None] | None = None
+    """Minimum and maximum radius sqrt(a b), pixels; null as the maximum sets no upper limit."""
+    min_visible_fraction: Share | None = None
+    """Minimum fraction of the rim that is inside the image and not hidden."""
+    min_sunlit_fraction: Share | None = None
+    """Minimum fraction of the crater's visible pixels that are in sunlight."""
+    min_depth_ratio: Share | None = None
+    """Minimum ratio of depth to diameter on the finished terrain; lower ratios mean an eroded crater."""
+    min_contrast: float | None = None
+    """Minimum contrast: the crater's own shading in the frame divided by its standard error, from noise and clutter."""
+
+
+SELECTIONS: dict[str, Selection] = {
+    "all": Selection(),
+    "paper": Selection(radius_px=(2.0, 50.0)),
+    "visible": Selection(
+        radius_px=(2.0, None),
+        min_visible_fraction=0.3,
+        min_sunlit_fraction=0.1,
+        min_depth_ratio=0.04,
+        min_contrast=4.0,
+    ),
+}
+"""`all`: every label. `paper`: the paper's rule, radius 2 to 50 px and centre in the frame (true of every label).
+`visible`: craters that a person can see in the frame, for training and evaluation."""
+
+
+def default_label_bound_px(width_px: int) -> float:
+    """Default maximum radius of a label, pixels: 50, and proportional to the width in images wider than 256 px."""
+    return max(50.0, width_px * 50 / 256)

@@ -1,0 +1,74 @@
+"""Every command explains itself, and none loads a library that it does not need for that."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import click
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import perilune_render.cli
+import perilune_shared.cli.main
+import perilune_train.cli
+
+PROGRAMS = {
+    "perilune-manifest": perilune_shared.cli.main.app,
+    "perilune-render": perilune_render.cli.app,
+    "perilune-train": perilune_train.cli.app,
+}
+HEAVY = {"pandas", "pyarrow", "numpy", "scipy", "matplotlib", "PIL", "cv2", "numba", "torch", "lightning", "bpy"}
+
+
+def commands(name: str, command: click.Command) -> Iterator[tuple[str, click.Command]]:
+    """A command and all its subcommands, each with what a user types."""
+    yield name, command
+    for sub, found in getattr(command, "commands", {}).items():
+        yield from commands(f"{name} {sub}", found)
+
+
+COMMANDS = [pair for name, app in PROGRAMS.items() for pair in commands(name, typer.main.get_command(app))]
+
+
+def test_there_are_commands():
+    assert len(COMMANDS) > 25
+
+
+@pytest.mark.parametrize(("typed", "command"), COMMANDS, ids=[typed for typed, _ in COMMANDS])
+def test_every_command_explains_itself(typed, command):
+    program, *words = typed.split()
+    shown = CliRunner().invoke(PROGRAMS[program], [*words, "--help"], env={"COLUMNS": "200", "NO_COLOR": "1"})
+    assert shown.exit_code == 0 and shown.exception is None
+    assert "Usage:" in shown.output and "Traceback" not in shown.output
+    summary = (command.help or "").strip().split("\n\n")[0]
+    assert re.fullmatch(r"[A-Z`].{8,118}\.", summary), (
+        f"one line of at most 120 characters, with a full stop: {summary}"
+    )
+    for parameter in command.params:
+        if parameter.name not in ("help", "install_completion", "show_completion"):
+            assert getattr(parameter, "help", None), f"{parameter.name} has no help"
+
+
+def loaded(code: str) -> set[str]:
+    """Top-level names of the modules that a new interpreter has loaded after `code`."""
+    script = f"{code}\nimport json, sys\nprint(json.dumps(sorted({{name.split('.')[0] for name in sys.modules}})))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_the_package_loads_no_library():
+    assert not loaded("import perilune_shared") & {"rich", "typer", "pydantic", *HEAVY}
+
+
+def test_a_dataset_opens_without_a_command_line():
+    """Also the check that `loaded` sees what is loaded."""
+    found = loaded("import perilune_shared as ps; ps.open_dataset")
+    assert {"pandas", "pyarrow"} <= found and not found & {"rich", "typer", "matplotlib", "torch"}
+
+
+@pytest.mark.parametrize("module", ["perilune_shared.cli.main", "perilune_render.cli", "perilune_train.cli"])
+def test_a_command_line_starts_without_heavy_libraries(module):
+    assert not loaded(f"import {module}") & HEAVY
