@@ -92,7 +92,7 @@ ablate-detect: train-detect ## train without attention, with plain CBAM, other s
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
 	  --out "$(RUNS)" --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset "$(DATA)/detect" $(OVER) &&) true
 	@$(BIN)/perilune-train detect compare $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
-	@$(BIN)/python benchmarks/size.py $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
+	@$(BIN)/python -m benchmarks.train.size $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect
@@ -111,40 +111,40 @@ lint: setup ## ruff and mypy
 	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train
 
 bench-render: setup ## time of a frame against a bare Blender loop; writes runs/bench/render.json
-	@$(BIN)/python benchmarks/render.py
+	@$(BIN)/python -m benchmarks.dataset.render
 
 compare-nac: setup ## rendered frames beside real NAC crops (NAC=folder); writes runs/nac/
-	@$(BIN)/python benchmarks/nac.py "$(NAC)" $(COMMON) --out "$(RUNS)/nac"
+	@$(BIN)/python -m benchmarks.nac.compare "$(NAC)" $(COMMON) --out "$(RUNS)/nac"
 
 bench-terrain: setup ## speed of growing the ground on one core; writes runs/bench/terrain.json
-	@$(BIN)/python benchmarks/terrain.py
+	@$(BIN)/python -m benchmarks.scene.terrain
 
 bench-photometry: setup ## rendered radiance against the formulas; writes runs/bench/photometry.json
-	@$(BIN)/python benchmarks/photometry.py
+	@$(BIN)/python -m benchmarks.scene.photometry
 
 bench-manifest: setup ## reads of 100,000 frames and 5 million labels; writes runs/bench/manifest.json
-	@$(BIN)/python benchmarks/manifest.py
+	@$(BIN)/python -m benchmarks.dataset.manifest
 
 bench-develop: setup ## frames a second of developing on one core; writes runs/bench/develop.json
-	@$(BIN)/python benchmarks/develop.py
+	@$(BIN)/python -m benchmarks.dataset.develop
 
 bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
-	@$(BIN)/python benchmarks/labels.py --picture docs/pictures/labels_histogram.png
+	@$(BIN)/python -m benchmarks.scene.labels --picture docs/pictures/labels_histogram.png
 
 bench-contrast: setup ## how well contrast tells craters that the detector finds; writes runs/bench/contrast.json
-	@$(BIN)/python benchmarks/contrast.py "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"
+	@$(BIN)/python -m benchmarks.train.contrast "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"
 
 bench-infer: setup ## time of the detector by engine, one image, two cores; writes runs/bench/infer.json
-	@$(BIN)/python benchmarks/infer.py
+	@$(BIN)/python -m benchmarks.train.infer
 
 bench-train: detect-frames ## training speed beside memory-fed and bare loops; writes runs/bench/train.json
-	@$(BIN)/python benchmarks/train.py --dataset "$(DATA)/detect" --preset $(PRESET)
+	@$(BIN)/python -m benchmarks.train.train --dataset "$(DATA)/detect" --preset $(PRESET)
 
 bench-transfer: detect-frames ## ways to start from a frozen backbone, compared; writes runs/bench/transfer.json
-	@$(BIN)/python benchmarks/transfer.py --dataset $(DATA)/detect
+	@$(BIN)/python -m benchmarks.train.transfer --dataset $(DATA)/detect
 
 bench-suppress: setup ## suppression of a batch against OpenCV's, frame by frame; writes runs/bench/suppress.json
-	@$(BIN)/python benchmarks/suppress.py
+	@$(BIN)/python -m benchmarks.train.suppress
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)

@@ -112,7 +112,7 @@ def test_the_distributions_have_one_version():
 
 
 OWN_MODULES = ["perilune_shared.config", "perilune_render.cli", "perilune_train.detect.train.run", "tests.test_house"]
-OWN_MODULES += [path.stem for path in (ROOT / "benchmarks").glob("*.py")]
+OWN_MODULES += [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in (ROOT / "benchmarks").rglob("*.py")]
 
 
 @pytest.mark.parametrize("kind", [DeprecationWarning, PendingDeprecationWarning, FutureWarning])

@@ -75,6 +75,9 @@ def _load() -> float:
 
 
 def _command() -> str:
-    program = Path(sys.argv[0])
-    name = f"python {program.parent.name}/{program.name}" if program.suffix == ".py" else program.name
+    spec, program = getattr(sys.modules["__main__"], "__spec__", None), Path(sys.argv[0])
+    if spec is not None:
+        name = f"python -m {spec.name.removesuffix('.__main__')}"
+    else:
+        name = f"python {program.parent.name}/{program.name}" if program.suffix == ".py" else program.name
     return " ".join([name, *sys.argv[1:]])

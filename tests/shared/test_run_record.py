@@ -59,3 +59,13 @@ def test_the_record_has_hardware_and_command():
     assert "cores" in record.hardware
     assert record.command
     assert len(record.date) == 10
+
+
+def test_a_benchmark_is_recorded_as_it_was_called(tmp_path):
+    bench = tmp_path / "bench"
+    bench.mkdir()
+    (bench / "speed.py").write_text("from perilune_shared.run_record import run_record; print(run_record().command)")
+    done = subprocess.run(
+        [sys.executable, "-m", "bench.speed", "--fast"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "python -m bench.speed --fast"

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import contrast
+from benchmarks.train import contrast
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.selection import read_labels, selected
 from perilune_shared.dataset.thresholds import SELECTIONS

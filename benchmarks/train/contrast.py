@@ -1,11 +1,11 @@
 """How well the labels' contrast separates craters that a trained detector finds from those that it misses.
 
-`python benchmarks/contrast.py DATASET RUN`: a dataset and a detect run on it. Evaluates on the test split, for the
-craters of the selection `visible` without its contrast threshold: the area under the ROC curve (AUC) of contrast, depth
-ratio and radius, overall and by radius; the share found by contrast; and the run's own detections, evaluated with each
-selection. A crater is found if a detection with at least the run's threshold overlaps it by IoU 0.5, highest scores
-first. Writes runs/bench/contrast.json, and with --picture FRAME_ID contrast.jpg, an enlarged frame, plain and coloured
-by contrast.
+`python -m benchmarks.train.contrast DATASET RUN` takes a dataset and a detect run on it. Evaluates on the test split,
+for the craters of the selection `visible` without its contrast threshold: the area under the ROC curve (AUC) of
+contrast, depth ratio and radius, overall and by radius; the share found by contrast; and the run's own detections,
+evaluated with each selection. A crater is found if a detection with at least the run's threshold overlaps it by IoU
+0.5, highest scores first. Writes runs/bench/contrast.json, and with --picture FRAME_ID contrast.jpg, an enlarged frame,
+plain and coloured by contrast.
 """
 
 import json
@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import typer
 from numpy.typing import NDArray
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.selection import read_labels, selected
 from perilune_shared.dataset.thresholds import SELECTIONS

@@ -1,9 +1,9 @@
 """Compare rendered frames with Narrow Angle Camera crops at the same ground sampling and under the same Sun.
 
-`python benchmarks/nac.py folder`: the folder holds 8-bit PNG crops named by their product number, from which the
-position of the Sun is computed, and a text file of human-drawn crater boxes beside each. For every crop, renders a
-nadir view of several scenes of the configuration. Writes to runs/nac/: nac.json, curves that may be published (spectra,
-gradients, brightness, counts) and sheet.png, which contains real pixels and must not be published.
+`make compare-nac NAC=folder`: the folder holds 8-bit PNG crops named by their product number, from which the position
+of the Sun is computed, and a text file of human-drawn crater boxes beside each. For every crop, renders a nadir view of
+several scenes of the configuration. Writes to runs/nac/: nac.json, curves that may be published (spectra, gradients,
+brightness, counts) and sheet.png, which contains real pixels and must not be published.
 """
 
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 import typer
 
-import nac_statistics as st
-from figures import write_figures
-from nac_plots import draw_curves
-from nac_sun import sun_over, time_of
+from benchmarks.figures import write_figures
+from benchmarks.nac import statistics as st
+from benchmarks.nac.plots import draw_curves
+from benchmarks.nac.sun import sun_over, time_of
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig
 from perilune_render.imaging.exr import Radiance

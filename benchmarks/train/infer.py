@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import typer
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_shared.errors import run_command_line
 from perilune_shared.progress import progress_bar
 from perilune_train.detect.deploy.engines import Engine, has_bf16, onnxruntime_engine, openvino_engine, torch_engine

@@ -20,8 +20,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-import rings
-from figures import write_figures
+from benchmarks.figures import write_figures
+from benchmarks.scene import rings
 from perilune_render.config import DatasetConfig
 from perilune_render.flight.plan import make_plan
 from perilune_render.imaging.resampling import refined, resample

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_shared.dataset.manifest import count_rows, open_dataset
 from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.dataset.parts import write_part

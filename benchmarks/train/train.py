@@ -23,7 +23,7 @@ import typer
 from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import run_command_line

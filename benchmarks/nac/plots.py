@@ -8,7 +8,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-import nac_statistics as st
+from benchmarks.nac import statistics as st
 from perilune_shared.storage.files import written_aside
 
 REAL, OURS = "tab:orange", "tab:blue"

@@ -5,8 +5,8 @@ from datetime import datetime
 import numpy as np
 import pytest
 
-import nac_statistics as st
-from nac_sun import subsolar_point, sun_over, time_of
+from benchmarks.nac import statistics as st
+from benchmarks.nac.sun import subsolar_point, sun_over, time_of
 from perilune_shared.errors import UserError
 
 SHAPE = (800, 800)

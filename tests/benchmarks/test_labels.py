@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import rings
+from benchmarks.scene import rings
 from perilune_render.imaging.resampling import refined
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_shared.geometry.camera import Camera, camera_from_site

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_render.blender import bpy
 from perilune_render.blender.renderer import Renderer, one_ray_a_pixel, quiet, render_through
 from perilune_render.blender.stage import aim

@@ -12,7 +12,7 @@ from typing import get_args
 
 import numpy as np
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_render.blender import bpy
 from perilune_render.blender.renderer import configure, render_through
 from perilune_render.blender.stage import aim, mesh_from_arrays, sunlit_stage, surface_material

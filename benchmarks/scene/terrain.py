@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import CratersConfig

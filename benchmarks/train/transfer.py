@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.config import Attention
 from perilune_train.detect.config import DetectConfig

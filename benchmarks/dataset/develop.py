@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.develop import develop_dataset
 from perilune_render.dataset.render import make_dataset

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from figures import write_figures
+from benchmarks.figures import write_figures
 from perilune_train.detect.evaluate.boxes import suppress
 from perilune_train.detect.inference.suppression import suppress_batch
 

@@ -1,0 +1,1 @@
+"""Datasets: time of rendering, developing and reading them."""

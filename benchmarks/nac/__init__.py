@@ -1,0 +1,1 @@
+"""Rendered frames compared with crops of the Narrow Angle Camera (NAC)."""

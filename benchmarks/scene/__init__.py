@@ -1,0 +1,1 @@
+"""Scenes: speed of the terrain, radiance and labels compared with the geometry."""

@@ -1,0 +1,1 @@
+"""Networks: speed of training, inference and suppression; transfer, size and contrast."""
