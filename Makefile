@@ -36,7 +36,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-manifest bench-labels bench-contrast bench-train bench-transfer bench-suppress bench-infer clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-labels bench-contrast bench-train bench-transfer bench-suppress bench-infer clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -127,6 +127,9 @@ bench-manifest: setup ## reads of 100,000 frames and 5 million labels; writes ru
 
 bench-develop: setup ## frames a second of developing on one core; writes runs/bench/develop.json
 	@$(BIN)/python -m benchmarks.dataset.develop
+
+bench-regenerate: setup ## frames that come out equal from a manifest alone; writes runs/bench/regenerate.json
+	@$(BIN)/python -m benchmarks.dataset.regenerate
 
 bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
 	@$(BIN)/python -m benchmarks.scene.labels --picture docs/pictures/labels_histogram.png

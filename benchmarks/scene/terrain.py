@@ -69,11 +69,11 @@ def main() -> None:
     flight = config.detect.flight.model_copy(update={"downrange_m": 1090.0})
     # Building the profile tables is part of the measured work; only numba's compiled code is kept.
     profile_tables.cache_clear()
-    start = time.perf_counter()
+    start, cpu_start = time.perf_counter(), time.process_time()
     scene = grow_scene(config, camera, flight, 7)
     grown_s = time.perf_counter() - start
     mesh_bytes = mesh_of(scene)
-    scene_s = time.perf_counter() - start
+    scene_s, scene_cpu_s = time.perf_counter() - start, time.process_time() - cpu_start
     peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     grid = graded_grid(config, camera, config.detect.flight)
     times = []
@@ -83,6 +83,8 @@ def main() -> None:
             times.append(min(lay(grid, craters) for _ in range(3)))
     figures = {
         "scene_s": scene_s,
+        # Time of a core that no other program uses.
+        "scene_cpu_s": scene_cpu_s,
         "grown_s": grown_s,
         "extent_m": scene.grid.extent_m,
         "downrange_m": flight.downrange_m,

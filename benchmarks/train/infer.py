@@ -133,7 +133,10 @@ def main(
             goal = GOALS_S.get(factor)
             rows.append({**row, "goal_s": goal, "reached": None if goal is None else row["best_s"] <= goal})
             bar.advance(task)
-    figures = {"cores": CORES, "size_px": SIZE_PX, "rounds": rounds, "networks": rows}
+    slowest = {
+        f"width_{row['width']:g}_s": max(r["best_s"] for r in rows if r["width"] == row["width"]) for row in rows
+    }
+    figures = {"cores": CORES, "size_px": SIZE_PX, "rounds": rounds, "slowest": slowest, "networks": rows}
     path = out / ("infer.json" if run is None else f"infer-{run.name}.json")
     write_figures(path, figures)
     print_table(rows)

@@ -4,6 +4,7 @@ import functools
 import os
 import platform
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -75,9 +76,11 @@ def _load() -> float:
 
 
 def _command() -> str:
-    spec, program = getattr(sys.modules["__main__"], "__spec__", None), Path(sys.argv[0])
-    if spec is not None:
-        name = f"python -m {spec.name.removesuffix('.__main__')}"
+    program = Path(sys.argv[0])
+    if sys.orig_argv[1:2] == ["-m"]:
+        name = f"python -m {sys.orig_argv[2]}"
+    elif program.suffix == ".py":
+        name = f"python {program.name}"
     else:
-        name = f"python {program.parent.name}/{program.name}" if program.suffix == ".py" else program.name
-    return " ".join([name, *sys.argv[1:]])
+        name = program.name
+    return shlex.join([*name.split(), *sys.argv[1:]])

@@ -69,3 +69,13 @@ def test_a_benchmark_is_recorded_as_it_was_called(tmp_path):
         [sys.executable, "-m", "bench.speed", "--fast"], cwd=tmp_path, capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "python -m bench.speed --fast"
+
+
+def test_the_command_is_the_one_to_type(tmp_path):
+    (tmp_path / "measure.py").write_text(
+        "from perilune_shared.run_record import run_record; print(run_record().command)"
+    )
+    for program in (["-m", "measure"], ["measure.py"]):
+        command = [sys.executable, *program, "--set", "a=b c"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.stdout.strip() == f"python {' '.join(program)} --set 'a=b c'", done.stderr

@@ -1,0 +1,41 @@
+"""How many frames come out equal, byte for byte, when they are rendered again from the manifest alone.
+
+Renders 30 frames of three scenes of `small`, then again from their tables, with the terrain grown again. Writes
+runs/bench/regenerate.json.
+"""
+
+import os
+import tempfile
+from pathlib import Path
+from typing import get_args
+
+from benchmarks.figures import write_figures
+from perilune_render.config import DatasetConfig
+from perilune_render.dataset.regenerate import State, regenerate, spread
+from perilune_render.dataset.render import make_dataset
+from perilune_shared.config import resolve
+from perilune_shared.terminal import progress_bar
+
+SETTINGS = ("dataset.detect.n_scenes=3", "dataset.detect.trajectories_per_scene=1", "dataset.detect.n_frames=10")
+
+
+def main() -> None:
+    """Run the benchmark."""
+    config = resolve(DatasetConfig, "dataset", "perilune_render", "small", None, SETTINGS)
+    with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
+        root = Path(folder)
+        os.environ["PERILUNE_CACHE"] = str(root / "cache")
+        dataset = make_dataset(config, "detect", "small", root / "made", bar)
+        n = dataset.info.counts.frames
+        os.environ["PERILUNE_CACHE"] = str(root / "other cache")
+        outcomes = regenerate(dataset, spread(dataset, n), root / "again", bar)
+    figures = {
+        "frames": n,
+        **{state: sum(outcome.state == state for outcome in outcomes) for state in get_args(State)},
+        "same_ground": all(outcome.same_ground for outcome in outcomes),
+    }
+    write_figures(Path("runs/bench/regenerate.json"), figures)
+
+
+if __name__ == "__main__":
+    main()
