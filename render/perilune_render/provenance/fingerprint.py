@@ -79,7 +79,7 @@ def _fingerprint(roots: tuple[str, ...], folders: tuple[tuple[str, Path], ...]) 
         module, _, name = root.partition(":")
         walk.follow(module, (name,) if name else ())
     # Module names are left out, so that moving code between files does not change the hash.
-    code = "\n".join(sorted(f"{name}\n{text}" for (_, name), text in walk.code.items()))
+    code = "\n".join(sorted(f"{name}\n{text}" for (_, name), text in walk.code.items() if text))
     modules = frozenset(module for module, _ in walk.code)
     libraries = frozenset(walk.libraries - sys.stdlib_module_names)
     return Fingerprint(hashlib.sha256(code.encode()).hexdigest(), modules, libraries)

@@ -109,6 +109,24 @@ def test_what_changes_no_frame_changes_no_hash(copy, module, pattern, replacemen
     assert changed(copy, module, pattern, replacement) == set()
 
 
+def test_splitting_a_file_changes_no_hash(tmp_path):
+    constant, function = "N = 3\n", "def f():\n    return N\n"
+    files = {
+        "whole/a.py": constant + function,
+        "split/a.py": "from package.b import N\n" + function,
+        "split/b.py": constant,
+        "other/a.py": constant.replace("3", "4") + function,
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    hashes = {
+        name: fingerprint("package.a:f", folders={"package": tmp_path / name}).sha256
+        for name in ("whole", "split", "other")
+    }
+    assert hashes["whole"] == hashes["split"] != hashes["other"]
+
+
 def test_every_library_that_computes_is_recorded():
     prints = [fingerprint(*roots) for roots in ROOTS.values()]
     assert all(isinstance(each, Fingerprint) and sys.stdlib_module_names.isdisjoint(each.libraries) for each in prints)
