@@ -18,6 +18,9 @@ ROOMS = {
         "config_values config_terrain config streams interrupts provenance terrain flight imaging labels blender "
         "dataset cli_options cli"
     ),
+    "render/perilune_render/terrain": (
+        "grid interpolation noise relief size_frequency craters albedo boulders elevation scene cache export"
+    ),
     "train/perilune_train": "config data evaluation models training detect navigate explain cli",
     "train/perilune_train/detect": (
         "config run_config data evaluate inference train evaluate_run compare_runs images deploy cli"

@@ -26,7 +26,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.flight.plan import make_plan
 from perilune_render.imaging.resampling import refined, resample
 from perilune_render.labels.frame_labels import RimCircles
-from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.config import resolve
 from perilune_shared.geometry.camera import Camera

@@ -21,12 +21,12 @@ from perilune_render.config_values import Span
 from perilune_render.flight.plan import camera_of, make_plan
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.cache import cached_scene
-from perilune_render.terrain.craters import Craters, draw_craters
+from perilune_render.terrain.craters.population import Craters, draw_craters
+from perilune_render.terrain.craters.profile import profile_tables
+from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.export import vertices
 from perilune_render.terrain.grid import Grid, graded_grid
-from perilune_render.terrain.profile import profile_tables
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.config import resolve
 from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.progress import progress_bar

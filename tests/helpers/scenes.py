@@ -4,9 +4,9 @@ import numpy as np
 
 from perilune_render.config import DatasetConfig, KindConfig
 from perilune_render.terrain.boulders import Boulders
-from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.craters.population import Craters
+from perilune_render.terrain.craters.rims import Rims, measure_rims
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.measure import Rims, measure_rims
 from perilune_render.terrain.scene import Scene
 
 NO_BOULDERS = Boulders(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64), np.empty((0, 4)))

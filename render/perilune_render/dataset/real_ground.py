@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from perilune_render.terrain.elevation.model import ElevationModel
-from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.frames import Array, site_from_selenographic

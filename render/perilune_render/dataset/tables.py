@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from perilune_render.config import DatasetConfig
 from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
 from perilune_render.labels.frame_labels import Labels
-from perilune_render.terrain.craters import ORIGINS
+from perilune_render.terrain.craters.population import ORIGINS
 from perilune_render.terrain.scene import Scene
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.schema import TABLES, complete

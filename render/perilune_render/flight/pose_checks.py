@@ -7,7 +7,7 @@ import numpy as np
 
 from perilune_render.flight.plan import Plan, TrajectoryPlan
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera

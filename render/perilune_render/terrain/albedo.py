@@ -8,7 +8,7 @@ import numpy as np
 
 from perilune_render.provenance.kernels import njit
 from perilune_render.streams import stream
-from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.grid import Grid, lines_in
 from perilune_render.terrain.noise import add_waves
 from perilune_shared.geometry.frames import Array

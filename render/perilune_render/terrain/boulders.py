@@ -13,7 +13,7 @@ import trimesh
 
 from perilune_render.config_terrain import BouldersConfig
 from perilune_render.streams import stream
-from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.size_frequency import BoulderLaw, draw_diameters, log_bins
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion

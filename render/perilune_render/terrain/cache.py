@@ -20,9 +20,9 @@ from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.provenance.caches import cache_home
 from perilune_render.provenance.versions import ground_versions
 from perilune_render.terrain.boulders import Boulders
-from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.craters.population import Craters
+from perilune_render.terrain.craters.rims import Rims
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.measure import Rims
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.storage.files import sha256_of, written_aside

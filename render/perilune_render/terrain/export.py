@@ -8,7 +8,7 @@ import trimesh
 
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M

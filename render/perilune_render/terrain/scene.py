@@ -9,7 +9,10 @@ from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import ReliefConfig, TerrainConfig
 from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.boulders import Boulders, draw_boulders
-from perilune_render.terrain.craters import Craters, draw_craters
+from perilune_render.terrain.craters.population import Craters, draw_craters
+from perilune_render.terrain.craters.profile import REACH
+from perilune_render.terrain.craters.rims import Rims, measure_rims
+from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.elevation.catalogue import read_catalogue
 from perilune_render.terrain.elevation.model import (
     ElevationModel,
@@ -23,10 +26,8 @@ from perilune_render.terrain.elevation.model import (
 )
 from perilune_render.terrain.elevation.surroundings import FittedRelief, add_fitted_relief, fitted_relief
 from perilune_render.terrain.grid import Grid, graded_grid
-from perilune_render.terrain.measure import Rims, measure_rims, value_at
-from perilune_render.terrain.profile import REACH
+from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.relief import add_relief, check_waves
-from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_shared.progress import say

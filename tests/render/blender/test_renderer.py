@@ -13,9 +13,9 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig
 from perilune_render.imaging.photometry import LAWS, radiance_factor
 from perilune_render.labels.frame_labels import RimCircles, crater_index, label_frame
+from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.measure import value_at
-from perilune_render.terrain.stamp import stamp_craters
+from perilune_render.terrain.interpolation import value_at
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction

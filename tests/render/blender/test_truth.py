@@ -18,7 +18,7 @@ from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.imaging.exr import read_radiance, write_exr
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.export import vertices
-from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY

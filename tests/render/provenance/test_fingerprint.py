@@ -53,8 +53,8 @@ def changed(copy, module, pattern, replacement):
     ("module", "name", "wanted"),
     [
         ("perilune_render.terrain.scene", "_LEAST_RIM", {"generator"}),
-        ("perilune_render.terrain.profile", "REACH", {"generator"}),
-        ("perilune_render.terrain.measure", "_N_RIM", {"generator"}),
+        ("perilune_render.terrain.craters.profile", "REACH", {"generator"}),
+        ("perilune_render.terrain.craters.rims", "_N_RIM", {"generator"}),
         ("perilune_render.blender.stage", "_EARTH_ANGULAR_DIAMETER_DEG", {"renderer"}),
         ("perilune_render.blender.renderer", "_FAR_M", {"renderer"}),
         ("perilune_render.imaging.photometry", "_LEAST_SINE_SQUARED", {"renderer"}),
@@ -92,7 +92,7 @@ def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, repla
         ("perilune_render.terrain.scene", '^"""', '"""Another docstring. '),
         ("perilune_render.imaging.sensor", '    """Grey image', '    """Another docstring'),
         ("perilune_render.terrain.scene", '"""Share of a crater', '"""Another text'),
-        ("perilune_render.terrain.stamp", r"^_N_RIM = 16", "# Why.\n_N_RIM = (\n    16\n)  # another comment"),
+        ("perilune_render.terrain.craters.stamp", r"^_N_RIM = 16", "# Why.\n_N_RIM = (\n    16\n)  # another comment"),
         ("perilune_render.terrain.grid", r"raise UserError\(", "raise UserError('more', "),
         ("perilune_render.cli", '"Folder', '"Another folder'),
         ("perilune_render.dataset.preview", "n_frames: int = 4", "n_frames: int = 5"),
@@ -139,4 +139,4 @@ def test_every_library_that_computes_is_recorded():
 
 def test_compiled_functions_are_found_in_every_module():
     known = {name.partition(":")[0].rpartition(".")[2] for name in compiled_functions()}
-    assert known == {"pixels", "grid", "albedo", "stamp", "noise", "measure"}
+    assert known == {"pixels", "grid", "albedo", "stamp", "noise", "interpolation"}

@@ -3,7 +3,7 @@ from tests.helpers.scenes import config_with, round_craters
 
 from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import grow_scene
 
 GRID = Grid.even(300, 300)

@@ -6,7 +6,7 @@ from tests.helpers.scenes import round_craters
 
 from perilune_render.config_terrain import BouldersConfig, CratersConfig
 from perilune_render.terrain.boulders import boulder_mesh, draw_boulders, rock
-from perilune_render.terrain.craters import draw_craters
+from perilune_render.terrain.craters.population import draw_craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.size_frequency import BoulderLaw
 

@@ -6,7 +6,7 @@ import rasterio
 from tests.helpers.elevation_models import POLAR, write
 from tests.helpers.scenes import config_with
 
-from perilune_render.terrain.craters import ORIGINS
+from perilune_render.terrain.craters.population import ORIGINS
 from perilune_render.terrain.elevation.catalogue import read_catalogue
 from perilune_render.terrain.elevation.model import raster_places, read_elevation
 from perilune_render.terrain.grid import Grid

@@ -5,7 +5,7 @@ import trimesh
 
 from perilune_render.terrain.elevation.model import base_heights, read_elevation
 from perilune_render.terrain.export import export_mesh, export_raster
-from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.interpolation import value_at
 from perilune_shared.errors import UserError
 
 

@@ -7,7 +7,7 @@ from tests.helpers.scenes import config_with
 from perilune_render.config import FlightConfig
 from perilune_render.flight.trajectories import fly
 from perilune_render.terrain.grid import Grid, graded_grid, lines_in, reach_m
-from perilune_render.terrain.measure import value_at
+from perilune_render.terrain.interpolation import value_at
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 

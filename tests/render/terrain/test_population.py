@@ -10,10 +10,10 @@ from tests.helpers.scenes import config_with
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import CratersConfig
 from perilune_render.config_values import Span
-from perilune_render.terrain.craters import ORIGINS, draw_craters
+from perilune_render.terrain.craters.population import ORIGINS, draw_craters
+from perilune_render.terrain.craters.profile import REACH, crest_radius, profile_tables, wear_row
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.measure import value_at
-from perilune_render.terrain.profile import REACH, crest_radius, profile_tables, wear_row
+from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_render.terrain.size_frequency import EQUILIBRIA, Minimum, NeukumProduction
 from perilune_shared.config import resolve

@@ -3,10 +3,11 @@ import pytest
 from scipy.spatial import cKDTree
 from tests.helpers.scenes import config_with, round_craters
 
-from perilune_render.terrain.craters import ORIGINS, draw_craters
+from perilune_render.terrain.craters.population import ORIGINS, draw_craters
+from perilune_render.terrain.craters.rims import measure_rims
+from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.measure import measure_rims, value_at
-from perilune_render.terrain.stamp import stamp_craters
+from perilune_render.terrain.interpolation import value_at
 
 GRID = Grid.even(200, 400)
 WIDE = Grid.even(1000, 2000)

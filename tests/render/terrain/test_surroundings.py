@@ -7,13 +7,13 @@ from tests.helpers.elevation_models import POLAR, write
 from tests.helpers.scenes import config_with
 
 from perilune_render.config_terrain import CratersConfig, ReliefConfig
-from perilune_render.terrain.craters import draw_craters
+from perilune_render.terrain.craters.population import draw_craters
+from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.elevation.model import base_heights, read_elevation, remarks, resolved_m
 from perilune_render.terrain.elevation.surroundings import add_fitted_relief, fitted_relief, second_differences
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.relief import add_relief
 from perilune_render.terrain.scene import base_of, check_ground, grow_scene
-from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.errors import UserError
 
 PIXEL_M = 4.0

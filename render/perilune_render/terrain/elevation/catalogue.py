@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from perilune_render.config_terrain import CratersConfig
-from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.elevation.model import ElevationModel, raster_places
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError

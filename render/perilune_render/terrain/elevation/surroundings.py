@@ -12,12 +12,12 @@ import numpy as np
 
 from perilune_render.config_terrain import CratersConfig, ReliefConfig
 from perilune_render.streams import derived_seed, stream
-from perilune_render.terrain.craters import draw_craters
+from perilune_render.terrain.craters.population import draw_craters
+from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.elevation.continuation import fade
 from perilune_render.terrain.elevation.model import ElevationModel, resolved_m
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.noise import add_waves
-from perilune_render.terrain.stamp import stamp_craters
 from perilune_shared.geometry.frames import Array
 
 _NORMAL = 0.6745

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from perilune_render.provenance.kernels import njit
-from perilune_render.terrain.craters import Craters
+from perilune_render.terrain.craters.population import Craters
+from perilune_render.terrain.craters.profile import REACH, crest_radius, profile_tables, wear_row
 from perilune_render.terrain.grid import Grid, lines_in, place_in_ring, vertex_of_ring
-from perilune_render.terrain.profile import REACH, crest_radius, profile_tables, wear_row
 from perilune_shared.geometry.frames import Array
 
 _N_RIM = 16

@@ -17,8 +17,8 @@ import numpy as np
 
 from perilune_render.config_terrain import CratersConfig
 from perilune_render.streams import stream
+from perilune_render.terrain.craters.profile import fresh_depth_m, fresh_rim_height_m
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.profile import fresh_depth_m, fresh_rim_height_m
 from perilune_render.terrain.size_frequency import (
     EQUILIBRIA,
     Minimum,
