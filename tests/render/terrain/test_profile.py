@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_render.terrain import profile
+from perilune_render.terrain.craters import profile
 
 PROFILES = ["fassett_thomson", "pangu"]
 
