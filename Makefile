@@ -36,7 +36,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-labels bench-contrast bench-train bench-transfer bench-suppress bench-infer clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-labels bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -148,6 +148,11 @@ bench-transfer: detect-frames ## ways to start from a frozen backbone, compared;
 
 bench-suppress: setup ## suppression of a batch against OpenCV's, frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress
+
+# RECORD=files keeps the JSON of runs or benchmarks first.
+results: setup ## headline figures into docs/results.md and README.md (RECORD="runs/bench/labels.json ...")
+	@$(if $(RECORD),$(BIN)/python scripts/results.py record $(RECORD))
+	@$(BIN)/python scripts/results.py write
 
 clean: ## remove the environment; data and runs stay
 	rm -rf $(VENV)
