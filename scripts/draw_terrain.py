@@ -17,6 +17,7 @@ import numpy as np
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
 from perilune_render.flight.plan import camera_of
+from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.sensor import FixedPattern, develop
 from perilune_render.terrain import profile
 from perilune_render.terrain.cache import cached_scene
@@ -105,7 +106,7 @@ def main() -> None:
     draw_profiles(out / "profiles.png")
     config = settings()
     flight = config.detect.flight
-    scene = cached_scene(config, camera_of(config.camera), flight, SEED)
+    scene = cached_scene(config, view_envelope(camera_of(config.camera), flight), SEED)
     altitudes = (1500.0, 800.0, 400.0, 200.0)
     frames = photographs(config, scene, [(a, 28.0) for a in altitudes])
     write_row(out / "altitudes.jpg", frames, [f"{a:.0f} m, Sun 28 deg" for a in altitudes])
@@ -115,7 +116,7 @@ def main() -> None:
     frames, captions = [], []
     for region in ("mare", "highland"):
         own = settings(config_file=Path("configs") / f"{region}.yaml")
-        grown = cached_scene(own, camera_of(own.camera), flight, SEED)
+        grown = cached_scene(own, view_envelope(camera_of(own.camera), flight), SEED)
         frames += photographs(own, grown, [(1200.0, 25.0), (300.0, 25.0)])
         captions += [f"{region}, 1200 m", f"{region}, 300 m"]
     write_row(out / "regions.jpg", frames, captions)
@@ -128,7 +129,7 @@ def main() -> None:
         )
         for name, changes in (("the model alone", bare), ("with our detail", ())):
             own = settings(f"dataset.terrain.dem={arguments.dem}", *changes)
-            grown = cached_scene(own, camera_of(own.camera), flight, SEED)
+            grown = cached_scene(own, view_envelope(camera_of(own.camera), flight), SEED)
             frames += photographs(own, grown, [(1000.0, 15.0), (250.0, 15.0)], (-150.0, 200.0))
             captions += [f"{name}, 1000 m", f"{name}, 250 m"]
         write_row(out / "elevation.jpg", frames, captions)

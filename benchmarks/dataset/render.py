@@ -39,7 +39,7 @@ def main() -> None:
     plan = make_plan(config, "detect")
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
     start = time.perf_counter()
-    scene = grow_scene(config, plan.camera, config.detect.flight, scene_plan.seed)
+    scene = grow_scene(config, plan.view, scene_plan.seed)
     scene_s = time.perf_counter() - start
     sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)

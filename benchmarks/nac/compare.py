@@ -20,6 +20,7 @@ from benchmarks.nac.plots import draw_curves
 from benchmarks.nac.sun import sun_over, time_of
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig
+from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.exr import Radiance
 from perilune_render.imaging.sensor import FixedPattern, develop
 from perilune_render.labels.drawing import write_sheet
@@ -137,7 +138,7 @@ def take_frames(config: DatasetConfig, crops: list[Picture], n_scenes: int, samp
     with progress_bar() as bar:
         task = bar.add_task("frames", total=n_scenes * len(crops), unit="frames")
         for number in range(n_scenes):
-            scene = grow_scene(config, camera, flight, derived_seed(config.seed, "nac", number))
+            scene = grow_scene(config, view_envelope(camera, flight), derived_seed(config.seed, "nac", number))
             for crop, taken in zip(crops, frames, strict=True):
                 taken.append(
                     take_frame(scene, config, camera, flight.end_altitude_m, crop.azimuth_deg, crop.elevation_deg)

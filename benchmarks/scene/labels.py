@@ -89,7 +89,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
         task = bar.add_task("poses", total=len(ALTITUDES_M) * len(TILTS_DEG), unit="poses", note="")
         for scene_plan, altitude_m in zip(plan.scenes, ALTITUDES_M, strict=False):
-            scene = grow_scene(config, plan.camera, config.detect.flight, scene_plan.seed)
+            scene = grow_scene(config, plan.view, scene_plan.seed)
             for tilt_deg in TILTS_DEG:
                 pose = altitude_m, tilt_deg, *view(scene, altitude_m, tilt_deg, rng)
                 main_run.append(judge(Path(folder), scene, plan.camera, SCALE, 16, *pose))

@@ -19,6 +19,7 @@ from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import CratersConfig
 from perilune_render.config_values import Span
 from perilune_render.flight.plan import camera_of, make_plan
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.craters.population import Craters, draw_craters
@@ -65,17 +66,17 @@ def main() -> None:
     config = resolve(DatasetConfig, "dataset", "perilune_render", "small")
     camera = camera_of(config.camera)
     tiny = resolve(DatasetConfig, "dataset", "perilune_render", "tiny")
-    grow_scene(config, camera_of(tiny.camera), FlightConfig(), 1)
+    grow_scene(config, view_envelope(camera_of(tiny.camera), FlightConfig()), 1)
     flight = config.detect.flight.model_copy(update={"downrange_m": 1090.0})
     # Building the profile tables is part of the measured work; only numba's compiled code is kept.
     profile_tables.cache_clear()
     start, cpu_start = time.perf_counter(), time.process_time()
-    scene = grow_scene(config, camera, flight, 7)
+    scene = grow_scene(config, view_envelope(camera, flight), 7)
     grown_s = time.perf_counter() - start
     mesh_bytes = mesh_of(scene)
     scene_s, scene_cpu_s = time.perf_counter() - start, time.process_time() - cpu_start
     peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    grid = graded_grid(config, camera, config.detect.flight)
+    grid = graded_grid(config.terrain, view_envelope(camera, config.detect.flight))
     times = []
     with progress_bar() as bar:
         for n in bar.track(COUNTS, description="laying craters"):
@@ -111,7 +112,7 @@ def second_descent(config: DatasetConfig) -> dict[str, float]:
         os.environ["PERILUNE_CACHE"] = folder
         for trajectory in plan.trajectories[:2]:
             start = time.perf_counter()
-            scene = cached_scene(config, plan.exr_camera, config.detect.flight, plan.scenes[0].seed)
+            scene = cached_scene(config, plan.view, plan.scenes[0].seed)
             with Renderer(scene, config, plan.exr_camera, sun_direction(90, 30)) as renderer:
                 renderer.render(trajectory.flight.position_m[0], trajectory.flight.rotation_camera_from_site[0])
             times.append(time.perf_counter() - start)

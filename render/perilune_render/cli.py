@@ -249,9 +249,8 @@ def export(
 
     if out.suffix not in MESH_SUFFIXES + RASTER_SUFFIXES:
         raise UserError(out, "format", out.suffix or "none", "one of " + ", ".join(MESH_SUFFIXES + RASTER_SUFFIXES))
-    name = first_kind(kind)
-    plan = make_plan(resolved, name)
-    scene = cached_scene(resolved, plan.exr_camera, resolved.ground_flight(name), plan.scenes[0].seed)
+    plan = make_plan(resolved, first_kind(kind))
+    scene = cached_scene(resolved, plan.view, plan.scenes[0].seed)
     if out.suffix in RASTER_SUFFIXES:
         export_raster(scene, out, pixel_m)
     else:

@@ -5,6 +5,7 @@ from tests.helpers.scenes import config_with
 
 from perilune_render.config import DatasetConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.geometry.camera import Camera
 
@@ -21,4 +22,4 @@ def small_config() -> DatasetConfig:
 
 @pytest.fixture(scope="session")
 def scene(small_config, camera) -> Scene:
-    return grow_scene(small_config, camera, small_config.detect.flight, 3)
+    return grow_scene(small_config, view_envelope(camera, small_config.detect.flight), 3)

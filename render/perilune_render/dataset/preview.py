@@ -30,8 +30,8 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     """
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
-    check_ground(config, plan.exr_camera, config.ground_flight(kind))
-    scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
+    check_ground(config, plan.view)
+    scene = cached_scene(config, plan.view, scene_plan.seed)
     check_poses(Poses.planned([trajectory]), plan.exr_camera, scene, f"configuration: dataset.{kind}")
     sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
     pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)

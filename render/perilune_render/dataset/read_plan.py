@@ -8,6 +8,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.dataset.output import info_of
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
 from perilune_render.flight.trajectories import Flight
+from perilune_render.flight.view import view_envelope
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
@@ -43,7 +44,9 @@ def plan_of(
         for row in manifest.table("scenes").sort_by("scene_id").to_pylist()
     ]
     descents = [descent for scene in scenes for descent in _descents(manifest, scene.scene_id)]
-    plan = Plan(camera, camera.covering_pinhole(), tuple(scenes), tuple(descents))
+    exr_camera = camera.covering_pinhole()
+    view = view_envelope(exr_camera, config.ground_flight(recipe.kind))
+    plan = Plan(camera, exr_camera, view, tuple(scenes), tuple(descents))
     begun = info_of(config, plan, recipe_of(config, recipe.kind, recipe.preset))
     kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     return plan, config, begun.model_copy(update=kept)

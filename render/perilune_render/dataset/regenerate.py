@@ -20,6 +20,7 @@ from perilune_render.dataset.frame import Shot, Studio
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.flight.plan import camera_of
 from perilune_render.flight.pose_checks import Poses, check_poses
+from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.imaging.exr import read_exr
 from perilune_render.imaging.sensor import FixedPattern
@@ -121,12 +122,12 @@ def _of_scene(
             raise UserError(dataset.root, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
     config = config_of(recipe, where, dem, catalogue)
     ground_config = _ground_config(recipe, config, where)
-    camera, flight = camera_of(config.camera), ground_config.ground_flight(recipe.kind)
-    exr_camera = camera_of(ground_config.camera).covering_pinhole()
+    camera, exr_camera = camera_of(config.camera), camera_of(ground_config.camera).covering_pinhole()
+    view = view_envelope(exr_camera, ground_config.ground_flight(recipe.kind))
     if camera != dataset.info.camera.intrinsics():
         raise UserError(where, "camera", dataset.info.camera.intrinsics(), f"that of its recipe, {camera}")
     with interrupts_held():
-        ground = cached_scene(ground_config, exr_camera, flight, scene["seed"])
+        ground = cached_scene(ground_config, view, scene["seed"])
     if not same_source(ground.dem_source, scene["dem_source"]):
         raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
     poses = (np.array([row[name] for row in rows]) for name in ("position_m", "rotation_wxyz"))

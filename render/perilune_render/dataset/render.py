@@ -65,9 +65,8 @@ def render_plan(
     ground; the last error names `where`, the origin of the plan. The first scene is checked before anything is written,
     every other one before its first frame is rendered.
     """
-    flight = config.ground_flight(info.recipe().kind)
-    check_ground(config, plan.exr_camera, flight)
-    check_plan(plan, graded_grid(config, plan.exr_camera, flight), where)
+    check_ground(config, plan.view)
+    check_plan(plan, graded_grid(config.terrain, plan.view), where)
     with writing(out):
         return _render(plan, config, info, out, progress, where)
 
@@ -78,7 +77,7 @@ def _render(
     kind = info.recipe().kind
     grown: dict[str, Scene] = {}
     if not is_begun(out) and plan.scenes:
-        grown[plan.scenes[0].scene_id] = _grow(plan, plan.scenes[0], config, kind, where)
+        grown[plan.scenes[0].scene_id] = _grow(plan, plan.scenes[0], config, where)
     info = begin_or_go_on(out, info)
     check_begun(out, plan)
     if info.complete:
@@ -92,7 +91,7 @@ def _render(
         if not waiting:
             continue
         progress.update(task, note=f"{scene_plan.scene_id}: growing")
-        scene = grown.pop(scene_plan.scene_id, None) or _grow(plan, scene_plan, config, kind, where)
+        scene = grown.pop(scene_plan.scene_id, None) or _grow(plan, scene_plan, config, where)
         _write_scene(out, scene_plan, scene, config, info.recipe().key, trajectories)
         progress.update(task, note=scene_plan.scene_id)
         sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
@@ -115,10 +114,10 @@ def _render(
     return open_dataset(out)
 
 
-def _grow(plan: Plan, scene_plan: ScenePlan, config: DatasetConfig, kind: Kind, where: object) -> Scene:
+def _grow(plan: Plan, scene_plan: ScenePlan, config: DatasetConfig, where: object) -> Scene:
     """Generate the ground of a scene, and check that all its poses fit it."""
     with interrupts_held():
-        scene = cached_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
+        scene = cached_scene(config, plan.view, scene_plan.seed)
     trajectories = plan.of_scene(scene_plan.scene_id)
     if trajectories:
         check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)

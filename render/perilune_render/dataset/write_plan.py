@@ -26,15 +26,15 @@ def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progre
     settings, or if `out` is not empty.
     """
     plan, where = make_plan(config, kind), f"configuration: dataset.{kind}"
-    check_ground(config, plan.exr_camera, config.ground_flight(kind))
-    check_plan(plan, graded_grid(config, plan.exr_camera, config.ground_flight(kind)), where)
+    check_ground(config, plan.view)
+    check_plan(plan, graded_grid(config.terrain, plan.view), where)
     recipe = recipe_of(config, kind, preset, planned=True)
     info = info_of(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes")
     with written(out, info, whole_tables=True) as writer:
         for scene_plan in plan.scenes:
             with interrupts_held():
-                scene = grow_scene(config, plan.exr_camera, config.ground_flight(kind), scene_plan.seed)
+                scene = grow_scene(config, plan.view, scene_plan.seed)
             sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
             trajectories = plan.of_scene(scene_plan.scene_id)
             check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)

@@ -10,7 +10,9 @@ import numpy as np
 
 from perilune_render.config import CameraConfig, DatasetConfig, KindConfig
 from perilune_render.flight.trajectories import Flight, fly
+from perilune_render.flight.view import view_envelope
 from perilune_render.streams import derived_seed, stream
+from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 
@@ -67,6 +69,8 @@ class Plan:
     """Camera of all frames."""
     exr_camera: Camera
     """Camera of the rendering and the EXRs: a pinhole that covers the view of `camera`."""
+    view: ViewEnvelope
+    """The views that the ground of every scene must serve."""
     scenes: tuple[ScenePlan, ...]
     """All scenes."""
     trajectories: tuple[TrajectoryPlan, ...]
@@ -134,7 +138,9 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
             flight = fly(settings.flight, settings.n_frames, own)
             name, places = f"trajectory-{t:04d}", tuple(range(settings.n_frames))
             trajectories.append(TrajectoryPlan(scenes[-1].scene_id, name, own, places, tuple(splits[s, t]), flight))
-    return Plan(camera, camera.covering_pinhole(), tuple(scenes), tuple(trajectories))
+    exr_camera = camera.covering_pinhole()
+    view = view_envelope(exr_camera, config.ground_flight(kind))
+    return Plan(camera, exr_camera, view, tuple(scenes), tuple(trajectories))
 
 
 def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:

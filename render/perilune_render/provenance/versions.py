@@ -7,7 +7,7 @@ import perilune_render
 import perilune_shared
 from perilune_render.provenance.fingerprint import fingerprint
 
-GROUND = ("perilune_render.terrain.scene:grow_scene",)
+GROUND = ("perilune_render.flight.view:view_envelope", "perilune_render.terrain.scene:grow_scene")
 """Code that generates ground, craters and boulders."""
 RENDERING = ("perilune_render.flight.plan:make_plan", "perilune_render.blender.renderer:Renderer")
 """Code that plans trajectories and renders radiance."""

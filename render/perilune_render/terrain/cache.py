@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config import DatasetConfig
 from perilune_render.provenance.caches import cache_home
 from perilune_render.provenance.versions import ground_versions
 from perilune_render.terrain.boulders import Boulders
 from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.craters.rims import Rims
+from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.geometry.camera import Camera
 from perilune_shared.storage.files import sha256_of, written_aside
 
 _PARTS: dict[str, type] = {"grid": Grid, "craters": Craters, "rims": Rims, "boulders": Boulders}
@@ -37,8 +37,8 @@ def cache_folder() -> Path:
     return cache_home() / "scenes"
 
 
-def scene_key(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> str:
-    """Hash of all that determines a scene: code, libraries, terrain settings, camera, flight, seed, input files."""
+def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
+    """Hash of all that determines a scene: code, libraries, terrain settings, views, seed, input files."""
     terrain = config.terrain.model_dump(mode="json")
     for name in ("dem", "catalogue"):
         if terrain[name] is not None and Path(terrain[name]).is_file():
@@ -49,21 +49,20 @@ def scene_key(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed:
         "versions": {name: version for name, version in versions.items() if not name.startswith("perilune")},
         "terrain": terrain,
         "albedo_variation": config.light.albedo_variation,
-        "camera": dataclasses.asdict(camera),
-        "flight": flight.model_dump(mode="json"),
+        "view": [view.height_m.tolist(), view.reach_m.tolist(), view.focal_px],
         "seed": seed,
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def cached_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> Scene:
+def cached_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     """The scene of a seed, read from the cache, or generated and stored there."""
     if config.render.cache_gib == 0:
-        return grow_scene(config, camera, flight, seed)
-    path = cache_folder() / f"{scene_key(config, camera, flight, seed)}.npz"
+        return grow_scene(config, view, seed)
+    path = cache_folder() / f"{scene_key(config, view, seed)}.npz"
     scene = _read(path)
     if scene is None:
-        scene = grow_scene(config, camera, flight, seed)
+        scene = grow_scene(config, view, seed)
         with contextlib.suppress(OSError):
             _write(path, scene)
             _make_room(path.parent, config.render.cache_gib * 2**30)

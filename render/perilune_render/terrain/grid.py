@@ -2,7 +2,7 @@
 
 Every ring has as many vertices as the inner square's border, so a ring of twice the half-width has twice the spacing;
 the distance between rings grows likewise. Neighbouring rings are joined vertex to vertex, so the mesh has no hanging
-vertices and no gaps. The spacing at each place is set by the lowest altitude from which a trajectory can see it.
+vertices and no gaps. The spacing at each place is set by the lowest height from which a camera can see it.
 
 Vertices are stored in one list: the inner square row by row (y, then x), then ring by ring, each counter-clockwise from
 its corner at -x, -y. `lines_in` returns the vertices in a window as straight lines of evenly spaced vertices, which
@@ -13,14 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig, FlightConfig
-from perilune_render.config_terrain import LARGEST_SPACING_PX
+from perilune_render.config_terrain import LARGEST_SPACING_PX, TerrainConfig
 from perilune_render.provenance.kernels import njit
+from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_shared.errors import UserError
-from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
-
-_WIDEST_RAD = np.radians(80)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,68 +86,40 @@ class Grid:
         return np.concatenate([inner, joined])
 
 
-def view_angle(camera: Camera, flight: FlightConfig) -> float:
-    """Largest angle from straight down, along either image axis, at which a frame shows the ground, radians."""
-    half_view = max(
-        max(camera.cx_px, camera.width_px - camera.cx_px) / camera.fx_px,
-        max(camera.cy_px, camera.height_px - camera.cy_px) / camera.fy_px,
-    )
-    return float(np.arctan(half_view) + 3 * np.radians(flight.attitude_sigma_deg))
+def graded_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
+    """The grid for the views of a camera: everywhere the spacing is at most `terrain.spacing_px` smallest pixels.
 
-
-def reach_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
-    """Largest |x| or |y| from the site that a frame at this nominal altitude can show, metres.
-
-    The camera's axes are parallel to those of O_L except for small rotations, so a frame covers a square along the
-    axes. Includes three standard deviations of tilt, rotation and position, and a margin of a twentieth for relief.
+    Raises UserError if that needs more than `terrain.max_vertices`.
     """
-    turn = min(3 * np.radians(flight.attitude_sigma_deg), np.pi / 4)
-    share = (altitude_m - flight.end_altitude_m) / (flight.start_altitude_m - flight.end_altitude_m)
-    slope = np.tan(min(view_angle(camera, flight), _WIDEST_RAD)) * (np.cos(turn) + np.sin(turn))
-    view = (altitude_m + 3 * flight.position_sigma_m) * slope
-    return flight.downrange_m * share**2 + 3 * flight.position_sigma_m + 1.05 * view
-
-
-def graded_grid(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> Grid:
-    """The grid for a camera and a flight: at every place the spacing is at most `terrain.spacing_px` smallest pixels.
-
-    Raises UserError if that needs more than `terrain.max_vertices`, or if frames could show the horizon.
-    """
-    if view_angle(camera, flight) > _WIDEST_RAD:
-        wide = f"frames reach {np.degrees(view_angle(camera, flight)):.0f} degrees from straight down"
-        raise UserError("configuration", "dataset.camera", wide, f"at most {np.degrees(_WIDEST_RAD):.0f}")
-    spacing_px, most = config.terrain.spacing_px, config.terrain.max_vertices
-    grid = _grid_of(spacing_px, camera, flight)
+    spacing_px, most = terrain.spacing_px, terrain.max_vertices
+    grid = _grid_of(spacing_px, view)
     if grid.n_vertices > most:
         raise UserError(
             "configuration",
             "dataset.terrain.spacing_px",
             f"{spacing_px} needs {grid.n_vertices:,} vertices",
-            f"{_wider(spacing_px, grid.n_vertices, most, camera, flight)} (dataset.terrain.max_vertices is {most:,})",
+            f"{_wider(spacing_px, grid.n_vertices, most, view)} (dataset.terrain.max_vertices is {most:,})",
         )
     return grid
 
 
-def _wider(spacing_px: float, n_vertices: int, most: int, camera: Camera, flight: FlightConfig) -> str:
+def _wider(spacing_px: float, n_vertices: int, most: int, view: ViewEnvelope) -> str:
     """The advice if a spacing needs more than `most` vertices: the smallest spacing allowed, rounded up to 0.01."""
     hundredths = int(np.ceil(100 * spacing_px * np.sqrt(n_vertices / most)))
     # The number of vertices is only roughly proportional to 1 / spacing^2.
-    while hundredths > 1 and _grid_of((hundredths - 1) / 100, camera, flight).n_vertices <= most:
+    while hundredths > 1 and _grid_of((hundredths - 1) / 100, view).n_vertices <= most:
         hundredths -= 1
     while hundredths <= 100 * LARGEST_SPACING_PX:
-        if _grid_of(hundredths / 100, camera, flight).n_vertices <= most:
+        if _grid_of(hundredths / 100, view).n_vertices <= most:
             return f"at least {hundredths / 100:g}, or more dataset.terrain.max_vertices"
         hundredths += 1
     return "more dataset.terrain.max_vertices, fewer or wider pixels of dataset.camera, or a higher end_altitude_m"
 
 
-def _grid_of(spacing_px: float, camera: Camera, flight: FlightConfig) -> Grid:
+def _grid_of(spacing_px: float, view: ViewEnvelope) -> Grid:
     """The grid of a spacing in pixels, with any number of vertices."""
-    altitude = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, 400)
-    reach = np.maximum.accumulate(reach_m(camera, flight, altitude))
-    # The ground may also rise towards the camera by a twentieth of the altitude.
-    lowest = np.maximum(0.95 * altitude - 3 * flight.position_sigma_m, 0.2 * altitude)
-    spacing = spacing_px * lowest / max(camera.fx_px, camera.fy_px)
+    reach = view.reach_m
+    spacing = spacing_px * view.height_m / view.focal_px
     n_half = int(np.ceil((reach / spacing).max()))
     inner = min(n_half * spacing[0], reach[-1])
     distance = np.linspace(inner, max(reach[-1], inner + spacing[0]), 20_000)

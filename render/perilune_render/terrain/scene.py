@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config import DatasetConfig
 from perilune_render.config_terrain import ReliefConfig, TerrainConfig
 from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.boulders import Boulders, draw_boulders
@@ -25,10 +25,10 @@ from perilune_render.terrain.elevation.model import (
     resolved_m,
 )
 from perilune_render.terrain.elevation.surroundings import FittedRelief, add_fitted_relief, fitted_relief
+from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.relief import add_relief, check_waves
-from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_shared.progress import say
 
@@ -114,10 +114,10 @@ def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, se
     return Base(height, beyond, model, around)
 
 
-def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed: int) -> Scene:
+def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     """Generate the scene of a seed: base, relief, craters from oldest to youngest, boulders."""
     terrain = config.terrain
-    grid = graded_grid(config, camera, flight)
+    grid = graded_grid(terrain, view)
     model = read_elevation(Path(terrain.dem)) if terrain.dem is not None else None
     base = base_of(model, grid, terrain, seed)
     height = base.height_m
@@ -152,12 +152,12 @@ def grow_scene(config: DatasetConfig, camera: Camera, flight: FlightConfig, seed
     )
 
 
-def check_ground(config: DatasetConfig, camera: Camera, flight: FlightConfig) -> None:
+def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
     """Check grid, relief and input files before the ground is generated. Raises UserError.
 
     Prints remarks on the elevation model.
     """
-    grid = graded_grid(config, camera, flight)
+    grid = graded_grid(config.terrain, view)
     check_waves(config.terrain.relief, grid)
     if config.terrain.dem is not None:
         model = read_elevation(Path(config.terrain.dem))

@@ -15,6 +15,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import RenderConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
+from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.exr import read_radiance, write_exr
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.export import vertices
@@ -108,7 +109,7 @@ def frames(tmp_path_factory):
     config = config_with(
         terrain=TerrainConfig(spacing_px=1.0, boulders=stones), render=RenderConfig(samples=2, exr=True)
     )
-    scene = grow_scene(config, CAMERA, config.detect.flight, 3)
+    scene = grow_scene(config, view_envelope(CAMERA, config.detect.flight), 3)
     caster, path = Caster(scene), tmp_path_factory.mktemp("truth") / "frame.exr"
     found = []
     with Renderer(scene, config, CAMERA, sun_direction(60, 30)) as renderer:

@@ -11,6 +11,7 @@ from tests.helpers.scenes import config_with
 
 from perilune_render.dataset.render import _write_scene
 from perilune_render.flight.plan import make_plan
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.errors import UserError
@@ -29,7 +30,7 @@ begin(Path(sys.argv[1]))
 
 def begin(out):
     plan = make_plan(CONFIG, "detect")
-    scene = grow_scene(CONFIG, CAMERA, CONFIG.detect.flight, 3)
+    scene = grow_scene(CONFIG, view_envelope(CAMERA, CONFIG.detect.flight), 3)
     _write_scene(out, plan.scenes[0], scene, CONFIG, "0" * 16, plan.trajectories)
     return plan, scene
 

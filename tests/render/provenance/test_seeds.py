@@ -12,6 +12,7 @@ from perilune_render.dataset.output import info_of
 from perilune_render.dataset.read_plan import plan_of
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.flight.plan import make_plan
+from perilune_render.flight.view import view_envelope
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import PRESETS, resolve
@@ -44,7 +45,9 @@ def cheap(**changes) -> DatasetConfig:
 
 def ground_sha256(config: DatasetConfig, kind: str, flight: FlightConfig | None = None) -> str:
     plan = make_plan(config, kind)
-    scene = grow_scene(config, plan.exr_camera, flight or config.ground_flight(kind), plan.scenes[0].seed)
+    scene = grow_scene(
+        config, view_envelope(plan.exr_camera, flight or config.ground_flight(kind)), plan.scenes[0].seed
+    )
     assert len(scene.craters) > 10
     tables = ground_tables("scene-0000", scene)
     return content_sha256(tables["craters"], tables["boulders"])

@@ -1,6 +1,7 @@
 import numpy as np
 from tests.helpers.scenes import config_with, round_craters
 
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import value_at
@@ -42,4 +43,4 @@ def test_patches_vary_with_place_about_one():
 
 def test_without_variation_the_ground_is_even(camera):
     config = config_with(light={"albedo_variation": 0.0}, terrain={"spacing_px": 2.0})
-    assert (grow_scene(config, camera, config.detect.flight, 1).albedo == 1).all()
+    assert (grow_scene(config, view_envelope(camera, config.detect.flight), 1).albedo == 1).all()

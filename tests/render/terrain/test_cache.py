@@ -6,12 +6,14 @@ import pytest
 from tests.helpers.scenes import config_with
 
 from perilune_render.config import FlightConfig
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain import cache
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.geometry.camera import Camera
 
 CAMERA = Camera.from_field_of_view(32, 32, 50.0)
 FLIGHT = FlightConfig()
+VIEW = view_envelope(CAMERA, FLIGHT)
 
 
 @pytest.fixture
@@ -31,58 +33,60 @@ def same(first, second):
 
 
 def test_a_cached_scene_is_the_grown_one(folder):
-    grown = grow_scene(config_with(), CAMERA, FLIGHT, 3)
-    same(cache.cached_scene(config_with(), CAMERA, FLIGHT, 3), grown)
+    grown = grow_scene(config_with(), VIEW, 3)
+    same(cache.cached_scene(config_with(), VIEW, 3), grown)
     assert len(list(folder.iterdir())) == 1
-    same(cache.cached_scene(config_with(), CAMERA, FLIGHT, 3), grown)
+    same(cache.cached_scene(config_with(), VIEW, 3), grown)
     assert len(list(folder.iterdir())) == 1
 
 
 def test_whatever_changes_the_ground_changes_the_key(tmp_path):
-    base = cache.scene_key(config_with(), CAMERA, FLIGHT, 3)
-    assert base == cache.scene_key(config_with(sensor={"bits": 12}, render={"samples": 9}), CAMERA, FLIGHT, 3)
+    base = cache.scene_key(config_with(), VIEW, 3)
+    assert base == cache.scene_key(config_with(sensor={"bits": 12}, render={"samples": 9}), VIEW, 3)
     dem = tmp_path / "a.tif"
     dem.write_bytes(b"one")
-    with_dem = cache.scene_key(config_with(terrain={"dem": str(dem)}), CAMERA, FLIGHT, 3)
+    with_dem = cache.scene_key(config_with(terrain={"dem": str(dem)}), VIEW, 3)
     dem.write_bytes(b"two")
     others = [
-        cache.scene_key(config_with(), CAMERA, FLIGHT, 4),
-        cache.scene_key(config_with(), CAMERA, FlightConfig(downrange_m=400.0), 3),
-        cache.scene_key(config_with(), dataclasses.replace(CAMERA, fx_px=30.0), FLIGHT, 3),
+        cache.scene_key(config_with(), VIEW, 4),
+        cache.scene_key(config_with(), view_envelope(CAMERA, FlightConfig(downrange_m=400.0)), 3),
+        cache.scene_key(config_with(), view_envelope(dataclasses.replace(CAMERA, fx_px=30.0), FLIGHT), 3),
         cache.scene_key(
-            config_with(terrain={"relief": {"rms_slope_deg": {"low": 1.0, "high": 1.0}}}), CAMERA, FLIGHT, 3
+            config_with(terrain={"relief": {"rms_slope_deg": {"low": 1.0, "high": 1.0}}}),
+            VIEW,
+            3,
         ),
-        cache.scene_key(config_with(light={"albedo_variation": 0.5}), CAMERA, FLIGHT, 3),
+        cache.scene_key(config_with(light={"albedo_variation": 0.5}), VIEW, 3),
         with_dem,
-        cache.scene_key(config_with(terrain={"dem": str(dem)}), CAMERA, FLIGHT, 3),
+        cache.scene_key(config_with(terrain={"dem": str(dem)}), VIEW, 3),
     ]
     assert len({base, *others}) == 8
 
 
 def test_a_damaged_file_is_grown_again_and_no_cache_keeps_nothing(folder):
-    cache.cached_scene(config_with(render={"cache_gib": 0.0}), CAMERA, FLIGHT, 3)
+    cache.cached_scene(config_with(render={"cache_gib": 0.0}), VIEW, 3)
     assert not folder.exists()
-    grown = cache.cached_scene(config_with(), CAMERA, FLIGHT, 3)
+    grown = cache.cached_scene(config_with(), VIEW, 3)
     path = next(folder.iterdir())
     for content in (path.read_bytes()[:5000], b"", b"rubbish"):
         path.write_bytes(content)
-        same(cache.cached_scene(config_with(), CAMERA, FLIGHT, 3), grown)
+        same(cache.cached_scene(config_with(), VIEW, 3), grown)
     assert path.stat().st_size > 5000
 
 
 def test_the_least_recently_used_goes_first(folder):
     config = config_with()
     for seed in (1, 2):
-        cache.cached_scene(config, CAMERA, FLIGHT, seed)
+        cache.cached_scene(config, VIEW, seed)
     time.sleep(0.02)
-    cache.cached_scene(config, CAMERA, FLIGHT, 1)
+    cache.cached_scene(config, VIEW, 1)
     size = max(path.stat().st_size for path in folder.iterdir())
-    cache.cached_scene(config_with(render={"cache_gib": 2.3 * size / 2**30}), CAMERA, FLIGHT, 3)
+    cache.cached_scene(config_with(render={"cache_gib": 2.3 * size / 2**30}), VIEW, 3)
     kept = {path.stem for path in folder.iterdir()}
-    assert kept == {cache.scene_key(config, CAMERA, FLIGHT, seed) for seed in (1, 3)}
+    assert kept == {cache.scene_key(config, VIEW, seed) for seed in (1, 3)}
 
 
 def test_a_folder_that_cannot_be_written_is_no_failure(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("PERILUNE_CACHE", str(tmp_path / "file" / "scenes"))
-    assert cache.cached_scene(config_with(), CAMERA, FLIGHT, 3).seed == 3
+    assert cache.cached_scene(config_with(), VIEW, 3).seed == 3

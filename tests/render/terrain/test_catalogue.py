@@ -6,6 +6,7 @@ import rasterio
 from tests.helpers.elevation_models import POLAR, write
 from tests.helpers.scenes import config_with
 
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.craters.population import ORIGINS
 from perilune_render.terrain.elevation.catalogue import read_catalogue
 from perilune_render.terrain.elevation.model import raster_places, read_elevation
@@ -77,7 +78,7 @@ def test_real_craters_are_measured_on_the_model_and_kept_beside_ours(tmp_path, m
             "boulders": {"density": 0.0},
         }
     )
-    scene = grow_scene(config, camera, config.detect.flight, 1)
+    scene = grow_scene(config, view_envelope(camera, config.detect.flight), 1)
     real = scene.craters.origin == ORIGINS.index("elevation model")
     assert real.sum() == 2 and len(scene.craters) > 100
     assert np.allclose(scene.rims.depth_m[real] / scene.craters.diameter_m[real], 0.14, atol=0.03)
@@ -85,8 +86,7 @@ def test_real_craters_are_measured_on_the_model_and_kept_beside_ours(tmp_path, m
     assert (scene.craters.diameter_m[inside] <= 4 * PIXEL_M * 1.01).all()
     without = grow_scene(
         config.model_copy(update={"terrain": config.terrain.model_copy(update={"catalogue": None})}),
-        camera,
-        config.detect.flight,
+        view_envelope(camera, config.detect.flight),
         1,
     )
     # A catalogue names what is there: it changes no height.

@@ -4,6 +4,7 @@ import rasterio
 from tests.helpers.elevation_models import POLAR, write
 from tests.helpers.scenes import config_with
 
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.elevation.model import base_heights, read_elevation
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import grow_scene
@@ -91,7 +92,7 @@ def test_holes_are_filled_and_the_outside_is_marked(tmp_path):
 def test_craters_on_the_model_are_only_those_below_what_it_resolves(tmp_path, camera):
     path = ramp_to_the_north(tmp_path / "a.tif")
     config = config_with(terrain={"dem": str(path), "spacing_px": 1.0})
-    scene = grow_scene(config, camera, config.detect.flight, 1)
+    scene = grow_scene(config, view_envelope(camera, config.detect.flight), 1)
     inside = np.maximum(np.abs(scene.craters.x_m), np.abs(scene.craters.y_m)) < 1000
     assert inside.sum() > 100 and scene.craters.diameter_m[inside].max() <= 80.5
     assert scene.dem_source.startswith("a.tif sha256:") and scene.latitude_deg == pytest.approx(-30, abs=0.1)

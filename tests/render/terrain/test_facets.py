@@ -39,7 +39,7 @@ HIGHLAND = Path(__file__).parents[3] / "configs" / "highland.yaml"
 def test_no_facet_is_over_a_pixel_in_any_frame(preset, kind, n_frames, config_file):
     config = resolve(DatasetConfig, "dataset", "perilune_render", preset, config_file)
     plan = make_plan(config, kind)
-    scene = grow_scene(config, plan.camera, config.kind(kind).flight, plan.scenes[0].seed)
+    scene = grow_scene(config, plan.view, plan.scenes[0].seed)
     x, y = scene.grid.vertices_xy()
     vertices, faces = np.stack([x, y, scene.height_m], axis=1), scene.grid.quads()
     for trajectory in plan.of_scene(plan.scenes[0].scene_id)[:2]:

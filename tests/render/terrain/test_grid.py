@@ -6,18 +6,21 @@ from tests.helpers.scenes import config_with
 
 from perilune_render.config import FlightConfig
 from perilune_render.flight.trajectories import fly
-from perilune_render.terrain.grid import Grid, graded_grid, lines_in, reach_m
+from perilune_render.flight.view import reach_m, view_envelope
+from perilune_render.terrain.envelope import ViewEnvelope
+from perilune_render.terrain.grid import Grid, graded_grid, lines_in
 from perilune_render.terrain.interpolation import value_at
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 
 CAMERA = Camera.from_field_of_view(256, 256, 50.0)
 FLIGHT = FlightConfig(azimuth_deg={"low": 0.0, "high": 360.0}, attitude_sigma_deg=1.0)
+VIEW = view_envelope(CAMERA, FLIGHT)
 RINGED = Grid(8, np.array([4.0, 4.5, 5.2, 6.0, 7.5, 9.0]))
 
 
 def test_the_terrain_reaches_everywhere_the_camera_sees():
-    half = graded_grid(config_with(), CAMERA, FLIGHT).extent_m / 2
+    half = graded_grid(config_with().terrain, VIEW).extent_m / 2
     corners = np.array([[0, 0], [256, 0], [0, 256], [256, 256]])
     for seed in range(40):
         flight = fly(FLIGHT, 40, seed)
@@ -27,12 +30,33 @@ def test_the_terrain_reaches_everywhere_the_camera_sees():
 
 
 def test_spacing_is_at_most_half_the_smallest_pixel_from_which_a_place_is_seen():
-    grid = graded_grid(config_with(), CAMERA, FLIGHT)
+    grid = graded_grid(config_with().terrain, VIEW)
     assert (np.diff(grid.half_widths_m) > 0).all() and 4_000_000 < grid.n_vertices < 6_000_000
     for altitude in np.linspace(200, 1500, 27):
         lowest = altitude - 3 * FLIGHT.position_sigma_m
         seen = grid.half_widths_m <= max(reach_m(CAMERA, FLIGHT, np.array(altitude)), grid.half_widths_m[0])
         assert grid.spacings_m[seen].max() <= 0.505 * lowest / CAMERA.fx_px
+
+
+def test_a_users_own_views_set_extent_and_spacing():
+    """Hovering at 60 m within 100 m of the site, never above 500 m, which shows 400 m: no flight is needed."""
+    view = ViewEnvelope(np.array([60.0, 500.0]), np.array([100.0, 400.0]), 300.0)
+    grid = graded_grid(config_with().terrain, view)
+    assert grid.extent_m == pytest.approx(800)
+    assert grid.spacing_at(99.0) <= 0.5 * 60 / 300 * 1.02 and 0.5 < grid.spacing_at(399.0) / (0.5 * 500 / 300) <= 1.01
+
+
+@pytest.mark.parametrize(
+    ("height_m", "reach_m"), [((), ()), ((0.0, 1.0), (1.0, 2.0)), ((2.0, 1.0), (1.0, 2.0)), ((1.0, 2.0), (1.0, np.inf))]
+)
+def test_views_that_are_none_are_refused(height_m, reach_m):
+    with pytest.raises(ValueError, match="positive and ascending"):
+        ViewEnvelope(np.array(height_m), np.array(reach_m), 300.0)
+
+
+def test_a_view_of_the_horizon_is_refused():
+    with pytest.raises(UserError, match=r"dataset.camera: got frames reach 8[0-9] degrees from straight down"):
+        view_envelope(Camera.from_field_of_view(64, 64, 120.0), FlightConfig(attitude_sigma_deg=8.0))
 
 
 def test_the_mesh_is_watertight_and_looks_up():
@@ -78,7 +102,7 @@ def test_values_between_vertices_are_those_of_a_plane():
 
 
 def test_half_width_for_is_where_the_spacing_is_reached():
-    grid = graded_grid(config_with(), CAMERA, FLIGHT)
+    grid = graded_grid(config_with().terrain, VIEW)
     half = grid.half_width_for(2.0)
     assert grid.spacing_at(half - 5) <= 2.0 <= grid.spacing_at(half + 20)
     assert grid.half_width_for(0.01) == 0
@@ -87,15 +111,15 @@ def test_half_width_for_is_where_the_spacing_is_reached():
 @pytest.mark.parametrize("most", [250_000, 900_000, 1_234_567])
 def test_too_many_vertices_are_refused_and_a_spacing_is_named_that_passes(most):
     with pytest.raises(UserError, match=r"dataset.terrain.spacing_px: got 0.5 needs 5,.* vertices") as refusal:
-        graded_grid(config_with(terrain={"max_vertices": most}), CAMERA, FLIGHT)
+        graded_grid(config_with(terrain={"max_vertices": most}).terrain, VIEW)
     named = float(re.search(r"at least ([0-9.]+),", refusal.value.wanted)[1])
     wider = config_with(terrain={"max_vertices": most, "spacing_px": named})
-    assert graded_grid(wider, CAMERA, FLIGHT).n_vertices <= most
+    assert graded_grid(wider.terrain, VIEW).n_vertices <= most
     finer = config_with(terrain={"max_vertices": most, "spacing_px": round(named - 0.01, 2)})
     with pytest.raises(UserError, match="spacing_px"):
-        graded_grid(finer, CAMERA, FLIGHT)
+        graded_grid(finer.terrain, VIEW)
 
 
 def test_a_mesh_that_no_spacing_makes_small_enough_names_none():
     with pytest.raises(UserError, match=r"expected more dataset.terrain.max_vertices, fewer or wider pixels"):
-        graded_grid(config_with(terrain={"max_vertices": 10_000}), CAMERA, FLIGHT)
+        graded_grid(config_with(terrain={"max_vertices": 10_000}).terrain, VIEW)

@@ -10,6 +10,7 @@ from tests.helpers.scenes import config_with
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import CratersConfig
 from perilune_render.config_values import Span
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.craters.population import ORIGINS, draw_craters
 from perilune_render.terrain.craters.profile import REACH, crest_radius, profile_tables, wear_row
 from perilune_render.terrain.grid import Grid
@@ -25,7 +26,7 @@ EVEN = Grid.even(1500, 1500)
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     config = config_with()
-    return grow_scene(config, Camera.from_field_of_view(256, 256, 50.0), FlightConfig(), 7)
+    return grow_scene(config, view_envelope(Camera.from_field_of_view(256, 256, 50.0), FlightConfig()), 7)
 
 
 @pytest.mark.parametrize("law", sorted(EQUILIBRIA))
@@ -123,7 +124,7 @@ def test_a_circle_fitted_to_every_fresh_crater_is_its_label():
     config = config_with()
     fits = []
     for seed in range(7, 19):
-        scene = grow_scene(config, Camera.from_field_of_view(192, 192, 50.0), FlightConfig(), seed)
+        scene = grow_scene(config, view_envelope(Camera.from_field_of_view(192, 192, 50.0), FlightConfig()), seed)
         c = scene.craters
         fresh = [k for k in settled(scene, 24, 0.1) if c.wear_m2[k] < 0.008 * (c.diameter_m[k] / 2) ** 2]
         fits += [fitted_radius(scene, k) for k in fresh]
@@ -135,7 +136,7 @@ def grown(region):
     """The scene of seed 7 with the settings of configs/<region>.yaml, one vertex a pixel."""
     file = Path(__file__).parents[3] / "configs" / f"{region}.yaml"
     config = resolve(DatasetConfig, "dataset", "perilune_render", "small", file, ("dataset.terrain.spacing_px=1.0",))
-    return grow_scene(config, Camera.from_field_of_view(192, 192, 50.0), FlightConfig(), 7)
+    return grow_scene(config, view_envelope(Camera.from_field_of_view(192, 192, 50.0), FlightConfig()), 7)
 
 
 def rises(scene, baseline_m, n=40_000):
@@ -161,7 +162,7 @@ def test_no_vertex_stands_up_as_a_spike():
     """Nothing is steeper than craters on craters make it; a spike would throw a line of shadow across the frames."""
     for seed in range(4):
         config = config_with(terrain={"relief": {"rms_slope_deg": 3.0}})
-        scene = grow_scene(config, Camera.from_field_of_view(160, 160, 50.0), FlightConfig(), seed)
+        scene = grow_scene(config, view_envelope(Camera.from_field_of_view(160, 160, 50.0), FlightConfig()), seed)
         faces, height = scene.grid.quads(), scene.height_m.astype(float)
         x, y = scene.grid.vertices_xy()
         for a, b in ((0, 1), (1, 2)):

@@ -7,6 +7,7 @@ from tests.helpers.elevation_models import POLAR, write
 from tests.helpers.scenes import config_with
 
 from perilune_render.config_terrain import CratersConfig, ReliefConfig
+from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.craters.population import draw_craters
 from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.elevation.model import base_heights, read_elevation, remarks, resolved_m
@@ -106,7 +107,7 @@ def test_flat_ground_gets_no_relief(tmp_path):
 
 def test_a_scene_says_what_is_real_and_has_large_craters_outside(pit, tmp_path, camera):
     config = config_with(terrain={"dem": str(tmp_path / "pit.tif"), "spacing_px": 1.0, "boulders": {"density": 0.0}})
-    scene = grow_scene(config, camera, config.detect.flight, 1)
+    scene = grow_scene(config, view_envelope(camera, config.detect.flight), 1)
     x, y = scene.grid.vertices_xy()
     # The raster is turned against the site's axes, since the site is not on its central meridian.
     half = np.hypot(x, y)
@@ -123,7 +124,7 @@ def test_ground_beyond_the_model_can_be_refused(pit, tmp_path, camera):
     terrain = {"dem": str(tmp_path / "pit.tif"), "spacing_px": 1.0, "elevation": {"outside": "refuse"}}
     config = config_with(terrain=terrain)
     with pytest.raises(UserError, match=r"dataset\.terrain\.elevation\.outside"):
-        check_ground(config, camera, config.detect.flight)
+        check_ground(config, view_envelope(camera, config.detect.flight))
 
 
 def test_what_is_real_is_said_before_the_work_begins(pit, tmp_path, camera, capsys):
@@ -132,7 +133,7 @@ def test_what_is_real_is_said_before_the_work_begins(pit, tmp_path, camera, caps
     assert "steps of 1 m" in lines[0] and "8% of the ground, 1800 m x 1800 m, is real, the rest procedural" in lines[1]
     assert remarks(pit, Grid.even(150, 30), "procedural") == []
     config = config_with(terrain={"dem": str(tmp_path / "pit.tif"), "spacing_px": 1.0})
-    check_ground(config, camera, config.detect.flight)
+    check_ground(config, view_envelope(camera, config.detect.flight))
     assert "is real, the rest procedural" in capsys.readouterr().err
 
 

@@ -1,0 +1,30 @@
+"""The view envelope: from how low a camera sees the ground, at each distance from the site."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_shared.geometry.frames import Array
+
+
+@dataclass(frozen=True, slots=True)
+class ViewEnvelope:
+    """The views that a scene's ground must serve: the mesh's extent and spacing follow from them.
+
+    Ground at the distance `reach_m[i]` from the site is never seen from less than `height_m[i]` above it; in between,
+    the height is interpolated linearly. Ground beyond the last reach is never seen. The envelope of a flight is
+    `perilune_render.flight.view.view_envelope`. Raises ValueError if a column is not finite, positive and ascending.
+    """
+
+    height_m: Array
+    """Lowest height of the camera above the ground in view, ascending, metres (N,)."""
+    reach_m: Array
+    """Distance max(|x|, |y|) of that ground from the site, not descending, metres (N,)."""
+    focal_px: float
+    """Largest focal length of the camera, pixels: a pixel shows at least height / focal_px metres of ground."""
+
+    def __post_init__(self) -> None:
+        columns = np.array([self.height_m, self.reach_m])
+        good = columns.size > 0 and np.isfinite(columns).all() and (columns > 0).all() and self.focal_px > 0
+        if not good or (np.diff(columns) < 0).any():
+            raise ValueError(f"height_m and reach_m of a view envelope: got {columns}, expected positive and ascending")
