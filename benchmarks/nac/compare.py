@@ -21,7 +21,7 @@ from benchmarks.nac.sun import sun_over, time_of
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig
 from perilune_render.flight.view import view_envelope
-from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import FixedPattern, develop
 from perilune_render.labels.drawing import write_sheet
 from perilune_render.labels.frame_labels import RimCircles, label_frame

@@ -16,7 +16,8 @@ import numpy as np
 
 from perilune_render.blender import stage as blender_stage
 from perilune_render.config import DatasetConfig, LightConfig, RenderConfig
-from perilune_render.imaging.exr import Radiance, read_exr
+from perilune_render.imaging.exr import read_exr
+from perilune_render.imaging.radiance import Radiance
 from perilune_render.interrupts import interrupts_held
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError

@@ -9,7 +9,8 @@ import numpy as np
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.output import file_columns, write_png
 from perilune_render.flight.plan import TrajectoryPlan
-from perilune_render.imaging.exr import Radiance, write_exr
+from perilune_render.imaging.exr import write_exr
+from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.resampling import seen_by
 from perilune_render.imaging.sensor import Exposure, FixedPattern, expected, expose, read_out
 from perilune_render.labels.frame_labels import Labels, RimCircles, Shown, crater_index, label_frame, with_contrast

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.radiance import Radiance
 from perilune_shared.progress import say
 
 _LEAST_SUNLIT = 0.01

@@ -1,34 +1,18 @@
 """EXR files: read those that Blender writes, and read and write those of datasets."""
 
 import errno
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 
+from perilune_render.imaging.radiance import Radiance
 from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import written_aside
 
 _MOST_CHANNELS = 64
 CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
-
-
-@dataclass(frozen=True, slots=True)
-class Radiance:
-    """Rendering of one frame, before the sensor model."""
-
-    radiance_factor: np.ndarray
-    """Radiance factor I/F (h, w) float32."""
-    depth_m: np.ndarray
-    """Depth along the camera's axis of the ray through the pixel's centre, metres; infinite if it hits nothing (h, w)
-    float32."""
-    normal: np.ndarray
-    """Unit shading normal in O_L, 0 where nothing is hit (h, w, 3) float32. With dataset.render.exr it is that of the
-    ray through the pixel's centre, else the mean direction over the pixel's samples."""
-    sunlit: np.ndarray
-    """Whether the pixel is sunlit (h, w) bool."""
 
 
 def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:

@@ -6,7 +6,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.radiance import Radiance
 from perilune_shared.geometry.camera import Camera
 
 

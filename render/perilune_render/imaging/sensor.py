@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import ive
 
 from perilune_render.config import SensorConfig
-from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.resampling import resample, resample_nearest
 from perilune_render.streams import stream
 from perilune_shared.geometry.camera import Camera

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.pixels import contrasts, smallest_crater, sunlit_fractions
 from perilune_render.terrain.scene import Scene
 from perilune_shared.dataset.masks import SLACK_PX, SLACK_RADII

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from perilune_render.config import LabelsConfig, SensorConfig
-from perilune_render.imaging.exr import Radiance
+from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import expected, expose
 from perilune_render.labels.frame_labels import RimCircles, Shown, crater_index, label_frame, with_contrast
 from perilune_render.labels.pixels import contrasts, sunlit_fractions

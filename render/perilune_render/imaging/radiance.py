@@ -1,0 +1,21 @@
+"""Radiance: the rendering of one frame, from which the sensor makes the image."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Radiance:
+    """Rendering of one frame, before the sensor model."""
+
+    radiance_factor: np.ndarray
+    """Radiance factor I/F (h, w) float32."""
+    depth_m: np.ndarray
+    """Depth along the camera's axis of the ray through the pixel's centre, metres; infinite if it hits nothing (h, w)
+    float32."""
+    normal: np.ndarray
+    """Unit shading normal in O_L, 0 where nothing is hit (h, w, 3) float32. With dataset.render.exr it is that of the
+    ray through the pixel's centre, else the mean direction over the pixel's samples."""
+    sunlit: np.ndarray
+    """Whether the pixel is sunlit (h, w) bool."""
