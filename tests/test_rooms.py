@@ -15,8 +15,8 @@ ROOMS = {
         "dataset validation editing export cli"
     ),
     "render/perilune_render": (
-        "config_values config_terrain config streams interrupts provenance terrain flight imaging labels blender "
-        "dataset cli_options cli"
+        "config_values config_terrain config streams interrupts provenance terrain flight imaging labels "
+        "frame_source blender dataset cli_options cli"
     ),
     "render/perilune_render/terrain": (
         "grid interpolation noise relief size_frequency craters albedo boulders elevation scene cache export"

@@ -20,14 +20,14 @@ from perilune_render.blender.renderer import Renderer, one_ray_a_pixel, quiet, r
 from perilune_render.blender.stage import aim
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
-from perilune_render.dataset.frame import Shot, Studio
+from perilune_render.dataset.frame_files import write_frame
+from perilune_render.dataset.shots import planned_shot
 from perilune_render.flight.plan import make_plan
+from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.exr import read_exr
-from perilune_render.imaging.sensor import FixedPattern
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import resolve
-from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.progress import progress_bar
 
 N_FRAMES = 38
@@ -41,16 +41,14 @@ def main() -> None:
     start = time.perf_counter()
     scene = grow_scene(config, plan.view, scene_plan.seed)
     scene_s = time.perf_counter() - start
-    sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
-    pattern = FixedPattern.draw(config.sensor, plan.camera, config.seed)
-    studio = Studio(config, plan.camera, plan.exr_camera, pattern, RimCircles.of_scene(scene), sun)
     ours, bare, centres = [], [], []
     with (
         tempfile.TemporaryDirectory() as folder,
-        Renderer(scene, config, plan.camera, sun) as renderer,
+        Renderer(scene, config, plan.exr_camera, scene_plan.sun) as renderer,
         progress_bar() as bar,
     ):
         out = Path(folder)
+        source = FrameSource.of(renderer, config, plan.camera, RimCircles.of_scene(scene))
         start = time.perf_counter()
         renderer.render(trajectory.flight.position_m[0], trajectory.flight.rotation_camera_from_site[0])
         first_frame_s = time.perf_counter() - start
@@ -59,10 +57,9 @@ def main() -> None:
             for which in (0, 1) if index % 2 else (1, 0):
                 start = time.perf_counter()
                 if which == 0:
-                    shot = Shot.planned(trajectory, index)
-                    radiance = renderer.render(*pose, seed=shot.render_seed)
-                    _, exposure = studio.write_png(out, shot, radiance)
-                    tables.label_table(shot.frame_id, studio.label(shot, radiance, exposure))
+                    frame_id, frame = trajectory.frame_id(index), source.take(planned_shot(trajectory, index))
+                    write_frame(out, frame_id, source, frame, exr=False)
+                    tables.label_table(frame_id, source.labels(frame))
                     ours.append(time.perf_counter() - start)
                 else:
                     aim(renderer.stage, *pose)

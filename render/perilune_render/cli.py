@@ -114,13 +114,13 @@ def _render_manifest(
         wanted = "--out, and --dem and --catalogue where its recipe names them; the rest is the manifest's"
         raise UserError("--manifest", "options", found, wanted)
     given = ps.open_dataset(manifest)
-    from perilune_render.dataset.read_plan import as_before, plan_of
+    from perilune_render.dataset.from_manifest import compare_hashes, plan_from_manifest
     from perilune_render.dataset.render import render_plan
 
-    plan, config, info = plan_of(given, dem, catalogue)
+    plan, config, info = plan_from_manifest(given, dem, catalogue)
     with progress_bar() as progress:
         made = render_plan(plan, config, info, out, progress, manifest)
-    same, known, other_scenes = as_before(given, made)
+    same, known, other_scenes = compare_hashes(given, made)
     told = f"; {same} of {known} frames are the manifest's byte for byte" if known else ""
     told += f"; {other_scenes} scenes have other ground" if other_scenes else "; the ground is the manifest's"
     Console().print(f"{out}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{told}", soft_wrap=True)
@@ -160,10 +160,10 @@ def plan(
     resolved = _resolve(preset, config, setting, dem, catalogue)
     if kind is not Kind.NAV:
         _warn_of_size(resolved)
-    from perilune_render.dataset.write_plan import write_plan
+    from perilune_render.dataset.manifest_only import write_manifest_only
 
     with progress_bar() as progress:
-        write_plan(resolved, one_kind(kind), preset, out, progress)
+        write_manifest_only(resolved, one_kind(kind), preset, out, progress)
     counts = ps.open_dataset(out).info.counts
     Console().print(f"{out}: {counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames planned")
 

@@ -36,10 +36,12 @@ _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
 class Renderer:
     """Renders frames of one scene. Use as a context manager, since it holds a temporary folder and Blender's one scene.
 
-    Raises RuntimeError if another Renderer is open in this process: Blender holds only one scene.
+    It is an `Engine` of `perilune_render.frame_source`: `camera` has no distortion, `sun` (3,) is the unit vector
+    towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only one scene.
     """
 
     def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array):
+        self.camera, self.sun = camera, sun
         if _open:
             raise RuntimeError("another Renderer is open in this process, and Blender holds one scene: close it first")
         _open.add(self)

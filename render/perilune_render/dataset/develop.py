@@ -4,7 +4,7 @@ Nothing is rendered, so Blender is not needed. An interrupted run is resumed as 
 once its part of `frames` is written, which comes last.
 """
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,31 +12,50 @@ import pyarrow as pa
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
-from perilune_render.dataset.frame import Shot, Studio
-from perilune_render.dataset.output import (
-    begin_or_go_on,
-    first_difference,
-    open_finished,
-    sync_frames,
-    write_overview,
-    writing,
-)
+from perilune_render.dataset.folder import begin_or_resume, finish, first_difference, open_finished, writing
+from perilune_render.dataset.frame_files import write_frame
+from perilune_render.dataset.shots import recorded_shot
+from perilune_render.dataset.trajectory_parts import finish_trajectory, is_finished
 from perilune_render.flight.plan import camera_of
+from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.exr import read_radiance
-from perilune_render.imaging.sensor import FixedPattern
+from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.provenance.recipe import recorded_settings, settings_of
 from perilune_render.provenance.versions import imaging_versions
 from perilune_shared.config import resolve_over
-from perilune_shared.dataset.manifest import Dataset, count_rows, open_dataset
-from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of, write_info
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.dataset.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
-from perilune_shared.storage.checksums import seal
+
+
+@dataclass(frozen=True, slots=True)
+class Renderings:
+    """The engine of a developed trajectory: it reads the EXRs of the source in place of rendering."""
+
+    camera: Camera
+    """Camera of the EXRs."""
+    sun: Array
+    """Unit vector towards the Sun, O_L (3,)."""
+    paths: dict[int, Path]
+    """EXR of each frame, by the random seed with which it was rendered."""
+
+    @classmethod
+    def of(cls, source: Dataset, frames: pa.Table, seed: int, camera: Camera) -> "Renderings":
+        """The EXRs of one trajectory: its rows of the table frames and its random seed."""
+        rows = frames.to_pylist()
+        paths = {recorded_shot(row, seed).render_seed: source.file(row["exr_path"]) for row in rows}
+        return cls(camera, np.array(rows[0]["sun_direction"]), paths)
+
+    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int) -> Radiance:
+        """Read the rendering of a random seed. Raises UserError if the file is damaged or of another size."""
+        return read_radiance(self.paths[seed], (self.camera.width_px, self.camera.height_px))
 
 
 def develop_dataset(
@@ -96,27 +115,21 @@ def _develop(
 ) -> Dataset:
     """Begin or resume the dataset in `out`; `cameras` are that of its PNGs and that of the source's EXRs."""
     camera, exr_camera = cameras
-    info = begin_or_go_on(out, info)
+    info = begin_or_resume(out, info)
     if info.complete:
         return open_finished(out)
     task = progress.add_task("develop", total=source.info.counts.frames, unit="frames")
-    pattern = FixedPattern.draw(config.sensor, camera, config.seed)
     for scene_id in source.scene_ids():
         _copy_scene(source, out, scene_id, info.recipe())
         circles = RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
         for descent in source.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pylist():
-            key = {"scene_id": scene_id, "trajectory_id": descent["trajectory_id"]}
             frames = source.table("frames", scene_id=scene_id, trajectory_id=descent["trajectory_id"])
-            if not (out / "manifest" / "frames" / f"{'.'.join(key.values())}.parquet").exists():
-                sun = np.array(frames["sun_direction"][0].as_py())
-                studio = Studio(config, camera, exr_camera, pattern, circles, sun)
-                _develop_descent(source, out, studio, key, frames, descent["seed"])
+            if not is_finished(out, scene_id, descent["trajectory_id"]):
+                renderings = Renderings.of(source, frames, descent["seed"], exr_camera)
+                frame_source = FrameSource.of(renderings, config, camera, circles)
+                _develop_trajectory(source, out, frame_source, frames, descent["seed"])
             progress.advance(task, len(frames))
-    dataset = Dataset(out, info)
-    write_overview(dataset)
-    write_info(out, info.model_copy(update={"counts": count_rows(dataset), "complete": True}))
-    seal(out)
-    return open_dataset(out)
+    return finish(out, info)
 
 
 def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
@@ -154,36 +167,27 @@ def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
     return camera, exr_camera
 
 
-def _develop_descent(
-    source: Dataset, out: Path, studio: Studio, key: dict[str, str], frames: pa.Table, seed: int
-) -> None:
-    """Develop one trajectory: write its images, labels and part of `frames`."""
+def _develop_trajectory(source: Dataset, out: Path, frame_source: FrameSource, frames: pa.Table, seed: int) -> None:
+    """Develop one trajectory, given its rows of the source's table `frames` and its random seed."""
+    scene_id, trajectory_id = (frames[name][0].as_py() for name in ("scene_id", "trajectory_id"))
     known = None
-    if studio.camera == source.info.camera.intrinsics():
-        table = source.table("labels", scene_id=key["scene_id"], trajectory_id=key["trajectory_id"]).to_pandas()
+    if frame_source.camera == source.info.camera.intrinsics():
+        table = source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id).to_pandas()
         known = {frame_id: rows for frame_id, rows in table.groupby("frame_id")}
         none = table.iloc[:0]
-    exr_camera = studio.exr_camera
     written: list[dict] = []
     labels = []
     for row in frames.to_pylist():
-        size_px = exr_camera.width_px, exr_camera.height_px
-        radiance = read_radiance(source.file(row["exr_path"]), size_px)
-        shot = Shot.recorded(row, seed)
-        png, exposure = studio.write_png(out, shot, radiance)
-        written.append(dict(png))
+        frame_id, frame = row["frame_id"], frame_source.take(recorded_shot(row, seed))
+        written.append(dict(write_frame(out, frame_id, frame_source, frame, exr=False)))
         if known is None:
-            found = studio.label(shot, radiance, exposure)
+            found = frame_source.labels(frame)
             written[-1]["n_craters_above_max_radius"] = found.n_above
         else:
-            found = studio.contrasted(Labels.from_table(known.get(shot.frame_id, none)), shot, exposure)
-        labels.append(tables.label_table(shot.frame_id, found))
-    name = ".".join(key.values())
-    # A run interrupted between the two leaves a labels part without its frames part.
-    (out / "manifest" / "labels" / f"{name}.parquet").unlink(missing_ok=True)
-    write_part(out, "labels", name, pa.concat_tables(labels))
-    sync_frames(out, written)
-    write_part(out, "frames", name, tables.developed_frame_table(frames, studio.camera, written))
+            found = frame_source.with_contrast(Labels.from_table(known.get(frame_id, none)), frame)
+        labels.append(tables.label_table(frame_id, found))
+    rows = tables.developed_frame_table(frames, frame_source.camera, written)
+    finish_trajectory(out, scene_id, trajectory_id, labels, rows)
 
 
 def _copy_scene(source: Dataset, out: Path, scene_id: str, recipe: Recipe) -> None:

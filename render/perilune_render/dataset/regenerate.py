@@ -16,14 +16,15 @@ import pyarrow.compute as pc
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig
-from perilune_render.dataset.frame import Shot, Studio
+from perilune_render.dataset.frame_files import write_frame
+from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.flight.plan import camera_of
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.flight.view import view_envelope
+from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.imaging.exr import read_exr
-from perilune_render.imaging.sensor import FixedPattern
 from perilune_render.interrupts import interrupts_held
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.provenance.recipe import config_of, same_source
@@ -32,6 +33,7 @@ from perilune_shared.config import resolve_over
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Recipe
+from perilune_shared.dataset.writer import frame_path
 from perilune_shared.errors import UserError
 from perilune_shared.progress import Progress
 from perilune_shared.storage.files import sha256_of
@@ -134,23 +136,19 @@ def _of_scene(
     check_poses(Poses([row["frame_id"] for row in rows], *poses), exr_camera, ground, dataset.root)
     tables = ground_tables(scene["scene_id"], ground)
     same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
-    sun = np.array(rows[0]["sun_direction"])
-    pattern = FixedPattern.draw(config.sensor, camera, config.seed)
-    studio = Studio(config, camera, exr_camera, pattern, RimCircles.of_scene(ground), sun)
     outcomes, dark = [], []
-    with Renderer(ground, ground_config, exr_camera, sun) as renderer:
+    with Renderer(ground, ground_config, exr_camera, np.array(rows[0]["sun_direction"])) as engine:
+        source = FrameSource.of(engine, config, camera, RimCircles.of_scene(ground))
         for row in rows:
-            shot = Shot.recorded(row, seed_of[row["trajectory_id"]])
-            radiance = renderer.render(shot.position_m, shot.rotation_camera_from_site, seed=shot.render_seed)
-            studio.write_png(out, shot, radiance)
+            frame_id, frame = row["frame_id"], source.take(recorded_shot(row, seed_of[row["trajectory_id"]]))
             # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
-            if row["exr_path"] is not None:
-                studio.write_exr(out, shot, radiance)
+            has_exr = row["exr_path"] is not None
+            write_frame(out, frame_id, source, frame, exr=has_exr)
             png = _compared(dataset, row, "png", out)
-            exr = _compared(dataset, row, "exr", out) if row["exr_path"] is not None else None
-            outcomes.append(Outcome(row["frame_id"], png, exr, same_ground, out / f"frames/{row['frame_id']}.png"))
-            if is_dark(radiance):
-                dark.append(row["frame_id"])
+            exr = _compared(dataset, row, "exr", out) if has_exr else None
+            outcomes.append(Outcome(frame_id, png, exr, same_ground, out / frame_path(frame_id, "png")))
+            if is_dark(frame.radiance):
+                dark.append(frame_id)
             advance()
     warn_of_dark_frames(scene["scene_id"], dark, len(rows), scene["sun_elevation_deg"])
     return outcomes
@@ -171,7 +169,7 @@ def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> Datase
 
 def _compared(dataset: Dataset, row: dict, kind: str, out: Path) -> State:
     """Compare a new file with the old one's hash and, if the hash differs, with the old file if it is present."""
-    new = out / f"frames/{row['frame_id']}.{kind}"
+    new = out / frame_path(row["frame_id"], kind)
     if row[f"{kind}_sha256"] is None:
         return "new"
     if sha256_of(new) == row[f"{kind}_sha256"]:

@@ -15,6 +15,7 @@ from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, sun_direction
 
 _LARGEST_COVER = 9
 """Largest ratio of rendered pixels to the camera's pixels."""
@@ -32,6 +33,11 @@ class ScenePlan:
     """Azimuth of the Sun, clockwise from north, degrees."""
     sun_elevation_deg: float
     """Elevation of the Sun above the ground plane, degrees."""
+
+    @property
+    def sun(self) -> Array:
+        """Unit vector towards the Sun, O_L (3,)."""
+        return sun_direction(self.sun_azimuth_deg, self.sun_elevation_deg)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ GROUND = ("perilune_render.flight.view:view_envelope", "perilune_render.terrain.
 RENDERING = ("perilune_render.flight.plan:make_plan", "perilune_render.blender.renderer:Renderer")
 """Code that plans trajectories and renders radiance."""
 IMAGING = (
-    "perilune_render.imaging.sensor:FixedPattern",
-    "perilune_render.dataset.frame:Shot",
-    "perilune_render.dataset.frame:Studio",
+    "perilune_render.frame_source:",
+    "perilune_render.dataset.shots:",
+    "perilune_render.dataset.frame_files:write_frame",
     "perilune_render.dataset.tables:",
 )
 """Code that makes images, labels and manifest rows from radiance."""

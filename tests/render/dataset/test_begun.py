@@ -12,7 +12,7 @@ from perilune_render.config import KindConfig
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.develop import develop_dataset
-from perilune_render.dataset.output import begin_or_go_on, check_begun, info_of, open_finished
+from perilune_render.dataset.folder import begin_or_resume, check_begun, new_info, open_finished
 from perilune_render.dataset.regenerate import png_far, regenerate
 from perilune_render.dataset.render import render_plan
 from perilune_render.flight.plan import make_plan
@@ -63,10 +63,10 @@ def test_a_rendering_goes_on_with_its_own_plan_alone(begun):
 
 def test_a_manifest_is_not_rendered_into_itself(tmp_path):
     config = config_with()
-    info = info_of(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
+    info = new_info(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
     write_info(tmp_path, info.model_copy(update={"images": "planned", "complete": True}))
     with pytest.raises(UserError, match="planned"):
-        begin_or_go_on(tmp_path, info)
+        begin_or_resume(tmp_path, info)
 
 
 def test_checksums_that_a_stop_left_out_are_written(drawn):
@@ -77,7 +77,7 @@ def test_checksums_that_a_stop_left_out_are_written(drawn):
 def test_a_folder_that_another_process_writes_is_left_alone(begun):
     plan, out = begun
     config = config_with()
-    info = info_of(config, plan, recipe_of(config, "detect", "tiny"))
+    info = new_info(config, plan, recipe_of(config, "detect", "tiny"))
     before = sorted(out.rglob("*"))
     with locked(out), pytest.raises(UserError, match=f"locked by PID {os.getpid()} "):
         render_plan(plan, config, info, out, Progress(), "configuration")
@@ -111,11 +111,11 @@ def test_another_release_with_the_same_code_resumes(tmp_path):
     recipe = recipe_of(config, "detect", "tiny")
     old = recipe.model_copy(update={"versions": {**recipe.versions, "perilune_render": "0.0.1"}})
     plan = make_plan(config, "detect")
-    write_info(tmp_path, info_of(config, plan, old))
-    assert begin_or_go_on(tmp_path, info_of(config, plan, recipe)).recipe() == old
+    write_info(tmp_path, new_info(config, plan, old))
+    assert begin_or_resume(tmp_path, new_info(config, plan, recipe)).recipe() == old
     other = recipe.model_copy(update={"versions": {**recipe.versions, "opencv": "0.0.1"}})
     with pytest.raises(UserError, match="opencv"):
-        begin_or_go_on(tmp_path, info_of(config, plan, other))
+        begin_or_resume(tmp_path, new_info(config, plan, other))
 
 
 def test_settings_that_are_none_are_refused(drawn):
@@ -138,5 +138,5 @@ def test_scenes_over_one_elevation_model_share_terrain():
     scenes = KindConfig(n_scenes=3, trajectories_per_scene=1, n_frames=4, split_by="scene")
     for dem, told in ((None, "scene"), ("a.tif", "trajectory")):
         config = config_with(detect=scenes, terrain=TerrainConfig(dem=dem))
-        info = info_of(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
+        info = new_info(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
         assert info.split_by == told

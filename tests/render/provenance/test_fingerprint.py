@@ -77,7 +77,7 @@ def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, wante
     [
         ("perilune_render.imaging.resampling", "INTER_LANCZOS4", "INTER_CUBIC", {"imaging"}),
         ("perilune_render.imaging.exr", "ZIP_COMPRESSION", "NO_COMPRESSION", {"imaging"}),
-        ("perilune_render.dataset.output", '".png", stored', '".png", stored + 1', {"imaging"}),
+        ("perilune_render.dataset.frame_files", '".png", stored', '".png", stored + 1', {"imaging"}),
         ("perilune_render.blender.nodes", "MULTIPLY", "ADD", {"renderer"}),
         ("perilune_render.terrain.noise", r"njit\(\)", "njit(fastmath=True)", {"generator"}),
     ],
@@ -96,7 +96,7 @@ def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, repla
         ("perilune_render.terrain.grid", r"raise UserError\(", "raise UserError('more', "),
         ("perilune_render.cli", '"Folder', '"Another folder'),
         ("perilune_render.dataset.preview", "n_frames: int = 4", "n_frames: int = 5"),
-        ("perilune_render.dataset.output", "^_SHEET_FRAMES = 12", "_SHEET_FRAMES = 13"),
+        ("perilune_render.dataset.overview", "^_SHEET_FRAMES = 12", "_SHEET_FRAMES = 13"),
         ("perilune_render.config", "= 256$", "= 257"),
         ("perilune_render.config", "_GROUND_FIELDS = ", "_GROUND_FIELDS = 1, "),
         ("perilune_render.config", "gt=0", "gt=1"),

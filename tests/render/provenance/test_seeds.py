@@ -8,8 +8,8 @@ from tests.helpers.scenes import config_with
 
 from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig, KindConfig, SunConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
-from perilune_render.dataset.output import info_of
-from perilune_render.dataset.read_plan import plan_of
+from perilune_render.dataset.folder import new_info
+from perilune_render.dataset.from_manifest import plan_from_manifest
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.view import view_envelope
@@ -116,7 +116,7 @@ def test_shared_terrain_refuses_kinds_that_need_different_scenes(nav, named):
 
 def test_a_datasets_name_follows_the_key():
     config = preset("tiny", "dataset.name=crater-field")
-    info = info_of(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
+    info = new_info(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
     assert info.name == "perilune-crater-field-detect"
 
 
@@ -131,7 +131,7 @@ def test_a_manifest_rendered_again_keeps_its_seeds(tiny):
     recipe = manifest.info.recipe()
     renamed = recipe.model_copy(update={"config": {**recipe.config, "name": "other"}})
     info = manifest.info.model_copy(update={"recipes": recipes_of(renamed)})
-    plan, config, begun = plan_of(Dataset(manifest.root, info))
+    plan, config, begun = plan_from_manifest(Dataset(manifest.root, info))
     stated = manifest.table("scenes").sort_by("scene_id")["seed"].to_pylist()
     assert [scene.seed for scene in plan.scenes] == stated
     assert stated != [scene.seed for scene in make_plan(config, "detect").scenes]

@@ -1,33 +1,26 @@
-"""Steps shared by all commands that make a dataset: begin or resume it, write PNGs, draw the overview."""
+"""The folder of a dataset that is rendered or developed: begin it, resume it, finish it."""
 
 import contextlib
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 
 from perilune_render.config import DatasetConfig
+from perilune_render.dataset.overview import write_overview
 from perilune_render.flight.plan import Plan
-from perilune_render.labels.drawing import draw_labels, enlarge, write_sheet
-from perilune_render.labels.frame_labels import Labels
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset, count_rows, open_dataset
 from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION
-from perilune_shared.dataset.selection import selected
-from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.errors import UserError
-from perilune_shared.storage import files
 from perilune_shared.storage.checksums import SUMS_NAME, seal
 from perilune_shared.storage.locks import LOCK_NAME, locked
 
 LICENCE = "CC-BY-4.0"
-_SHEET_FRAMES = 12
 _SAME_PLACE_M = 1e-6
 
 
-def info_of(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
+def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
     """The dataset.json of a new dataset."""
     settings = config.kind(recipe.kind)
     split_by = settings.split_by
@@ -53,14 +46,6 @@ def writing(out: Path) -> contextlib.AbstractContextManager[None]:
     return contextlib.nullcontext() if (out / SUMS_NAME).exists() else locked(out)
 
 
-def sync_frames(root: Path, rows: list[dict[str, Any]]) -> None:
-    """Wait until the files of frames, given by the columns png_path and exr_path of `rows`, are on the disk.
-
-    Each frame is written without waiting. This call must precede the manifest part that marks the frames as finished.
-    """
-    files.sync_all(root / row[name] for row in rows for name in ("png_path", "exr_path") if row.get(name) is not None)
-
-
 def is_begun(out: Path) -> bool:
     """Whether a folder holds a dataset. Raises UserError if it holds something else."""
     begun = (out / "dataset.json").exists()
@@ -70,7 +55,7 @@ def is_begun(out: Path) -> bool:
     return begun
 
 
-def begin_or_go_on(out: Path, info: DatasetInfo) -> DatasetInfo:
+def begin_or_resume(out: Path, info: DatasetInfo) -> DatasetInfo:
     """Write the dataset.json of a new dataset, or read that of an existing one with the same settings.
 
     Raises UserError if `out` holds anything else.
@@ -118,6 +103,15 @@ def check_begun(out: Path, plan: Plan) -> None:
             raise UserError(part, "trajectories", "those of another plan", "the manifest that it was begun with")
 
 
+def finish(out: Path, info: DatasetInfo) -> Dataset:
+    """Complete a dataset of which all parts are written: overview, counts, checksums."""
+    dataset = Dataset(out, info)
+    write_overview(dataset)
+    write_info(out, info.model_copy(update={"counts": count_rows(dataset), "complete": True}))
+    seal(out)
+    return open_dataset(out)
+
+
 def open_finished(out: Path) -> Dataset:
     """Open a complete dataset; write its checksums if the run was interrupted just before that."""
     if not (out / SUMS_NAME).exists():
@@ -138,39 +132,3 @@ def first_difference(theirs: object, ours: object, path: str = "") -> str:
             if theirs.get(key) != ours.get(key):
                 return first_difference(theirs.get(key), ours.get(key), f"{path}.{key}".lstrip("."))
     return f"{path} {theirs!r} there, {ours!r} asked for".strip()
-
-
-def write_png(root: Path, frame_id: str, image: np.ndarray, bits: int) -> dict[str, str | int]:
-    """Write a frame's PNG; returns its columns png_* of the manifest.
-
-    Above 8 bits the PNG has 16 bits: a grey value fills the upper bits, the lower ones are 0.
-    """
-    path = f"frames/{frame_id}.png"
-    stored = image if bits == 8 else image << (16 - bits)
-    files.write_bytes(files.inside(root, path), cv2.imencode(".png", stored)[1].tobytes(), durable=False)
-    return file_columns(root, "png", path)
-
-
-def file_columns(root: Path, kind: str, path: str) -> dict[str, str | int]:
-    """The columns png_* or exr_* (by `kind`) of a written file."""
-    whole = root / path
-    return {
-        f"{kind}_path": path,
-        f"{kind}_bytes": whole.stat().st_size,
-        f"{kind}_sha256": files.sha256_of(whole),
-    }
-
-
-def write_overview(dataset: Dataset) -> None:
-    """Write overview.png: frames from the whole dataset, each also with its labels, visible ones in green."""
-    frames = dataset.table("frames", ["frame_id", "scene_id", "trajectory_id", "png_path"]).to_pandas()
-    chosen = frames.iloc[np.unique(np.linspace(0, len(frames) - 1, _SHEET_FRAMES).astype(int))]
-    pictures = []
-    for frame in chosen.itertuples():
-        image = cv2.imread(str(dataset.file(frame.png_path)), cv2.IMREAD_GRAYSCALE)
-        labels = dataset.table("labels", scene_id=frame.scene_id, trajectory_id=frame.trajectory_id).to_pandas()
-        craters = dataset.table("craters", ["crater_id", "depth_m", "diameter_m"], scene_id=frame.scene_id).to_pandas()
-        own = labels[labels["frame_id"] == frame.frame_id].merge(craters, on="crater_id")
-        drawn = draw_labels(image, Labels.from_table(own), selected(own, SELECTIONS["visible"]))
-        pictures += [enlarge(image, 2), drawn]
-    write_sheet(dataset.root / "overview.png", pictures, 6)

@@ -1,11 +1,11 @@
-"""Read a manifest as a plan, so that a published dataset can be rendered again with its labels."""
+"""The plan of a manifest, so that a published dataset can be rendered again with its labels."""
 
 from pathlib import Path
 
 import numpy as np
 
 from perilune_render.config import DatasetConfig
-from perilune_render.dataset.output import info_of
+from perilune_render.dataset.folder import new_info
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import view_envelope
@@ -17,7 +17,7 @@ from perilune_shared.geometry.descent import NominalDescent
 from perilune_shared.storage.files import sha256_of
 
 
-def plan_of(
+def plan_from_manifest(
     manifest: Dataset, dem: Path | None = None, catalogue: Path | None = None
 ) -> tuple[Plan, DatasetConfig, DatasetInfo]:
     """The plan of a manifest's scenes, trajectories and frames, its settings, and the dataset.json to begin with.
@@ -47,7 +47,7 @@ def plan_of(
     exr_camera = camera.covering_pinhole()
     view = view_envelope(exr_camera, config.ground_flight(recipe.kind))
     plan = Plan(camera, exr_camera, view, tuple(scenes), tuple(descents))
-    begun = info_of(config, plan, recipe_of(config, recipe.kind, recipe.preset))
+    begun = new_info(config, plan, recipe_of(config, recipe.kind, recipe.preset))
     kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     return plan, config, begun.model_copy(update=kept)
 
@@ -79,7 +79,7 @@ def _descents(manifest: Dataset, scene_id: str) -> list[TrajectoryPlan]:
     return found
 
 
-def as_before(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:
+def compare_hashes(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:
     """Number of frames whose hash equals the manifest's, of frames with a hash there, and of scenes that differ."""
     old, new = (
         dict(zip(*(d.table("frames", ["frame_id", "png_sha256"]).to_pydict().values()), strict=True))

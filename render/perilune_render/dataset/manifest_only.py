@@ -1,4 +1,4 @@
-"""Write a plan as a dataset without images: scenes, trajectories and frames as Parquet, to be rendered later."""
+"""Write the manifest of a dataset before its frames: scenes, trajectories and poses as Parquet, to render later."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import pyarrow as pa
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
-from perilune_render.dataset.output import info_of
+from perilune_render.dataset.folder import new_info
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
 from perilune_render.interrupts import interrupts_held
@@ -14,13 +14,12 @@ from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground, grow_scene
 from perilune_shared.dataset.schema import TABLES, Kind
-from perilune_shared.dataset.writer import written
-from perilune_shared.geometry.frames import sun_direction
+from perilune_shared.dataset.writer import frame_path, written
 from perilune_shared.progress import Progress
 
 
-def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> None:
-    """Write the plan of the dataset `detect` or `nav` into the new folder `out`.
+def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> None:
+    """Write the manifest of the dataset `detect` or `nav`, as planned, into the new folder `out`.
 
     Every scene is generated once, for the hash of its content; nothing is rendered. Raises UserError on invalid
     settings, or if `out` is not empty.
@@ -29,28 +28,20 @@ def write_plan(config: DatasetConfig, kind: Kind, preset: str, out: Path, progre
     check_ground(config, plan.view)
     check_plan(plan, graded_grid(config.terrain, plan.view), where)
     recipe = recipe_of(config, kind, preset, planned=True)
-    info = info_of(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
+    info = new_info(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes")
     with written(out, info, whole_tables=True) as writer:
         for scene_plan in plan.scenes:
             with interrupts_held():
                 scene = grow_scene(config, plan.view, scene_plan.seed)
-            sun = sun_direction(scene_plan.sun_azimuth_deg, scene_plan.sun_elevation_deg)
             trajectories = plan.of_scene(scene_plan.scene_id)
             check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)
-            paths = ("png", "exr") if config.render.exr else ("png",)
-            frames = [
-                tables.frame_table(
-                    trajectory,
-                    plan.camera,
-                    sun,
-                    [
-                        {f"{kind}_path": f"frames/{trajectory.frame_id(i)}.{kind}" for kind in paths}
-                        for i in range(len(trajectory.splits))
-                    ],
-                )
-                for trajectory in trajectories
-            ]
+            kinds = ("png", "exr") if config.render.exr else ("png",)
+            frames = []
+            for trajectory in trajectories:
+                ids = [trajectory.frame_id(place) for place in range(len(trajectory.splits))]
+                paths = [{f"{kind}_path": frame_path(frame_id, kind) for kind in kinds} for frame_id in ids]
+                frames.append(tables.frame_table(trajectory, plan.camera, scene_plan.sun, paths))
             writer.add_scene(
                 {
                     "scenes": tables.scene_tables(scene_plan, scene, config, recipe.key)["scenes"],

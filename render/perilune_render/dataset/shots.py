@@ -1,0 +1,32 @@
+"""Shots of a dataset's frames: from a plan, or from rows of a manifest."""
+
+from typing import Any
+
+import numpy as np
+
+from perilune_render.flight.plan import TrajectoryPlan
+from perilune_render.frame_source import Shot
+from perilune_shared.geometry.frames import matrix_from_quaternion
+
+
+def planned_shot(trajectory: TrajectoryPlan, place: int) -> Shot:
+    """The shot of the frame at index `place` of a planned trajectory's frames."""
+    flight = trajectory.flight
+    return Shot(
+        flight.position_m[place],
+        flight.rotation_camera_from_site[place],
+        flight.velocity_mps[place],
+        trajectory.seed,
+        trajectory.frame_index[place],
+    )
+
+
+def recorded_shot(row: dict[str, Any], trajectory_seed: int) -> Shot:
+    """The shot of a row of the manifest's table `frames`."""
+    return Shot(
+        np.array(row["position_m"]),
+        matrix_from_quaternion(row["rotation_wxyz"]),
+        np.array(row["velocity_mps"]),
+        trajectory_seed,
+        row["frame_index"],
+    )

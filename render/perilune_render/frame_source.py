@@ -1,0 +1,130 @@
+"""The frame source: a frame from a pose and a random seed, by any rendering engine.
+
+    with Renderer(scene, config, exr_camera, sun) as engine:
+        source = FrameSource.of(engine, config, camera, RimCircles.of_scene(scene))
+        frame = source.take(Shot(position_m, rotation_camera_from_site, velocity_mps, seed))
+        labels = source.labels(frame)
+
+The engine makes the radiance; the rest is the same for all engines: sensor, labels, contrast, crater index.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from perilune_render.config import DatasetConfig, LabelsConfig, SensorConfig
+from perilune_render.imaging.radiance import Radiance
+from perilune_render.imaging.resampling import seen_by
+from perilune_render.imaging.sensor import Exposure, FixedPattern, expected, expose, read_out
+from perilune_render.labels.frame_labels import Labels, RimCircles, Shown, crater_index, label_frame, with_contrast
+from perilune_render.streams import derived_seed, stream
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """Pose, velocity and random seed of one frame."""
+
+    position_m: Array
+    """Position of the camera, O_L, metres (3,)."""
+    rotation_camera_from_site: Array
+    """Rotation matrix (3, 3)."""
+    velocity_mps: Array
+    """Velocity of the camera, O_L, metres per second (3,): it blurs the image."""
+    seed: int
+    """Random seed of the sequence of frames; in a dataset that of the trajectory."""
+    index: int = 0
+    """Index of the frame in the sequence. Frames that differ in seed or index have independent noise."""
+
+    @property
+    def pose(self) -> tuple[Array, Array]:
+        """Position and rotation."""
+        return self.position_m, self.rotation_camera_from_site
+
+    @property
+    def render_seed(self) -> int:
+        """Random seed of the engine's samples."""
+        return derived_seed(self.seed, "frame", self.index)
+
+
+class Engine(Protocol):
+    """What renders a lit scene, such as `perilune_render.blender.renderer.Renderer`."""
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the renderings, without distortion; its image covers the view of the frames' camera."""
+
+    @property
+    def sun(self) -> Array:
+        """Unit vector towards the Sun, O_L (3,)."""
+
+    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int) -> Radiance:
+        """The rendering, in the pixels of `camera`, at a position (3,), O_L, metres, with a rotation matrix (3, 3)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame, as a frame source takes it."""
+
+    shot: Shot
+    """Pose, velocity and random seed."""
+    radiance: Radiance
+    """Rendering in the pixels of the engine's camera."""
+    exposure: Exposure
+    """Light on the sensor, without noise and fixed pattern."""
+    image: np.ndarray
+    """Grey values, DN (h, w): uint8, or uint16 above 8 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSource:
+    """Takes frames of one lit scene with one sensor, and labels them. Create it with `FrameSource.of`."""
+
+    engine: Engine
+    """Makes the radiance."""
+    camera: Camera
+    """Camera of images and labels."""
+    circles: RimCircles
+    """Rims of the scene's craters."""
+    sensor: SensorConfig
+    """Settings of the sensor."""
+    pattern: FixedPattern
+    """Fixed pattern of the sensor."""
+    bounds: LabelsConfig
+    """Which craters become labels."""
+
+    @classmethod
+    def of(cls, engine: Engine, config: DatasetConfig, camera: Camera, circles: RimCircles) -> "FrameSource":
+        """The source with a configuration's sensor, labels and random seed (of the sensor's fixed pattern).
+
+        Raises ValueError if the engine's camera does not cover the view of `camera`.
+        """
+        if not engine.camera.covers(camera):
+            raise ValueError(f"camera of the engine: got {engine.camera}, expected one that covers {camera}")
+        pattern = FixedPattern.draw(config.sensor, camera, config.seed)
+        return cls(engine, camera, circles, config.sensor, pattern, config.labels)
+
+    def take(self, shot: Shot) -> Frame:
+        """Render and develop one frame. Raises what the engine raises: OSError if Blender wrote no readable frame."""
+        radiance = self.engine.render(*shot.pose, seed=shot.render_seed)
+        velocity = shot.rotation_camera_from_site @ shot.velocity_mps
+        exposure = expose(radiance, self.sensor, self.camera, self.engine.camera, velocity)
+        noise = stream(shot.seed, "sensor", shot.index)
+        return Frame(shot, radiance, exposure, read_out(exposure, self.sensor, self.pattern, noise))
+
+    def labels(self, frame: Frame) -> Labels:
+        """Labels of a frame, in the pixels of its image."""
+        seen = seen_by(frame.radiance, self.camera, self.engine.camera)
+        limits = self.bounds.bounds_px(self.camera.width_px)
+        return self.with_contrast(label_frame(self.circles, self.camera, *frame.shot.pose, seen, *limits), frame)
+
+    def with_contrast(self, labels: Labels, frame: Frame) -> Labels:
+        """Labels of a frame with their contrast in its exposure."""
+        shown = Shown(*expected(frame.exposure, self.sensor), self.engine.sun)
+        return with_contrast(labels, self.circles, self.camera, *frame.shot.pose, shown)
+
+    def crater_index(self, frame: Frame) -> np.ndarray:
+        """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32, -1 for none."""
+        return crater_index(self.circles, self.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
