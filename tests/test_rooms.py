@@ -99,6 +99,7 @@ SHARED_ROOMS = [
         (["torch", "lightning", "bpy", "typer", "rich"], SHARED_ROOMS),
         (["lightning", "bpy"], ["perilune_train.detect.images", "perilune_train.detect.deploy"]),
         (["bpy", "typer", "rich"], ["perilune_render.flight", "perilune_render.imaging", "perilune_render.labels"]),
+        (["bpy", "typer", "rich"], ["perilune_render.frame_source", "perilune_render.dataset.develop"]),
     ],
 )
 def test_a_room_needs_no_more_than_it_says(blocked, modules):
