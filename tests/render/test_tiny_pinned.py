@@ -1,0 +1,96 @@
+"""The preset `tiny` is as it was when tiny_pinned.json was written: ground, plan, and every byte of tables and images.
+
+Bytes are compared only on the kind of processor and with the libraries with which they were written, since others
+differ in the last digits. To pin an intended change, with FOLDER from `perilune-render dataset --preset tiny --out
+FOLDER`: `python -m tests.render.test_tiny_pinned FOLDER > tests/render/tiny_pinned.json`.
+"""
+
+import hashlib
+import json
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from llvmlite.binding import get_host_cpu_name
+from numpy.core._multiarray_umath import __cpu_features__
+
+from perilune_shared.dataset.manifest import open_dataset
+
+PINNED = Path(__file__).with_name("tiny_pinned.json")
+KINDS = ("detect", "nav")
+CODE = ("perilune_render", "perilune_shared", "generator", "renderer", "imaging")
+OF_IMAGES = ("png_sha256", "png_bytes", "exr_sha256", "exr_bytes")
+
+
+def made_with(folder):
+    """Processor and libraries of this machine; libraries as recorded, without perilune's own code."""
+    recorded = open_dataset(folder / "detect").info.recipe().versions
+    libraries = {name: version for name, version in recorded.items() if name not in CODE}
+    features = [name for name, there in sorted(__cpu_features__.items()) if there]
+    return {
+        "processor": f"{get_host_cpu_name()}: {' '.join(features)}",
+        "libraries": libraries | {"pyarrow": metadata.version("pyarrow")},
+    }
+
+
+def hash_of(content):
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+def plan_of(folder):
+    """Per dataset: hashes of each scene's ground, and of the names, numbers and seeds in each table of the plan."""
+    found = {}
+    for kind in KINDS:
+        dataset = open_dataset(folder / kind)
+        scenes = dataset.table("scenes").sort_by("scene_id")
+        found[kind] = dict(zip(scenes["scene_id"].to_pylist(), scenes["content_sha256"].to_pylist(), strict=True))
+        for name in ("scenes", "trajectories", "frames"):
+            table = dataset.table(name)
+            left_out = ("recipe", *OF_IMAGES)
+            fields = [f.name for f in table.schema if f.name not in left_out and not holds_floats(f.type)]
+            found[kind][name] = hash_of(table.select(fields).to_pylist())
+    return found
+
+
+def holds_floats(kind):
+    return pa.types.is_floating(kind.value_type if pa.types.is_fixed_size_list(kind) else kind)
+
+
+def bytes_of(folder):
+    """Per dataset: hashes of the tables' values, and of the files by folder and kind.
+
+    The recipe's key in the table scenes and dataset.json hold the hash of the code, which may change.
+    """
+    found = {}
+    for kind in KINDS:
+        root = folder / kind
+        dataset = open_dataset(root)
+        tables = {name: dataset.table(name) for name in ("scenes", "craters", "boulders", "trajectories", "frames")}
+        tables = {**tables, "scenes": tables["scenes"].drop_columns(["recipe"]), "labels": dataset.table("labels")}
+        groups = {}
+        for path in sorted(path for path in root.rglob("*") if path.suffix in (".png", ".exr", ".parquet")):
+            name = path.relative_to(root).as_posix()
+            if not name.startswith("manifest/scenes/"):
+                group = path.name if path.parent == root else f"{name.partition('/')[0]}/*{path.suffix}"
+                groups.setdefault(group, []).append([name, hashlib.sha256(path.read_bytes()).hexdigest()])
+        found[kind] = {name: hash_of(table.to_pylist()) for name, table in tables.items()}
+        found[kind] |= {group: hash_of(files) for group, files in groups.items()}
+    return found
+
+
+def test_ground_and_plan_of_tiny_are_as_before(tiny):
+    assert plan_of(tiny) == json.loads(PINNED.read_text())["plan"]
+
+
+def test_every_byte_of_tiny_is_as_before(tiny):
+    pinned, here = json.loads(PINNED.read_text()), made_with(tiny)
+    if here != pinned["made_with"]:
+        pytest.skip(f"pinned with {pinned['made_with']}, this machine has {here}: bytes may differ")
+    assert bytes_of(tiny) == pinned["bytes"]
+
+
+if __name__ == "__main__":
+    made = Path(sys.argv[1])
+    print(json.dumps({"made_with": made_with(made), "plan": plan_of(made), "bytes": bytes_of(made)}, indent=1))
