@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.helpers.flat_engine import FlatEngine
+from tests.helpers.scenes import config_with
 
 from perilune_render.config import CameraConfig, DistortionConfig, LightConfig
 from perilune_render.flight.plan import camera_of
@@ -13,8 +15,6 @@ from perilune_render.labels.frame_labels import RimCircles
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import sun_direction
-from tests.render.conftest import config_with
-from tests.render.flat_engine import FlatEngine
 
 CAMERA = Camera.from_field_of_view(96, 64, 50.0)
 SUN = sun_direction(70, 30)

@@ -1,6 +1,8 @@
 """Blender as the engine of a frame source, compared with one in NumPy."""
 
 import numpy as np
+from tests.helpers.flat_engine import FlatEngine
+from tests.helpers.scenes import config_with, flat_scene, round_craters
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig
@@ -9,8 +11,6 @@ from perilune_render.labels.frame_labels import RimCircles
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
-from tests.render.conftest import config_with, flat_scene, round_craters
-from tests.render.flat_engine import FlatEngine
 
 
 def test_two_engines_give_the_same_frame_of_flat_ground():

@@ -2,7 +2,7 @@
 
 Bytes are compared only on the kind of processor and with the libraries with which they were written, since others
 differ in the last digits. To pin an intended change, with FOLDER from `perilune-render dataset --preset tiny --out
-FOLDER`: `python -m tests.render.test_tiny_pinned FOLDER > tests/render/tiny_pinned.json`.
+FOLDER`: `python -m tests.render.dataset.test_tiny_pinned FOLDER > tests/render/dataset/tiny_pinned.json`.
 """
 
 import hashlib
