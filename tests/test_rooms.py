@@ -19,7 +19,7 @@ ROOMS = {
         "frame_source blender dataset cli_options cli"
     ),
     "render/perilune_render/terrain": (
-        "grid interpolation noise relief size_frequency craters albedo boulders elevation scene cache export"
+        "envelope grid interpolation noise relief size_frequency craters albedo boulders elevation scene cache export"
     ),
     "train/perilune_train": "config data evaluation models training detect navigate explain cli",
     "train/perilune_train/detect": (
