@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from perilune_train.models.boxes import iou
+
 
 @dataclass(frozen=True)
 class Targets:
@@ -50,16 +52,16 @@ class Assignment:
 def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float) -> Tensor:
     """Whether anchors (K, 2) are assigned to boxes (T, 4): (T, K) bool.
 
-    True for every anchor whose width and height are within the factor `ratio`, and always for the one of best IoU.
+    True for every anchor whose width and height are within the factor `ratio`, and always for the one of highest IoU
+    (all boxes centred on one point).
     """
     size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)[:, None]
     quotient = size / anchors
     near = torch.maximum(quotient, 1 / quotient).amax(2) < ratio
-    overlap = torch.minimum(size, anchors).prod(2)
-    iou = overlap / (size.prod(2) + anchors.prod(1) - overlap)
     best = torch.zeros_like(near)
     if len(boxes):
-        best[torch.arange(len(boxes), device=boxes.device), iou.argmax(1)] = True
+        overlap = iou(torch.cat([-size, size], -1) / 2, torch.cat([-anchors, anchors], -1) / 2)
+        best[torch.arange(len(boxes), device=boxes.device), overlap.argmax(1)] = True
     return near | best
 
 

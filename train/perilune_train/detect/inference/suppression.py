@@ -6,6 +6,7 @@ from torch import Tensor
 from perilune_train.detect.config import EvaluationSettings
 from perilune_train.detect.evaluate.boxes import suppress
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.models.boxes import iou
 
 _BLOCK = 256
 """Boxes decided together: a larger block computes more overlaps, a smaller one needs more steps."""
@@ -89,9 +90,6 @@ def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou
 def _overlap(first: Tensor, second: Tensor) -> Tensor:
     """Intersection over union (N, A, B) of boxes (N, A, 4) and (N, B, 4), rounded as OpenCV does; 1 for two points."""
     a, b = first[:, :, None], second[:, None]
-    size = (torch.minimum(a[..., 2:], b[..., 2:]) - torch.maximum(a[..., :2], b[..., :2])).clamp(min=0)
-    shared = size[..., 0] * size[..., 1]
-    area_a, area_b = ((part[..., 2] - part[..., 0]) * (part[..., 3] - part[..., 1]) for part in (a, b))
-    both = area_a + area_b
-    distance = torch.where(both <= torch.finfo(torch.float64).eps, 0.0, 1.0 - shared / (both - shared))
-    return 1.0 - distance.float()
+    # OpenCV computes 1 - IoU in float64, 0 for two points, and stores it as float32.
+    points = (a[..., 2:] == a[..., :2]).any(-1) & (b[..., 2:] == b[..., :2]).any(-1)
+    return torch.where(points, 1.0, 1.0 - (1.0 - iou(a, b)).float())

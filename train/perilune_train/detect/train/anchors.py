@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from perilune_train.detect.evaluate.boxes import iou_matrix
+
 Array = NDArray[np.float64]
 _SAMPLE = 20_000
 _STEPS = 24
@@ -11,8 +13,7 @@ _ROUNDS = 100
 
 def size_iou(sizes: Array, anchors: Array) -> Array:
     """IoU (N, K) of boxes of widths and heights (N, 2) with anchors (K, 2), all centred on one point."""
-    overlap = np.minimum(sizes[:, None], anchors[None]).prod(axis=2)
-    return overlap / (sizes.prod(axis=1)[:, None] + anchors.prod(axis=1)[None] - overlap)
+    return iou_matrix(*(np.concatenate([-sides, sides], axis=1) / 2 for sides in (sizes, anchors)))
 
 
 def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator) -> Array:

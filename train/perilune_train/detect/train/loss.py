@@ -9,17 +9,10 @@ from torch import Tensor
 
 from perilune_train.detect.config import LossSettings
 from perilune_train.detect.data.assign import Targets, assign
+from perilune_train.models.boxes import iou
 from perilune_train.models.yolo import decode
 
 _TINY = 1e-7
-
-
-def iou(first: Tensor, second: Tensor) -> Tensor:
-    """Intersection over union (N,) of pairs of boxes (N, 4), x0 y0 x1 y1; 0 if neither has an area."""
-    area = (first[:, 2:] - first[:, :2]).clamp(min=0).prod(1) + (second[:, 2:] - second[:, :2]).clamp(min=0).prod(1)
-    shared = torch.minimum(first[:, 2:], second[:, 2:]) - torch.maximum(first[:, :2], second[:, :2])
-    intersection = shared.clamp(min=0).prod(1)
-    return intersection / (area - intersection + _TINY)
 
 
 def ciou_loss(predicted: Tensor, label: Tensor, aspect: Literal["circular", "standard"] = "circular") -> Tensor:
