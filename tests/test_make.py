@@ -46,7 +46,7 @@ def test_the_example_of_make_help_works():
     example = next(line for line in make("help").stdout.splitlines() if line.startswith("  make dataset SET="))
     found = values(words("dataset", "perilune-render", shlex.split(example)[2]), "--set")
     assert found == ["dataset.seed=7", "dataset.detect.sun.elevation_deg={low: 5, high: 9}"]
-    assert example.strip() in (ROOT / "README.md").read_text()
+    assert example.strip() in (ROOT / "docs/how-to/settings.md").read_text()
 
 
 def test_paths_may_hold_anything():
