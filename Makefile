@@ -36,7 +36,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-labels bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -133,6 +133,9 @@ bench-regenerate: setup ## frames that come out equal from a manifest alone; wri
 
 bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
 	@$(BIN)/python -m benchmarks.scene.labels --picture docs/pictures/labels_histogram.png
+
+bench-truth: setup ## depth and normals of EXRs against cast rays; writes runs/bench/truth.json
+	@$(BIN)/python -m benchmarks.scene.truth
 
 bench-contrast: setup ## how well contrast tells craters that the detector finds; writes runs/bench/contrast.json
 	@$(BIN)/python -m benchmarks.train.contrast "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"
