@@ -17,6 +17,7 @@ from perilune_shared.dataset.manifest import count_rows, open_dataset
 from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.dataset.writer import frame_path
 from perilune_shared.editing.pack import pack
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.progress import progress_bar
@@ -113,7 +114,7 @@ def _fill(root: Path, progress) -> None:
             "frames": {
                 "frame_id": ids,
                 "frame_index": np.arange(N_FRAMES),
-                "png_path": [f"frames/{name}.png" for name in ids],
+                "png_path": [frame_path(name, "png") for name in ids],
                 "png_sha256": [rng.bytes(32).hex() for _ in ids],
             },
             "labels": {"frame_id": np.repeat(ids, N_LABELS), "crater_id": np.tile(np.arange(N_LABELS), N_FRAMES)},
