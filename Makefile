@@ -36,7 +36,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint bench-render compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint docs docs-build bench-render compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -109,6 +109,12 @@ test: setup ## run all tests, in JOBS=2 processes
 lint: setup ## ruff and mypy
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train
+
+docs: docs-build ## build and serve the documentation (http://127.0.0.1:8000)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs serve
+
+docs-build: setup ## build the documentation into site/; a broken link or name is an error
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 bench-render: setup ## time of a frame against a bare Blender loop; writes runs/bench/render.json
 	@$(BIN)/python -m benchmarks.dataset.render

@@ -1,20 +1,81 @@
-"""The examples in the pages run."""
+"""The pages are true: examples run; links, commands, options, settings and files that they name exist."""
 
 import re
+import shlex
 from pathlib import Path
 
+import nbformat
 import pytest
+from nbclient import NotebookClient
+from scripts.pages.command_page import commands
+from scripts.pages.hooks import PROGRAMS, generated_pages
+from scripts.pages.notebook_page import notebook_page
 
+from perilune_render.config import DatasetConfig
+from perilune_shared.config import resolve
+from perilune_shared.config_page import annotated_yaml, keys
 from perilune_shared.dataset.schema import TABLES
+from perilune_train.cli import SECTIONS
 
 TOP = Path(__file__).parent.parent
 DOCS = TOP / "docs"
+NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
 PAGES = [*sorted(DOCS.rglob("*.md")), *sorted(TOP.glob("*.md")), TOP / "data_manifests/README.md"]
+CURRENT = [page for page in PAGES if "notebook" not in page.parts and page.name != "CHANGELOG.md"]
+"""Pages that describe the present code; the dated notebook and the changelog tell what was."""
 BLOCKS = [
     (page.relative_to(TOP).as_posix(), block)
     for page in sorted(DOCS.rglob("*.md"))
     for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 ]
+COMMANDS = {name: command for program, app in PROGRAMS.items() for name, command in commands(program, app).items()}
+OPTIONS = {option for each in COMMANDS.values() for p in each.params for option in (*p.opts, *p.secondary_opts)}
+GENERATED = generated_pages()
+CONFIGS = {"dataset": (DatasetConfig, "perilune_render"), **{n: (m, "perilune_train") for n, m in SECTIONS.items()}}
+KEYS = {key.name for n, (model, package) in CONFIGS.items() for key in keys(n, resolve(model, n, package, "small"))}
+GROUPS = {name.rsplit(".", n)[0] for name in KEYS for n in range(1, name.count(".") + 1)}
+FOLDERS = r"(?:benchmarks|configs|scripts|tests|(?:shared|render|train)/perilune_\w+|docs|data_manifests|results)"
+
+
+def texts() -> list[tuple[str, str]]:
+    """Every current page with its text, the notebooks too."""
+    pages = [(page.relative_to(TOP).as_posix(), page.read_text(encoding="utf-8")) for page in CURRENT]
+    return pages + [(each.relative_to(TOP).as_posix(), notebook_page(each)[0]) for each in NOTEBOOKS]
+
+
+def code(text: str) -> tuple[list[str], list[str]]:
+    """Lines of the code blocks of a page, with continued lines joined, and its inline code."""
+    fenced = re.findall(r"^```.*?\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    fenced += re.findall(r"(?:^    .*\n)+", text, re.MULTILINE)
+    inline = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
+    return [line.strip() for block in fenced for line in block.replace("\\\n", " ").splitlines()], inline
+
+
+def words(line: str) -> list[str]:
+    return shlex.split(line.replace("[--", "--").replace("]", " ") if "[--" in line else line, comments=True)
+
+
+def fault(line: str, *, complete: bool) -> str | None:
+    """What is wrong with a command line; a complete one has everything that its command requires."""
+    given = words(line.removeprefix("$ "))
+    given = given[next(i for i, word in enumerate(given) if word.startswith("perilune-")) :]
+    name = next((" ".join(given[:n]) for n in (3, 2) if " ".join(given[:n]) in COMMANDS), None)
+    if name is None:
+        groups = {word for known in COMMANDS for word in (known.split()[0], " ".join(known.split()[:2]))}
+        plain = " ".join(word for word in given if word not in ("...", "--help"))
+        return None if plain in groups and not complete else "no such command"
+    command, rest = COMMANDS[name], given[len(name.split()) :]
+    known = {option: p for p in command.params for option in (*p.opts, *p.secondary_opts) if option.startswith("--")}
+    used = [word.split("=")[0] for word in rest if word.startswith("--")]
+    if unknown := [option for option in used if option not in {*known, "--help"}]:
+        return f"no option {unknown}"
+    wanted = [p for p in command.params if p.required and complete]
+    if missing := [p.opts for p in wanted if p.param_type_name == "option" and not set(p.opts) & set(used)]:
+        return f"without {missing}"
+    n_arguments = sum(p.param_type_name == "argument" for p in wanted)
+    if n_arguments and (not rest or rest[0].startswith("--")):
+        return "without its argument"
+    return None
 
 
 @pytest.mark.parametrize(("page", "block"), BLOCKS)
@@ -23,25 +84,79 @@ def test_example_runs(page, block, tiny, tmp_path, monkeypatch):
     (tmp_path / "data").mkdir()
     (tmp_path / "data/tiny").symlink_to(tiny)
     monkeypatch.chdir(tmp_path)
-    exec(compile(block, page, "exec"), {})  # noqa: S102 - our own page
+    exec(compile(block.replace("data/small", "data/tiny"), page, "exec"), {})  # noqa: S102 - our own page
 
 
 def test_there_are_examples():
     assert any(page == "docs/reference/frames.md" for page, _ in BLOCKS)
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs(path, tiny, tmp_path):
+    """Beside a folder where `make dataset PRESET=tiny` was run; as saved, it has outputs without paths of a machine."""
+    folder = tmp_path / path.parent.relative_to(TOP)
+    folder.mkdir(parents=True)
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/tiny").symlink_to(tiny)
+    saved = nbformat.read(path, as_version=4)
+    assert all(cell.outputs for cell in saved.cells if cell.cell_type == "code")
+    assert not re.search(r"/(home|root|work|tmp|Users)/", nbformat.writes(saved))
+    NotebookClient(saved, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
+
+
 def test_links_between_pages_lead_somewhere():
+    made = {DOCS / path for path in GENERATED}
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
-            assert (page.parent / target).exists(), f"{page.relative_to(TOP)}: {target}"
+            path = (page.parent / target).resolve()
+            assert path.exists() or path in made, f"{page.relative_to(TOP)}: {target}"
 
 
-def test_the_manifest_page_has_every_column_as_the_schema_has_it():
-    page = (DOCS / "reference/manifest.md").read_text(encoding="utf-8")
-    rows = {}
-    for name, part in re.findall(r"### (\w+)\n(.*?)(?=\n##)", page, re.DOTALL):
-        rows[name] = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", part, re.MULTILINE)
+@pytest.mark.parametrize(("page", "text"), texts(), ids=lambda value: value if value.endswith(("md", "ipynb")) else "")
+def test_commands_options_settings_and_files_exist(page, text):
+    lines, inline = code(text)
+    shown = [(line, True) for line in lines if re.match(r"(\$ |time )?perilune-\w+ \w", line)]
+    shown += [(line, False) for line in inline if re.match(r"perilune-\w+ \w", line)]
+    wrong = [f"{line}: {why}" for line, whole in shown if (why := fault(line, complete=whole))]
+    for line in inline:
+        option = re.match(r"--[a-z0-9-]+", line)
+        if option and option[0] not in OPTIONS | {"--help", "--nproc-per-node", "--nnodes", "--strict"}:
+            wrong.append(f"{line}: no command has this option")
+        path = re.fullmatch(rf"{FOLDERS}/[\w./*-]+", line)
+        if path and not list(TOP.glob(path[0].rstrip("/"))):
+            wrong.append(f"{line}: no such file")
+    settings = re.findall(r"""(?:--set |SET="|SET=)['"]?((?:dataset|detect|navigate|explain)\.[\w.]+)=""", text)
+    settings += [
+        line.split("=")[0] for line in inline if re.fullmatch(r"(detect|navigate|explain)\.\w[\w.]*(=.*)?", line)
+    ]
+    wrong += [f"{name}: no such setting" for name in settings if name not in KEYS | GROUPS]
+    assert not wrong
+
+
+def test_targets_of_make_exist():
+    known = set(re.findall(r"^([a-z-]+):", (TOP / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    for page, text in texts():
+        lines, inline = code(text)
+        named = [found[1] for line in (*lines, *inline) if (found := re.match(r"(?:\$ |time )?make ([a-z-]+)", line))]
+        assert set(named) <= known, page
+
+
+def test_generated_pages_have_every_command_column_and_key():
+    for program in PROGRAMS:
+        page = GENERATED[f"reference/commands/{program}.md"]
+        for name, command in COMMANDS.items():
+            if name.startswith(program):
+                section = page.split(f"## {name}\n")[1].split("\n## ")[0]
+                assert all(option in section for p in command.params for option in p.opts if option.startswith("--"))
+    columns = GENERATED["reference/columns.md"]
     for name, schema in TABLES.items():
-        told = [(column, unit.strip(), meaning, "or null" in kind) for column, kind, unit, meaning in rows[name]]
+        section = columns.split(f"## {name}\n")[1].split("\n## ")[0]
+        told = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", section, re.MULTILINE)
         wanted = [(f.name, f.metadata[b"unit"].decode(), f.metadata[b"meaning"].decode(), f.nullable) for f in schema]
-        assert told == wanted, f"{name}: run scripts/describe_columns.py with a dataset"
+        assert [(column, unit, meaning, "or null" in kind) for column, kind, unit, meaning in told] == wanted
+    for name, (model, package) in CONFIGS.items():
+        page = GENERATED[f"reference/configuration/{package.removeprefix('perilune_')}.md"]
+        shown = annotated_yaml(name, resolve(model, name, package, "small"))
+        assert set(re.findall(r"^ *(\w+): \S", shown, re.MULTILINE)) <= set(
+            re.findall(r"^\| `(\w+)` ", page, re.MULTILINE)
+        )

@@ -4,6 +4,7 @@ import json
 import textwrap
 import typing
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic.fields import FieldInfo
@@ -11,6 +12,36 @@ from pydantic.fields import FieldInfo
 from perilune_shared.config import Section
 
 _WIDTH = 118
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key of a configuration, described."""
+
+    name: str
+    """Full name, as dataset.camera.width_px."""
+    field: FieldInfo
+    """pydantic's field: limits and kind."""
+    meaning: str
+    """Its docstring, on one line."""
+    choices: tuple[str, ...]
+    """Values of a Literal; empty for any other kind."""
+    default: str | None
+    """Value without a preset, as YAML on one line; None if it must be given."""
+    value: str
+    """Value in this configuration, as YAML on one line."""
+
+
+def keys(section: str, config: Section) -> Iterator[Key]:
+    """Yield every key of a resolved section, in the order of the file."""
+    plain = config.model_dump(mode="json")
+    for name, field in type(config).model_fields.items():
+        value, full = getattr(config, name), f"{section}.{name}"
+        if isinstance(value, Section) and not _is_span(value):
+            yield from keys(full, value)
+        else:
+            default = None if field.is_required() else _default(field)
+            yield Key(full, field, _meaning(field), _choices(field), default, _flow(plain[name]))
 
 
 def annotated_yaml(section: str, config: Section) -> str:
@@ -27,7 +58,7 @@ def _lines(config: Section, depth: int) -> Iterator[str]:
     for name, field in type(config).model_fields.items():
         value = getattr(config, name)
         nested = isinstance(value, Section) and not _is_span(value)
-        comment = _meaning(field) if nested else f"{_meaning(field)}{_choices(field)} Default: {_default(field)}."
+        comment = _meaning(field) if nested else f"{_meaning(field)}{_one_of(field)} Default: {_default(field)}."
         yield from textwrap.wrap(comment, _WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
         if nested:
             yield f"{indent}{name}:"
@@ -40,12 +71,16 @@ def _meaning(field: FieldInfo) -> str:
     return " ".join((field.description or "").split())
 
 
-def _choices(field: FieldInfo) -> str:
+def _choices(field: FieldInfo) -> tuple[str, ...]:
     """List the values of a Literal, also inside a union with other types."""
     kinds = [field.annotation, *typing.get_args(field.annotation)]
-    values = [
+    return tuple(
         str(value) for kind in kinds if typing.get_origin(kind) is typing.Literal for value in typing.get_args(kind)
-    ]
+    )
+
+
+def _one_of(field: FieldInfo) -> str:
+    values = _choices(field)
     return f" One of: {', '.join(values)}." if values else ""
 
 

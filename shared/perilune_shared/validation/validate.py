@@ -44,7 +44,7 @@ def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
         for file, found, wanted in checksums.faults_of(dataset.root, progress)
     ]
     try:
-        wanted = "only files that a dataset is made of (docs/reference/manifest.md)"
+        wanted = "only files that a dataset is made of (docs/reference/validation.md)"
         faults += [Fault.of(path, None, "file", "an unexpected file or folder", wanted) for path in unexpected(dataset)]
     except UserError as error:
         faults.append(Fault.told("manifest/frames", None, error))

@@ -66,7 +66,7 @@ def motion_errors(descents: list[Descent], motions: list[Motion]) -> pd.DataFram
 def summary(errors: pd.DataFrame) -> dict[str, float]:
     """Root mean squares over all pairs of all trajectories; drift (length) over all frames and at the last frames.
 
-    Each RMSE in two forms, see `squared_errors`, and by axis. docs/reference/runs.md has the formulas.
+    Each RMSE in two forms, see `squared_errors`, and by axis. docs/reference/metrics.md has the formulas.
     """
     ends = errors.groupby(["scene_id", "trajectory_id"])["drift_m"].last()
     figures = {key: float(np.sqrt(np.mean(values))) for key, values in squared_errors(errors).items()}

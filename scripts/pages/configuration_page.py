@@ -1,0 +1,79 @@
+"""Reference of the configuration keys as Markdown, from the pydantic models behind `config --show`."""
+
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+from perilune_shared.config import PRESETS, Section, resolve
+from perilune_shared.config_page import Key, keys
+
+UNITS = {
+    "_e_per_s": "e/s",
+    "_minutes": "min",
+    "_percentile": "%",
+    "_px": "px",
+    "_deg": "deg",
+    "_gib": "GiB",
+    "_gyr": "Gyr",
+    "_m": "m",
+    "_s": "s",
+    "_e": "e",
+}
+"""Ends of names, longest first, and their units; a key with another name has no unit or states it in its meaning."""
+LIMITS = {"gt": "above", "ge": "from", "lt": "below", "le": "to", "multiple_of": "multiple of"}
+
+
+def configuration_page(title: str, package: str, models: dict[str, type[Section]]) -> str:
+    """Return the page of one program's sections: a table of keys for each group, and the presets' values."""
+    pieces = [f"# {title}", "", "`null` in a file is None in Python. A range (`low`, `high`) may be one number.", ""]
+    for section, model in models.items():
+        presets = {name: list(keys(section, resolve(model, section, package, name))) for name in PRESETS}
+        described = presets["small"]
+        for group in dict.fromkeys(_group(key) for key in described):
+            pieces.append(f"## {group}\n\n| Key | Unit | Default | Allowed | Meaning |\n|---|---|---|---|---|")
+            pieces += [_row(key) for key in described if _group(key) == group]
+            pieces.append("")
+        pieces += _presets(section, presets)
+    return "\n".join(pieces)
+
+
+def _group(key: Key) -> str:
+    return key.name.rpartition(".")[0]
+
+
+def _row(key: Key) -> str:
+    name = key.name.rpartition(".")[2]
+    default = "in the preset" if key.default is None else f"`{key.default}`"
+    return f"| `{name}` | {_unit(name)} | {default} | {_allowed(key)} | {key.meaning.replace('|', chr(92) + '|')} |"
+
+
+def _unit(name: str) -> str:
+    return next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
+
+
+def _allowed(key: Key) -> str:
+    limits = [
+        f"{word} {getattr(limit, kind):g}"
+        for limit in key.field.metadata or _inner_limits(key.field.annotation)
+        for kind, word in LIMITS.items()
+        if hasattr(limit, kind)
+    ]
+    return ", ".join(limits) or " ".join(f"`{each}`" for each in key.choices)
+
+
+def _inner_limits(kind: Any) -> list[Any]:
+    """Return the limits of the first number within a union or a tuple."""
+    for inner in typing.get_args(kind):
+        found = [limit for field in getattr(inner, "__metadata__", ()) for limit in field.metadata]
+        if found := found or _inner_limits(inner):
+            return found
+    return []
+
+
+def _presets(section: str, presets: dict[str, list[Key]]) -> Iterator[str]:
+    """Yield a table of the keys that a preset sets: those without default, and those that differ from it."""
+    yield f"## Presets of {section}\n\n| Key | {' | '.join(PRESETS)} |\n|---|{'---|' * len(PRESETS)}"
+    for same in zip(*presets.values(), strict=True):
+        if any(key.value != key.default for key in same):
+            yield f"| `{same[0].name}` | {' | '.join(f'`{key.value}`' for key in same)} |"
+    yield ""

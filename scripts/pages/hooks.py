@@ -1,0 +1,61 @@
+"""Pages of the documentation that are made from the code when the site is built (hooks of MkDocs).
+
+They are never committed, so they cannot differ from the code.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+from scripts.pages.column_page import column_page
+from scripts.pages.command_page import command_page
+from scripts.pages.configuration_page import configuration_page
+from scripts.pages.notebook_page import notebook_page
+
+from perilune_render.cli import app as render
+from perilune_render.config import DatasetConfig
+from perilune_shared.cli.main import app as manifest
+from perilune_train.cli import SECTIONS
+from perilune_train.cli import app as train
+
+DOCS = Path(__file__).parent.parent.parent / "docs"
+PROGRAMS = {"perilune-render": render, "perilune-manifest": manifest, "perilune-train": train}
+
+
+def generated_pages() -> dict[str, str]:
+    """Every generated page, by its path in the documentation folder."""
+    pages = {f"reference/commands/{name}.md": command_page(name, app) for name, app in PROGRAMS.items()}
+    pages["reference/configuration/render.md"] = configuration_page(
+        "Settings of the renderer", "perilune_render", {"dataset": DatasetConfig}
+    )
+    pages["reference/configuration/train.md"] = configuration_page(
+        "Settings of the trainer", "perilune_train", SECTIONS
+    )
+    pages["reference/columns.md"] = column_page()
+    return pages
+
+
+def on_config(config: Any) -> Any:
+    """Append the pages of the notebook (docs/notebook), the latest first."""
+    dated = [f"notebook/{path.name}" for path in sorted((DOCS / "notebook").glob("2*.md"), reverse=True)]
+    config.nav = [*config.nav, {"Notebook": ["notebook/index.md", *dated]}]
+    return config
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the generated pages, and replace Jupyter notebooks by pages."""
+    for path, text in generated_pages().items():
+        files.append(File.generated(config, path, content=text))
+    for notebook in [each for each in files if each.src_uri.endswith(".ipynb")]:
+        files.remove(notebook)
+        text, pictures = notebook_page(Path(notebook.abs_src_path))
+        folder = notebook.src_uri.rpartition("/")[0]
+        files.append(File.generated(config, notebook.src_uri.removesuffix(".ipynb") + ".md", content=text))
+        for name, picture in pictures.items():
+            files.append(File.generated(config, f"{folder}/{name}", content=picture))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Point links to notebooks at their pages."""
+    return markdown.replace(".ipynb)", ".md)")
