@@ -106,8 +106,9 @@ JOBS ?= 2
 test: setup ## run all tests, in JOBS=2 processes
 	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 
-lint: setup ## ruff and mypy
+lint: setup ## ruff (rules and format) and mypy
 	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train
 
 docs: docs-build ## build and serve the documentation (http://127.0.0.1:8000)
