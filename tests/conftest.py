@@ -66,6 +66,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory) -> Path:
     """Folder with the `tiny` preset's datasets `detect` and `nav`. Read only: copy before a change."""
+    pytest.importorskip("perilune_render", reason="needs a rendered dataset")
     own = tmp_path_factory.getbasetemp()
     # The parent of a worker's folder is the whole run's. The second worker to come finds the datasets complete.
     folder = (own.parent if WORKER else own) / "tiny"

@@ -5,12 +5,13 @@ import re
 import pytest
 from pydantic import ValidationError
 
-from perilune_render.config import DatasetConfig
 from perilune_shared.config import SECTIONS, parse_setting, resolve, resolve_over, to_yaml
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.navigate.config import NavigateConfig
+
+DatasetConfig = pytest.importorskip("perilune_render.config").DatasetConfig
 
 
 def dataset(**kwargs):

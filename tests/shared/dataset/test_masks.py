@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perilune_render.imaging.exr import read_exr
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.masks import crater_masks, frame_masks
 from perilune_shared.errors import UserError
@@ -77,6 +76,8 @@ def test_a_ridge_hides_what_lies_behind_it():
 
 
 def test_masks_of_a_rendered_frame(tiny):
+    from perilune_render.imaging.exr import read_exr
+
     dataset = open_dataset(tiny / "detect")
     frame = dataset.table("frames").to_pandas().iloc[5]
     exr = read_exr(dataset.file(frame.exr_path))
@@ -115,6 +116,8 @@ def test_masks_of_a_rendered_frame(tiny):
 
 def test_masks_under_distortion_are_in_the_camera_that_is_asked_for(tiny_detect):
     """A pinhole dataset read as that of a distorted camera within it: the same ground, other pixels."""
+    from perilune_render.imaging.exr import read_exr
+
     dataset = open_dataset(tiny_detect)
     pinhole = dataset.info.camera
     bent = pinhole.model_copy(update={"width_px": 64, "height_px": 64, "cx_px": 31.7, "cy_px": 32.0})
