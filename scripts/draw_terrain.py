@@ -19,8 +19,8 @@ from perilune_render.config import DatasetConfig
 from perilune_render.flight.plan import camera_of
 from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.sensor import FixedPattern, develop
-from perilune_render.terrain import profile
 from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.craters import profile
 from perilune_render.terrain.scene import Scene
 from perilune_shared.config import resolve
 from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY

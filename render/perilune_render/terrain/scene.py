@@ -128,10 +128,10 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     if variation > 0:
         add_patches(albedo, grid, variation, seed)
         add_rays(albedo, grid, craters, terrain.craters.n_rayed, variation, seed)
-    laid = stamp_craters(height, albedo, grid, craters, variation * brightness(craters), terrain.craters.profile)
+    stamped = stamp_craters(height, albedo, grid, craters, variation * brightness(craters), terrain.craters.profile)
     base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
-    kept = laid.rim_left >= _LEAST_RIM
-    craters, sag = craters.chosen(kept), laid.sag_m[kept]
+    kept = stamped.rim_left >= _LEAST_RIM
+    craters, sag = craters.chosen(kept), stamped.sag_m[kept]
     if model is not None and terrain.catalogue is not None:
         real = read_catalogue(Path(terrain.catalogue), model, grid, terrain.craters, resolved_m(model))
         craters, sag = real.joined(craters), np.concatenate([np.zeros(len(real)), sag])

@@ -1,6 +1,7 @@
 """Stamp craters on the ground, oldest first, each in its own window (compiled by numba)."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,10 +12,13 @@ from perilune_render.terrain.grid import Grid, lines_in, place_in_ring, vertex_o
 from perilune_shared.geometry.frames import Array
 
 _N_RIM = 16
+"""Number of points at which a rim's survival is sampled."""
+_PLANE_REACH = 1.3
+"""Radius of the ground that the plane is fitted to, fresh crater radii."""
 
 
 @dataclass(frozen=True, slots=True)
-class Laid:
+class Stamped:
     """Results of stamping N craters."""
 
     sag_m: Array
@@ -24,9 +28,89 @@ class Laid:
     """Share of each crater's rim that younger craters have not removed (N,)."""
 
 
+class _Ground(NamedTuple):
+    """Fields on the vertices, changed in place."""
+
+    height: Array
+    """Heights, metres (n_vertices,)."""
+    albedo: Array
+    """Factor on the reflectance (n_vertices,)."""
+    log_left: Array
+    """Logarithm of the share of the initial ground that is left (n_vertices,). The difference of two values is the loss
+    of a rim since it was stamped."""
+    n_half: int
+    """`Grid.n_half`."""
+    half_widths: Array
+    """`Grid.half_widths_m`."""
+
+
+class _Shapes(NamedTuple):
+    """Craters as the kernels need them, oldest first."""
+
+    x: Array
+    """x of the centres, O_L, metres (N,)."""
+    y: Array
+    """y of the centres, O_L, metres (N,)."""
+    radius: Array
+    """Radii of the fresh crests, which scale the profile, metres (N,)."""
+    label_radius: Array
+    """Radii of the current crests, metres (N,)."""
+    depth: Array
+    """Fresh depths, metres (N,)."""
+    rim_height: Array
+    """Fresh rim heights, metres (N,)."""
+    wear_row: Array
+    """Fractional rows in the profile tables (N,)."""
+    flat_floor: np.ndarray
+    """Whether a floor is flat (N,)."""
+    outline: Array
+    """`Craters.outline` (N, 6)."""
+    crest: Array
+    """`Craters.crest` (N, 6)."""
+    brightness: Array
+    """Relative brightening within the rim (N,)."""
+
+
+class _Tables(NamedTuple):
+    """`ProfileTables`, with both bowls in one array."""
+
+    rim: Array
+    """`ProfileTables.rim` (N_WEAR, n_x)."""
+    bowls: Array
+    """`ProfileTables.bowl` and `.flat_bowl` (2, N_WEAR, n_x)."""
+    removed: Array
+    """`ProfileTables.removed` (N_WEAR, n_x)."""
+
+
+class _Profile(NamedTuple):
+    """The profile of one crater over distance, 0 to REACH."""
+
+    rim: Array
+    """Height of rim and ejecta, metres (n_x,)."""
+    bowl: Array
+    """Height of the bowl, metres (n_x,)."""
+    removed: Array
+    """Share of the older ground that is removed (n_x,)."""
+
+
+class _Plane(NamedTuple):
+    """A plane through the ground around a crater."""
+
+    level: float
+    """Height at the crater's centre, metres."""
+    slope_x: float
+    """Slope along x."""
+    slope_y: float
+    """Slope along y."""
+    rim: float
+    """Mean height of the ground near the crater's rim above `level`, metres."""
+    floor: float
+    """Mean height of the ground near the crater's centre above `level`, metres."""
+
+
 def stamp_craters(
     height_m: Array, albedo: Array, grid: Grid, craters: Craters, brightness: Array, profile: str = "fassett_thomson"
-) -> Laid:
+) -> Stamped:
     """Stamp `craters` on height_m (n_vertices,) and brighten albedo (n_vertices,), both in place.
 
     A crater first replaces the ground below it by a plane fitted to it, to a degree that falls with the crater's wear,
@@ -36,11 +120,7 @@ def stamp_craters(
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     # The label's circle is the current crest; the profile is scaled by the fresh crest's radius.
     grown = crest_radius(wear, craters.fresh_depth_m / craters.rim_height_m, profile)
-    sag, rim_left = _stamp(
-        height_m,
-        albedo,
-        grid.n_half,
-        grid.half_widths_m,
+    shapes = _Shapes(
         craters.x_m,
         craters.y_m,
         craters.diameter_m / 2 / grown,
@@ -52,11 +132,177 @@ def stamp_craters(
         craters.outline,
         craters.crest,
         brightness,
-        tables.rim,
-        np.stack([tables.bowl, tables.flat_bowl]),
-        tables.removed,
     )
-    return Laid(sag, rim_left)
+    ground = _Ground(height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m)
+    bowls = np.stack([tables.bowl, tables.flat_bowl])
+    return Stamped(*_stamp(ground, shapes, _Tables(tables.rim, bowls, tables.removed)))
+
+
+@njit()
+def _stamp(ground, shapes, tables):
+    """Stamp all craters; returns `Stamped.sag_m` and `Stamped.rim_left`."""
+    n, columns = len(shapes.x), tables.rim.shape[1]
+    profile = _Profile(np.empty(columns), np.empty(columns), np.empty(columns))
+    lines = np.empty((2 * ground.n_half + 1 + 4 * len(ground.half_widths), 7))
+    sag = np.zeros(n)
+    angle = 2 * np.pi * np.arange(_N_RIM) / _N_RIM
+    circle = np.cos(angle), np.sin(angle)
+    rim_vertex = np.full((n, _N_RIM), -1)
+    rim_before = np.zeros((n, _N_RIM))
+    for k in range(n):
+        _interpolate_profile(shapes, k, tables, profile)
+        x, y, reach = shapes.x[k], shapes.y[k], REACH * shapes.radius[k]
+        count = lines_in(x - reach, x + reach, y - reach, y + reach, ground.n_half, ground.half_widths, lines)
+        found, plane = _fit_plane(ground.height, x, y, shapes.radius[k], lines, count)
+        if not found:
+            continue
+        sag[k] = _sag(plane, profile.removed)
+        _stamp_one(ground, shapes, k, profile, plane, lines, count)
+        _sample_rim(ground, x, y, shapes.label_radius[k], circle, k, rim_vertex, rim_before)
+    return sag, _rims_left(ground.log_left, rim_vertex, rim_before)
+
+
+@njit(inline="always")
+def _interpolate_profile(shapes, k, tables, profile):
+    """Interpolate the profile of crater `k` between two rows of the tables, into `profile`."""
+    depth, rim_height = shapes.depth[k], shapes.rim_height[k]
+    upper = min(int(shapes.wear_row[k]), tables.rim.shape[0] - 2)
+    share = shapes.wear_row[k] - upper
+    rim, removed = tables.rim, tables.removed
+    bowl = tables.bowls[1] if shapes.flat_floor[k] else tables.bowls[0]
+    for c in range(rim.shape[1]):
+        profile.rim[c] = rim_height * (rim[upper, c] * (1 - share) + rim[upper + 1, c] * share)
+        profile.bowl[c] = depth * (bowl[upper, c] * (1 - share) + bowl[upper + 1, c] * share)
+        profile.removed[c] = removed[upper, c] * (1 - share) + removed[upper + 1, c] * share
+
+
+@njit(inline="always")
+def _fit_plane(height, x, y, radius, lines, count):
+    """Fit a plane to the ground around (x, y) by least squares; returns whether there are enough vertices, and it."""
+    s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
+    n_rim = n_floor = h_rim = h_floor = 0.0
+    square_r = radius**2
+    for line in range(count):
+        dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x, y, _PLANE_REACH * radius)
+        for p in range(start, stop):
+            px, py = dx + p * step_x, dy + p * step_y
+            square = px * px + py * py
+            h = height[first + p]
+            if square < 0.0625 * square_r:
+                n_floor += 1.0
+                h_floor += h
+            elif 0.81 * square_r < square < 1.21 * square_r:
+                n_rim += 1.0
+                h_rim += h
+            s0 += 1.0
+            sx += px
+            sy += py
+            sxx += px * px
+            sxy += px * py
+            syy += py * py
+            sh += h
+            sxh += px * h
+            syh += py * h
+    if s0 < 3:
+        return False, _Plane(0.0, 0.0, 0.0, 0.0, 0.0)
+    cxx, cxy, cyy = sxx - sx * sx / s0, sxy - sx * sy / s0, syy - sy * sy / s0
+    cxh, cyh = sxh - sx * sh / s0, syh - sy * sh / s0
+    determinant = cxx * cyy - cxy * cxy
+    slope_x = slope_y = 0.0
+    # A few nearly collinear vertices do not determine the slope across them: the plane would become a spike.
+    if s0 >= 6 and determinant > 0.05 * cxx * cyy:
+        slope_x = (cxh * cyy - cyh * cxy) / determinant
+        slope_y = (cyh * cxx - cxh * cxy) / determinant
+    level = (sh - slope_x * sx - slope_y * sy) / s0
+    both = n_rim > 0 and n_floor > 0
+    rim, floor = (h_rim / n_rim - level, h_floor / n_floor - level) if both else (0.0, 0.0)
+    return True, _Plane(level, slope_x, slope_y, rim, floor)
+
+
+@njit(inline="always")
+def _sag(plane, removed):
+    """Height difference from rim to centre, at least 0, of the older ground that a crater has not removed."""
+    rim_column = int((len(removed) - 1) / REACH)
+    return max(plane.rim * (1 - removed[rim_column]) - plane.floor * (1 - removed[0]), 0.0)
+
+
+@njit(inline="always")
+def _stamp_one(ground, shapes, k, profile, plane, lines, count):
+    """Stamp crater `k` on its window of the ground, `count` lines of vertices."""
+    x, y, radius, brightness = shapes.x[k], shapes.y[k], shapes.radius[k], shapes.brightness[k]
+    outline, crest = shapes.outline[k], shapes.crest[k]
+    height, albedo, log_left = ground.height, ground.albedo, ground.log_left
+    own_rim, own_bowl, removed = profile
+    columns = len(own_rim)
+    per_radius = (columns - 1) / REACH
+    for line in range(count):
+        dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x, y, REACH * radius)
+        for p in range(start, stop):
+            px, py = dx + p * step_x, dy + p * step_y
+            distance = np.sqrt(px * px + py * py)
+            stray, uneven = _irregularity(px, py, distance, outline, crest)
+            r = distance / (radius * (1 + stray))
+            position = r * per_radius
+            c = int(position)
+            if c >= columns - 1:
+                continue
+            f = position - c
+            # The rim is uneven, the floor is not.
+            inner = min(r, 1.0)
+            uneven *= inner * inner * (3 - 2 * inner)
+            lost = removed[c] * (1 - f) + removed[c + 1] * f
+            crest_here = (own_rim[c] * (1 - f) + own_rim[c + 1] * f) * (1 + uneven)
+            here = first + p
+            old = height[here]
+            level = plane.level + plane.slope_x * px + plane.slope_y * py
+            height[here] = old + lost * (level - old) + crest_here + own_bowl[c] * (1 - f) + own_bowl[c + 1] * f
+            if lost > 1e-3:
+                log_left[here] += np.log1p(-0.999999 * lost)
+            if brightness > 0:
+                fade = 1.0 if r < 1 else np.exp(-(r - 1) / 0.5) * (1 - r / REACH)
+                albedo[here] += brightness * fade
+
+
+@njit(inline="always")
+def _irregularity(px, py, distance, outline, crest):
+    """Relative deviations of the rim's radius and of its height at (px, py) from the centre."""
+    if distance > 0:
+        c1, s1 = px / distance, py / distance
+    else:
+        c1, s1 = 1.0, 0.0
+    c2, s2 = c1 * c1 - s1 * s1, 2 * c1 * s1
+    c3, s3 = c2 * c1 - s2 * s1, s2 * c1 + c2 * s1
+    c4, s4 = c2 * c2 - s2 * s2, 2 * c2 * s2
+    radius = outline[0] * c2 + outline[1] * s2 + outline[2] * c3 + outline[3] * s3
+    radius += outline[4] * c4 + outline[5] * s4
+    height = crest[0] * c1 + crest[1] * s1 + crest[2] * c2 + crest[3] * s2
+    height += crest[4] * c3 + crest[5] * s3
+    return radius, height
+
+
+@njit(inline="always")
+def _sample_rim(ground, x, y, radius, circle, k, rim_vertex, rim_before):
+    """Write the vertices nearest to points of a new rim, -1 outside the grid, and their `log_left`, into row `k`."""
+    for p in range(_N_RIM):
+        vertex = _nearest(x + radius * circle[0][p], y + radius * circle[1][p], ground.n_half, ground.half_widths)
+        rim_vertex[k, p] = vertex
+        if vertex >= 0:
+            rim_before[k, p] = ground.log_left[vertex]
+
+
+@njit()
+def _rims_left(log_left, rim_vertex, rim_before):
+    """`Stamped.rim_left` from the sampled rims (N, _N_RIM); 1 for a rim outside the grid."""
+    rim_left = np.ones(len(rim_vertex))
+    for k in range(len(rim_vertex)):
+        total = on_grid = 0.0
+        for p in range(_N_RIM):
+            if rim_vertex[k, p] >= 0:
+                on_grid += 1.0
+                total += np.exp(log_left[rim_vertex[k, p]] - rim_before[k, p])
+        if on_grid > 0:
+            rim_left[k] = total / on_grid
+    return rim_left
 
 
 @njit()
@@ -89,140 +335,3 @@ def _chord(lines, line, x, y, reach):
     low, high = min((-half - along) / step, (half - along) / step), max((-half - along) / step, (half - along) / step)
     last = min(int(np.floor(high)) + 1, int(lines[line, 5]))
     return dx, dy, step_x, step_y, int(lines[line, 4]), max(int(np.ceil(low)), 0), last
-
-
-@njit()
-def _stamp(
-    height,
-    albedo,
-    n_half,
-    half_widths,
-    x,
-    y,
-    radius,
-    label_radius,
-    depth,
-    rim_height,
-    wear_row,
-    flat_floor,
-    outline,
-    crest,
-    brightness,
-    rim,
-    bowls,
-    removed,
-):
-    columns = rim.shape[1]
-    per_radius = (columns - 1) / REACH
-    own_rim, own_bowl, gone = np.empty(columns), np.empty(columns), np.empty(columns)
-    lines = np.empty((2 * n_half + 1 + 4 * len(half_widths), 7))
-    sag = np.zeros(len(x))
-    # Logarithm of the share of the initial ground that is left at each vertex. The difference of two values is the loss
-    # of a rim since it was stamped.
-    log_left = np.zeros(len(height))
-    rim_vertex = np.full((len(x), _N_RIM), -1)
-    rim_before = np.zeros((len(x), _N_RIM))
-    for k in range(len(x)):
-        upper = min(int(wear_row[k]), rim.shape[0] - 2)
-        share = wear_row[k] - upper
-        bowl = bowls[1] if flat_floor[k] else bowls[0]
-        for c in range(columns):
-            own_rim[c] = rim_height[k] * (rim[upper, c] * (1 - share) + rim[upper + 1, c] * share)
-            own_bowl[c] = depth[k] * (bowl[upper, c] * (1 - share) + bowl[upper + 1, c] * share)
-            gone[c] = removed[upper, c] * (1 - share) + removed[upper + 1, c] * share
-        reach = REACH * radius[k]
-        count = lines_in(x[k] - reach, x[k] + reach, y[k] - reach, y[k] + reach, n_half, half_widths, lines)
-        # Least-squares plane of the ground within 1.3 radii, about the crater's centre.
-        s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
-        n_rim = n_floor = h_rim = h_floor = 0.0
-        square_r = radius[k] ** 2
-        for line in range(count):
-            dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x[k], y[k], 1.3 * radius[k])
-            for p in range(start, stop):
-                px, py = dx + p * step_x, dy + p * step_y
-                square = px * px + py * py
-                h = height[first + p]
-                if square < 0.0625 * square_r:
-                    n_floor += 1.0
-                    h_floor += h
-                elif 0.81 * square_r < square < 1.21 * square_r:
-                    n_rim += 1.0
-                    h_rim += h
-                s0 += 1.0
-                sx += px
-                sy += py
-                sxx += px * px
-                sxy += px * py
-                syy += py * py
-                sh += h
-                sxh += px * h
-                syh += py * h
-        if s0 < 3:
-            continue
-        cxx, cxy, cyy = sxx - sx * sx / s0, sxy - sx * sy / s0, syy - sy * sy / s0
-        cxh, cyh = sxh - sx * sh / s0, syh - sy * sh / s0
-        determinant = cxx * cyy - cxy * cxy
-        slope_x = slope_y = 0.0
-        # A few nearly collinear vertices do not determine the slope across them: the plane would become a spike.
-        if s0 >= 6 and determinant > 0.05 * cxx * cyy:
-            slope_x = (cxh * cyy - cyh * cxy) / determinant
-            slope_y = (cyh * cxx - cxh * cxy) / determinant
-        level = (sh - slope_x * sx - slope_y * sy) / s0
-        if n_rim > 0 and n_floor > 0:
-            # Height of the remaining older ground at rim and centre, above the plane that replaced the rest.
-            rim_share, floor_share = 1 - gone[int(per_radius)], 1 - gone[0]
-            sag[k] = max((h_rim / n_rim - level) * rim_share - (h_floor / n_floor - level) * floor_share, 0.0)
-        for line in range(count):
-            dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x[k], y[k], reach)
-            for p in range(start, stop):
-                px, py = dx + p * step_x, dy + p * step_y
-                distance = np.sqrt(px * px + py * py)
-                if distance > 0:
-                    c1, s1 = px / distance, py / distance
-                else:
-                    c1, s1 = 1.0, 0.0
-                c2, s2 = c1 * c1 - s1 * s1, 2 * c1 * s1
-                c3, s3 = c2 * c1 - s2 * s1, s2 * c1 + c2 * s1
-                c4, s4 = c2 * c2 - s2 * s2, 2 * c2 * s2
-                stray = outline[k, 0] * c2 + outline[k, 1] * s2 + outline[k, 2] * c3 + outline[k, 3] * s3
-                stray += outline[k, 4] * c4 + outline[k, 5] * s4
-                uneven = crest[k, 0] * c1 + crest[k, 1] * s1 + crest[k, 2] * c2 + crest[k, 3] * s2
-                uneven += crest[k, 4] * c3 + crest[k, 5] * s3
-                r = distance / (radius[k] * (1 + stray))
-                position = r * per_radius
-                c = int(position)
-                if c >= columns - 1:
-                    continue
-                f = position - c
-                # The rim is uneven, the floor is not.
-                inner = min(r, 1.0)
-                uneven *= inner * inner * (3 - 2 * inner)
-                lost = gone[c] * (1 - f) + gone[c + 1] * f
-                crest_here = (own_rim[c] * (1 - f) + own_rim[c + 1] * f) * (1 + uneven)
-                here = first + p
-                old = height[here]
-                plane = level + slope_x * px + slope_y * py
-                height[here] = old + lost * (plane - old) + crest_here + own_bowl[c] * (1 - f) + own_bowl[c + 1] * f
-                if lost > 1e-3:
-                    log_left[here] += np.log1p(-0.999999 * lost)
-                if brightness[k] > 0:
-                    fade = 1.0 if r < 1 else np.exp(-(r - 1) / 0.5) * (1 - r / REACH)
-                    albedo[here] += brightness[k] * fade
-        for p in range(_N_RIM):
-            angle = 2 * np.pi * p / _N_RIM
-            vertex = _nearest(
-                x[k] + label_radius[k] * np.cos(angle), y[k] + label_radius[k] * np.sin(angle), n_half, half_widths
-            )
-            rim_vertex[k, p] = vertex
-            if vertex >= 0:
-                rim_before[k, p] = log_left[vertex]
-    rim_left = np.ones(len(x))
-    for k in range(len(x)):
-        total = on_grid = 0.0
-        for p in range(_N_RIM):
-            if rim_vertex[k, p] >= 0:
-                on_grid += 1.0
-                total += np.exp(log_left[rim_vertex[k, p]] - rim_before[k, p])
-        if on_grid > 0:
-            rim_left[k] = total / on_grid
-    return sag, rim_left
