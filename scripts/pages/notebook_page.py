@@ -23,7 +23,12 @@ def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
                 pictures[name] = base64.b64decode(data["image/png"])
                 pieces.append(f"![Output of the cell above]({name})")
             elif "text/html" in data:
-                pieces.append(re.sub(r"<style.*?</style>", "", data["text/html"], flags=re.DOTALL))
+                pieces.append(_plain_table(data["text/html"]))
             else:
                 pieces.append(f"```text\n{output.get('text') or data['text/plain']}\n```")
     return "\n\n".join(pieces) + "\n", pictures
+
+
+def _plain_table(html: str) -> str:
+    """Remove a table's own style, so that it looks like the tables of the site."""
+    return re.sub(r"<style.*?</style>|(?<=<table)[^>]*", "", html, flags=re.DOTALL)
