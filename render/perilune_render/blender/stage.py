@@ -19,7 +19,7 @@ _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 _EARTH_ANGULAR_DIAMETER_DEG = 1.9
 """Angular diameter of the Earth from the Moon's mean distance."""
 _EARTHSHINE = 0.1 / 1361
-"""Irradiance of the full Earth over that of the Sun, from a secondary source."""
+"""Irradiance of the full Earth over that of the Sun."""
 
 
 def clear() -> bpy.types.Scene:

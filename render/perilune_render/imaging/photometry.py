@@ -6,7 +6,8 @@ Multiplied by mu0 it is the radiance factor I/F, the radiance over that of the p
 angle equals i + e in the principal plane only.
 
 Use: `radiance_factor("hapke_highland", mu0, mu, cos_phase)`. The functions use only arithmetic and NumPy's ufuncs, so
-that `perilune_render.blender.nodes` can call them with symbols and build shader nodes from the same code.
+that `perilune_render.blender.nodes` can call them with symbols and build shader nodes from the same code. Sources:
+docs/reference/sources.md.
 """
 
 from collections.abc import Callable
@@ -36,19 +37,19 @@ class HapkeParameters:
     h_s: float
     """Width of the surge, radians of tan(g/2)."""
     theta_bar_deg: float = 23.657
-    """Mean slope of macroscopic roughness, > 0, degrees; attributed to Sato et al. 2014, from a secondary source."""
+    """Mean slope of macroscopic roughness, > 0, degrees (Sato et al. 2014)."""
 
 
 HIGHLAND = HapkeParameters(0.385, 0.2375, 0.325, 1.686, 0.0672)
-"""Median of latitudes within 30 degrees, 643 nm, attributed to Sato et al. 2014, from a secondary source."""
+"""Median of latitudes within 30 degrees, 643 nm (Sato et al. 2014)."""
 MARE = HapkeParameters(0.222, 0.254, 0.160, 1.993, 0.0597)
-"""Mare Tranquillitatis, 643 nm, attributed to Sato et al. 2014, from a secondary source."""
+"""Mare Tranquillitatis, 643 nm (Sato et al. 2014)."""
 MEAN = HapkeParameters(0.2242, 0.24575, 0.2425, 1.8395, 0.06345)
 """The mean Moon: b, c, B_S0 and h_S midway between mare and highland, w fitted by us.
 
 w makes the mean ratio of the law to a published fit to NAC images 1, over incidences of 5 to 80 degrees in nadir view.
-The published fit, from a secondary source, is ln(I/F) = -2.98 - 0.011 g - 0.81 cos e + 1.32 cos i. The ratio is 0.92 to
-1.19 up to 70 degrees and falls to 0.63 at 80 degrees, where the law is darker than the fit.
+The published fit is ln(I/F) = -2.98 - 0.011 g - 0.81 cos e + 1.32 cos i. The ratio is 0.92 to 1.19 up to 70 degrees and
+falls to 0.63 at 80 degrees, where the law is darker than the fit.
 """
 
 
@@ -81,8 +82,8 @@ def roughness(theta_bar_deg: float, mu0: Any, mu: Any, cos_phase: Any) -> tuple[
 
     Returns the effective cosine of the larger of incidence and emission, that of the smaller, and S / (mu0 mue). Hapke
     gives two cases, i <= e and e <= i, which differ only by exchanging the two angles. Ordered by size they are one
-    case, and S / (mu0 mue) is the same in both. The formulas come from a secondary source, which attributes them to
-    Hapke's book of 2012, chapter 12. In this form S exceeds 1 at grazing angles, by at most 7 percent up to 85 degrees.
+    case, and S / (mu0 mue) is the same in both. The formulas are those of Hapke's book of 2012, chapter 12. In this
+    form S exceeds 1 at grazing angles, by at most 7 percent up to 85 degrees.
     """
     slope = float(np.tan(np.radians(theta_bar_deg)))
     chi = float(1 / np.sqrt(1 + np.pi * slope**2))
@@ -127,10 +128,10 @@ LUNAR_LAMBERT_SCALE = 0.0503
 def lunar_lambert(mu0: Any, mu: Any, cos_phase: Any) -> Any:
     """McEwen's lunar-Lambert law, I/F = scale [2 L mu0/(mu0+mu) + (1-L) mu0].
 
-    L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3, g in degrees, attributed to McEwen 1991
-    (doi 10.1016/0019-1035(91)90053-V) and his later work, from a secondary source. Valid up to g = 104 degrees, where
-    the polynomial falls below 0; beyond, L is 0. The law describes how brightness varies over a surface at one phase
-    angle. Deviation: McEwen's factor that falls with the phase angle, fitted to each image, is constant here.
+    L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3, g in degrees (McEwen 1991, doi 10.1016/0019-1035(91)90053-V). Valid up
+    to g = 104 degrees, where the polynomial falls below 0; beyond, L is 0. The law describes how brightness varies over
+    a surface at one phase angle. Deviation: McEwen's factor that falls with the phase angle, fitted to each image, is
+    constant here.
     """
     g = np.arccos(np.minimum(np.maximum(cos_phase, -1), 1)) * (180 / np.pi)
     share = np.maximum(1 + g * (-0.019 + g * (2.42e-4 + g * -1.46e-6)), 0)

@@ -1,1 +1,1 @@
-"""The ground as plain data, independent of Blender: laws, populations, height field."""
+"""The ground as plain data, independent of Blender: laws, populations, heights. Sources: docs/reference/sources.md."""

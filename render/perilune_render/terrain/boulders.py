@@ -1,9 +1,9 @@
 """The boulder population and the rock shapes.
 
-Shapes: convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (S/I 0.770, I/L 0.758,
-from a secondary source); some are cut by planes, like fractured rocks. Deviation: near fresh craters, observed counts
-fall more steeply above 4.4 m (exponent -4, from a secondary source). Here one exponent is used everywhere, and
-a boulder of a crater's field is at most a twentieth of the crater's diameter.
+Shapes: convex hulls of points on ellipsoids with the mean axis ratios of Tsuchiyama et al. 2022 (S/I 0.770, I/L 0.758);
+some are cut by planes, like fractured rocks. Deviation: near fresh craters, observed counts fall more steeply above
+4.4 m (exponent -4). Here one exponent is used everywhere, and a boulder of a crater's field is at most a twentieth of
+the crater's diameter.
 """
 
 from dataclasses import dataclass
@@ -53,8 +53,8 @@ def draw_boulders(config: BouldersConfig, grid: Grid, craters: Craters, seed: in
     """Draw the boulders of a scene: a uniform density on the plain, and fields around young craters.
 
     Fields surround primary craters of at least 10 m. At the rim of a newly formed crater the density of its field is
-    `field_density` times that of the plain. It falls with distance as exp(-(x - 1) / 0.7), x = r/R, and with age as
-    (1 - age / 4 Gyr)^3, both from a secondary source, and with the crater's wear as exp(-K / 0.05 R^2), our choice.
+    `field_density` times that of the plain. It falls with distance as exp(-(x - 1) / 0.7), x = r/R, with age as
+    (1 - age / 4 Gyr)^3, and with the crater's wear as exp(-K / 0.05 R^2), our choice.
     """
     rng = stream(seed, "boulders")
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())

@@ -125,8 +125,7 @@ class TraskEquilibrium(SizeFrequency):
 class MintonEquilibrium(SizeFrequency):
     """Equilibrium of small craters on a mare, N(>D) = 0.0336 D^-2 per square metre.
 
-    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021, with the constant from a secondary source. The support is that
-    of Trask's law.
+    Minton et al. 2019, doi 10.1016/j.icarus.2019.02.021. The support is that of Trask's law.
     """
 
     share: float = 1.0
@@ -140,7 +139,7 @@ class MintonEquilibrium(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViperEquilibrium(SizeFrequency):
-    """Craters of the VIPER landing area, N(>D) = 29174 D^-1.92 per km^2 up to 80 m, from a secondary source.
+    """Craters of the VIPER landing area, N(>D) = 29174 D^-1.92 per km^2 up to 80 m.
 
     Above 80 m the law is extrapolated (our extension); there production is below it for most ages.
     """
@@ -177,7 +176,7 @@ class ChangE4Equilibrium(SizeFrequency):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoulderLaw(SizeFrequency):
-    """Boulders, N(>D) = 3e-4 D^-2.482 per square metre, used for the VIPER landing area, from a secondary source."""
+    """Boulders, N(>D) = 3e-4 D^-2.482 per square metre, used for the VIPER landing area."""
 
     density: float = 1.0
     """Density relative to the published law."""

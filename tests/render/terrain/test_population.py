@@ -146,7 +146,7 @@ def rises(scene, baseline_m, n=40_000):
 
 
 def test_finished_ground_has_the_slopes_and_the_hurst_exponent_asked_for():
-    """Craters and relief together. Published for baselines of metres to tens of metres, second hand: H 0.7 to 0.95."""
+    """Craters and relief together. Published for baselines of metres to tens of metres: H 0.7 to 0.95."""
     median = {}
     for region in ("mare", "highland"):
         scene = grown(region)

@@ -100,8 +100,7 @@ class Craters:
 def diffusivity_m2_per_myr(diameter_m: Array) -> Array:
     """Topographic diffusivity at the scale of a crater, m^2/Myr.
 
-    5.5 m^2/Myr at 1 km (Fassett & Thomson 2014, doi 10.1002/2014JE004698). The dependence on size as D^0.9 is
-    from a secondary source, without a primary source.
+    5.5 m^2/Myr at 1 km (Fassett & Thomson 2014, doi 10.1002/2014JE004698). It depends on size as D^0.9.
     """
     return 5.5 * (np.asarray(diameter_m) / 1000) ** 0.9
 

@@ -8,9 +8,9 @@ end of the ejecta blanket would render as a ring.
   scaled by 13 % to meet the crest (as printed it leaves a step of 0.004 D). Cubics round the crest and the end of the
   blanket, where the source has a flat crest and ends at x = 1.5 with a slope. The bowl is scaled to the given depth,
   and a soft minimum rounds its floor, where the source cuts it flat. `flat` keeps that cut, softened.
-- `pangu`: a parabolic bowl, a cubic flank and ejecta that thin as x^-3, as in the simulator PANGU (Martin, Parkes
-  & Dunstan 2014, doi 10.1109/TAES.2014.120282, from a secondary source). Deviations: its printed constants beta and h3
-  are not used, since they give unrealistic shapes; the crest is rounded, and the ejecta end at REACH.
+- `pangu`: a parabolic bowl, a cubic flank and ejecta that thin as x^-3, as in the simulator PANGU (Martin, Parkes &
+  Dunstan 2014, doi 10.1109/TAES.2014.120282). Deviations: its printed constants beta and h3 are not used, since they
+  give unrealistic shapes; the crest is rounded, and the ejecta end at REACH.
 
 Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solved exactly on a radial grid. With x = r/R
 it depends on K/R^2 alone, K = kappa t. The profile is linear in h_rim and d, and diffusion is linear, so one table for
@@ -116,9 +116,9 @@ def _sunk(x: Array, profile: str, flat: bool) -> Array:
 def fresh_depth_m(diameter_m: Array, law: str = "stopar") -> Array:
     """Depth of a newly formed crater from rim to floor, metres.
 
-    `stopar`: Stopar et al. 2017, from a secondary source. Their steps of d/D (0.21 from 400 m, 0.17, 0.15, 0.13 from
-    40 m; extrapolated to 0.11 and 0.10 below) are interpolated linearly in log D between the middles of their ranges.
-    `pike`: Pike 1977, from a secondary source, 0.196 D^1.01 km with D in km; derived for larger craters.
+    `stopar`: Stopar et al. 2017. Their steps of d/D (0.21 from 400 m, 0.17, 0.15, 0.13 from 40 m; extrapolated to 0.11
+    and 0.10 below) are interpolated linearly in log D between the middles of their ranges.
+    `pike`: Pike 1977, 0.196 D^1.01 km with D in km; derived for larger craters.
     """
     d = np.asarray(diameter_m, np.float64)
     if law == "pike":
@@ -132,7 +132,7 @@ def fresh_rim_height_m(diameter_m: Array, depth_m: Array, profile: str = "fasset
     `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to Pike's depth. At 1 km this is 0.0368 D, the
     value of the source, which is for craters of 1 km; with that share of D, small shallow craters would be mostly rim.
     `pangu`: the smaller of the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), and Pike's rim
-    height, 0.036 D^1.014 km with D in km; both from secondary sources.
+    height, 0.036 D^1.014 km with D in km.
     """
     if profile == "pangu":
         d = np.asarray(diameter_m, np.float64)
