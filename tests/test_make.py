@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import re
 import shlex
 import subprocess
 from pathlib import Path
@@ -63,3 +64,12 @@ def test_settings_that_are_no_words_are_told(given):
     done = make("-n", "dataset", f"SET={given}", check=False)
     assert done.returncode == 2 and "SET: got" in done.stderr and "expected shell words" in done.stderr
     assert "perilune-render" not in done.stdout
+
+
+def test_the_image_installs_from_what_make_setup_reads():
+    """The Dockerfile copies these files before the rest, so that a change of the code installs nothing again."""
+    read = re.search(r"^\$\(VENV\)/\.ready: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert read is not None
+    before_setup, _ = (ROOT / "Dockerfile").read_text().split("RUN make setup")
+    for name in ["requirements-dev.txt", *read.group(1).split()]:
+        assert re.search(rf"^COPY .*\b{re.escape(name)}\b", before_setup, re.MULTILINE), name
