@@ -7,6 +7,8 @@ import stat
 import tempfile
 from pathlib import Path
 
+import platformdirs
+
 from perilune_render.provenance.fingerprint import compiled_functions, fingerprint
 
 _KEPT = 5
@@ -19,14 +21,8 @@ def cache_home() -> Path:
     Other users may write to the temporary folder, and numba executes the files it reads. If the folder there is not
     owned by the user or is accessible to others, a new folder with a random name is used.
     """
-    if os.environ.get("XDG_CACHE_HOME"):
-        return Path(os.environ["XDG_CACHE_HOME"]) / "perilune"
-    try:
-        home = Path.home()
-        if home.is_dir():
-            return home / ".cache" / "perilune"
-    except RuntimeError:  # no HOME and no entry in the password database, as in containers
-        pass
+    if Path(os.environ.get("XDG_CACHE_HOME", "")).is_absolute() or _has_home():
+        return platformdirs.user_cache_path("perilune")
     folder = Path(tempfile.gettempdir()) / f"perilune-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -36,6 +32,13 @@ def cache_home() -> Path:
     except OSError:
         pass
     return Path(tempfile.mkdtemp(prefix="perilune-"))
+
+
+def _has_home() -> bool:
+    try:
+        return Path.home().is_dir()
+    except RuntimeError:  # no HOME and no entry in the password database, as in containers
+        return False
 
 
 @functools.cache

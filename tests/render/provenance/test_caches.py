@@ -37,8 +37,17 @@ def test_a_folder_that_others_may_write_is_not_taken(homeless):
     assert cache_home() != theirs
 
 
-def test_a_home_that_is_no_folder_is_none(homeless, monkeypatch):
-    monkeypatch.setattr(Path, "home", lambda: homeless / "nonexistent")
+def test_a_home_that_is_no_folder_is_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "nonexistent"))
+    assert cache_home().parent == tmp_path
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache_home() == tmp_path / ".cache" / "perilune"
+
+
+def test_only_an_absolute_xdg_folder_is_used(homeless, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(homeless / "xdg"))
+    assert cache_home() == homeless / "xdg" / "perilune"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     assert cache_home().parent == homeless
-    monkeypatch.setattr(Path, "home", lambda: homeless)
-    assert cache_home() == homeless / ".cache" / "perilune"

@@ -1,9 +1,10 @@
 """Location of an image on the Moon, and detections as GeoJSON.
 
-The georeference is a GeoTIFF's own, or a world file (.pgw, .tfw, .jgw) with the projection's .prj beside the image. It
-is read with rasterio, which is needed only for this (the extra `geo`).
+The georeference is a GeoTIFF's own, or a world file (.pgw, .tfw, .jgw) with the projection's .prj beside the image.
+Reading it needs rasterio and pyproj (the extra `geo`).
 """
 
+import functools
 import importlib.util
 import warnings
 from dataclasses import dataclass
@@ -45,22 +46,22 @@ class Georeference:
 
         Raises UserError if the projection is not one of the Moon.
         """
-        from rasterio._err import CPLE_AppDefinedError, CPLE_BaseError
-        from rasterio.errors import RasterioError
-        from rasterio.warp import transform
+        from pyproj.exceptions import ProjError
 
         a, b, c, d, e, f = self.transform
         x, y = a * pixels[:, 0] + b * pixels[:, 1] + c, d * pixels[:, 0] + e * pixels[:, 1] + f
         try:
-            return np.stack(transform(self.projection, _MOON, x, y)[:2], axis=1)
-        except CPLE_AppDefinedError:
-            # One point outside the projection's domain fails the whole call: bisect until it is alone.
-            half = len(pixels) // 2
-            if half == 0:
-                return np.full((1, 2), np.inf)
-            return np.concatenate([self.lon_lat_deg(part) for part in (pixels[:half], pixels[half:])])
-        except (RasterioError, CPLE_BaseError, ValueError) as error:
+            return np.stack(_lon_lat_from_map(self.projection).transform(x, y), axis=1)
+        except ProjError as error:
             raise UserError(self.path, "projection", error, "a coordinate reference system of the Moon") from None
+
+
+@functools.cache
+def _lon_lat_from_map(projection: str) -> Any:
+    """The pyproj.Transformer to longitude and latitude on the Moon. Raises ProjError for other bodies."""
+    from pyproj import Transformer
+
+    return Transformer.from_crs(projection, _MOON, always_xy=True)
 
 
 def read_georeference(path: Path) -> Georeference | None:
@@ -91,9 +92,9 @@ def read_georeference(path: Path) -> Georeference | None:
     return found
 
 
-def has_rasterio() -> bool:
-    """Whether rasterio is installed, so that georeferences can be read."""
-    return importlib.util.find_spec("rasterio") is not None
+def can_read_georeferences() -> bool:
+    """Whether rasterio and pyproj are installed."""
+    return all(importlib.util.find_spec(name) is not None for name in ("rasterio", "pyproj"))
 
 
 def features(name: str, found: Detections, reference: Georeference) -> list[dict[str, Any]]:
@@ -103,6 +104,8 @@ def features(name: str, found: Detections, reference: Georeference) -> list[dict
     latitude: the corners of such a crater are right, its filling is not. Detections that reach off the map are left
     out.
     """
+    from pyproj import Geod
+
     if not len(found.boxes):
         return []
     centre, half = (found.boxes[:, :2] + found.boxes[:, 2:]) / 2, (found.boxes[:, 2:] - found.boxes[:, :2]) / 2
@@ -114,7 +117,9 @@ def features(name: str, found: Detections, reference: Georeference) -> list[dict
     places, centre, half, scores = places[on_map], centre[on_map], half[on_map], found.scores[on_map]
     places[:, 1:, 0] -= 360 * np.round((places[:, 1:, 0] - places[:, :1, 0]) / 360)
     quarter = _CORNERS // 4
-    along, across = (great_circle_m(places[:, 1 + k], places[:, 1 + k + 2 * quarter]) for k in (0, quarter))
+    sphere = Geod(a=MOON_RADIUS_M, b=MOON_RADIUS_M)
+    ends = ((places[:, 1 + k], places[:, 1 + k + 2 * quarter]) for k in (0, quarter))
+    along, across = (sphere.inv(*start.T, *end.T)[2] for start, end in ends)
     rows = zip(places, np.sqrt(along * across), 2 * np.sqrt(half.prod(axis=1)), scores, centre, strict=True)
     return [
         {
@@ -143,13 +148,6 @@ def collection(parts: list[dict[str, Any]]) -> dict[str, Any]:
     """
     crs = {"type": "name", "properties": {"name": MOON_CRS}}
     return {"type": "FeatureCollection", "name": "craters", "crs": crs, "features": parts}
-
-
-def great_circle_m(first: Array, second: Array) -> Array:
-    """Distances (N,) on the Moon's sphere, metres, of longitudes and latitudes (N, 2) in degrees (haversine)."""
-    (lon0, lat0), (lon1, lat1) = np.radians(first).T, np.radians(second).T
-    h = np.sin((lat1 - lat0) / 2) ** 2 + np.cos(lat0) * np.cos(lat1) * np.sin((lon1 - lon0) / 2) ** 2
-    return 2 * MOON_RADIUS_M * np.arcsin(np.sqrt(np.clip(h, 0, 1)))
 
 
 def _ring(corners: Array) -> list[list[float]]:

@@ -17,9 +17,9 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.evaluate_run import read_metrics, threshold_of
 from perilune_train.detect.images.georeference import (
     Georeference,
+    can_read_georeferences,
     collection,
     features,
-    has_rasterio,
     read_georeference,
 )
 from perilune_train.detect.images.read import picture_size, read_grey
@@ -89,10 +89,10 @@ def predict_images(
 
 
 def _reference(path: Path) -> Georeference | None:
-    if has_rasterio():
+    if can_read_georeferences():
         return read_georeference(path)
     if path.suffix.lower() in (".tif", ".tiff") or path.with_suffix(".prj").is_file():
-        console.print(f"{path.name}: no georeference is read without rasterio (pip install 'perilune-train[geo]')")
+        console.print(f"{path.name}: its georeference needs rasterio and pyproj (pip install 'perilune-train[geo]')")
     return None
 
 
