@@ -8,7 +8,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from perilune_shared.geometry.descent import NominalDescent
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 
 def axes(ax, origin, vectors, names, colour, length):
@@ -24,7 +24,7 @@ def main() -> None:
     """Write docs/pictures/frames.png."""
     figure = plt.figure(figsize=(10, 8))
     ax = figure.add_subplot(projection="3d", computed_zorder=False)
-    descent = NominalDescent.parabola(1500, 200, 1100, 300.0, 65.0)
+    descent = NominalTrajectory.parabola(1500, 200, 1100, 300.0, 65.0)
     path = descent.position_at(np.linspace(0, 65, 100))
     x, y = np.meshgrid([-1000, 1400], [-1000, 1000])
     ax.plot_surface(x, y, np.zeros_like(x), color="0.8", alpha=0.35)

@@ -23,7 +23,7 @@ from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.craters import profile
 from perilune_render.terrain.scene import Scene
 from perilune_shared.config import resolve
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.storage.files import written_aside
 

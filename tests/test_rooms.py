@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
         "errors run_record terminal progress content yaml_text config_errors config config_page storage geometry "
-        "dataset validation editing export cli"
+        "dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
         "config_values config_terrain config streams interrupts provenance terrain flight imaging labels "
@@ -88,7 +88,8 @@ for module in {modules!r}:
 
 
 SHARED_ROOMS = [
-    f"perilune_shared.{room}" for room in ["storage", "geometry", "dataset", "validation", "editing", "export"]
+    f"perilune_shared.{room}"
+    for room in ["storage", "geometry", "dataset", "labels", "validation", "editing", "export"]
 ]
 
 

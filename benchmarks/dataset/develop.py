@@ -16,7 +16,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.dataset.develop import develop_dataset
 from perilune_render.dataset.render import make_dataset
 from perilune_shared.config import resolve
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 
 SETTINGS = (
     "dataset.render.exr=true",

@@ -13,15 +13,16 @@ import numpy as np
 import pyarrow as pa
 
 from benchmarks.figures import write_figures
+from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import count_rows, open_dataset
-from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
+from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
+from perilune_shared.dataset.names import frame_path
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
-from perilune_shared.dataset.writer import frame_path
 from perilune_shared.editing.pack import pack
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.progress import progress_bar
 from perilune_shared.storage.checksums import seal
+from perilune_shared.terminal import progress_bar
 
 N_SCENES, N_FRAMES, N_LABELS, N_CRATERS = 1000, 100, 50, 2000
 """Scenes of one trajectory each, frames per scene, labels per frame, craters per scene."""
@@ -88,7 +89,7 @@ def _fill(root: Path, progress) -> None:
         complete=True,
         images="absent",
         split_by="scene",
-        camera=CameraInfo.of(camera),
+        camera=CameraRecord.of(camera),
         recipes=recipes_of(recipe),
         counts=Counts(),
         licence="CC0-1.0",

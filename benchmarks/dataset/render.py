@@ -28,7 +28,7 @@ from perilune_render.imaging.exr import read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.config import resolve
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 
 N_FRAMES = 38
 

@@ -29,10 +29,9 @@ from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.config import resolve
 from perilune_shared.errors import UserError, run_command_line
-from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import Array, sun_direction
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 
 FRAME_PX, FOV_DEG = 400, 12.0
 THRESHOLDS_PX = (8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)

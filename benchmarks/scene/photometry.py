@@ -21,7 +21,7 @@ from perilune_render.imaging.photometry import radiance_factor
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array, sun_direction
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 
 PHASE_DEG = (0, 0.5, 1, 2, 5, 10, 20, 30, 45, 60, 75, 90, 105, 120, 135, 140)
 EMISSION_DEG = np.arange(0, 61, 5)

@@ -30,7 +30,7 @@ from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.config import resolve
 from perilune_shared.geometry.frames import sun_direction
-from perilune_shared.progress import progress_bar
+from perilune_shared.terminal import progress_bar
 
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000)
 

@@ -23,8 +23,7 @@ from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.export import vertices
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, sun_direction
 
 CAMERA = Camera.from_field_of_view(160, 128, 50.0)

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import write_figures
 from perilune_shared.dataset.manifest import Dataset, open_dataset
-from perilune_shared.dataset.selection import read_labels, selected
-from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.errors import run_command_line
 from perilune_shared.geometry.frames import Array
+from perilune_shared.labels.selection import read_labels, selected
+from perilune_shared.labels.thresholds import SELECTIONS
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.bins import RADIUS_BINS_PX

@@ -2,16 +2,17 @@
 
 import tempfile
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, get_args
 
 import typer
 from rich.console import Console
 
 import perilune_shared as ps
-from perilune_render.cli_options import Catalogue, Config, Dem, Kind, Preset, Setting, first_kind, one_kind
+from perilune_render.cli_options import Catalogue, Config, Dem, KindChoice, Preset, Setting, first_kind, one_kind
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
+from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import EXIT_USER_ERROR, UserError, run_command_line
 from perilune_shared.terminal import progress_bar
 
@@ -67,7 +68,7 @@ def dataset(
     setting: Setting = None,
     dem: Dem = None,
     catalogue: Catalogue = None,
-    kind: Annotated[Kind, typer.Option(help="Crater detection, navigation, or both.")] = Kind.BOTH,
+    kind: Annotated[KindChoice, typer.Option(help="Crater detection, navigation, or both.")] = "both",
     out: Annotated[
         Path | None,
         typer.Option(help="Folder for the datasets `detect` and `nav`; data/<preset> unless given."),
@@ -83,14 +84,13 @@ def dataset(
         _render_manifest(manifest, out, dem, catalogue, given)
         return
     resolved = _resolve(preset, config, setting, dem, catalogue)
-    if kind is not Kind.NAV:
+    if kind != "nav":
         _warn_of_size(resolved)
     folder = out or Path("data") / preset
     # Importing Blender takes seconds; check the settings first.
     from perilune_render.dataset.render import make_dataset
 
-    names: tuple[Literal["detect", "nav"], ...] = ("detect", "nav")
-    for name in names if kind is Kind.BOTH else (first_kind(kind),):
+    for name in KINDS if kind == "both" else (kind,):
         with progress_bar() as progress:
             made = make_dataset(resolved, name, preset, folder / name, progress)
         counts = made.info.counts
@@ -154,11 +154,11 @@ def plan(
     setting: Setting = None,
     dem: Dem = None,
     catalogue: Catalogue = None,
-    kind: Annotated[Kind, typer.Option(help="Crater detection or navigation (detect or nav).")] = Kind.DETECT,
+    kind: Annotated[KindChoice, typer.Option(help="Crater detection or navigation (detect or nav).")] = "detect",
 ) -> None:
     """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
-    if kind is not Kind.NAV:
+    if kind != "nav":
         _warn_of_size(resolved)
     from perilune_render.dataset.manifest_only import write_manifest_only
 
@@ -216,7 +216,7 @@ def preview(
     setting: Setting = None,
     dem: Dem = None,
     catalogue: Catalogue = None,
-    kind: Annotated[Kind, typer.Option(help="Whose first scene and descent (detect or nav).")] = Kind.DETECT,
+    kind: Annotated[KindChoice, typer.Option(help="Whose first scene and descent (detect or nav).")] = "detect",
     out: Annotated[Path, typer.Option(help="File of the picture.")] = Path("preview.png"),
 ) -> None:
     """Render a contact sheet of a configuration, with and without labels, in seconds."""
@@ -234,7 +234,7 @@ def export(
     setting: Setting = None,
     dem: Dem = None,
     catalogue: Catalogue = None,
-    kind: Annotated[Kind, typer.Option(help="Whose first scene (detect or nav).")] = Kind.DETECT,
+    kind: Annotated[KindChoice, typer.Option(help="Whose first scene (detect or nav).")] = "detect",
     step: Annotated[int, typer.Option(min=1, help="Times the mesh's own vertex spacing.")] = 4,
     pixel_m: Annotated[float, typer.Option(min=0.01, help="Ground size of a GeoTIFF's pixel, metres.")] = 1.0,
     out: Annotated[Path, typer.Option(help="A .glb, .ply, .obj or .stl mesh, or a .tif of heights.")] = Path(

@@ -1,22 +1,15 @@
 """Options shared by several commands of `perilune-render`."""
 
-import enum
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
 
-
-class Kind(enum.StrEnum):
-    """Which of a preset's two datasets."""
-
-    DETECT = "detect"
-    NAV = "nav"
-    BOTH = "both"
-
-
+KindChoice = Literal[Kind, "both"]
+"""Which of a preset's two datasets."""
 Preset = Annotated[
     str,
     typer.Option(
@@ -37,13 +30,13 @@ Catalogue = Annotated[
 ]
 
 
-def first_kind(kind: Kind) -> Literal["detect", "nav"]:
+def first_kind(kind: KindChoice) -> Kind:
     """The dataset of this kind; detect for `both`."""
-    return "nav" if kind is Kind.NAV else "detect"
+    return "detect" if kind == "both" else kind
 
 
-def one_kind(kind: Kind) -> Literal["detect", "nav"]:
+def one_kind(kind: KindChoice) -> Kind:
     """The dataset of this kind. Raises UserError for `both`."""
-    if kind is Kind.BOTH:
+    if kind == "both":
         raise UserError("--kind", "kind", "both", "detect or nav: one dataset")
     return first_kind(kind)

@@ -7,7 +7,8 @@ from pydantic import Field, model_validator
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
-from perilune_shared.dataset.thresholds import default_label_bound_px
+from perilune_shared.dataset.names import SplitUnit
+from perilune_shared.labels.thresholds import default_label_bound_px
 
 
 class DistortionConfig(Section):
@@ -95,7 +96,7 @@ class KindConfig(Section):
     """Number of trajectories over each scene."""
     n_frames: Annotated[int, Field(ge=2)]
     """Number of frames of each trajectory."""
-    split_by: Literal["scene", "trajectory", "frame"]
+    split_by: SplitUnit
     """Unit of the split: each scene, trajectory or frame belongs to one split as a whole."""
     val_share: Share = 0.1
     """Share of these units in the validation split."""

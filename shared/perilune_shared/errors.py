@@ -27,11 +27,11 @@ _DISK_FAULTS = (
 class UserError(Exception):
     """An error in the user's input: file or place, field, value found, and value expected."""
 
-    def __init__(self, where: object, field: str, found: object, wanted: str):
+    def __init__(self, where: object, field: str, found: object, expected: str):
         # These texts may come from untrusted files and may be of any length.
-        self.field, self.found, self.wanted = shortened(field), shortened(found), shortened(wanted, 500)
+        self.field, self.found, self.expected = shortened(field), shortened(found), shortened(expected, 500)
         super().__init__(
-            one_line(f"{shortened(where, 4200)}: {self.field}: got {self.found}, expected {self.wanted}"),
+            one_line(f"{shortened(where, 4200)}: {self.field}: got {self.found}, expected {self.expected}"),
         )
 
 
@@ -55,12 +55,12 @@ def run_command_line(app: Callable[[], object]) -> None:
     except OSError as error:
         if error.errno not in _DISK_FAULTS:
             raise
-        fail = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; what was finished stays valid"
+        fail = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; finished files stay valid"
     except (KeyboardInterrupt, SystemExit) as stop:
         # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
         if isinstance(stop, SystemExit) and stop.code != _EXIT_INTERRUPTED:
             raise
-        print("stopped; what was finished stays valid and can be resumed", file=sys.stderr)
+        print("stopped; finished files stay valid; run the same command again to resume", file=sys.stderr)
         sys.exit(_EXIT_INTERRUPTED)
     else:
         return

@@ -8,8 +8,7 @@ import pytest
 from benchmarks.scene import rings
 from perilune_render.imaging.resampling import refined
 from perilune_render.labels.frame_labels import RimCircles
-from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 
 CAMERA = Camera(160, 128, 170.0, 170.0, 70.0, 68.0)

@@ -14,13 +14,14 @@ import pyarrow.compute as pc
 
 import perilune_shared
 from perilune_shared.content import content_sha256
-from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
+from perilune_shared.dataset.info_file import write_info
+from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
 from perilune_shared.dataset.parts import WHOLE_TABLE, write_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.geometry import frames
-from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY, NominalDescent
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.ellipse import project_circles
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_shared.storage.checksums import seal
 
 _TEXEL_M = 2.0
@@ -97,7 +98,7 @@ def build_dataset(
         if scene not in grounds:
             grounds[scene] = _Ground(np.random.default_rng([seed, 1000, int(scene[1:])]), craters)
             _add_scene(rows, scene, grounds[scene], recipe.key)
-        nominal = NominalDescent.parabola(**_PARABOLA, azimuth_deg=float(rng.uniform(0, 360)))
+        nominal = NominalTrajectory.parabola(**_PARABOLA, azimuth_deg=float(rng.uniform(0, 360)))
         rows["trajectories"].append(
             {
                 "scene_id": scene,
@@ -163,7 +164,7 @@ def build_dataset(
         complete=True,
         images="files",
         split_by="scene" if scenes is None else "trajectory",
-        camera=CameraInfo.of(camera),
+        camera=CameraRecord.of(camera),
         recipes=recipes_of(recipe),
         counts=Counts(**{name: len(table) for name, table in tables.items()}),
         licence="CC0-1.0",

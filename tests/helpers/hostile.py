@@ -132,7 +132,7 @@ def told_of(root: Path) -> Told:
     except UserError as error:
         assert "\n" not in str(error) and len(str(error)) < 6000
         return [(str(error), str(error))]
-    assert all(len(text) <= 300 for fault in faults for text in (fault.file, fault.column, fault.found, fault.wanted))
+    assert all(len(text) <= 300 for fault in faults for text in (fault.file, fault.column, fault.found, fault.expected))
     return [(fault.file, fault.column) for fault in faults]
 
 

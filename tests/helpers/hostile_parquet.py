@@ -108,7 +108,7 @@ def groups(footer: Fields) -> list[Fields]:
 
 
 def columns(group: Fields) -> list[Fields]:
-    """Metadata of a row group's columns: 5 num_values, 6 and 7 bytes unpacked and packed, 9 to 11 offsets."""
+    """Metadata of a row group's columns: 5 num_values, 6 and 7 decompressed and compressed bytes, 9 to 11 offsets."""
     return [chunk[3][1] for chunk in group[1][1][1]]
 
 

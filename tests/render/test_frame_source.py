@@ -12,8 +12,7 @@ from perilune_render.flight.plan import camera_of
 from perilune_render.frame_source import FrameSource, Shot
 from perilune_render.imaging.sensor import expected
 from perilune_render.labels.frame_labels import RimCircles
-from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.frames import sun_direction
 
 CAMERA = Camera.from_field_of_view(96, 64, 50.0)

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 from tests.helpers.drawn_dataset import build_dataset
 
+from perilune_shared.dataset.info_file import read_info
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.metadata import read_info
-from perilune_shared.dataset.writer import written
+from perilune_shared.dataset.packed import write_packed
+from perilune_shared.dataset.writer import new_dataset
 
 
 @pytest.fixture(scope="session")
@@ -35,12 +36,12 @@ def crowded_packed(crowded, tmp_path_factory) -> Path:
     """The same with whole tables and its frames in Parquet."""
     source, out = open_dataset(crowded), tmp_path_factory.mktemp("packed") / "set"
     info = read_info(crowded).model_copy(update={"images": "packed"})
-    with written(out, info, whole_tables=True) as writer:
+    with new_dataset(out, info, whole_tables=True) as writer:
         for scene_id in source.scene_ids():
             writer.add_scene(source.scene(scene_id))
         frames = source.table("frames")
         paths = dict(zip(frames["frame_id"].to_pylist(), frames["png_path"].to_pylist(), strict=True))
-        writer.pack_images(((name, paths[name], png) for name, png in source.pngs(frames)), shard_bytes=100_000)
+        write_packed(writer.root, ((name, paths[name], png) for name, png in source.pngs(frames)), shard_bytes=100_000)
     return out
 
 

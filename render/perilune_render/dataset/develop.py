@@ -155,7 +155,7 @@ def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
     if not source.info.complete:
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
     camera = camera_of(config.camera)
-    exr_camera = (source.info.exr_camera or source.info.camera).intrinsics()
+    exr_camera = source.exr_camera
     if not exr_camera.covers(camera):
         raise UserError(
             "--set or --config",
@@ -171,7 +171,7 @@ def _develop_trajectory(source: Dataset, out: Path, frame_source: FrameSource, f
     """Develop one trajectory, given its rows of the source's table `frames` and its random seed."""
     scene_id, trajectory_id = (frames[name][0].as_py() for name in ("scene_id", "trajectory_id"))
     known = None
-    if frame_source.camera == source.info.camera.intrinsics():
+    if frame_source.camera == source.camera:
         table = source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id).to_pandas()
         known = {frame_id: rows for frame_id, rows in table.groupby("frame_id")}
         none = table.iloc[:0]

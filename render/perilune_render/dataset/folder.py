@@ -8,8 +8,9 @@ import numpy as np
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.overview import write_overview
 from perilune_render.flight.plan import Plan
+from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import Dataset, count_rows, open_dataset
-from perilune_shared.dataset.metadata import CameraInfo, Counts, DatasetInfo, Recipe, recipes_of, write_info
+from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION
 from perilune_shared.errors import UserError
@@ -33,8 +34,8 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
         complete=False,
         images="files",
         split_by=split_by,
-        camera=CameraInfo.of(plan.camera),
-        exr_camera=CameraInfo.of(plan.exr_camera) if config.render.exr else None,
+        camera=CameraRecord.of(plan.camera),
+        exr_camera=CameraRecord.of(plan.exr_camera) if config.render.exr else None,
         recipes=recipes_of(recipe),
         counts=Counts(),
         licence=LICENCE,

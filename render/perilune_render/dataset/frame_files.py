@@ -7,7 +7,7 @@ import numpy as np
 
 from perilune_render.frame_source import Frame, FrameSource
 from perilune_render.imaging.exr import write_exr
-from perilune_shared.dataset.writer import frame_path
+from perilune_shared.dataset.names import ImageKind, frame_path
 from perilune_shared.storage import files
 
 
@@ -33,7 +33,7 @@ def write_png(path: Path, image: np.ndarray, bits: int) -> None:
     files.write_bytes(path, cv2.imencode(".png", stored)[1].tobytes(), durable=False)
 
 
-def _columns(root: Path, frame_id: str, kind: str) -> dict[str, str | int]:
+def _columns(root: Path, frame_id: str, kind: ImageKind) -> dict[str, str | int]:
     """The columns png_* or exr_* (by `kind`) of a written file."""
     path = frame_path(frame_id, kind)
     whole = root / path

@@ -13,7 +13,7 @@ from perilune_render.provenance.recipe import config_of, recipe_of, same_source
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.errors import UserError
-from perilune_shared.geometry.descent import NominalDescent
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_shared.storage.files import sha256_of
 
 
@@ -71,7 +71,7 @@ def _descents(manifest: Dataset, scene_id: str) -> list[TrajectoryPlan]:
             tuple(row[f"nominal_{name}"]) for name in ("position_m", "velocity_mps", "acceleration_mps2")
         )
         flight = Flight(
-            NominalDescent(position, velocity, acceleration, row["duration_s"]),
+            NominalTrajectory(position, velocity, acceleration, row["duration_s"]),
             *(np.array(columns[name]) for name in ("time_s", "position_m", "velocity_mps", "rotation_wxyz")),
         )
         places, splits = tuple(columns["frame_index"]), tuple(columns["split"])

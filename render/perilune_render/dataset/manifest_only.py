@@ -13,8 +13,9 @@ from perilune_render.interrupts import interrupts_held
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground, grow_scene
-from perilune_shared.dataset.schema import TABLES, Kind
-from perilune_shared.dataset.writer import frame_path, written
+from perilune_shared.dataset.names import ImageKind, Kind, frame_path
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.writer import new_dataset
 from perilune_shared.progress import Progress
 
 
@@ -30,13 +31,13 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Pat
     recipe = recipe_of(config, kind, preset, planned=True)
     info = new_info(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes")
-    with written(out, info, whole_tables=True) as writer:
+    with new_dataset(out, info, whole_tables=True) as writer:
         for scene_plan in plan.scenes:
             with interrupts_held():
                 scene = grow_scene(config, plan.view, scene_plan.seed)
             trajectories = plan.of_scene(scene_plan.scene_id)
             check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)
-            kinds = ("png", "exr") if config.render.exr else ("png",)
+            kinds: tuple[ImageKind, ...] = ("png", "exr") if config.render.exr else ("png",)
             frames = []
             for trajectory in trajectories:
                 ids = [trajectory.frame_id(place) for place in range(len(trajectory.splits))]

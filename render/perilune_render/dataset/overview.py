@@ -6,8 +6,8 @@ import numpy as np
 from perilune_render.labels.drawing import draw_labels, enlarge, write_sheet
 from perilune_render.labels.frame_labels import Labels
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.selection import selected
-from perilune_shared.dataset.thresholds import SELECTIONS
+from perilune_shared.labels.selection import selected
+from perilune_shared.labels.thresholds import SELECTIONS
 
 _SHEET_FRAMES = 12
 

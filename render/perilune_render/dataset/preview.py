@@ -18,8 +18,8 @@ from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation.model import read_elevation
 from perilune_render.terrain.scene import check_ground
-from perilune_shared.dataset.selection import selected
-from perilune_shared.dataset.thresholds import SELECTIONS
+from perilune_shared.labels.selection import selected
+from perilune_shared.labels.thresholds import SELECTIONS
 
 
 def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 4) -> None:

@@ -33,7 +33,7 @@ from perilune_shared.config import resolve_over
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Recipe
-from perilune_shared.dataset.writer import frame_path
+from perilune_shared.dataset.names import ImageKind, frame_path
 from perilune_shared.errors import UserError
 from perilune_shared.progress import Progress
 from perilune_shared.storage.files import sha256_of
@@ -126,8 +126,8 @@ def _of_scene(
     ground_config = _ground_config(recipe, config, where)
     camera, exr_camera = camera_of(config.camera), camera_of(ground_config.camera).covering_pinhole()
     view = view_envelope(exr_camera, ground_config.ground_flight(recipe.kind))
-    if camera != dataset.info.camera.intrinsics():
-        raise UserError(where, "camera", dataset.info.camera.intrinsics(), f"that of its recipe, {camera}")
+    if camera != dataset.camera:
+        raise UserError(where, "camera", dataset.camera, f"that of its recipe, {camera}")
     with interrupts_held():
         ground = cached_scene(ground_config, view, scene["seed"])
     if not same_source(ground.dem_source, scene["dem_source"]):
@@ -167,7 +167,7 @@ def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> Datase
     return config.model_copy(update={"camera": camera})
 
 
-def _compared(dataset: Dataset, row: dict, kind: str, out: Path) -> State:
+def _compared(dataset: Dataset, row: dict, kind: ImageKind, out: Path) -> State:
     """Compare a new file with the old one's hash and, if the hash differs, with the old file if it is present."""
     new = out / frame_path(row["frame_id"], kind)
     if row[f"{kind}_sha256"] is None:

@@ -36,8 +36,8 @@ from perilune_render.terrain.scene import Scene, check_ground
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.names import Kind
 from perilune_shared.dataset.parts import read_part, write_part
-from perilune_shared.dataset.schema import Kind
 from perilune_shared.errors import UserError
 from perilune_shared.progress import Progress
 

@@ -13,6 +13,7 @@ from perilune_render.flight.trajectories import Flight, fly
 from perilune_render.flight.view import view_envelope
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.envelope import ViewEnvelope
+from perilune_shared.dataset.names import frame_id_of
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, sun_direction
@@ -59,7 +60,7 @@ class TrajectoryPlan:
 
     def frame_id(self, place: int) -> str:
         """Id, unique in the dataset, of the frame at index `place` of `frame_index`."""
-        return f"{self.scene_id}/{self.trajectory_id}/{self.frame_index[place]:06d}"
+        return frame_id_of(self.scene_id, self.trajectory_id, self.frame_index[place])
 
     @property
     def split(self) -> str | None:

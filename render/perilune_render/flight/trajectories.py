@@ -6,20 +6,21 @@ import numpy as np
 
 from perilune_render.config import FlightConfig
 from perilune_render.streams import stream
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY, NominalDescent
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import (
     Array,
     matrix_from_quaternion,
     matrix_from_rotation_vector,
     quaternion_from_matrix,
 )
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 
 @dataclass(frozen=True, slots=True)
 class Flight:
     """True motion of the camera along one trajectory of N frames."""
 
-    nominal: NominalDescent
+    nominal: NominalTrajectory
     """Nominal parabola."""
     time_s: Array
     """Time since the first frame, seconds (N,)."""
@@ -46,7 +47,7 @@ def fly(config: FlightConfig, n_frames: int, seed: int) -> Flight:
     """
     rng = stream(seed, "flight")
     azimuth = rng.uniform(config.azimuth_deg.low, config.azimuth_deg.high)
-    nominal = NominalDescent.parabola(
+    nominal = NominalTrajectory.parabola(
         config.start_altitude_m, config.end_altitude_m, config.downrange_m, azimuth, config.duration_s
     )
     time = np.linspace(0, config.duration_s, n_frames)

@@ -8,10 +8,10 @@ import pandas as pd
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.pixels import contrasts, smallest_crater, sunlit_fractions
 from perilune_render.terrain.scene import Scene
-from perilune_shared.dataset.masks import SLACK_PX, SLACK_RADII
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses, plane_basis, project_circles, rim_points
 from perilune_shared.geometry.frames import Array
+from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII
 
 _N_RIM = 48
 

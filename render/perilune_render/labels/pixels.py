@@ -3,10 +3,10 @@
 import numpy as np
 
 from perilune_render.provenance.kernels import njit
-from perilune_shared.dataset.masks import SLACK_PX, SLACK_RADII
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import Ellipses
 from perilune_shared.geometry.frames import Array
+from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII
 
 REACH = 1.5
 """Radius of the disc in which contrast is measured, rim radii."""

@@ -8,7 +8,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.provenance.versions import all_versions, ground_versions
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.metadata import Recipe
-from perilune_shared.dataset.schema import Kind
+from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
 
 _FILES = ("dem", "catalogue")

@@ -1,8 +1,7 @@
 """Commands of `perilune-manifest` that edit or compare datasets."""
 
-import enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -10,48 +9,30 @@ from rich.table import Table
 from rich.text import Text
 
 import perilune_shared as ps
+from perilune_shared.dataset.names import ImageChoice, ImageMode, SplitUnit
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import progress_bar
-
-if TYPE_CHECKING:
-    from perilune_shared.editing.rewrite import ImageMode
 
 EXIT_DIFFERENT = 1
 
 
-class Images(enum.StrEnum):
-    """How frames are written to the new dataset."""
-
-    COPY = "copy"
-    NONE = "none"
-    PLAN = "plan"
-
-
-class Unit(enum.StrEnum):
-    """Unit that is assigned to a split as a whole."""
-
-    SCENE = "scene"
-    TRAJECTORY = "trajectory"
-    FRAME = "frame"
-
-
-DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset, which holds dataset.json.")]
+DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset (contains dataset.json).")]
 OutOption = Annotated[Path, typer.Option(help="New folder for the result.")]
 ImagesOption = Annotated[
-    Images,
+    ImageChoice,
     typer.Option(help="Frames: copy, none (leave them out), plan (leave out craters, boulders and labels too)."),
 ]
 
 LinkOption = Annotated[
     bool,
-    typer.Option("--link", help="Hard links instead of copies of frames: an edit in one dataset changes both."),
+    typer.Option("--link", help="Hard-link frames instead of copying them: an edit in one dataset changes both."),
 ]
 
 
-def _mode(images: Images, link: bool) -> "ImageMode":
-    if link and images is not Images.COPY:
-        raise UserError("--link", "--images", images.value, "copy: the others leave frames out")
-    return "link" if link else images.value
+def _mode(images: ImageChoice, link: bool) -> ImageMode:
+    if link and images != "copy":
+        raise UserError("--link", "--images", images, "copy: other modes write no frames")
+    return "link" if link else images
 
 
 def add_to(app: typer.Typer) -> None:
@@ -60,12 +41,12 @@ def add_to(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def _tell(out: Path) -> None:
+def _print_counts(out: Path) -> None:
     """Print the counts of the new dataset and whether its splits share terrain."""
     info = ps.open_dataset(out).info
     counts = info.counts
-    told = f"{counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames, {counts.labels} labels"
-    line = f"{out}: {told}, frames {info.images}, split by {info.split_by}{info.leak}"
+    text = f"{counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames, {counts.labels} labels"
+    line = f"{out}: {text}, frames {info.images}, split by {info.split_by}{info.leak}"
     Console().print(Text(line), soft_wrap=True)
 
 
@@ -75,7 +56,7 @@ def merge(
     ],
     out: OutOption,
     name: Annotated[str, typer.Option(help="Name of the result.")] = "merged",
-    images: ImagesOption = Images.COPY,
+    images: ImagesOption = "copy",
     link: LinkOption = False,
 ) -> None:
     """Merge several datasets into one. A scene or frame that is in two of them is written once."""
@@ -83,7 +64,7 @@ def merge(
 
     with progress_bar() as progress:
         merge_datasets([ps.open_dataset(path) for path in datasets], out, name, _mode(images, link), progress)
-    _tell(out)
+    _print_counts(out)
 
 
 def subset(
@@ -91,11 +72,11 @@ def subset(
     out: OutOption,
     where: Annotated[
         list[str] | None,
-        typer.Option(help='Condition on columns, as "radius_px > 5" or "split == \'test\'"; may be repeated.'),
+        typer.Option(help='Condition on columns, for example "radius_px > 5" or "split == \'test\'"; may be repeated.'),
     ] = None,
-    frames: Annotated[int | None, typer.Option(help="At most this many frames.")] = None,
-    mb: Annotated[float | None, typer.Option(help="At most this many megabytes of PNGs.")] = None,
-    images: ImagesOption = Images.COPY,
+    frames: Annotated[int | None, typer.Option(help="Maximum number of frames.")] = None,
+    mb: Annotated[float | None, typer.Option(help="Maximum size of all PNGs, 10^6 bytes.")] = None,
+    images: ImagesOption = "copy",
     link: LinkOption = False,
 ) -> None:
     """Copy part of a dataset: by conditions on columns, number of frames or size."""
@@ -103,27 +84,27 @@ def subset(
 
     with progress_bar() as progress:
         choose(ps.open_dataset(dataset), out, tuple(where or ()), frames, mb, _mode(images, link), progress)
-    _tell(out)
+    _print_counts(out)
 
 
 def split(
     dataset: DatasetArgument,
     out: OutOption,
     by: Annotated[
-        Unit, typer.Option(help="What stays in one split; frame is the paper's protocol, which leaks terrain.")
-    ] = Unit.SCENE,
-    val: Annotated[float, typer.Option(help="Share for validation.")] = 0.1,
-    test: Annotated[float, typer.Option(help="Share for the test.")] = 0.1,
+        SplitUnit, typer.Option(help="Unit of the split. frame is the paper's protocol: its splits share terrain.")
+    ] = "scene",
+    val: Annotated[float, typer.Option(help="Share of units for validation.")] = 0.1,
+    test: Annotated[float, typer.Option(help="Share of units for the test.")] = 0.1,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the split.")] = 0,
-    images: ImagesOption = Images.COPY,
+    images: ImagesOption = "copy",
     link: LinkOption = False,
 ) -> None:
-    """Split a dataset anew into train, val and test, by scene, trajectory or frame."""
+    """Re-split a dataset into train, val and test, by scene, trajectory or frame."""
     from perilune_shared.editing.split import split_dataset
 
     with progress_bar() as progress:
-        split_dataset(ps.open_dataset(dataset), out, by.value, val, test, seed, _mode(images, link), progress)
-    _tell(out)
+        split_dataset(ps.open_dataset(dataset), out, by, val, test, seed, _mode(images, link), progress)
+    _print_counts(out)
 
 
 def diff(first: DatasetArgument, second: DatasetArgument) -> None:
@@ -148,7 +129,7 @@ def migrate(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) 
 
     with progress_bar() as progress:
         migrate_dataset(dataset, out, progress, link=link)
-    _tell(out)
+    _print_counts(out)
 
 
 def pack(
@@ -161,7 +142,7 @@ def pack(
 
     with progress_bar() as progress:
         pack_dataset(ps.open_dataset(dataset), out, shard_mb, progress)
-    _tell(out)
+    _print_counts(out)
 
 
 def unpack(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -> None:
@@ -170,7 +151,7 @@ def unpack(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -
 
     with progress_bar() as progress:
         unpack_dataset(ps.open_dataset(dataset), out, progress, link=link)
-    _tell(out)
+    _print_counts(out)
 
 
 def attach(
@@ -178,7 +159,7 @@ def attach(
     frames: Annotated[Path, typer.Option(help="Folder that `perilune-render regenerate --out` filled.")],
     out: OutOption,
     rehash: Annotated[
-        bool, typer.Option("--rehash", help="Accept frames with other hashes, and record these.")
+        bool, typer.Option("--rehash", help="Accept frames with other hashes and record their hashes.")
     ] = False,
     link: LinkOption = False,
 ) -> None:
@@ -187,4 +168,4 @@ def attach(
 
     with progress_bar() as progress:
         attach_frames(ps.open_dataset(manifest), frames, out, rehash, progress, link=link)
-    _tell(out)
+    _print_counts(out)

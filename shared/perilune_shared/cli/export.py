@@ -1,8 +1,7 @@
 """`perilune-manifest export` and `card`: convert a dataset to other formats, and write a page about it."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -13,19 +12,8 @@ from perilune_shared.cli.edit import DatasetArgument, LinkOption
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import progress_bar
 
-
-class ExportFormat(StrEnum):
-    """Export formats."""
-
-    COCO = "coco"
-    YOLO = "yolo"
-    TUM = "tum"
-    KITTI = "kitti"
-    CROISSANT = "croissant"
-    HUGGING_FACE = "huggingface"
-
-
-_WITH_LABELS = (ExportFormat.COCO, ExportFormat.YOLO, ExportFormat.HUGGING_FACE)
+ExportFormat = Literal["coco", "yolo", "tum", "kitti", "croissant", "huggingface"]
+_WITH_LABELS = ("coco", "yolo", "huggingface")
 
 
 def add_to(app: typer.Typer) -> None:
@@ -45,14 +33,14 @@ def export(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="New folder; for croissant a .json file in the dataset, croissant.json unless given."),
+        typer.Option(help="New folder; for croissant a .json file in the dataset, by default croissant.json."),
     ] = None,
-    split: Annotated[str | None, typer.Option(help="train, val or test alone (not for croissant).")] = None,
+    split: Annotated[str | None, typer.Option(help="Only this split: train, val or test (not for croissant).")] = None,
     selection: Annotated[
         str,
         typer.Option(
-            help="Labels to find: all, paper, visible; coco marks others as iscrowd, yolo drops them, huggingface "
-            "says which are chosen."
+            help="Labels to export: all, paper or visible. coco marks the others as iscrowd, yolo omits them, "
+            "huggingface marks the selected ones."
         ),
     ] = "all",
     link: LinkOption = False,
@@ -60,14 +48,14 @@ def export(
     """Write labels, trajectories or metadata in the format of other tools."""
     from perilune_shared.config_errors import nearest
     from perilune_shared.dataset.keys import check_keys
-    from perilune_shared.dataset.schema import SPLITS
-    from perilune_shared.dataset.thresholds import SELECTIONS
+    from perilune_shared.dataset.names import SPLITS
     from perilune_shared.export.coco import export_coco
     from perilune_shared.export.croissant import export_croissant
     from perilune_shared.export.hugging_face import export_hugging_face
     from perilune_shared.export.rows import by_selection
     from perilune_shared.export.trajectory import export_kitti, export_tum
     from perilune_shared.export.yolo import export_yolo
+    from perilune_shared.labels.thresholds import SELECTIONS
     from perilune_shared.storage.files import check_free
 
     opened = ps.open_dataset(dataset)
@@ -79,11 +67,11 @@ def export(
     choose = by_selection(SELECTIONS[selection]) if selection != "all" else None
     if choose is not None and format not in _WITH_LABELS:
         raise UserError(
-            "--selection", "selection", selection, "--format coco, yolo or huggingface: the others hold no labels"
+            "--selection", "selection", selection, "--format coco, yolo or huggingface: other formats have no labels"
         )
-    if link and format is not ExportFormat.YOLO:
-        raise UserError("--link", "--format", format.value, "yolo: the others hold no images")
-    if format is ExportFormat.CROISSANT:
+    if link and format != "yolo":
+        raise UserError("--link", "--format", format, "yolo: other formats have no images")
+    if format == "croissant":
         if split is not None:
             raise UserError("--split", "split", split, "none: Croissant describes the whole dataset")
         with progress_bar() as progress:
@@ -95,23 +83,23 @@ def export(
     check_free(out)
     with progress_bar() as progress:
         match format:
-            case ExportFormat.COCO:
+            case "coco":
                 done = f"{export_coco(opened, out, progress, split, choose)} annotations"
-            case ExportFormat.YOLO:
+            case "yolo":
                 done = f"{export_yolo(opened, out, progress, split, choose, link=link)} boxes"
-            case ExportFormat.HUGGING_FACE:
+            case "huggingface":
                 done = f"{export_hugging_face(opened, out, progress, split, choose)} frames"
-            case ExportFormat.TUM:
-                done = f"{export_tum(opened, out, progress, split)} descents"
-            case ExportFormat.KITTI:
-                done = f"{export_kitti(opened, out, progress, split)} descents"
+            case "tum":
+                done = f"{export_tum(opened, out, progress, split)} trajectories"
+            case "kitti":
+                done = f"{export_kitti(opened, out, progress, split)} trajectories"
     _say(f"{out}: {done}")
 
 
 def card(
     dataset: DatasetArgument,
     out: Annotated[
-        Path | None, typer.Option(help="Markdown file, its picture beside it; README.md in the dataset unless given.")
+        Path | None, typer.Option(help="Markdown file beside its picture, by default README.md in the dataset.")
     ] = None,
 ) -> None:
     """Write a dataset card: counts, histograms, labelled frames, licence and the command that makes the dataset."""

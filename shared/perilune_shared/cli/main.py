@@ -26,9 +26,9 @@ app = typer.Typer(
 
 @app.command()
 def validate(
-    dataset: DatasetArgument, most: Annotated[int, typer.Option(min=1, help="Show at most this many faults.")] = 50
+    dataset: DatasetArgument, most: Annotated[int, typer.Option(min=1, help="Maximum number of faults to show.")] = 50
 ) -> None:
-    """Check schema, ranges, keys, splits, labels against poses, and the hash of every file. Exit code 2 on a fault."""
+    """Check schema, ranges, keys, splits, labels and file hashes. Exit code 2 if there is a fault."""
     from perilune_shared.validation.validate import validate as find_faults
 
     with progress_bar() as progress:
@@ -42,7 +42,7 @@ def validate(
     for fault in faults[:most]:
         row = "" if fault.row is None else str(fault.row)
         # Text, since a plain string would be parsed as markup; the values are untrusted.
-        cells = (fault.file, row, fault.column, fault.found, fault.wanted)
+        cells = (fault.file, row, fault.column, fault.found, fault.expected)
         table.add_row(*(Text(cell, overflow="fold") for cell in cells))
     console.print(table)
     raise typer.Exit(EXIT_USER_ERROR)

@@ -102,8 +102,8 @@ class Condition:
             MemoryError,
             pa.ArrowException,
         ) as error:
-            wanted = f"a condition such as radius_px > 5 and split == 'test' ({error})"
-            raise self._fault(self.text, wanted) from None
+            expected = f"a condition such as radius_px > 5 and split == 'test' ({error})"
+            raise self._fault(self.text, expected) from None
         if value.kind != "truth":
             raise self._fault(self.text, "a condition that is true or false for each row")
         return value.expression
@@ -146,7 +146,7 @@ class Condition:
                     return _Value(value.kind, pc.abs_checked(value.expression))
                 return _Value("real", _FUNCTIONS[name](value.expression.cast(pa.float64())))
             case ast.Call(func=ast.Name(id=name)) if name in _FUNCTIONS:
-                raise self._fault(ast.unparse(node), f"one argument of {name}, without a name")
+                raise self._fault(ast.unparse(node), f"one argument of {name}, positional")
         raise self._fault(ast.unparse(node), _FORMS)
 
     def _arithmetic(self, node: ast.BinOp, left: _Value, right: _Value) -> _Value:
@@ -197,8 +197,8 @@ class Condition:
         texts = all(isinstance(word, str) for word in words)
         numbers = all(isinstance(word, int | float) and not isinstance(word, bool) for word in words)
         if not ((texts and value.kind == "text") or (numbers and value.is_number)):
-            wanted = "comparisons of numbers with numbers and text with text"
-            raise self._fault(f"{ast.unparse(left)} ({value.kind}) in {ast.unparse(right)}", wanted)
+            expected = "comparisons of numbers with numbers and text with text"
+            raise self._fault(f"{ast.unparse(left)} ({value.kind}) in {ast.unparse(right)}", expected)
         if texts:
             found = value.expression.isin(pa.array(words, pa.string()))
         elif value.kind == "integer" and all(isinstance(word, int) for word in words):
@@ -216,7 +216,7 @@ class Condition:
 
     def _truth(self, value: _Value, node: ast.expr) -> Any:
         if value.kind != "truth":
-            raise self._fault(f"{ast.unparse(node)} ({value.kind})", "conditions beside and, or, not")
+            raise self._fault(f"{ast.unparse(node)} ({value.kind})", "conditions as operands of and, or, not")
         return value.expression
 
     def _column(self, node: ast.Name | ast.Attribute) -> tuple[str, str]:
@@ -230,11 +230,11 @@ class Condition:
                 return table, node.id
         known = sorted({name for table in _SEARCHED for name in TABLES[table].names})
         near = difflib.get_close_matches(node.id, known, n=1)
-        raise self._fault(node.id, f"{near[0]}?" if near else "a column of " + ", ".join(_SEARCHED))
+        raise self._fault(node.id, f"{near[0]} (nearest known)" if near else "a column of " + ", ".join(_SEARCHED))
 
     @staticmethod
-    def _fault(found: str, wanted: str) -> UserError:
-        return UserError("--where", "condition", found, wanted)
+    def _fault(found: str, expected: str) -> UserError:
+        return UserError("--where", "condition", found, expected)
 
 
 def _column_value(kind: pa.DataType, expression: Any) -> _Value:

@@ -8,10 +8,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
 from perilune_shared.errors import UserError
 from perilune_shared.storage.png import png_header
-
-_MOST_PIXELS = 2**27
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +36,7 @@ class Frame:
 
         try:
             header = png_header(self.png)
-            if header.width_px * header.height_px > _MOST_PIXELS:
+            if header.width_px * header.height_px > LARGEST_IMAGE_PX:
                 raise ValueError(f"{header.width_px} x {header.height_px} pixels")
             with Image.open(io.BytesIO(self.png), formats=["PNG"]) as picture:
                 if header.bits == 8:
@@ -45,5 +44,5 @@ class Frame:
                 return np.asarray(picture).astype(np.uint16)
         except (ValueError, OSError, SyntaxError) as error:
             raise UserError(
-                self.frame_id, "image", error, f"a grey PNG of 8 or 16 bits, at most {_MOST_PIXELS} pixels"
+                self.frame_id, "image", error, f"a grey PNG of 8 or 16 bits, at most {LARGEST_IMAGE_PX} pixels"
             ) from None

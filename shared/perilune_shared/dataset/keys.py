@@ -76,7 +76,7 @@ class KeyCheck:
         known[known] = (place < len(self._keys)) & (self._keys[np.minimum(place, len(self._keys) - 1)] == key[known])
         if not known.all():
             row = rows.slice(int(np.argmin(known)), 1).to_pylist()[0]
-            found = f"no crater {row['crater_id']}, which a label of {row['frame_id']} names"
+            found = f"no crater {row['crater_id']} of a label of {row['frame_id']} names"
             raise UserError(self._dataset.root, "labels: crater_id", found, f"a crater of the frame's scene; {_HINT}")
         self._seen.append(frame * len(self._numbers) + number)
         return frame

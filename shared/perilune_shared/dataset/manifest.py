@@ -18,10 +18,15 @@ import pyarrow.compute as pc
 
 from perilune_shared.dataset.expression import Condition
 from perilune_shared.dataset.frame import Frame
-from perilune_shared.dataset.metadata import Counts, DatasetInfo, read_info
-from perilune_shared.dataset.parts import Part, is_whole
-from perilune_shared.dataset.schema import IMAGES, SPLITS, TABLES
+from perilune_shared.dataset.info_file import read_info
+from perilune_shared.dataset.metadata import Counts, DatasetInfo
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.packed import read_packed, shards_of
+from perilune_shared.dataset.part_rows import may_hold, rows_of_part
+from perilune_shared.dataset.parts import Part
+from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
 from perilune_shared.storage import files
 
 LARGEST_FRAME_BYTES = 2**30
@@ -60,6 +65,16 @@ class Dataset:
                 del self._opened[next(iter(self._opened))]
             self._opened[path] = part
         return self._opened[path]
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the frames' PNGs."""
+        return self.info.camera.intrinsics()
+
+    @property
+    def exr_camera(self) -> Camera:
+        """Camera of the frames' EXRs; that of the PNGs if there are no EXRs."""
+        return (self.info.exr_camera or self.info.camera).intrinsics()
 
     @functools.cached_property
     def scenes(self) -> pd.DataFrame:
@@ -112,7 +127,7 @@ class Dataset:
         """Return a table's part files, sorted by name; with ids, those that may contain matching rows."""
         files = self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet")
         found = sorted(files, key=lambda part: part.stem)
-        return [part for part in found if _may_hold(part.stem, scene_id, trajectory_id)]
+        return [part for part in found if may_hold(part.stem, scene_id, trajectory_id)]
 
     def table(
         self,
@@ -134,17 +149,17 @@ class Dataset:
         if split is not None and split not in SPLITS:
             raise UserError(table, "split", split, "one of " + ", ".join(SPLITS))
         if trajectory_id is not None and scene_id is None:
-            raise UserError("table", "scene_id", "None", "the scene too: names of descents repeat in each scene")
+            raise UserError("table", "scene_id", "None", "the scene_id too: trajectory_ids repeat in each scene")
         if where is not None and where.columns_of_only(table) is None:
             raise UserError(table, "where", where.text, f"a condition on columns of {table} alone")
         names = list(columns) if columns is not None else TABLES[table].names
-        wanted = pa.schema([TABLES[table].field(name) for name in names])
+        schema = pa.schema([TABLES[table].field(name) for name in names])
         of_split = split if table != "labels" else None
         pieces = [
-            _chosen(self.open_part(part, table), names, scene_id, trajectory_id, of_split, where)
+            rows_of_part(self.open_part(part, table), names, scene_id, trajectory_id, of_split, where)
             for part in self.parts(table, scene_id, trajectory_id)
         ]
-        rows = pa.concat_tables(pieces).replace_schema_metadata() if pieces else wanted.empty_table()
+        rows = pa.concat_tables(pieces).replace_schema_metadata() if pieces else schema.empty_table()
         if split is not None and table == "labels":
             if "frame_id" not in names:
                 return self.table(table, [*names, "frame_id"], scene_id, trajectory_id, split, where).select(names)
@@ -173,43 +188,25 @@ class Dataset:
         Raises UserError if a frame is missing.
         """
         if self.info.images in ("absent", "planned"):
-            made = "regenerate" if self.info.images == "absent" else "dataset --manifest"
-            wanted = f"a dataset with its frames; `perilune-render {made}` makes them"
-            raise UserError(self.root, "images", self.info.images, wanted)
+            command = "regenerate" if self.info.images == "absent" else "dataset --manifest"
+            expected = f"a dataset with frames; render them with `perilune-render {command}`"
+            raise UserError(self.root, "images", self.info.images, expected)
         rows = frames.select(["frame_id", "png_path"]).to_pydict()
         paths = dict(zip(rows["frame_id"], rows["png_path"], strict=True))
         if self.info.images == "packed":
-            yield from self._packed(set(paths))
+            yield from read_packed(self.root, set(paths))
             return
         for frame_id, relative in paths.items():
             path = self.file(relative)
             if not path.is_file():
-                raise UserError(path, "frame", "no such file", "the PNG that the manifest names")
+                raise UserError(path, "frame", "no such file", "the PNG listed in the manifest")
             if path.stat().st_size > LARGEST_FRAME_BYTES:
                 raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {LARGEST_FRAME_BYTES}")
             yield frame_id, path.read_bytes()
 
-    def _packed(self, wanted: set[str]) -> Iterator[tuple[str, bytes]]:
-        missing = set(wanted)
-        for shard in self.shards():
-            if not missing:
-                return
-            part = Part(shard, "images", IMAGES)
-            for group in part.groups_within("frame_id", min(missing), max(missing) + "\x00"):
-                keys = part.read(["frame_id"], [group])["frame_id"].to_pylist()
-                if missing.isdisjoint(keys):
-                    continue
-                images = part.read(["image"], [group])["image"]
-                for frame_id, image in zip(keys, images, strict=True):
-                    if frame_id in missing:
-                        missing.remove(frame_id)
-                        yield frame_id, image["bytes"].as_py() or b""
-        if missing:
-            raise UserError(self.root / "images", "frame_id", f"no {min(missing)}", "every frame of the manifest")
-
     def shards(self) -> list[Path]:
         """Return the Parquet files that contain packed frames."""
-        return sorted(self.root.joinpath("images").glob("[A-Za-z0-9]*.parquet"))
+        return shards_of(self.root)
 
 
 def open_dataset(root: str | Path) -> Dataset:
@@ -229,52 +226,3 @@ def _check_names(table: str, columns: Sequence[str] | None) -> None:
     for name in columns or ():
         if name not in TABLES[table].names:
             raise UserError(table, "column", name, "one of " + ", ".join(TABLES[table].names))
-
-
-def _may_hold(stem: str, scene_id: str | None, trajectory_id: str | None) -> bool:
-    """Whether a part of this name may contain rows of a scene, and of a trajectory in it."""
-    scene, _, trajectory = stem.partition(".")
-    if is_whole(stem) or scene_id is None:
-        return True
-    return scene == scene_id and (trajectory_id is None or trajectory in ("", trajectory_id))
-
-
-def _chosen(
-    part: Part,
-    names: Sequence[str],
-    scene_id: str | None,
-    trajectory_id: str | None,
-    split: str | None,
-    where: Condition | None,
-) -> pa.Table:
-    """Read the rows of a part that belong to a scene, a trajectory and a split; labels are matched by frame_id."""
-    columns = part.schema.names
-    equal = {"scene_id": scene_id, "trajectory_id": trajectory_id, "split": split}
-    equal = {name: value for name, value in equal.items() if value is not None and name in columns}
-    by_frame = scene_id is not None and "scene_id" not in columns
-    prefix = f"{scene_id}/{trajectory_id}/" if trajectory_id is not None else f"{scene_id}/"
-    groups = None
-    if is_whole(part.path.stem) and scene_id is not None:
-        # In sorted order the frame ids "S/..." are in ["S/", "S0"), since "0" is the character after "/".
-        if "frame_id" in columns:
-            groups = part.groups_within("frame_id", prefix, prefix[:-1] + "0")
-        else:
-            groups = part.groups_within("scene_id", scene_id, scene_id + "\x00")
-    needed = [*names, *equal, *(["frame_id"] if by_frame else [])]
-    expression = None
-    if where is not None:
-        expression = where.within_table()
-        needed += [name for _, name in sorted(where.columns)]
-        may_hold = set(part.groups_where(expression))
-        groups = [group for group in (range(part.n_groups) if groups is None else groups) if group in may_hold]
-    rows = part.read(list(dict.fromkeys(needed)), groups)
-    if expression is not None:
-        try:
-            rows = rows.filter(expression)
-        except pa.ArrowException as error:
-            raise UserError(part.path, "condition", error, "numbers within the range of their columns") from None
-    for name, value in equal.items():
-        rows = rows.filter(pc.equal(rows[name], value))
-    if by_frame and (is_whole(part.path.stem) or part.path.stem == scene_id):
-        rows = rows.filter(pc.starts_with(rows["frame_id"], prefix))
-    return rows.select(list(names))

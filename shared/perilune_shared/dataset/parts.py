@@ -35,8 +35,8 @@ _MOST_BYTES = 8 * 2**30
 _LONGEST_LIST = 10_000
 _LONGEST_FOOTER_TEXT = 10_000_000
 # Bounds on compression: no row of any table takes fewer bytes, and no data compresses by a larger factor.
-_SPARE_ROWS, _BYTES_A_ROW = 10_000, 4
-_SPARE_BYTES, _MOST_SHRUNK = 2**26, 200
+_SPARE_ROWS, _BYTES_PER_ROW = 10_000, 4
+_SPARE_BYTES, _MOST_COMPRESSION = 2**26, 200
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
 _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
@@ -72,13 +72,13 @@ class Part:
             self.found = self.file.metadata.schema.to_arrow_schema()
             self._check_size()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-            raise UserError(path, "content", error, "a whole Parquet file") from None
+            raise UserError(path, "content", error, "a complete Parquet file") from None
         metadata = self.found.metadata or {}
-        for name, wanted in (("schema_version", version), ("table", table)):
+        for name, expected in (("schema_version", version), ("table", table)):
             got = metadata.get(f"perilune.{name}".encode(), b"none").decode(errors="replace")
-            if got != wanted:
+            if got != expected:
                 hint = "; see `perilune-manifest migrate`" if name == "schema_version" else ""
-                raise UserError(path, f"perilune.{name}", got, wanted + hint)
+                raise UserError(path, f"perilune.{name}", got, expected + hint)
 
     def _parquet(self, texts: Sequence[str]) -> pq.ParquetFile:
         """Open the file; the columns `texts` are read as dictionaries.
@@ -109,14 +109,14 @@ class Part:
 
     def _check_size(self) -> None:
         footer = self.file.metadata
-        most_rows = min(_MOST_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_A_ROW)
+        most_rows = min(_MOST_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_PER_ROW)
         n_bytes, n_rows = 0, 0
         for group in range(footer.num_row_groups):
             rows = footer.row_group(group)
             n_rows += rows.num_rows
             if not 0 <= rows.num_rows <= min(_MOST_GROUP_ROWS, most_rows):
-                wanted = f"at most {min(_MOST_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
-                raise UserError(self.path, "rows", f"{rows.num_rows} in a row group", wanted)
+                expected = f"at most {min(_MOST_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
+                raise UserError(self.path, "rows", f"{rows.num_rows} in a row group", expected)
             for place in range(rows.num_columns):
                 column = rows.column(place)
                 if column.path_in_schema.split(".")[0] not in self.schema.names:
@@ -124,13 +124,17 @@ class Part:
                 n_bytes += max(column.total_uncompressed_size, 0)
                 # The longest list is a quaternion.
                 if column.num_values > 4 * rows.num_rows:
-                    raise UserError(self.path, column.path_in_schema, f"{column.num_values} values", "4 a row at most")
+                    raise UserError(
+                        self.path, column.path_in_schema, f"{column.num_values} values", "at most 4 per row"
+                    )
         if footer.num_rows != n_rows or n_rows > most_rows:
-            wanted = f"those of its row groups, {n_rows}, and at most {most_rows} for {self._n_bytes} bytes"
-            raise UserError(self.path, "rows", footer.num_rows, wanted)
-        most = min(_MOST_BYTES, _SPARE_BYTES + _MOST_SHRUNK * self._n_bytes)
+            expected = f"{n_rows}, the sum of the row groups, at most {most_rows} for {self._n_bytes} bytes"
+            raise UserError(self.path, "rows", footer.num_rows, expected)
+        most = min(_MOST_BYTES, _SPARE_BYTES + _MOST_COMPRESSION * self._n_bytes)
         if n_bytes > most:
-            raise UserError(self.path, "size", f"{n_bytes} bytes unpacked", f"at most {most} for {self._n_bytes} bytes")
+            raise UserError(
+                self.path, "size", f"{n_bytes} bytes after decompression", f"at most {most} for {self._n_bytes} bytes"
+            )
 
     def read(
         self, columns: Sequence[str] | None = None, groups: Iterable[int] | None = None, *, any_ids: bool = False
@@ -142,10 +146,10 @@ class Part:
         """
         chosen = list(range(self.n_groups) if groups is None else groups)
         names = list(columns) if columns is not None else self.schema.names
-        wanted = pa.schema([self.schema.field(name) for name in names], metadata=self.schema.metadata)
+        schema = pa.schema([self.schema.field(name) for name in names], metadata=self.schema.metadata)
         missing = [name for name in names if name in self._optional and name not in self.found.names]
         present = [name for name in names if name not in missing]
-        for field in map(wanted.field, present):
+        for field in map(schema.field, present):
             place = self.found.get_field_index(field.name)
             if place < 0:
                 raise UserError(self.path, "columns", f"no {field.name}", f"every column of version {SCHEMA_VERSION}")
@@ -158,17 +162,17 @@ class Part:
                     self._check_pages(stream, group, present)
             # Threads slow down the reading of a single row group.
             rows = self.file.read_row_groups(chosen, columns=present, use_threads=len(chosen) > 1)
-            for field in map(wanted.field, present):
+            for field in map(schema.field, present):
                 if pa.types.is_string(field.type):
                     self._check_text(field.name, rows[field.name], None if any_ids else _IDS.get(field.name))
             for name in missing:
                 n_rows = sum(self.file.metadata.row_group(group).num_rows for group in chosen)
-                rows = rows.append_column(name, pa.nulls(n_rows, wanted.field(name).type))
-            rows = rows.select(names).cast(wanted)
+                rows = rows.append_column(name, pa.nulls(n_rows, schema.field(name).type))
+            rows = rows.select(names).cast(schema)
             rows.validate(full=True)
             return rows
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-            raise UserError(self.path, "content", error, "a whole Parquet file") from None
+            raise UserError(self.path, "content", error, "a complete Parquet file") from None
 
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
         """Check that the pages do not exceed the sizes in the footer, which have been checked."""
@@ -179,9 +183,9 @@ class Part:
                 continue
             pages = pages_of(stream, column)
             if pages.unpacked_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
-                found = f"{pages.unpacked_bytes} bytes unpacked and {pages.n_values} values"
-                wanted = f"at most {column.total_uncompressed_size} and {column.num_values}, as its footer says"
-                raise UserError(self.path, name, found, wanted)
+                found = f"{pages.unpacked_bytes} bytes after decompression and {pages.n_values} values"
+                expected = f"at most {column.total_uncompressed_size} and {column.num_values}, as in the footer"
+                raise UserError(self.path, name, found, expected)
             # With a dictionary, a small file could repeat one image and decompress to any size.
             if name.startswith("image.") and pages.has_dictionary:
                 raise UserError(self.path, name, "a dictionary", "plain bytes for each frame")

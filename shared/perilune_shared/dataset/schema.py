@@ -3,8 +3,6 @@
 Every Parquet file contains these units and meanings as metadata, so a single file documents itself.
 """
 
-from typing import Literal
-
 import pyarrow as pa
 
 SCHEMA_VERSION = "3"
@@ -192,8 +190,3 @@ IMAGES = pa.schema(
     },
 )
 """Schema of the packed frames, images/*.parquet."""
-
-Kind = Literal["detect", "nav"]
-SplitUnit = Literal["scene", "trajectory", "frame"]
-ImageState = Literal["files", "packed", "absent", "planned"]
-SPLITS = ("train", "val", "test")

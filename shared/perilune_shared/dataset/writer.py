@@ -6,33 +6,31 @@ The row counts, the number of frames and split of each trajectory, and the split
 import contextlib
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from perilune_shared.content import terrain_of
+from perilune_shared.dataset.info_file import checked_info, write_info
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import Counts, DatasetInfo, checked_info, write_info
+from perilune_shared.dataset.metadata import Counts, DatasetInfo
+from perilune_shared.dataset.names import IMAGE_KINDS, SplitUnit, frame_path
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WHOLE_TABLE, write_part
-from perilune_shared.dataset.schema import IMAGES, TABLES, SplitUnit, complete
+from perilune_shared.dataset.schema import TABLES, complete
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums, files
 
 SceneTables = dict[str, pa.Table]
 """All tables of one scene, by name."""
-_PER_DESCENT = ("frames", "labels")
-_IMAGES_A_GROUP, _BYTES_A_GROUP = 128, 2**28
-MOST_IMAGES_WRITTEN = 1_000_000
-"""Maximum number of frames of a shard: 7,813 row groups; readers accept 10,000."""
+_PER_TRAJECTORY = ("frames", "labels")
 
 
 class DatasetWriter:
-    """Write a dataset into a folder; create it with `written`."""
+    """Write a dataset into a folder; create it with `new_dataset`."""
 
     def __init__(
         self, root: Path, info: DatasetInfo, *, whole_tables: bool = False, most_rows: int = MOST_ROWS_WRITTEN
@@ -43,7 +41,7 @@ class DatasetWriter:
         self._rows = dict.fromkeys(TABLES, 0)
         self._kept: dict[str, list[pa.Table]] = defaultdict(list)
         self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
-        self._splits_of_descent: dict[tuple[str, int], set[str]] = defaultdict(set)
+        self._splits_of_trajectory: dict[tuple[str, int], set[str]] = defaultdict(set)
         self._has_exr = False
         self._recipes: set[str] = set()
 
@@ -54,25 +52,25 @@ class DatasetWriter:
         stores the frames. Raises UserError if the table scenes has not exactly one row, or if a frame's trajectory is
         missing.
         """
-        check_scene("the dataset given", tables)
-        frames = _placed(tables["frames"])
+        check_scene("new dataset", tables)
+        frames = _with_new_paths(tables["frames"])
         splits = frames["split"].to_numpy(zero_copy_only=False)
         scene = tables["scenes"].to_pylist()[0]
         terrain = terrain_of(scene["dem_source"], scene["content_sha256"])
         self._splits_of_terrain[terrain] |= set(splits)
-        for descent in tables["trajectories"].select(["trajectory_id", "seed"]).to_pylist():
-            own = np.asarray(pc.equal(frames["trajectory_id"], descent["trajectory_id"]), bool)
-            self._splits_of_descent[terrain, descent["seed"]] |= set(splits[own])
+        for trajectory in tables["trajectories"].select(["trajectory_id", "seed"]).to_pylist():
+            own = np.asarray(pc.equal(frames["trajectory_id"], trajectory["trajectory_id"]), bool)
+            self._splits_of_trajectory[terrain, trajectory["seed"]] |= set(splits[own])
         self._has_exr |= frames["exr_path"].null_count < len(frames)
         self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
-        tables = {**tables, "frames": frames, "trajectories": _settled(tables["trajectories"], frames)}
+        tables = {**tables, "frames": frames, "trajectories": _with_counts_and_splits(tables["trajectories"], frames)}
         scene_id = scene["scene_id"]
         for name, rows in tables.items():
             self._rows[name] += len(rows)
             rows = complete(name, rows)
             if self.whole_tables:
-                self._keep(name, _sorted_by(rows, "frame_id") if name in _PER_DESCENT else rows)
-            elif name in _PER_DESCENT:
+                self._keep(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
+            elif name in _PER_TRAJECTORY:
                 for trajectory_id in pc.unique(frames["trajectory_id"]).to_pylist():
                     own = pc.starts_with(rows["frame_id"], f"{scene_id}/{trajectory_id}/")
                     write_part(self.root, name, f"{scene_id}.{trajectory_id}", rows.filter(own))
@@ -108,56 +106,20 @@ class DatasetWriter:
             for row in frames.select(["frame_id", "png_path"]).to_pylist():
                 by_id[row["frame_id"]]["png_path"] = row["png_path"]
         for frame_id, row in by_id.items():
-            for kind in ("png", "exr"):
+            for kind in IMAGE_KINDS:
                 if row.get(f"{kind}_path") is not None:
                     to = files.inside(self.root, frame_path(names[frame_id], kind))
-                    files.bring(source.file(row[f"{kind}_path"]), to, link=link)
-
-    def pack_images(
-        self, images: Iterable[tuple[str, str, bytes]], shard_bytes: int, most_images: int = MOST_IMAGES_WRITTEN
-    ) -> None:
-        """Write frames (frame_id, png_path, PNG bytes) into images/*.parquet, of up to about `shard_bytes` each."""
-        shard, size, held, n_images, writer = 0, 0, 0, 0, None
-        waiting: list[tuple[str, str, bytes]] = []
-        self.root.joinpath("images").mkdir(parents=True, exist_ok=True)
-
-        def flush() -> None:
-            nonlocal writer, waiting, held
-            if not waiting:
-                return
-            if writer is None:
-                path = self.root / "images" / f"{shard:05d}.parquet"
-                # PNG is already compressed, and all frames differ.
-                writer = pq.ParquetWriter(path, IMAGES, compression="none", use_dictionary=["frame_id"])
-            rows = [{"frame_id": name, "image": {"bytes": png, "path": path}} for name, path, png in waiting]
-            writer.write_table(pa.Table.from_pylist(rows, schema=IMAGES))
-            waiting, held = [], 0
-
-        for name, path, png in images:
-            if size and (size + len(png) > shard_bytes or n_images == most_images):
-                flush()
-                if writer is not None:
-                    writer.close()
-                shard, size, n_images, writer = shard + 1, 0, 0, None
-            waiting.append((name, path, png))
-            n_images += 1
-            size += len(png)
-            held += len(png)
-            if len(waiting) == _IMAGES_A_GROUP or held > _BYTES_A_GROUP:
-                flush()
-        flush()
-        if writer is not None:
-            writer.close()
+                    files.copy_or_link(source.file(row[f"{kind}_path"]), to, link=link)
 
     def finish(self, out: Path, progress: Progress = NO_PROGRESS) -> None:
         """Write buffered rows, dataset.json and the checksums. Raises UserError about `out` if there are no frames."""
         if not self._rows["frames"]:
-            raise UserError(out, "frames", "none left", "a choice that leaves at least one frame")
+            raise UserError(out, "frames", "none left", "conditions that select at least one frame")
         for name in TABLES if self.whole_tables else ():
             if self._kept[name] or not self._n_whole[name]:
                 self._write_whole(name)
         # A trajectory may occur twice: rendered, and developed again with another sensor.
-        torn = any(len(splits) > 1 for splits in self._splits_of_descent.values())
+        torn = any(len(splits) > 1 for splits in self._splits_of_trajectory.values())
         shared = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
         unit: SplitUnit = "frame" if torn else "trajectory" if shared else "scene"
         exr_camera = self.info.exr_camera if self._has_exr else None
@@ -170,7 +132,7 @@ class DatasetWriter:
 
 
 @contextlib.contextmanager
-def written(
+def new_dataset(
     out: Path,
     info: DatasetInfo,
     *,
@@ -196,11 +158,11 @@ def check_scene(where: object, tables: SceneTables) -> None:
     scenes, frames = tables["scenes"]["scene_id"], tables["frames"]
     if len(scenes) != 1:
         found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"
-        raise UserError(where, "scenes", found, "one row each; see `perilune-manifest validate`")
+        raise UserError(where, "scenes", found, "one row for the scene; see `perilune-manifest validate`")
     odd = set(frames["trajectory_id"].to_pylist()) - set(tables["trajectories"]["trajectory_id"].to_pylist())
     if odd:
         found = f"no {scenes[0].as_py()}/{min(odd)}"
-        raise UserError(where, "trajectories", found, "the descent of every frame; see `perilune-manifest validate`")
+        raise UserError(where, "trajectories", found, "the trajectory of every frame; see `perilune-manifest validate`")
 
 
 def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
@@ -211,15 +173,10 @@ def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
     return table.set_column(place, field, array)
 
 
-def frame_path(frame_id: str, kind: str) -> str:
-    """Return the relative path of a frame's PNG or EXR in datasets written by this module."""
-    return f"frames/{frame_id}.{kind}"
-
-
-def _placed(frames: pa.Table) -> pa.Table:
+def _with_new_paths(frames: pa.Table) -> pa.Table:
     """Return frames with the file paths of the new dataset; the source dataset may use other paths."""
     ids = frames["frame_id"].to_pylist()
-    for kind in ("png", "exr"):
+    for kind in IMAGE_KINDS:
         name = f"{kind}_path"
         known = frames[name].to_pylist()
         paths = [None if path is None else frame_path(key, kind) for key, path in zip(ids, known, strict=True)]
@@ -227,7 +184,7 @@ def _placed(frames: pa.Table) -> pa.Table:
     return frames
 
 
-def _settled(trajectories: pa.Table, frames: pa.Table) -> pa.Table:
+def _with_counts_and_splits(trajectories: pa.Table, frames: pa.Table) -> pa.Table:
     """Return the trajectories that have frames, with the number of frames and their common split."""
     counted = frames.group_by("trajectory_id").aggregate(
         [("frame_id", "count"), ("split", "count_distinct"), ("split", "min")]

@@ -5,7 +5,8 @@ from pathlib import Path
 import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.writer import with_column, written
+from perilune_shared.dataset.names import IMAGE_KINDS
+from perilune_shared.dataset.writer import new_dataset, with_column
 from perilune_shared.editing.rewrite import check_source
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
@@ -31,14 +32,14 @@ def attach(
     """
     check_source(manifest, out, progress)
     if manifest.info.images != "absent":
-        wanted = "absent: a manifest with labels and without frames"
-        raise UserError(manifest.root, "images", manifest.info.images, wanted)
+        expected = "absent: a manifest with labels and without frames"
+        raise UserError(manifest.root, "images", manifest.info.images, expected)
     source = Dataset(frames_root, manifest.info.model_copy(update={"images": "files"}))
     line = "frames attached" + (", hashed anew" if rehash else "")
     info = manifest.info.changed(line, images="files")
     scene_ids = manifest.scene_ids()
     task = progress.add_task("attaching", total=manifest.info.counts.frames, unit="frames")
-    with written(out, info, progress=progress) as writer:
+    with new_dataset(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = manifest.scene(scene_id)
             frames = _checked(source, tables["frames"], rehash)
@@ -51,17 +52,17 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
     """Return a scene's rows of `frames` with the hashes of the existing files."""
     camera = source.info.camera
     rows = frames.select(["frame_id", "png_path", "png_sha256", "exr_path", "exr_sha256"]).to_pylist()
-    found: dict[str, list] = {f"{kind}_{name}": [] for kind in ("png", "exr") for name in ("sha256", "bytes", "path")}
+    found: dict[str, list] = {f"{kind}_{name}": [] for kind in IMAGE_KINDS for name in ("sha256", "bytes", "path")}
     for row in rows:
-        for kind in ("png", "exr"):
+        for kind in IMAGE_KINDS:
             path = source.file(row[f"{kind}_path"]) if row[f"{kind}_path"] is not None else None
             there = path is not None and path.is_file()
             if kind == "png" and not there:
                 raise UserError(source.root, "frame", f"no {row['png_path']}", "every frame of the manifest")
             sha256 = files.sha256_of(path) if there and path is not None else None
             if there and not rehash and sha256 != row[f"{kind}_sha256"]:
-                wanted = f"the file with SHA-256 {row[f'{kind}_sha256']}, or --rehash"
-                raise UserError(path, f"{kind}_sha256", sha256, wanted)
+                expected = f"the file with SHA-256 {row[f'{kind}_sha256']}, or --rehash"
+                raise UserError(path, f"{kind}_sha256", sha256, expected)
             found[f"{kind}_sha256"].append(sha256)
             found[f"{kind}_bytes"].append(path.stat().st_size if there and path is not None else None)
             found[f"{kind}_path"].append(row[f"{kind}_path"] if there else None)

@@ -36,16 +36,16 @@ def joined_licence(licences: Iterable[tuple[object, str]]) -> str:
 
 def _terms(spdx: Licensing, place: object, text: str) -> list[Any]:
     """Return the terms that an expression joins by AND."""
-    wanted = "an SPDX licence expression such as CC-BY-4.0, or LicenseRef-<name>"
+    expected = "an SPDX licence expression such as CC-BY-4.0, or LicenseRef-<name>"
     try:
         expression = spdx.parse(text)
         if expression is None:
-            raise UserError(place, "licence", "nothing", wanted)
+            raise UserError(place, "licence", "nothing", expected)
         odd = [key for key in spdx.unknown_license_keys(expression) if not _OWN.fullmatch(key)]
     except (ExpressionError, ValueError, TypeError, RecursionError) as error:
-        raise UserError(place, "licence", f"{text!r} ({error})", wanted) from None
+        raise UserError(place, "licence", f"{text!r} ({error})", expected) from None
     if odd:
-        raise UserError(place, "licence", ", ".join(odd), wanted)
+        raise UserError(place, "licence", ", ".join(odd), expected)
     waiting, terms = [expression], []
     while waiting:
         term = waiting.pop(0)

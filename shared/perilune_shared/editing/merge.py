@@ -7,10 +7,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import CameraInfo, DatasetInfo
-from perilune_shared.dataset.writer import SceneTables, check_scene, with_column, written
+from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
+from perilune_shared.dataset.names import ImageMode, frame_id_of
+from perilune_shared.dataset.writer import SceneTables, check_scene, new_dataset, with_column
 from perilune_shared.editing.licence import joined_licence
-from perilune_shared.editing.rewrite import ImageMode, bare, check_source, state_of
+from perilune_shared.editing.rewrite import bare, check_source, state_of
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 
@@ -42,7 +43,7 @@ def merge(
     info = _joined_info(sources, name, state_of(list(sources), images))
     groups = _same_scenes(sources, planned=info.images == "planned")
     task = progress.add_task("merging", total=len(groups), unit="scenes")
-    with written(out, info, progress=progress) as writer:
+    with new_dataset(out, info, progress=progress) as writer:
         for scene_id, members in groups.items():
             tables, brought = _join(scene_id, [(sources[i], own) for i, own in members])
             writer.add_scene(bare(tables) if info.images == "planned" else tables)
@@ -71,13 +72,13 @@ def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetI
     return info.changed("merge of " + ", ".join(source.info.name for source in sources))
 
 
-def _exr_camera(sources: Sequence[Dataset]) -> CameraInfo | None:
+def _exr_camera(sources: Sequence[Dataset]) -> CameraRecord | None:
     """Return the camera of all EXRs. Raises UserError if two sources have EXRs of different cameras."""
     with_exrs = [source for source in sources if _has_exrs(source)]
     for source in with_exrs:
         if source.info.exr_camera != with_exrs[0].info.exr_camera:
-            wanted = f"the exr_camera of {with_exrs[0].root}; `perilune-manifest pack` leaves EXRs out"
-            raise UserError(source.root, "exr_camera", "another", wanted)
+            expected = f"the exr_camera of {with_exrs[0].root}; `perilune-manifest pack` leaves EXRs out"
+            raise UserError(source.root, "exr_camera", "another", expected)
     return with_exrs[0].info.exr_camera if with_exrs else None
 
 
@@ -121,7 +122,7 @@ def _join(
     """Return the tables of a merged scene and, for each member, its frames that are used and their new names."""
     joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels")}
     brought: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
-    descents: list[tuple[dict, str]] = []
+    known_trajectories: list[tuple[dict, str]] = []
     taken: dict[str, dict] = {}
     first: SceneTables = {}
     for source, own in members:
@@ -129,12 +130,14 @@ def _join(
         check_scene(source.root, tables)
         if not first:
             first = {name: with_column(tables[name], "scene_id", [scene_id] * len(tables[name])) for name in _GROUND}
-        new_ids, rows = _descents(tables["trajectories"], descents)
+        new_ids, rows = _trajectories(tables["trajectories"], known_trajectories)
         rows = with_column(rows, "scene_id", [scene_id] * len(rows))
         joined["trajectories"].append(rows)
         frames = tables["frames"]
         old = frames.select(["frame_id", "trajectory_id", "frame_index", *_RENDERED]).to_pylist()
-        names = {row["frame_id"]: f"{scene_id}/{new_ids[row['trajectory_id']]}/{row['frame_index']:06d}" for row in old}
+        names = {
+            row["frame_id"]: frame_id_of(scene_id, new_ids[row["trajectory_id"]], row["frame_index"]) for row in old
+        }
         fresh = []
         for row in old:
             before = taken.get(names[row["frame_id"]])
@@ -152,7 +155,7 @@ def _join(
     return first | {name: pa.concat_tables(pieces) for name, pieces in joined.items()}, brought
 
 
-def _descents(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tuple[dict[str, str], pa.Table]:
+def _trajectories(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tuple[dict[str, str], pa.Table]:
     """Map a member's trajectory ids to new ids; also return the renamed rows of trajectories not yet in `known`.
 
     `known` contains the trajectories of earlier members (content and new id); new ones are added to it.

@@ -11,11 +11,12 @@ from typing import Any
 import pyarrow as pa
 
 from perilune_shared.content import content_sha256
+from perilune_shared.dataset.info_file import INFO_NAME, checked_info, read_object
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import INFO_NAME, DatasetInfo, Recipe, checked_info, read_object
+from perilune_shared.dataset.metadata import DatasetInfo, Recipe
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
-from perilune_shared.dataset.writer import written
+from perilune_shared.dataset.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 
@@ -45,16 +46,16 @@ def migrate(root: Path, out: Path, progress: Progress = NO_PROGRESS, *, link: bo
     content = read_object(path)
     version = content.get("schema_version")
     if version == SCHEMA_VERSION:
-        raise UserError(path, "schema_version", version, "an older one; there is nothing to migrate")
+        raise UserError(path, "schema_version", version, "an older version; this one is current")
     if not isinstance(version, str) or version not in OLD_TABLES:
         raise UserError(path, "schema_version", version, f"one of {', '.join(OLD_TABLES)}")
     if content.get("complete") is not True:
-        raise UserError(path, "complete", content.get("complete"), "a dataset that was rendered to its end")
+        raise UserError(path, "complete", content.get("complete"), "a finished dataset")
     info = _info(content, path)
     source = _Old(root, info, version)
     scene_ids = sorted(source.rows("scenes")["scene_id"].to_pylist())
     task = progress.add_task("migrating", total=len(scene_ids), unit="scenes")
-    with written(out, info, progress=progress) as writer:
+    with new_dataset(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = {name: source.rows(name, scene_id) for name in TABLES}
             writer.add_scene(tables)
@@ -68,7 +69,7 @@ def _info(content: dict[str, Any], path: Path) -> DatasetInfo:
     version = content["schema_version"]
     missing = [name for name in ("preset", "kind", "seed", "config", "versions") if name not in content]
     if missing:
-        raise UserError(path, missing[0], "nothing", f"what every dataset of version {version} has")
+        raise UserError(path, missing[0], "nothing", f"a value, as in every dataset of version {version}")
     made = {name: content.pop(name) for name in ("preset", "seed", "config", "versions")}
     origin = content.pop("developed_from", None)
     if isinstance(origin, dict):

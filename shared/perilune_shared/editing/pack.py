@@ -7,8 +7,10 @@ import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.names import frame_path
+from perilune_shared.dataset.packed import MOST_IMAGES_WRITTEN, write_packed
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
-from perilune_shared.dataset.writer import MOST_IMAGES_WRITTEN, frame_path, with_column, written
+from perilune_shared.dataset.writer import new_dataset, with_column
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
@@ -42,12 +44,12 @@ def pack(
     if packed:
         info = info.changed("packed", images="packed", exr_camera=None)
     frames = source.table("frames").sort_by(_ORDER)
-    with written(out, info, whole_tables=True, most_rows=most_rows, progress=progress) as writer:
+    with new_dataset(out, info, whole_tables=True, most_rows=most_rows, progress=progress) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
             writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
         if packed:
-            writer.pack_images(_images(source, frames, progress), round(shard_mb * 1e6), most_images)
+            write_packed(writer.root, _images(source, frames, progress), round(shard_mb * 1e6), most_images)
 
 
 def _images(source: Dataset, frames: pa.Table, progress: Progress) -> Iterator[tuple[str, str, bytes]]:

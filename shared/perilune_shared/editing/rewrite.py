@@ -2,23 +2,18 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
 
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.keys import check_keys
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.dataset.schema import ImageState
-from perilune_shared.dataset.writer import SceneTables, written
+from perilune_shared.dataset.names import ImageMode, ImageState
+from perilune_shared.dataset.writer import SceneTables, new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums
 
-ImageMode = Literal["copy", "link", "none", "plan"]
-"""How frames are written: `copy`; `link` (hard links where the file system allows them: an edit of a frame changes
-both datasets); `none` (left out); `plan` (frames, craters, boulders and labels left out: scenes and poses determine
-them)."""
 _FOLLOWING = ("craters", "boulders", "labels")
 
 
@@ -38,7 +33,7 @@ def rewrite(
     info = info.model_copy(update={"images": state_of([source], images)})
     scene_ids = source.scene_ids() if scene_ids is None else scene_ids
     task = progress.add_task("writing", total=len(scene_ids), unit="scenes")
-    with written(out, info, progress=progress) as writer:
+    with new_dataset(out, info, progress=progress) as writer:
         for scene_id in scene_ids:
             tables = change(source.scene(scene_id))
             frames = tables["frames"]
@@ -62,8 +57,8 @@ def check_source(source: Dataset, out: Path, progress: Progress = NO_PROGRESS) -
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
     if out.resolve().is_relative_to(source.root.resolve()):
         raise UserError(out, "--out", f"a folder in {source.root}", "one outside the dataset")
-    for name, found, wanted in checksums.faults_of(source.root, progress):
-        raise UserError(source.root / name, "SHA-256", found, f"{wanted}; see `perilune-manifest validate`")
+    for name, found, expected in checksums.faults_of(source.root, progress):
+        raise UserError(source.root / name, "SHA-256", found, f"{expected}; see `perilune-manifest validate`")
     check_keys(source)
 
 

@@ -1,25 +1,23 @@
 """Re-split a dataset into train, val and test."""
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.names import ImageMode, SplitUnit
 from perilune_shared.dataset.writer import SceneTables, with_column
 from perilune_shared.editing.flights import terrains_and_flights
-from perilune_shared.editing.rewrite import ImageMode, check_source, rewrite
+from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
-
-SplitBy = Literal["scene", "trajectory", "frame"]
 
 
 def split_dataset(
     source: Dataset,
     out: Path,
-    by: SplitBy = "scene",
+    by: SplitUnit = "scene",
     val_share: float = 0.1,
     test_share: float = 0.1,
     seed: int = 0,
@@ -36,18 +34,18 @@ def split_dataset(
     too few units.
     """
     if not (0 <= val_share < 1 and 0 <= test_share < 1 and val_share + test_share < 1):
-        raise UserError("--val and --test", "shares", f"{val_share}, {test_share}", "from 0 to less than 1 in all")
+        raise UserError("--val and --test", "shares", f"{val_share}, {test_share}", "at least 0, with a sum below 1")
     check_source(source, out, progress)
     frames = terrains_and_flights(source)
     key = {"scene": "terrain", "trajectory": "flight", "frame": "pose"}[by]
     units = frames[key].drop_duplicates().to_numpy()
     n_val, n_test = (int(np.ceil(share * len(units))) for share in (val_share, test_share))
     if n_val + n_test >= len(units):
-        wanted = f"more than {n_val + n_test}, for train, val and test"
-        raise UserError(source.root, "--by", f"{len(units)} of {by}", wanted)
+        expected = f"more than {n_val + n_test}, for train, val and test"
+        raise UserError(source.root, "--by", f"{len(units)} {key}s", expected)
     names = np.array(["train"] * (len(units) - n_val - n_test) + ["val"] * n_val + ["test"] * n_test)
-    dealt = dict(zip(units, np.random.default_rng(seed).permutation(names), strict=True))
-    split_of = dict(zip(frames["frame_id"], frames[key].map(dealt), strict=True))
+    assigned = dict(zip(units, np.random.default_rng(seed).permutation(names), strict=True))
+    split_of = dict(zip(frames["frame_id"], frames[key].map(assigned), strict=True))
 
     def change(tables: SceneTables) -> SceneTables:
         ids = tables["frames"]["frame_id"].to_pylist()

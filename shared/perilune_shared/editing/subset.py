@@ -10,8 +10,9 @@ import pyarrow.compute as pc
 
 from perilune_shared.dataset.expression import Condition, columns_of
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.names import ImageMode
 from perilune_shared.dataset.writer import SceneTables
-from perilune_shared.editing.rewrite import ImageMode, check_source, rewrite
+from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 
@@ -37,8 +38,8 @@ def subset(
     on_labels = [condition for condition in conditions if condition.on_labels]
     planned = source.info.images == "planned" or images == "plan"
     if on_labels and planned:
-        wanted = "conditions on frames, trajectories and scenes: a plan has no labels"
-        raise UserError("--where", "condition", on_labels[0].text, wanted)
+        expected = "conditions on frames, trajectories and scenes: a plan has no labels"
+        raise UserError("--where", "condition", on_labels[0].text, expected)
     check_source(source, out, progress)
     kept = None
     if n_frames is not None or megabytes is not None:
@@ -52,11 +53,11 @@ def subset(
         labels = tables["labels"].filter(pa.array(_holds(on_labels, tables, tables["labels"])))
         return {**tables, "frames": frames.filter(pa.array(mask)), "labels": labels}
 
-    told = [*(f"where {text}" for text in where)]
-    told += [f"{n_frames} frames"] if n_frames is not None else []
-    told += [f"{megabytes:g} MB"] if megabytes is not None else []
-    told += ["no craters and labels"] if images == "plan" else []
-    info = source.info.changed("subset: " + ("; ".join(told) or "all").replace("<", " lt ").replace(">", " gt "))
+    steps = [*(f"where {text}" for text in where)]
+    steps += [f"{n_frames} frames"] if n_frames is not None else []
+    steps += [f"{megabytes:g} MB"] if megabytes is not None else []
+    steps += ["no craters and labels"] if images == "plan" else []
+    info = source.info.changed("subset: " + ("; ".join(steps) or "all").replace("<", " lt ").replace(">", " gt "))
     rewrite(source, out, info, change, images, progress, _scenes_with(source, on_frames))
 
 
@@ -84,9 +85,9 @@ def _first_frames(
         raise UserError(source.root, "scenes", "none", "a dataset with frames")
     table = pd.concat(pieces, ignore_index=True)
     if megabytes is not None and table["png_bytes"].isna().any():
-        raise UserError(source.root, "png_bytes", "null", "--frames: the size of frames never rendered is not known")
-    table["descent"] = table.groupby("scene_id")["trajectory_id"].transform(lambda ids: pd.factorize(ids, sort=True)[0])
-    table = table.sort_values(["descent", "scene_id", "frame_index"], ignore_index=True)
+        raise UserError(source.root, "png_bytes", "null", "--frames instead: unrendered frames have no size")
+    table["turn"] = table.groupby("scene_id")["trajectory_id"].transform(lambda ids: pd.factorize(ids, sort=True)[0])
+    table = table.sort_values(["turn", "scene_id", "frame_index"], ignore_index=True)
     if n_frames is not None:
         table = table.iloc[:n_frames]
     if megabytes is not None:

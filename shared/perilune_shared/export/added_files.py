@@ -21,15 +21,15 @@ def check_sums(dataset: Dataset, paths: Iterable[Path], progress: Progress = NO_
     """
     for path in paths:
         if any(path.resolve().is_relative_to((dataset.root / folder).resolve()) for folder in ("manifest", "images")):
-            raise UserError(path, "--out", "a file among the dataset's tables", "another place")
+            raise UserError(path, "--out", "a file in a folder of tables or images", "another place")
     own = {path.name for path in paths if path.resolve().parent == dataset.root.resolve()}
     for name in sorted(own - EXTRA_NAMES):
         raise UserError(dataset.root / name, "--out", name, f"{', '.join(sorted(EXTRA_NAMES))}, or another folder")
     if not own or not dataset.info.complete:
         return None
-    for name, found, wanted in checksums.faults_of(dataset.root, progress):
+    for name, found, expected in checksums.faults_of(dataset.root, progress):
         if name not in own:
-            raise UserError(dataset.root / name, "SHA-256", found, f"{wanted}; see `perilune-manifest validate`")
+            raise UserError(dataset.root / name, "SHA-256", found, f"{expected}; see `perilune-manifest validate`")
     return {name: sha256 for name, sha256 in checksums.sums_of(dataset.root).items() if name not in own}
 
 

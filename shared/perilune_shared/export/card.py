@@ -14,8 +14,9 @@ import numpy as np
 import pandas as pd
 
 from perilune_shared.content import terrain_of
+from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import INFO_NAME, DatasetInfo, Recipe
+from perilune_shared.dataset.metadata import DatasetInfo, Recipe
 from perilune_shared.dataset.stats import summary
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.export.added_files import add_files, check_sums
@@ -40,7 +41,7 @@ _IMAGES = {
 def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[Path, Path]:
     """Write the page and the picture beside it, and update the dataset's checksums; return the two paths.
 
-    `out` is by default README.md in the dataset. Raises UserError if a file that no card wrote would be overwritten,
+    `out` is by default README.md in the dataset. Raises UserError if a file that is not a card would be overwritten,
     the dataset has no frames or its checksums are wrong.
     """
     out = out or dataset.root / CARD_NAME
@@ -50,7 +51,7 @@ def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[
     ours = out.is_file() and _MARK in out.read_text(encoding="utf-8", errors="replace")
     for path in (out, picture):
         if path.exists() and not ours:
-            raise UserError(path, "--out", "a file that no card wrote", "another place, or that file moved away")
+            raise UserError(path, "--out", "a file that is not a card", "another path, or move that file away")
     known = check_sums(dataset, (out, picture), progress)
     gathered = gather(dataset, progress)
     # Build the page first: it checks the keys and is much faster than the picture.

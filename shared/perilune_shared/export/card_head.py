@@ -1,6 +1,8 @@
 """The YAML head of a dataset card, in Hugging Face's format.
 
-Format: https://huggingface.co/docs/hub/datasets-cards and datasets-manual-configuration.
+Format: https://huggingface.co/docs/hub/datasets-cards and datasets-manual-configuration. huggingface_hub's
+`DatasetCardData` would write the same mapping, but it would add 13 packages (30 MB, with an HTTP client) to every
+installation; the tests read the head with it.
 """
 
 from typing import Any

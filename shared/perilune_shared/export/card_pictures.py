@@ -14,10 +14,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.schema import SPLITS, TABLES
-from perilune_shared.dataset.thresholds import SELECTIONS
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.rows import SceneRows, by_selection, scenes_of
+from perilune_shared.labels.thresholds import SELECTIONS
 from perilune_shared.progress import Progress
 from perilune_shared.storage.png import png_header
 
@@ -65,14 +66,14 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
     samples: list[tuple[dict, pd.DataFrame]] = []
     # Spread the frames over the scenes and over the length of trajectories.
     places = np.linspace(0, len(ids) - 1e-9, _N_FRAMES, endpoint=False).astype(int)
-    wanted = {ids[place]: np.flatnonzero(places == place) for place in places}
+    shown_of_scene = {ids[place]: np.flatnonzero(places == place) for place in places}
     for scene in scenes_of(dataset, choose=by_selection(SELECTIONS["visible"])):
         ratio = _depth_ratios(dataset, scene)
         for split, frames in scene.frames.groupby("split"):
             own = scene.labels["frame_id"].isin(frames["frame_id"]).to_numpy()
             for name, values in _measured(frames, scene.labels[own], ratio[own]).items():
                 collected.setdefault(name, {}).setdefault(str(split), []).append(values.astype(np.float32))
-        for k in wanted.get(scene.scene_id, ()):
+        for k in shown_of_scene.get(scene.scene_id, ()):
             row = scene.frames.iloc[round(k / (_N_FRAMES - 1) * (len(scene.frames) - 1))]
             own = (scene.labels["frame_id"] == row["frame_id"]).to_numpy()
             samples.append((row.to_dict(), scene.labels[own].assign(visible=scene.labels["chosen"][own])))

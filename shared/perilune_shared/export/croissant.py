@@ -16,8 +16,8 @@ from typing import Any
 
 import pyarrow as pa
 
+from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import INFO_NAME
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import KEYS, OPTIONAL, TABLES
 from perilune_shared.errors import UserError
@@ -81,7 +81,7 @@ def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progre
     """
     out = out or dataset.root / CROISSANT_NAME
     if out.resolve().parent != dataset.root.resolve() or out.suffix != ".json":
-        raise UserError(out, "--out", "another folder", f"a .json file in {dataset.root}, whose files it names by path")
+        raise UserError(out, "--out", "another folder", f"a .json file in {dataset.root}, since its paths are relative")
     if out.name == INFO_NAME:
         raise UserError(out, "--out", INFO_NAME, "a name that is not taken")
     if not dataset.info.complete:

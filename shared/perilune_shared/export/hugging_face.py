@@ -16,7 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.schema import IMAGES, SPLITS, TABLES
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.schema import IMAGES, TABLES
 from perilune_shared.export.card_head import head_of
 from perilune_shared.export.rows import Choice, SceneRows, scenes_of
 from perilune_shared.progress import Progress
@@ -29,7 +30,7 @@ _LABEL = pa.struct(
         pa.field("chosen", pa.bool_()),
     ]
 )
-_FRAMES_A_GROUP = 128
+_FRAMES_PER_GROUP = 128
 _DTYPES = {pa.string(): "string", pa.int64(): "int64", pa.float64(): "float64", pa.bool_(): "bool"}
 
 
@@ -102,8 +103,8 @@ def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]
     """Yield split and rows of a scene's frames, in batches."""
     schema = schema_of()
     for split, frames in scene.frames.groupby("split"):
-        for start in range(0, len(frames), _FRAMES_A_GROUP):
-            some = frames.iloc[start : start + _FRAMES_A_GROUP]
+        for start in range(0, len(frames), _FRAMES_PER_GROUP):
+            some = frames.iloc[start : start + _FRAMES_PER_GROUP]
             pngs = dict(dataset.pngs(pa.Table.from_pandas(some[["frame_id", "png_path"]], preserve_index=False)))
             images = [{"bytes": pngs[name], "path": f"{name}.png"} for name in some["frame_id"]]
             columns = {

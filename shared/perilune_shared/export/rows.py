@@ -15,10 +15,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.schema import SPLITS, TABLES
-from perilune_shared.dataset.selection import selected
-from perilune_shared.dataset.thresholds import Selection
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
+from perilune_shared.labels.selection import selected
+from perilune_shared.labels.thresholds import Selection
 
 Choice = Callable[[Dataset, str, pa.Table], NDArray[np.bool_]]
 """Select labels: takes the dataset, a scene_id and its labels (N rows, all columns); returns bool (N,)."""

@@ -13,7 +13,7 @@ import pandas as pd
 import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.schema import SPLITS
+from perilune_shared.dataset.names import SPLITS
 from perilune_shared.export.rows import Choice, clipped_boxes, scenes_of, sizes
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
@@ -70,7 +70,7 @@ def _bring_images(dataset: Dataset, frames: pd.DataFrame, folder: Path, *, link:
     if dataset.info.images == "files":
         for row in rows.to_dict("records"):
             to = files.inside(folder, f"images/{row['frame_id']}.png")
-            files.bring(dataset.file(row["png_path"]), to, link=link)
+            files.copy_or_link(dataset.file(row["png_path"]), to, link=link)
         return
     for frame_id, png in dataset.pngs(pa.Table.from_pandas(rows, preserve_index=False)):
         files.write_bytes(files.inside(folder, f"images/{frame_id}.png"), png, durable=False)

@@ -1,1 +1,1 @@
-"""Frames of reference, camera, ellipses and the nominal descent."""
+"""Frames of reference, camera, ellipses and the nominal trajectory."""

@@ -21,7 +21,10 @@ from perilune_shared.geometry.frames import Array
 
 Distortion = tuple[float, float, float, float, float]
 NO_DISTORTION: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
-_UNDISTORTED_TO = 1e-10
+ROTATION_CAMERA_FROM_BODY = np.diag([1.0, -1.0, -1.0])
+"""Default mounting: the camera looks along -Z_B, its x axis along X_B. With the body level in O_L this is the paper's
+"along the negative axis of Z_L"."""
+_MAX_UNDISTORTION_ERROR = 1e-10
 """Maximum error of `rays`, in coordinates divided by the focal length."""
 
 
@@ -153,24 +156,24 @@ class Camera:
             scale + slope * y * y + 6 * p1 * y + 2 * p2 * x,
         )
 
-    def _undistorted(self, wanted_x: Array, wanted_y: Array) -> tuple[Array, Array]:
+    def _undistorted(self, target_x: Array, target_y: Array) -> tuple[Array, Array]:
         """Invert the distortion by Newton's method, from a tabulated inverse of the radial part inside the fold."""
-        wanted_r = np.hypot(wanted_x, wanted_y)
-        radial = self._radial_table(float(np.nanmax(wanted_r, initial=0.0)))
-        start = np.interp(wanted_r, radial[1], radial[0]) / np.maximum(wanted_r, 1e-300)
-        x, y = wanted_x * start, wanted_y * start
+        target_r = np.hypot(target_x, target_y)
+        radial = self._radial_table(float(np.nanmax(target_r, initial=0.0)))
+        start = np.interp(target_r, radial[1], radial[0]) / np.maximum(target_r, 1e-300)
+        x, y = target_x * start, target_y * start
         for _ in range(20):
             got_x, got_y = self._distorted(x, y)
-            off_x, off_y = wanted_x - got_x, wanted_y - got_y
+            off_x, off_y = target_x - got_x, target_y - got_y
             # A point exactly on the fold cannot be inverted; it stays NaN.
-            if not (np.maximum(np.abs(off_x), np.abs(off_y)) > 1e-2 * _UNDISTORTED_TO).any():
+            if not (np.maximum(np.abs(off_x), np.abs(off_y)) > 1e-2 * _MAX_UNDISTORTION_ERROR).any():
                 break
             xx, xy, yy = self._jacobian(x, y)
             determinant = xx * yy - xy * xy
             x = x + (yy * off_x - xy * off_y) / determinant
             y = y + (xx * off_y - xy * off_x) / determinant
         got_x, got_y = self._distorted(x, y)
-        found = np.maximum(np.abs(wanted_x - got_x), np.abs(wanted_y - got_y)) < _UNDISTORTED_TO
+        found = np.maximum(np.abs(target_x - got_x), np.abs(target_y - got_y)) < _MAX_UNDISTORTION_ERROR
         return np.where(found, x, np.nan), np.where(found, y, np.nan)
 
     def _radial_table(self, largest: float) -> Array:

@@ -51,27 +51,27 @@ def faults_of(root: Path, progress: Progress = NO_PROGRESS) -> Iterator[tuple[st
     text = path.read_bytes().decode("utf-8", errors="replace")
     lines = [_LINE.fullmatch(line) for line in text.removesuffix("\n").split("\n")]
     if not text.endswith("\n") or None in lines:
-        yield SUMS_NAME, "a line of another form", "64 hexadecimal digits, two blanks, a path"
+        yield SUMS_NAME, "an invalid line", "64 hexadecimal digits, two spaces, a path"
         return
     listed = {line[2]: line[1] for line in lines if line is not None}
     if list(listed) != sorted(listed) or len(listed) != len(lines):
-        yield SUMS_NAME, "paths twice or out of order", "each path once, in order"
+        yield SUMS_NAME, "repeated or unsorted paths", "each path once, sorted"
     present = set(_covered(root))
     with _hashing(root, [name for name in listed if name in present], progress) as advance:
         for name, sha256 in listed.items():
             try:
                 file = files.inside(root, name)
             except UserError as error:
-                yield SUMS_NAME, error.found, error.wanted
+                yield SUMS_NAME, error.found, error.expected
                 continue
             if not file.is_file():
-                yield name, "no such file", f"the file with SHA-256 {sha256}, as {SUMS_NAME} has it"
+                yield name, "no such file", f"the file with SHA-256 {sha256}, as in {SUMS_NAME}"
             elif file.stat().st_size > _LARGEST_FILE:
                 yield name, f"{file.stat().st_size} bytes", f"at most {_LARGEST_FILE}"
             elif files.sha256_of(file, advance) != sha256:
-                yield name, "another content", f"SHA-256 {sha256}, as {SUMS_NAME} has it"
+                yield name, "a different SHA-256", f"SHA-256 {sha256}, as in {SUMS_NAME}"
     for name in sorted(present - set(listed)):
-        yield name, "not listed in SHA256SUMS", "only files that the dataset was written with"
+        yield name, "not listed in SHA256SUMS", "only the dataset's files"
 
 
 @contextlib.contextmanager

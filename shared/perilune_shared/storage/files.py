@@ -112,7 +112,7 @@ def inside(root: Path, relative: str) -> Path:
     except (OSError, RuntimeError):  # cyclic links
         own = False
     if not own:
-        raise UserError(root, "path", repr(relative), "a path that no link leads out of the dataset")
+        raise UserError(root, "path", repr(relative), "a path without links that leave the dataset")
     return path
 
 
@@ -121,10 +121,10 @@ def check_plain_file(path: Path) -> int:
     try:
         state = path.lstat()
     except (OSError, ValueError):
-        raise UserError(path, "file", "no such file", "a file of the dataset's own") from None
+        raise UserError(path, "file", "no such file", "a regular file") from None
     if not stat.S_ISREG(state.st_mode):
         found = "a link" if stat.S_ISLNK(state.st_mode) else "a folder, a pipe or a device"
-        raise UserError(path, "file", found, "a file of the dataset's own")
+        raise UserError(path, "file", found, "a regular file")
     return state.st_size
 
 
@@ -160,16 +160,16 @@ def new_folder(out: Path) -> Iterator[Path]:
 def check_free(out: Path) -> None:
     """Raise UserError if the folder for a new dataset is not empty."""
     if out.is_symlink() or (out.exists() and (not out.is_dir() or any(out.iterdir()))):
-        raise UserError(out, "--out", "something that is there", "a new or empty folder")
+        raise UserError(out, "--out", "a path that is not empty", "a new or empty folder")
 
 
-def bring(path: Path, to: Path, *, link: bool) -> None:
+def copy_or_link(path: Path, to: Path, *, link: bool) -> None:
     """Copy a frame's file to `to`; with `link`, make a hard link where the file system allows it.
 
     Copies are reflinks (copy-on-write) where the file system supports them. Raises UserError if the file is missing.
     """
     if not path.is_file():
-        raise UserError(path, "frame", "no such file", "the file that the manifest names")
+        raise UserError(path, "frame", "no such file", "the file listed in the manifest")
     to.parent.mkdir(parents=True, exist_ok=True)
     if link:
         with contextlib.suppress(OSError):

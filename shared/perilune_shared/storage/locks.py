@@ -62,8 +62,8 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
         left_s = _left_s(record)
         elsewhere = left_s > 0
         if elsewhere:
-            wanted = f"a free folder: if that process was killed, remove {record} or wait {left_s:.0f} s"
-            raise _refusal(folder, _read(record), wanted)
+            expected = f"a free folder: if that process was killed, remove {record} or wait {left_s:.0f} s"
+            raise _refusal(folder, _read(record), expected)
         with _recorded(record):
             yield
     finally:
@@ -118,11 +118,11 @@ def _read(record: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def _refusal(folder: Path, holder: dict[str, Any] | None, wanted: str) -> UserError:
+def _refusal(folder: Path, holder: dict[str, Any] | None, expected: str) -> UserError:
     known = holder or {}
     words = {"pid": "PID", "host": "on host", "since": "since"}
-    told = " ".join(f"{word} {known[name]}" for name, word in words.items() if name in known)
-    return UserError(folder, "folder", f"one locked by {told or 'another process'}", wanted)
+    text = " ".join(f"{word} {known[name]}" for name, word in words.items() if name in known)
+    return UserError(folder, "folder", f"one locked by {text or 'another process'}", expected)
 
 
 def _boot_id() -> str:

@@ -8,8 +8,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import INFO_NAME
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.storage.checksums import SUMS_NAME
 from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE

@@ -10,8 +10,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, is_whole
-from perilune_shared.dataset.schema import OPTIONAL, SPLITS, TABLES
+from perilune_shared.dataset.schema import OPTIONAL, TABLES
 from perilune_shared.errors import UserError, one_line, shortened
 
 _PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
@@ -74,31 +75,31 @@ class Fault:
     """Column or property that is wrong."""
     found: str
     """Value found."""
-    wanted: str
+    expected: str
     """Value expected."""
 
     @classmethod
-    def of(cls, file: object, row: int | None, column: object, found: object, wanted: object) -> "Fault":
+    def of(cls, file: object, row: int | None, column: object, found: object, expected: object) -> "Fault":
         """Create a fault from untrusted values: shortened, on one line, without control characters."""
         return cls(
             shortened(one_line(file), 300),
             row,
             shortened(one_line(column)),
             shortened(one_line(found)) or "nothing",
-            shortened(one_line(wanted), 300),
+            shortened(one_line(expected), 300),
         )
 
     @classmethod
-    def told(cls, file: object, row: int | None, error: UserError) -> "Fault":
+    def from_error(cls, file: object, row: int | None, error: UserError) -> "Fault":
         """Create a fault from an error raised while reading."""
-        return cls.of(file, row, error.field, error.found, error.wanted)
+        return cls.of(file, row, error.field, error.found, error.expected)
 
 
 def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
     """Yield the faults that can be found in one part alone."""
     where = path.relative_to(dataset.root).as_posix()
     if path.is_symlink() or not path.resolve().is_relative_to(dataset.root.resolve()):
-        yield Fault.of(where, None, "part", "a link", "a file of the dataset's own")
+        yield Fault.of(where, None, "part", "a link", "a regular file")
         return
     if not matches(PART_PATTERN, path.stem):
         yield Fault.of(where, None, "part", path.stem, f"a name like {PART_PATTERN}")
@@ -113,9 +114,12 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
         if odd or present != [name for name in known if name in names]:
             yield Fault.of(where, None, "schema", odd or "another order", f"the columns of {table}")
             return
-        for found, wanted in ((part.found.field(name), TABLES[table].field(name)) for name in present):
-            if (found.type, found.nullable) != (wanted.type, wanted.nullable) or found.metadata != wanted.metadata:
-                yield Fault.of(where, None, found.name, found.metadata, f"{wanted.type} with {wanted.metadata}")
+        for found, expected in ((part.found.field(name), TABLES[table].field(name)) for name in present):
+            if (found.type, found.nullable) != (
+                expected.type,
+                expected.nullable,
+            ) or found.metadata != expected.metadata:
+                yield Fault.of(where, None, found.name, found.metadata, f"{expected.type} with {expected.metadata}")
         first_row = 0
         for group in range(part.n_groups):
             rows = part.read(groups=[group], any_ids=True)
@@ -124,7 +128,7 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
                 yield from _of_values(where, first_row, field, rows[field.name].combine_chunks())
             first_row += len(rows)
     except UserError as error:
-        yield Fault.told(where, None, error)
+        yield Fault.from_error(where, None, error)
 
 
 def _of_the_name(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
@@ -172,10 +176,10 @@ def _of_values(where: str, first_row: int, field: pa.Field, column: pa.Array) ->
             checks.append(((values[:, 0] < low) | (values[:, 0] > high), f"{low} to {high}"))
         if field.name in _UNIT_VECTORS:
             checks.append((np.abs(np.linalg.norm(values, axis=1) - 1) > 1e-6, "length 1"))
-    for wrong, wanted in checks:
+    for wrong, expected in checks:
         rows = np.flatnonzero(wrong & present)
         if len(rows):
-            yield Fault.of(where, first_row + int(rows[0]), field.name, column[int(rows[0])].as_py(), wanted)
+            yield Fault.of(where, first_row + int(rows[0]), field.name, column[int(rows[0])].as_py(), expected)
 
 
 def matches(pattern: str, text: object) -> bool:

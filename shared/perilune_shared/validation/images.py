@@ -8,6 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
+from perilune_shared.dataset.names import IMAGE_KINDS
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import IMAGES
 from perilune_shared.errors import UserError
@@ -23,7 +24,7 @@ def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     if info.images in ("absent", "planned"):
         return
     task = progress.add_task("hashing", total=info.counts.frames, unit="frames")
-    columns = ["frame_id", *(f"{kind}_{name}" for kind in ("png", "exr") for name in ("path", "bytes", "sha256"))]
+    columns = ["frame_id", *(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "bytes", "sha256"))]
     for part in dataset.parts("frames"):
         where = part.relative_to(dataset.root).as_posix()
         first_row = 0
@@ -31,7 +32,7 @@ def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
             places = {frame_id: first_row + row for row, frame_id in enumerate(rows["frame_id"].to_pylist())}
             records = rows.to_pylist()
             for row, frame in enumerate(records, first_row):
-                for kind in ("png", "exr") if info.images == "files" else ():
+                for kind in IMAGE_KINDS if info.images == "files" else ():
                     if frame[f"{kind}_path"] is not None:
                         yield from _file(dataset, frame, kind, row, where)
                 progress.advance(task)
@@ -42,7 +43,7 @@ def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
                         sha256 = hashlib.sha256(png).hexdigest()
                         yield from _png(dataset, png, len(png), sha256, records[row - first_row], row)
                 except UserError as error:
-                    yield Fault.told("images", None, error)
+                    yield Fault.from_error("images", None, error)
             first_row += len(rows)
     if info.images == "packed":
         yield from _shards(dataset)
@@ -64,7 +65,7 @@ def _shards(dataset: Dataset) -> Iterator[Fault]:
         try:
             keys = Part(shard, "images", IMAGES).read(["frame_id"])["frame_id"].to_pylist()
         except UserError as error:
-            yield Fault.told(where, None, error)
+            yield Fault.from_error(where, None, error)
             continue
         odd = [key for key in keys if key not in known or key in found]
         if odd or len(set(keys)) != len(keys):
@@ -77,7 +78,7 @@ def _file(dataset: Dataset, frame: dict, kind: str, row: int, where: str) -> Ite
     try:
         path = dataset.file(relative)
     except UserError as error:
-        yield Fault.of(where, row, f"{kind}_path", error.found, error.wanted)
+        yield Fault.of(where, row, f"{kind}_path", error.found, error.expected)
         return
     if not path.is_file():
         yield Fault.of(relative, row, f"{kind}_path", "no such file", "the frame")

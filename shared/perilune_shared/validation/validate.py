@@ -19,10 +19,10 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums
-from perilune_shared.validation.descent import descent_faults
 from perilune_shared.validation.expected_files import unexpected
 from perilune_shared.validation.faults import Fault, part_faults
 from perilune_shared.validation.images import image_faults
+from perilune_shared.validation.trajectory import trajectory_faults
 
 _DEGREES = 1e-9
 _NOT_PLANNED = ("craters", "boulders", "labels")
@@ -40,17 +40,19 @@ def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
 
 def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
     faults = [
-        Fault.of(file, None, "SHA-256", found, wanted)
-        for file, found, wanted in checksums.faults_of(dataset.root, progress)
+        Fault.of(file, None, "SHA-256", found, expected)
+        for file, found, expected in checksums.faults_of(dataset.root, progress)
     ]
     try:
-        wanted = "only files that a dataset is made of (docs/reference/validation.md)"
-        faults += [Fault.of(path, None, "file", "an unexpected file or folder", wanted) for path in unexpected(dataset)]
+        expected = "only files of the dataset format (docs/reference/validation.md)"
+        faults += [
+            Fault.of(path, None, "file", "an unexpected file or folder", expected) for path in unexpected(dataset)
+        ]
     except UserError as error:
-        faults.append(Fault.told("manifest/frames", None, error))
+        faults.append(Fault.from_error("manifest/frames", None, error))
     if not dataset.info.complete:
-        wanted = "a finished dataset; run `make dataset` again to go on"
-        faults.append(Fault.of("dataset.json", None, "complete", "False", wanted))
+        expected = "a finished dataset; run `make dataset` again to resume"
+        faults.append(Fault.of("dataset.json", None, "complete", "False", expected))
     for name in TABLES:
         for part in dataset.parts(name):
             faults += part_faults(dataset, part, name)
@@ -58,12 +60,12 @@ def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
         faults += _tables(dataset, progress)
     except UserError as error:
         if not faults:
-            faults.append(Fault.told("manifest", None, error))
+            faults.append(Fault.from_error("manifest", None, error))
     try:
         faults += image_faults(dataset, progress)
     except UserError as error:
         if not faults:
-            faults.append(Fault.told("images", None, error))
+            faults.append(Fault.from_error("images", None, error))
     return list({(fault.file, fault.column, fault.row is None): fault for fault in reversed(faults)}.values())[::-1]
 
 
@@ -73,22 +75,22 @@ def _tables(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     for name, present in counts.items():
         counted = getattr(dataset.info.counts, name)
         if counted != present:
-            yield Fault.of("dataset.json", None, f"counts.{name}", counted, f"{present}, the rows present")
+            yield Fault.of("dataset.json", None, f"counts.{name}", counted, f"{present}, the number of rows")
         if dataset.info.images == "planned" and name in _NOT_PLANNED and present:
-            yield Fault.of(f"manifest/{name}", None, "images", "rows", "none: the dataset says that it is only planned")
+            yield Fault.of(f"manifest/{name}", None, "images", "rows", "none: dataset.json says images: planned")
     scene_ids = dataset.table("scenes", ["scene_id"])["scene_id"].to_pylist()
     yield from _unique(dataset, "scenes", dataset.table("scenes", KEYS["scenes"]), "manifest/scenes")
     used: set[str] = set()
-    told: set[tuple[str, str]] = set()
+    reported: set[tuple[str, str]] = set()
     seen = dict.fromkeys(TABLES, 0)
     splits_of_terrain: dict[str, set[str]] = defaultdict(set)
-    splits_of_descent: dict[tuple[str, object], set[str]] = defaultdict(set)
+    splits_of_trajectory: dict[tuple[str, object], set[str]] = defaultdict(set)
     task = progress.add_task("checking", total=len(scene_ids), unit="scenes")
     for scene_id in dict.fromkeys(scene_ids):
         scene = dataset.table("scenes", scene_id=scene_id)
         if not len(scene):
-            wanted = "names of parts and statistics of row groups that tell where a scene's rows are"
-            yield Fault.of("manifest/scenes", None, "part", f"{scene_id} elsewhere", wanted)
+            expected = "part names and row group statistics that match the scene's rows"
+            yield Fault.of("manifest/scenes", None, "part", f"{scene_id} elsewhere", expected)
             continue
         used.add(scene["recipe"][0].as_py())
         frame_splits = dataset.table("frames", ["trajectory_id", "split"], scene_id=scene_id)
@@ -98,28 +100,36 @@ def _tables(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
         seeds = dataset.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pydict()
         seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
         for trajectory_id, split in {tuple(each.values()) for each in frame_splits.to_pylist()}:
-            splits_of_descent[terrain, seed_of.get(trajectory_id, trajectory_id)].add(split)
+            splits_of_trajectory[terrain, seed_of.get(trajectory_id, trajectory_id)].add(split)
         seen["scenes"] += len(scene)
-        yield from _scene(dataset, scene_id, scene, seen, told)
+        yield from _scene(dataset, scene_id, scene, seen, reported)
         progress.advance(task)
     for name, present in counts.items():
         if seen[name] != present:
-            wanted = f"{seen[name]}: those of the scenes and descents listed"
-            yield Fault.of(f"manifest/{name}", None, "+".join(KEYS[name][:1]), f"{present} rows", wanted)
+            expected = f"{seen[name]}: the rows of the listed scenes and trajectories"
+            yield Fault.of(f"manifest/{name}", None, "+".join(KEYS[name][:1]), f"{present} rows", expected)
     if used != set(dataset.info.recipes):
-        yield Fault.of("dataset.json", None, "recipes", sorted(dataset.info.recipes), f"{sorted(used)}, as scenes name")
+        yield Fault.of(
+            "dataset.json", None, "recipes", sorted(dataset.info.recipes), f"{sorted(used)}, the recipes of the scenes"
+        )
     for terrain, splits in splits_of_terrain.items():
         if len(splits) > 1 and dataset.info.split_by == "scene":
             found = f"terrain {terrain[:12]} in {' and '.join(sorted(map(str, splits)))}"
-            yield Fault.of("manifest/frames", None, "split", found, "one split for each scene: no common terrain")
-    for (terrain, _), splits in splits_of_descent.items():
+            yield Fault.of("manifest/frames", None, "split", found, "one split for each terrain (split_by is scene)")
+    for (terrain, _), splits in splits_of_trajectory.items():
         if len(splits) > 1 and dataset.info.split_by != "frame":
-            found = f"a descent over terrain {terrain[:12]} in {' and '.join(sorted(map(str, splits)))}"
-            yield Fault.of("manifest/frames", None, "split", found, "one split for each descent, whatever its name")
+            found = f"a trajectory over terrain {terrain[:12]} in {' and '.join(sorted(map(str, splits)))}"
+            yield Fault.of(
+                "manifest/frames",
+                None,
+                "split",
+                found,
+                "one split for each trajectory, also for copies with another name",
+            )
 
 
 def _scene(
-    dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int], told: set[tuple[str, str]]
+    dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int], reported: set[tuple[str, str]]
 ) -> Iterator[Fault]:
     """Check one scene's row, craters and boulders, then each of its trajectories; count the rows seen."""
     where = {name: _place(dataset, name, scene_id) for name in TABLES}
@@ -133,11 +143,17 @@ def _scene(
     if dataset.info.images != "planned":
         content = content_sha256(craters, boulders)
         if row["content_sha256"] != content:
-            yield Fault.of(where["scenes"], 0, "content_sha256", row["content_sha256"], f"{content}, of its craters")
+            yield Fault.of(
+                where["scenes"],
+                0,
+                "content_sha256",
+                row["content_sha256"],
+                f"{content}, the hash of craters and boulders",
+            )
     if len(craters):
-        yield from _in_file(dataset, _crater_places(craters, row, where["craters"]), scene_id, told)
-    for descent in trajectories.to_pylist():
-        trajectory_id = descent["trajectory_id"]
+        yield from _in_file(dataset, _crater_places(craters, row, where["craters"]), scene_id, reported)
+    for trajectory in trajectories.to_pylist():
+        trajectory_id = trajectory["trajectory_id"]
         frames = dataset.table("frames", scene_id=scene_id, trajectory_id=trajectory_id)
         labels = dataset.table("labels", scene_id=scene_id, trajectory_id=trajectory_id)
         seen["frames"] += len(frames)
@@ -145,20 +161,20 @@ def _scene(
         places = {name: _place(dataset, name, scene_id, trajectory_id) for name in ("frames", "labels")}
         for name, rows in (("frames", frames), ("labels", labels)):
             yield from _unique(dataset, name, rows.select(KEYS[name]), places[name])
-        faults = descent_faults(dataset.info, row, craters, descent, frames, labels, places)
-        yield from _in_file(dataset, faults, f"{scene_id}/{trajectory_id}/", told)
+        faults = trajectory_faults(dataset.info, row, craters, trajectory, frames, labels, places)
+        yield from _in_file(dataset, faults, f"{scene_id}/{trajectory_id}/", reported)
 
 
-def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, told: set[tuple[str, str]]) -> Iterator[Fault]:
+def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, reported: set[tuple[str, str]]) -> Iterator[Fault]:
     """Convert row numbers within a scene or trajectory (prefix `own` of its frame_ids) to row numbers of the file.
 
-    Skips faults of files and columns already in `told`.
+    Skips faults of files and columns already in `reported`.
     """
     for fault in faults:
         path = dataset.root / fault.file
-        if (fault.file, fault.column) in told:
+        if (fault.file, fault.column) in reported:
             continue
-        told.add((fault.file, fault.column))
+        reported.add((fault.file, fault.column))
         if fault.row is not None and is_whole(path.stem):
             part = dataset.open_part(path, path.parent.name)
             key = "frame_id" if "frame_id" in part.schema.names else "scene_id"
@@ -182,7 +198,7 @@ def _crater_places(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault
         wrong = np.flatnonzero(apart > _DEGREES)
         if len(wrong):
             found = craters[name][int(wrong[0])].as_py()
-            yield Fault.of(where, int(wrong[0]), name, found, f"{again[wrong[0]]}, of the place x_m, y_m")
+            yield Fault.of(where, int(wrong[0]), name, found, f"{again[wrong[0]]}, from x_m and y_m")
 
 
 def _place(dataset: Dataset, table: str, scene_id: str, trajectory_id: str | None = None) -> str:

@@ -8,8 +8,7 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig
 from perilune_render.frame_source import FrameSource, Shot
 from perilune_render.labels.frame_labels import RimCircles
-from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
 
 

@@ -16,8 +16,7 @@ from perilune_render.labels.frame_labels import RimCircles, crater_index, label_
 from perilune_render.terrain.craters.stamp import stamp_craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import value_at
-from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
 
 CAMERA = Camera(96, 64, 110.0, 110.0, 50.0, 30.0)

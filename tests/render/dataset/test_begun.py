@@ -17,8 +17,8 @@ from perilune_render.dataset.regenerate import png_far, regenerate
 from perilune_render.dataset.render import render_plan
 from perilune_render.flight.plan import make_plan
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
+from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.metadata import write_info
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError

@@ -7,8 +7,8 @@ from tests.helpers import in_process
 
 from perilune_render.cli import main
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.selection import read_labels, selected
-from perilune_shared.dataset.thresholds import SELECTIONS
+from perilune_shared.labels.selection import read_labels, selected
+from perilune_shared.labels.thresholds import SELECTIONS
 
 DARK = [
     "--preset=tiny",

@@ -201,7 +201,7 @@ def test_a_distorted_dataset_is_rendered_labelled_and_developed(tmp_path):
     assert made.returncode == 0, made.stderr
     dataset = open_dataset(tmp_path / "detect")
     assert validate(dataset) == []
-    camera, exr_camera = dataset.info.camera.intrinsics(), dataset.info.exr_camera.intrinsics()
+    camera, exr_camera = dataset.camera, dataset.info.exr_camera.intrinsics()
     assert exr_camera == camera.covering_pinhole() and exr_camera.width_px > camera.width_px == 128
     # Developed for the pinhole itself and distorted by OpenCV's own means, the frame is the same.
     plain = settings(

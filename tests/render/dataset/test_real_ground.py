@@ -7,8 +7,7 @@ from tests.helpers.scenes import flat_scene
 
 from perilune_render.dataset.real_ground import draw_outline, outline_m, real_ground_share
 from perilune_render.terrain.elevation.model import beyond_m, raster_places, read_elevation
-from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 
 CAMERA = Camera.from_field_of_view(64, 64, 2 * np.degrees(np.arctan(0.5)))
 DOWN = ROTATION_CAMERA_FROM_BODY

@@ -170,7 +170,7 @@ def test_a_full_disk_leaves_what_was_finished(tmp_path):
     assert result.returncode == 2 and "Traceback" not in result.stderr and "stays valid" in result.stderr
     dataset = open_dataset(tmp_path / "detect")
     for fault in validate(dataset):
-        assert "readable part" not in fault.wanted, fault
+        assert "readable part" not in fault.expected, fault
     assert not [p for p in tmp_path.rglob("*") if ".part" in p.name]
     assert run("dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", tmp_path).returncode == 0
     assert validate(open_dataset(tmp_path / "detect")) == []

@@ -2,7 +2,7 @@ import numpy as np
 
 from perilune_render.config import FlightConfig
 from perilune_render.flight.trajectories import fly, smooth_process
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 
 FLIGHT = FlightConfig(position_sigma_m=8.0, attitude_sigma_deg=0.5, correlation_time_s=3.0)
 

@@ -10,11 +10,10 @@ from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import expected, expose
 from perilune_render.labels.frame_labels import RimCircles, Shown, crater_index, label_frame, with_contrast
 from perilune_render.labels.pixels import contrasts, sunlit_fractions
-from perilune_shared.dataset.masks import crater_masks
-from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
+from perilune_shared.labels.masks import crater_masks
 
 CAMERA = Camera.from_field_of_view(128, 128, 50.0)
 ABOVE = np.array([0.0, 0.0, 500.0])

@@ -62,7 +62,7 @@ def changed(copy, module, pattern, replacement):
         ("perilune_render.config", "_SPREAD_FIELDS", {"generator", "renderer", "imaging"}),
         ("perilune_render.labels.pixels", "_N_FITTED", {"imaging"}),
         ("perilune_render.labels.frame_labels", "_N_RIM", {"imaging"}),
-        ("perilune_shared.dataset.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
+        ("perilune_shared.labels.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
         ("perilune_shared.geometry.ellipse", "_N_FITTED", {"imaging"}),
         ("perilune_shared.geometry.camera", "_UNDISTORTED_TO", {"generator", "renderer", "imaging"}),
         ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "imaging"}),

@@ -112,7 +112,7 @@ def test_half_width_for_is_where_the_spacing_is_reached():
 def test_too_many_vertices_are_refused_and_a_spacing_is_named_that_passes(most):
     with pytest.raises(UserError, match=r"dataset.terrain.spacing_px: got 0.5 needs 5,.* vertices") as refusal:
         graded_grid(config_with(terrain={"max_vertices": most}).terrain, VIEW)
-    named = float(re.search(r"at least ([0-9.]+),", refusal.value.wanted)[1])
+    named = float(re.search(r"at least ([0-9.]+),", refusal.value.expected)[1])
     wider = config_with(terrain={"max_vertices": most, "spacing_px": named})
     assert graded_grid(wider.terrain, VIEW).n_vertices <= most
     finer = config_with(terrain={"max_vertices": most, "spacing_px": round(named - 0.01, 2)})

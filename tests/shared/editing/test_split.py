@@ -31,7 +31,7 @@ def test_split(drawn, tmp_path, by):
 
 
 def test_too_few_to_split(drawn, tmp_path):
-    with pytest.raises(UserError, match="5 of scene"):
+    with pytest.raises(UserError, match="5 terrains"):
         split_dataset(open_dataset(drawn), tmp_path / "s", val_share=0.5, test_share=0.4)
     with pytest.raises(UserError, match="shares"):
         split_dataset(open_dataset(drawn), tmp_path / "s", val_share=0.5, test_share=0.5)

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from huggingface_hub import DatasetCard
 from markdown_it import MarkdownIt
 from PIL import Image
 from rich.progress import Progress
@@ -21,8 +22,8 @@ from tests.helpers.drawn_dataset import build_dataset
 from typer.testing import CliRunner
 
 from perilune_shared.cli.main import app
+from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.metadata import write_info
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
@@ -50,6 +51,17 @@ def card(crowded, tmp_path_factory):
     page, picture = carded(root)
     assert (page.name, picture.name) == ("README.md", "card.png")
     return root
+
+
+def test_huggingface_hub_reads_the_head(card):
+    data = DatasetCard.load(card / "README.md").data
+    assert (data.license, data.pretty_name, data.size_categories) == ("cc0-1.0", "test", ["n<1K"])
+    (frames,) = [config for config in data.configs if config.get("default")]
+    assert frames == {
+        "config_name": "frames",
+        "data_files": [{"split": "mixed", "path": "manifest/frames/*.parquet"}],
+        "default": True,
+    }
 
 
 def test_the_head_is_of_the_hubs_form(card):
@@ -154,12 +166,12 @@ def test_packed_and_absent_frames(crowded_packed, crowded, card, tmp_path):
 def test_files_of_others_stay(crowded, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     (root / "README.md").write_text("mine")
-    with pytest.raises(UserError, match="no card wrote"):
+    with pytest.raises(UserError, match="not a card"):
         carded(root)
     (root / "README.md").unlink()
     info = json.loads((root / "dataset.json").read_text())
     (root / "dataset.json").write_text(json.dumps(info))
-    with pytest.raises(UserError, match="another content"):
+    with pytest.raises(UserError, match="different SHA-256"):
         carded(root)
     assert not (root / "README.md").exists() and not (root / "card.png").exists()
 

@@ -20,10 +20,10 @@ from perilune_shared.cli.main import app
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.dataset.selection import read_labels, selected
-from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.errors import UserError
 from perilune_shared.export.coco import area_of, cut_at_edges, export_coco
+from perilune_shared.labels.selection import read_labels, selected
+from perilune_shared.labels.thresholds import SELECTIONS
 
 SMALLEST_PX = 4.0
 

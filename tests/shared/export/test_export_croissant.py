@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from perilune_shared.cli.main import app
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.dataset.writer import written
+from perilune_shared.dataset.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.export.croissant import export_croissant
 from perilune_shared.validation.validate import validate
@@ -28,7 +28,7 @@ def described(request, tmp_path_factory):
     copy = tmp_path_factory.mktemp(request.param) / "set"
     if request.param == "parts":
         source = open_dataset(request.getfixturevalue("crowded"))
-        with written(copy, source.info) as writer:
+        with new_dataset(copy, source.info) as writer:
             for scene_id in source.scene_ids():
                 writer.add_scene(source.scene(scene_id))
             frames = source.table("frames")
@@ -91,7 +91,7 @@ def test_a_wrong_sum_is_not_sealed_over(crowded, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     sums = (root / "SHA256SUMS").read_text()
     (root / "SHA256SUMS").write_text(sums.replace(sums[:8], "00000000"))
-    with pytest.raises(UserError, match="another content"):
+    with pytest.raises(UserError, match="different SHA-256"):
         export_croissant(open_dataset(root))
     assert not (root / "croissant.json").exists()
     with pytest.raises(UserError, match="another folder"):

@@ -79,7 +79,7 @@ def test_a_pose_takes_the_camera_to_the_site(crowded, files):
     labels = dataset.table("labels", scene_id="s000", trajectory_id="t000").to_pandas()
     labels = labels[labels["frame_id"] == "s000/t000/000000"]
     labels = labels[labels["radius_px"] < 6]
-    camera: Camera = dataset.info.camera.intrinsics()
+    camera: Camera = dataset.camera
     points = craters.loc[labels["crater_id"], ["x_m", "y_m", "z_m"]].to_numpy()
     seen = camera.project((points - pose[:3, 3]) @ pose[:3, :3])
     assert len(labels) > 3

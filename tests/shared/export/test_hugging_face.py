@@ -9,11 +9,11 @@ from PIL import Image
 from rich.progress import Progress
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.thresholds import SELECTIONS
 from perilune_shared.editing.split import split_dataset
 from perilune_shared.export.card import write_card
 from perilune_shared.export.hugging_face import export_hugging_face
 from perilune_shared.export.rows import by_selection
+from perilune_shared.labels.thresholds import SELECTIONS
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from perilune_shared.geometry import frames
 
@@ -66,3 +67,16 @@ def test_site_and_selenographic_are_inverse(x, y, latitude, longitude):
     lat, lon = frames.selenographic_from_site(x, y, latitude, longitude)
     back = frames.site_from_selenographic(lat, lon, latitude, longitude)
     assert np.allclose(back, [x, y], atol=1e-4)
+
+
+def test_rotations_equal_those_of_scipy_to_rounding():
+    rng = np.random.default_rng(3)
+    quaternions = rng.normal(size=(200, 4))
+    expected = Rotation.from_quat(quaternions, scalar_first=True)
+    matrices = frames.matrix_from_quaternion(quaternions)
+    np.testing.assert_allclose(matrices, expected.as_matrix(), rtol=0, atol=4e-15)
+    found = np.array([frames.quaternion_from_matrix(matrix) for matrix in matrices])
+    np.testing.assert_allclose(found, expected.as_quat(canonical=True, scalar_first=True), rtol=0, atol=4e-15)
+    vectors = rng.normal(size=(200, 3))
+    found = np.array([frames.matrix_from_rotation_vector(vector) for vector in vectors])
+    np.testing.assert_allclose(found, Rotation.from_rotvec(vectors).as_matrix(), rtol=0, atol=4e-15)

@@ -111,14 +111,14 @@ def test_a_second_new_folder_leaves_the_first_alone(tmp_path):
     with pytest.raises(UserError, match=f"locked by PID {process.pid} "), new_folder(out):
         pytest.fail("written twice")
     process.communicate("\n")
-    with pytest.raises(UserError, match="something that is there"), new_folder(out):
+    with pytest.raises(UserError, match="a path that is not empty"), new_folder(out):
         pytest.fail("written twice")
     assert names(tmp_path) == ["out"] and (out / "first").read_text() == "first"
 
 
 def test_a_folder_filled_meanwhile_is_not_replaced(tmp_path):
     out = tmp_path / "out"
-    with pytest.raises(UserError, match="something that is there"), new_folder(out) as folder:
+    with pytest.raises(UserError, match="a path that is not empty"), new_folder(out) as folder:
         (folder / "mine").write_text("mine")
         out.mkdir()
         (out / "theirs").write_text("theirs")

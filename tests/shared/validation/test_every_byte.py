@@ -30,7 +30,7 @@ def named(root, name):
         return str(root / name) in str(error)
     texts = [fault.file for fault in faults]
     if name == checksums.SUMS_NAME:
-        texts += [fault.wanted for fault in faults if fault.column == "SHA-256"]
+        texts += [fault.expected for fault in faults if fault.column == "SHA-256"]
     return any(name in text for text in texts)
 
 

@@ -7,8 +7,9 @@ import shutil
 import pytest
 from tests.helpers.hostile import assert_refused, edit, sealed
 
+from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.metadata import recipes_of, write_info
+from perilune_shared.dataset.metadata import recipes_of
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files

@@ -13,7 +13,7 @@ from tests.helpers.hostile import assert_refused, digest, edit, pack, part_of, p
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import Counts
 from perilune_shared.dataset.schema import IMAGES
-from perilune_shared.dataset.writer import written
+from perilune_shared.dataset.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
 
@@ -287,6 +287,6 @@ def test_frames_are_brought_under_plain_names_alone(new, victim):
     names = dict.fromkeys(frames["frame_id"].to_pylist(), new)
     info = dataset.info.model_copy(update={"counts": Counts()})
     before = sorted(victim.parent.rglob("*"))
-    with pytest.raises(UserError, match="path"), written(victim.parent / "new", info) as writer:
+    with pytest.raises(UserError, match="path"), new_dataset(victim.parent / "new", info) as writer:
         writer.add_images(dataset, frames, names, link=False)
     assert sorted(victim.parent.rglob("*")) == before

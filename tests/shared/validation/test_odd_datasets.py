@@ -8,8 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
 
+from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.metadata import Recipe, write_info
+from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.dataset.writer import with_column
@@ -150,7 +151,7 @@ def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
     scenes = rows_of(victim, "scenes")
     replaced(victim, "scenes", with_column(scenes, "dem_source", ["a.tif sha256:" + "1" * 64] * len(scenes)))
     (fault,) = validate(open_dataset(victim))
-    assert fault.column == "split" and "common terrain" in fault.wanted
+    assert fault.column == "split" and "common terrain" in fault.expected
     subset(open_dataset(victim), tmp_path / "same")
     assert open_dataset(tmp_path / "same").info.split_by == "trajectory"
     with pytest.raises(UserError, match="1 of scene"):
@@ -195,7 +196,7 @@ def test_a_descent_developed_twice_is_one_descent(drawn, tmp_path):
     boast = made.info.model_copy(update={"split_by": "trajectory"})
     write_info(made.root, boast)
     seal(made.root)
-    assert "one split for each descent" in validate(open_dataset(made.root))[0].wanted
+    assert "one split for each trajectory" in validate(open_dataset(made.root))[0].expected
 
 
 @pytest.mark.parametrize("inside", ["", "frames", "new/folder"])

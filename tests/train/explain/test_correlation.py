@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_train.explain import correlation
 
 _RINGS = (1.1, 1.2, 1.3, 1.4)

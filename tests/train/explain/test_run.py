@@ -10,8 +10,8 @@ from tests.helpers.stored_run import store_run
 from tests.helpers.terrain_record import store_record, uses_of
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.selection import read_labels
 from perilune_shared.errors import UserError
+from perilune_shared.labels.selection import read_labels
 from perilune_train.data.frames import load_frames
 from perilune_train.detect.cli.evaluate import config_of_run
 from perilune_train.detect.inference.detector import load_detector

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from perilune_shared.geometry.camera import Camera, camera_from_site
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.navigate import geometry
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.descent import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.navigate.data import Descent
 from perilune_train.navigate.metrics import mean_motion, mean_motion_at_step, motion_errors, summary, summary_spreads

@@ -6,7 +6,7 @@ from pydantic import Field, field_validator, model_validator
 
 from perilune_shared.config import Section
 from perilune_shared.config_errors import nearest
-from perilune_shared.dataset.thresholds import SELECTIONS, Selection
+from perilune_shared.labels.thresholds import SELECTIONS, Selection
 from perilune_train.config import Attention, Count, Device, Positive, Precision, Share, Strategy
 
 

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.schema import SPLITS
+from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.descent import NominalDescent
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion, matrix_from_rotation_vector
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_train.data.frames import load_frames, normalised
 from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography, relative_poses
 
@@ -99,7 +99,7 @@ def _split_descents(dataset: Dataset, split: str, curves: dict[tuple[str, str], 
     for key, rows in store.table.groupby(["scene_id", "trajectory_id"]):
         scene_id, trajectory_id = (str(part) for part in key)
         curve = curves[scene_id, trajectory_id]
-        nominal = NominalDescent(
+        nominal = NominalTrajectory(
             tuple(curve["nominal_position_m"]),
             tuple(curve["nominal_velocity_mps"]),
             tuple(curve["nominal_acceleration_mps2"]),
@@ -112,7 +112,7 @@ def _split_descents(dataset: Dataset, split: str, curves: dict[tuple[str, str], 
                 (scene_id, trajectory_id),
                 split,
                 store.images[rows.index],
-                dataset.info.camera.intrinsics(),
+                dataset.camera,
                 np.array(rows["position_m"].tolist()),
                 matrix_from_quaternion(rows["rotation_wxyz"].tolist()),
                 nominal.position_at(rows["time_s"].to_numpy()),

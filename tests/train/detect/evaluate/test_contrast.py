@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.train import contrast
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.selection import read_labels, selected
-from perilune_shared.dataset.thresholds import SELECTIONS
+from perilune_shared.labels.selection import read_labels, selected
+from perilune_shared.labels.thresholds import SELECTIONS
 
 
 def test_auc_by_hand():

@@ -61,7 +61,7 @@ def evaluate(
     The threshold is the run's own, chosen on the validation split of its training dataset, unless --threshold sets one
     or --choose-threshold chooses a new one.
     """
-    from perilune_shared.dataset.schema import SPLITS
+    from perilune_shared.dataset.names import SPLITS
 
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))

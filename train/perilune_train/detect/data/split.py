@@ -8,11 +8,11 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.selection import label_bound_px, read_labels, selected
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import matrix_from_quaternion
+from perilune_shared.labels.selection import label_bound_px, read_labels, selected
 from perilune_train.data.frames import FrameStore, load_frames
 from perilune_train.detect.config import LabelSettings
 

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.selection import label_bound_px, read_labels, selected
-from perilune_shared.dataset.thresholds import SELECTIONS, Selection
+from perilune_shared.labels.selection import label_bound_px, read_labels, selected
+from perilune_shared.labels.thresholds import SELECTIONS, Selection
 
 GOOD = {
     "radius_px": 5.0,

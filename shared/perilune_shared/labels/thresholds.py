@@ -1,6 +1,6 @@
 """Named sets of label thresholds: from all craters in the frame to those visible in the image.
 
-Without pandas and pyarrow, so that configurations and `--help` load without them. `perilune_shared.dataset.selection`
+Without pandas and pyarrow, so that configurations and `--help` load without them. `perilune_shared.labels.selection`
 applies the thresholds.
 """
 

@@ -1,4 +1,4 @@
-"""Read labels and select them by the thresholds of `perilune_shared.dataset.thresholds`.
+"""Read labels and select them by the thresholds of `perilune_shared.labels.thresholds`.
 
 Use::
 
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from perilune_shared.dataset.keys import FRAME_COLUMNS, KeyCheck
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.dataset.thresholds import Selection, default_label_bound_px
+from perilune_shared.labels.thresholds import Selection, default_label_bound_px
 
-_JUDGED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
+_THRESHOLDED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
 _CRATER = ["scene_id", "crater_id", "depth_m", "diameter_m"]
 
 
@@ -55,9 +55,9 @@ def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None
     Rows are in the order of the table labels. Depth and diameter (metres) come from the table craters, joined by
     scene_id and crater_id. Raises UserError if a part cannot be read or keys are broken.
     """
-    wanted = list(dict.fromkeys(["frame_id", "crater_id", *_JUDGED, *columns]))
+    names = list(dict.fromkeys(["frame_id", "crater_id", *_THRESHOLDED, *columns]))
     frames = dataset.table("frames", ["frame_id", "scene_id"], split=split).to_pandas()
-    rows = dataset.table("labels", wanted)
+    rows = dataset.table("labels", names)
     keys = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
     keys.add_labels(rows)
     keys.finish()

@@ -1,8 +1,8 @@
 import numpy as np
 
-from perilune_shared.geometry.descent import NominalDescent
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
-DESCENT = NominalDescent.parabola(1500, 200, 500, 90.0, 65.0)
+DESCENT = NominalTrajectory.parabola(1500, 200, 500, 90.0, 65.0)
 
 
 def test_it_starts_downrange_in_the_east_and_ends_above_the_site():

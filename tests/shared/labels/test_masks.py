@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.masks import crater_masks, frame_masks
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import matrix_from_quaternion
+from perilune_shared.labels.masks import crater_masks, frame_masks
 
 CAMERA = Camera(120, 90, 130.0, 120.0, 57.0, 48.0)
 BARREL = replace(CAMERA, distortion=(-0.25, 0.04, 0.003, -0.002, 0.0))
@@ -85,7 +85,7 @@ def test_masks_of_a_rendered_frame(tiny):
     labels = labels[labels["frame_id"] == frame.frame_id]
     masks = frame_masks(dataset, frame.frame_id, depth_m=exr["Z"])
     assert [mask.crater_id for mask in masks] == labels["crater_id"].tolist()
-    camera = dataset.info.camera.intrinsics()
+    camera = dataset.camera
     inside = labels[["bbox_x0_px", "bbox_y0_px"]].min(axis=1) > 0
     inside &= labels[["bbox_x1_px", "bbox_y1_px"]].max(axis=1) < camera.width_px
     area = np.array([mask.amodal.sum() for mask in masks])

@@ -13,12 +13,12 @@ hides a pixel only if it is nearer by more than a tenth of the radius and by mor
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.names import ImageKind
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import project_circles
@@ -56,7 +56,7 @@ def frame_masks(
     frame_id: str,
     crater_ids: Sequence[int] | None = None,
     depth_m: NDArray[np.floating] | None = None,
-    image: Literal["png", "exr"] = "png",
+    image: ImageKind = "png",
 ) -> list[CraterMask]:
     """Compute the masks of all labelled craters of a frame, in the order of the labels, or of `crater_ids`.
 
@@ -80,12 +80,11 @@ def frame_masks(
     if unknown:
         raise UserError(dataset.root, "crater_id", unknown[0], f"a crater of {pose['scene_id']}")
     rows = craters.loc[list(crater_ids)]
-    camera = dataset.info.camera.intrinsics()
-    exr_camera = (dataset.info.exr_camera or dataset.info.camera).intrinsics()
+    camera, exr_camera = dataset.camera, dataset.exr_camera
     if depth_m is not None:
         if depth_m.shape != (exr_camera.height_px, exr_camera.width_px):
-            wanted = f"{exr_camera.width_px} x {exr_camera.height_px} pixels, as dataset.json says of the EXRs"
-            raise UserError(frame_id, "depth_m", f"{depth_m.shape[::-1]}", wanted)
+            expected = f"{exr_camera.width_px} x {exr_camera.height_px} pixels, the size of the EXRs"
+            raise UserError(frame_id, "depth_m", f"{depth_m.shape[::-1]}", expected)
         if image == "png" and camera != exr_camera:
             depth_m = _looked_up(depth_m, camera, exr_camera)
     rotation = matrix_from_quaternion(pose["rotation_wxyz"])

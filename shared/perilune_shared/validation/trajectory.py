@@ -18,33 +18,37 @@ _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
 _BOX = ("bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px")
 
 
-def descent_faults(
+def trajectory_faults(
     info: DatasetInfo,
     scene: dict,
     craters: pa.Table,
-    descent: dict,
+    trajectory: dict,
     frames: pa.Table,
     labels: pa.Table,
     where: dict[str, str],
 ) -> Iterator[Fault]:
-    """Yield the faults of a trajectory (row `descent`), given its scene and tables; `where` maps tables to files."""
-    yield from _frames(info, scene, descent, frames, where["frames"])
+    """Yield the faults of a trajectory.
+
+    `scene` and `trajectory` are rows of these tables; the other tables have the trajectory's rows, and the craters of
+    the scene. `where` gives the file of each table.
+    """
+    yield from _frames(info, scene, trajectory, frames, where["frames"])
     if len(labels):
         yield from _labels(info, craters, frames, labels, where)
 
 
-def _frames(info: DatasetInfo, scene: dict, descent: dict, frames: pa.Table, where: str) -> Iterator[Fault]:
-    key = f"{descent['scene_id']}/{descent['trajectory_id']}"
-    if len(frames) != descent["n_frames"]:
-        wanted = f"{len(frames)}, the frames of {key} that are present"
-        yield Fault.of("manifest/trajectories", None, "n_frames", descent["n_frames"], wanted)
+def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, where: str) -> Iterator[Fault]:
+    key = f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"
+    if len(frames) != trajectory["n_frames"]:
+        expected = f"{len(frames)}, the number of frames of {key}"
+        yield Fault.of("manifest/trajectories", None, "n_frames", trajectory["n_frames"], expected)
     if not len(frames):
         return
     splits = set(frames["split"].to_pylist())
-    if descent["split"] != (splits.pop() if len(splits) == 1 else None):
-        yield Fault.of("manifest/trajectories", None, "split", descent["split"], f"that of the frames of {key}")
-    if descent["split"] is None and info.split_by != "frame":
-        yield Fault.of("dataset.json", None, "split_by", info.split_by, f"frame: {key} lies in several splits")
+    if trajectory["split"] != (splits.pop() if len(splits) == 1 else None):
+        yield Fault.of("manifest/trajectories", None, "split", trajectory["split"], f"the split of the frames of {key}")
+    if trajectory["split"] is None and info.split_by != "frame":
+        yield Fault.of("dataset.json", None, "split_by", info.split_by, f"frame: {key} is in several splits")
     index = frames["frame_index"].to_numpy()
     ids = frames["frame_id"].to_pylist()
     for row, (frame_id, place) in enumerate(zip(ids, index.tolist(), strict=True)):
@@ -54,7 +58,7 @@ def _frames(info: DatasetInfo, scene: dict, descent: dict, frames: pa.Table, whe
     time = frames["time_s"].to_numpy()
     order = np.argsort(index)
     if (np.diff(time[order]) <= 0).any():
-        yield Fault.of(where, None, "time_s", "not rising with frame_index", "later frames at later times")
+        yield Fault.of(where, None, "time_s", "not increasing with frame_index", "increasing times")
     for name in _CAMERA:
         wrong = np.flatnonzero(frames[name].to_numpy() != getattr(info.camera, name))
         if len(wrong):
@@ -88,7 +92,7 @@ def _labels(
         unknown = np.flatnonzero(found_at < 0)
         if len(unknown):
             found = labels[name][int(unknown[0])].as_py()
-            yield Fault.of(where, int(unknown[0]), name, found, f"in {name.removesuffix('_id')}s")
+            yield Fault.of(where, int(unknown[0]), name, found, f"a row of {name.removesuffix('_id')}s")
     known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
     if not len(known):
         return
@@ -105,15 +109,21 @@ def _labels(
         misfit[wrong] = True
         if len(wrong):
             row = int(known[wrong[0]])
-            wanted = f"{values[wrong[0]]}, projected from crater and pose"
-            yield Fault.of(where, row, name, labels[name][row].as_py(), wanted)
+            expected = f"{values[wrong[0]]}, projected from crater and pose"
+            yield Fault.of(where, row, name, labels[name][row].as_py(), expected)
     # If all labels of a frame with several labels are wrong, the pose is probably wrong: report it too.
     labelled = np.bincount(frame_of[known], minlength=len(frames))
     lost = np.bincount(frame_of[known[misfit]], minlength=len(frames))
     odd = np.flatnonzero((labelled > 1) & (lost == labelled))
     if len(odd):
-        found = f"none of {labelled[odd[0]]} labels fits"
-        yield Fault.of(places["frames"], int(odd[0]), "position_m+rotation_wxyz", found, "the pose of its labels")
+        found = f"a pose that matches none of {labelled[odd[0]]} labels"
+        yield Fault.of(
+            places["frames"],
+            int(odd[0]),
+            "position_m+rotation_wxyz",
+            found,
+            "the pose of its labels",
+        )
 
 
 def _projected(

@@ -1,4 +1,4 @@
-"""The nominal descent: the planned trajectory, known to the guidance before the flight.
+"""The nominal trajectory: the planned path, known to the guidance before the flight.
 
 The paper uses "a parabola" from 1500 m to 200 m and does not specify it. Here the vertical speed is constant and the
 horizontal speed decreases linearly to zero at the end point. The path is a parabola with a vertical axis that ends
@@ -14,7 +14,7 @@ from perilune_shared.geometry.frames import Array
 
 
 @dataclass(frozen=True, slots=True)
-class NominalDescent:
+class NominalTrajectory:
     """A trajectory of constant acceleration in O_L, with the camera looking along -Z_L."""
 
     position_m: tuple[float, float, float]
@@ -34,8 +34,8 @@ class NominalDescent:
         downrange_m: float,
         azimuth_deg: float,
         duration_s: float,
-    ) -> "NominalDescent":
-        """Create a descent to a point above the site.
+    ) -> "NominalTrajectory":
+        """Create a trajectory to a point above the site.
 
         It starts `downrange_m` from the site, in the direction `azimuth_deg` (clockwise from north) seen from the site.
         """
@@ -59,8 +59,3 @@ class NominalDescent:
         return (
             np.array(self.velocity_mps) + np.array(self.acceleration_mps2) * np.asarray(time_s, np.float64)[..., None]
         )
-
-
-ROTATION_CAMERA_FROM_BODY = np.diag([1.0, -1.0, -1.0])
-"""Default mounting: the camera looks along -Z_B, its x axis along X_B. With the body level in O_L this is the paper's
-"along the negative axis of Z_L"."""

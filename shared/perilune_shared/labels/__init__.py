@@ -1,0 +1,1 @@
+"""Labels of frames: named thresholds, selections by them, and crater masks."""
