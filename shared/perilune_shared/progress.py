@@ -42,12 +42,3 @@ def say(line: str, style: str | None = None) -> None:
     from perilune_shared.terminal import console
 
     console.print(line, style=style, markup=False, highlight=False, soft_wrap=True)
-
-
-def __getattr__(name: str) -> Any:
-    """Import `console` and `progress_bar` from their new place."""
-    if name in ("console", "progress_bar"):
-        from perilune_shared import terminal
-
-        return getattr(terminal, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
