@@ -78,7 +78,7 @@ def _fingerprint(roots: tuple[str, ...], folders: tuple[tuple[str, Path], ...]) 
     for root in roots:
         module, _, name = root.partition(":")
         walk.follow(module, (name,) if name else ())
-    # Module names are left out, so that moving code between files does not change the hash.
+    # Without module names and empty modules, so that moving code between files does not change the hash.
     code = "\n".join(sorted(f"{name}\n{text}" for (_, name), text in walk.code.items() if text))
     modules = frozenset(module for module, _ in walk.code)
     libraries = frozenset(walk.libraries - sys.stdlib_module_names)
@@ -93,9 +93,9 @@ def compiled_functions() -> tuple[str, ...]:
         text = path.read_text(encoding="utf-8")
         if "njit" in text:
             name = ".".join(("perilune_render", *path.relative_to(root).with_suffix("").parts))
-            for own, (*_, node) in _parsed(text).definitions.items():
+            for function, (*_, node) in _parsed(text).definitions.items():
                 if isinstance(node, ast.FunctionDef) and any("njit" in ast.dump(each) for each in node.decorator_list):
-                    found.append(f"{name}:{own}")
+                    found.append(f"{name}:{function}")
     return tuple(found)
 
 
@@ -116,8 +116,8 @@ class _Walk:
         if source is None:
             self.libraries.add(module.partition(".")[0])
             return
-        wanted = names[:1] or (*source.definitions, *source.imported)
-        for name in wanted:
+        to_follow = names[:1] or (*source.definitions, *source.imported)
+        for name in to_follow:
             if name in source.imported:
                 self._follow_import(*source.imported[name], names[1:])
             elif name in source.definitions:

@@ -17,7 +17,7 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
-    """The recipe of a dataset; with `planned`, that of a plan, which has the versions for its ground only."""
+    """The recipe of a dataset. With `planned`, the recipe of a plan: it lists only the versions behind the ground."""
     with_dem = config.terrain.dem is not None
     versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
     return Recipe(preset=preset, kind=kind, seed=config.seed, config=recorded_settings(config, kind), versions=versions)

@@ -55,7 +55,11 @@ def _found(names: tuple[str, ...]) -> dict[str, str]:
         "perilune_render": perilune_render.__version__,
         "perilune_shared": perilune_shared.__version__,
         **{name: each.sha256[:16] for name, each in prints.items()},
-        **{told: metadata.version(distribution) for name, (told, distribution) in LIBRARIES.items() if name in used},
+        **{
+            recorded: metadata.version(distribution)
+            for name, (recorded, distribution) in LIBRARIES.items()
+            if name in used
+        },
     }
 
 

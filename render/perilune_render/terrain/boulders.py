@@ -23,7 +23,7 @@ _BURIED_SHARE = 0.3
 _FIELD_DECAY = 0.7
 """Decay length of a boulder field's density beyond the crater's rim, crater radii."""
 _FULL_SPACINGS = 5.0
-"""Diameter, in vertex spacings, from which a boulder gets the mesh with more faces."""
+"""Smallest diameter, in vertex spacings, of a boulder with the finer mesh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ def draw_boulders(config: BouldersConfig, grid: Grid, craters: Craters, seed: in
     rng = stream(seed, "boulders")
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
     if config.density == 0 or smallest >= config.max_diameter_m:
-        none = np.empty(0)
-        return Boulders(none, none, none, np.empty(0, np.int64), np.empty((0, 4)))
+        empty = np.empty(0)
+        return Boulders(empty, empty, empty, np.empty(0, np.int64), np.empty((0, 4)))
     law = BoulderLaw(density=config.density)
     edges = log_bins(smallest, config.max_diameter_m, 20)
     half = np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
@@ -70,9 +70,9 @@ def draw_boulders(config: BouldersConfig, grid: Grid, craters: Craters, seed: in
     field_x, field_y, field = _fields(config, law, grid, craters, rng)
     x, y, diameter = np.concatenate([x, field_x]), np.concatenate([y, field_y]), np.concatenate([plain, field])
     shape = rng.integers(0, config.n_shapes, len(diameter))
-    turn = rng.normal(size=(len(diameter), 4))
-    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-    return Boulders(x, y, diameter, shape, np.where(turn[:, :1] < 0, -turn, turn))
+    rotation = rng.normal(size=(len(diameter), 4))
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    return Boulders(x, y, diameter, shape, np.where(rotation[:, :1] < 0, -rotation, rotation))
 
 
 def _fields(
@@ -100,8 +100,8 @@ def _fields(
     angle = rng.uniform(0, 2 * np.pi, len(host))
     x, y = craters.x_m[host] + distance * np.cos(angle), craters.y_m[host] + distance * np.sin(angle)
     outermost = np.maximum(np.abs(x), np.abs(y))
-    held = (diameter >= config.min_diameter_spacings * grid.spacing_at(outermost)) & (outermost < grid.extent_m / 2)
-    return x[held], y[held], diameter[held]
+    inside = (diameter >= config.min_diameter_spacings * grid.spacing_at(outermost)) & (outermost < grid.extent_m / 2)
+    return x[inside], y[inside], diameter[inside]
 
 
 def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:
@@ -121,9 +121,9 @@ def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:
             normal = rng.normal(size=3)
             normal /= np.linalg.norm(normal)
             support = float((mesh.vertices @ normal).max())
-            kept = mesh.vertices[mesh.vertices @ normal < 0.6 * support]
+            below = mesh.vertices[mesh.vertices @ normal < 0.6 * support]
             cut = trimesh.intersections.mesh_plane(mesh, -normal, normal * 0.6 * support).reshape(-1, 3)
-            mesh = trimesh.convex.convex_hull(np.concatenate([kept, cut]))
+            mesh = trimesh.convex.convex_hull(np.concatenate([below, cut]))
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     mesh.apply_scale(1.0 / float(mesh.extents.mean()))
     return mesh

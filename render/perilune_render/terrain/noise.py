@@ -7,7 +7,7 @@ from perilune_render.terrain.grid import Grid, lines_in
 from perilune_shared.geometry.frames import Array
 
 RMS_SLOPE = 0.87
-"""RMS slope times wavelength of `add_waves` with amplitude 1, measured at 4 million places."""
+"""RMS slope times wavelength of `add_waves` with amplitude 1, measured at 4 million points."""
 
 
 def add_waves(
@@ -18,10 +18,10 @@ def add_waves(
     The wave fades where the grid is too coarse for it: full amplitude up to a spacing of a sixth of the wavelength,
     half at a third, none from a half. Spacings below `finest_m` count as `finest_m`.
     """
-    held = np.clip(1.5 - 3 * np.maximum(grid.spacings_m, finest_m) / wavelength_m, 0, 1)
-    if not held.any():
+    shares = np.clip(1.5 - 3 * np.maximum(grid.spacings_m, finest_m) / wavelength_m, 0, 1)
+    if not shares.any():
         return
-    half = float(grid.half_widths_m[held > 0].max())
+    half = float(grid.half_widths_m[shares > 0].max())
     # Shift the lattice by a random part of a cell, since gradient noise is 0 at the points of its lattice.
     shift = rng.uniform(0, 1, 2)
     n_cells = int(np.ceil(2 * half / wavelength_m)) + 3
@@ -33,7 +33,7 @@ def add_waves(
         half,
         wavelength_m,
         shift + half / wavelength_m,
-        held,
+        shares,
         amplitude,
         np.cos(angle),
         np.sin(angle),
@@ -41,12 +41,12 @@ def add_waves(
 
 
 @njit()
-def _add_waves(field, n_half, half_widths, half, wavelength, shift, held, amplitude, gx, gy):
+def _add_waves(field, n_half, half_widths, half, wavelength, shift, shares, amplitude, gx, gy):
     lines = np.empty((2 * n_half + 1 + 4 * len(half_widths), 7))
     count = lines_in(-half, half, -half, half, n_half, half_widths, lines)
     for row in range(count):
         first, number = int(lines[row, 4]), int(lines[row, 5])
-        weight = amplitude * held[int(lines[row, 6])]
+        weight = amplitude * shares[int(lines[row, 6])]
         if weight == 0:
             continue
         u, v = lines[row, 0] / wavelength + shift[0], lines[row, 1] / wavelength + shift[1]

@@ -22,7 +22,7 @@ def finest_wave_m(grid: Grid) -> float:
 
 
 def check_waves(config: ReliefConfig, grid: Grid) -> None:
-    """Raise UserError if the longest wavelength is too short for the grid, or below 1 m, down to which slopes count."""
+    """Raise UserError if the longest wavelength is too short for the grid, or below 1 m (see `add_relief`)."""
     least_m = max(finest_wave_m(grid), 1.0)
     if config.longest_wavelength_m < least_m:
         raise UserError(

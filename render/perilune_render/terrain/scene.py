@@ -78,24 +78,24 @@ class Base:
     """Distances (n_vertices,) from known ground of the model, metres; infinite without a model."""
     model: ElevationModel | None
     """The elevation model, if any."""
-    around: FittedRelief | None
+    surroundings: FittedRelief | None
     """Relief of the procedural ground beyond the model, if there is such ground."""
 
     @property
     def largest_m(self) -> float | None:
-        """Largest diameter of generated craters, metres; None for that of the configuration."""
-        return None if self.model is None or self.around is not None else resolved_m(self.model)
+        """Largest diameter of generated craters, metres; None to use the configured one."""
+        return None if self.model is None or self.surroundings is not None else resolved_m(self.model)
 
     def add_waves(self, grid: Grid, relief: ReliefConfig, seed: int, shortest_m: float, longest_m: float) -> None:
-        """Add relief: on a model the wavelengths that it does not resolve, beyond it all wavelengths."""
+        """Add relief: on a model only wavelengths that it does not resolve, around it all wavelengths."""
         resolved = np.inf if self.model is None else resolved_m(self.model)
         add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved))
-        if self.around is not None:
-            add_fitted_relief(self.height_m, grid, self.around, self.beyond_m, seed, shortest_m, longest_m)
+        if self.surroundings is not None:
+            add_fitted_relief(self.height_m, grid, self.surroundings, self.beyond_m, seed, shortest_m, longest_m)
 
     def permitted(self, craters: Craters) -> Craters:
-        """The craters that may be added: of sizes that a model resolves, only those that do not change its ground."""
-        if self.model is None or self.around is None:
+        """The craters to add: those too small for the model to resolve, and those that do not reach the model."""
+        if self.model is None or self.surroundings is None:
             return craters
         large = craters.diameter_m > resolved_m(self.model)
         column, row = raster_places(self.model, craters.x_m[large], craters.y_m[large])
@@ -110,8 +110,8 @@ def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, se
         return Base(np.zeros(grid.n_vertices), np.full(grid.n_vertices, np.inf), None, None)
     height, beyond = base_heights(model, grid, terrain.elevation.outside)
     needed = terrain.elevation.outside == "procedural" and bool((beyond > 0).any())
-    around = fitted_relief(model, terrain.relief, terrain.craters, seed) if needed else None
-    return Base(height, beyond, model, around)
+    surroundings = fitted_relief(model, terrain.relief, terrain.craters, seed) if needed else None
+    return Base(height, beyond, model, surroundings)
 
 
 def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
@@ -130,8 +130,8 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
         add_rays(albedo, grid, craters, terrain.craters.n_rayed, variation, seed)
     stamped = stamp_craters(height, albedo, grid, craters, variation * brightness(craters), terrain.craters.profile)
     base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
-    kept = stamped.rim_left >= _LEAST_RIM
-    craters, sag = craters.chosen(kept), stamped.sag_m[kept]
+    visible = stamped.rim_left >= _LEAST_RIM
+    craters, sag = craters.chosen(visible), stamped.sag_m[visible]
     if model is not None and terrain.catalogue is not None:
         real = read_catalogue(Path(terrain.catalogue), model, grid, terrain.craters, resolved_m(model))
         craters, sag = real.joined(craters), np.concatenate([np.zeros(len(real)), sag])

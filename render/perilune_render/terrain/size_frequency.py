@@ -58,8 +58,8 @@ class SizeFrequency(ABC):
         """
         nodes = np.geomspace(self.max_diameter_m, self.min_diameter_m, 2000)
         numbers = self.csfd(nodes)
-        wanted = numbers[-1] - np.asarray(share) * (numbers[-1] - numbers[0])
-        found = np.exp(np.interp(np.log(wanted), np.log(numbers), np.log(nodes)))
+        number = numbers[-1] - np.asarray(share) * (numbers[-1] - numbers[0])
+        found = np.exp(np.interp(np.log(number), np.log(numbers), np.log(nodes)))
         return np.clip(found, self.min_diameter_m, self.max_diameter_m)
 
     def rvs(self, area_m2: float, rng: np.random.Generator) -> Array:

@@ -4,7 +4,7 @@ A crater's age is drawn uniformly from 0 to the time in which production reaches
 so that fresh, worn and nearly erased craters occur together, as in real images. If production has not reached
 equilibrium, the age is drawn from 0 to the age of the surface (our simplification: production fell fast before 3 Gyr
 ago). Equilibrium densities are counts of craters that are still visible, so no crater in equilibrium is drawn with more
-wear than `_LAST_SEEN_WEAR`.
+wear than `_LARGEST_VISIBLE_WEAR`.
 
 Craters are ordered by age, not by wear: diffusivity grows with size as D^0.9, so an order by wear could place a large
 young crater before a small old one that it has removed.
@@ -31,7 +31,7 @@ from perilune_shared.geometry.frames import Array
 
 ORIGINS = ("primary", "secondary", "elevation model")
 """Values of `Craters.origin`: drawn alone, drawn in a cluster, or read from a catalogue of real ground."""
-_LAST_SEEN_WEAR = 0.11
+_LARGEST_VISIBLE_WEAR = 0.11
 """Wear K/R^2 at which a crater has lost three quarters of its depth and is rarely counted."""
 _LARGEST_SECONDARY_M = 30.0
 _PER_CLUSTER = 40
@@ -67,9 +67,9 @@ class Craters:
     def __len__(self) -> int:
         return len(self.x_m)
 
-    def chosen(self, which: np.ndarray) -> "Craters":
+    def chosen(self, selection: np.ndarray) -> "Craters":
         """The craters selected by indices or by a mask."""
-        return Craters(*(getattr(self, field.name)[which] for field in dataclasses.fields(self)))
+        return Craters(*(getattr(self, field.name)[selection] for field in dataclasses.fields(self)))
 
     def joined(self, other: "Craters") -> "Craters":
         """These craters followed by `other`."""
@@ -91,10 +91,10 @@ class Craters:
         """Circular craters with bowl-shaped floors, in the given order; arrays (N,)."""
         n = len(x_m)
         rim = fresh_rim_height_m(diameter_m, fresh_depth_m, profile)
-        still = np.zeros((n, 6))
+        even = np.zeros((n, 6))
         kind = np.full(n, ORIGINS.index(origin))
-        none = np.zeros(n, bool)
-        return cls(x_m, y_m, diameter_m, fresh_depth_m, rim, age_myr, wear_m2, none, still, still.copy(), kind)
+        not_flat = np.zeros(n, bool)
+        return cls(x_m, y_m, diameter_m, fresh_depth_m, rim, age_myr, wear_m2, not_flat, even, even.copy(), kind)
 
 
 def diffusivity_m2_per_myr(diameter_m: Array) -> Array:
@@ -127,9 +127,9 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
     x, y = rng.uniform(-1, 1, (2, n)) * reach
     # Production was linear over the last 3 Gyr: use the rate of the last 1 Gyr.
     to_equilibrium = 1000 * _in_bin(equilibrium, diameter) / _in_bin(NeukumProduction(age_gyr=1.0), diameter)
-    to_unseen = _LAST_SEEN_WEAR * (diameter / 2) ** 2 / diffusivity_m2_per_myr(diameter)
+    to_invisible = _LARGEST_VISIBLE_WEAR * (diameter / 2) ** 2 / diffusivity_m2_per_myr(diameter)
     surface_myr = 1000 * config.surface_age_gyr
-    oldest = np.where(to_equilibrium < surface_myr, np.minimum(to_equilibrium, to_unseen), surface_myr)
+    oldest = np.where(to_equilibrium < surface_myr, np.minimum(to_equilibrium, to_invisible), surface_myr)
     age = rng.random(n) * oldest
     fresh = fresh_depth_m(diameter, config.depth)
     depth = np.maximum(fresh + 0.02 * diameter * np.clip(rng.normal(size=n), -2, 2), 0.08 * diameter)
@@ -184,13 +184,13 @@ def _cluster(
     cos, sin = np.cos(heading)[cluster], np.sin(heading)[cluster]
     new_x = x[chosen[first]][cluster] + along * cos - across * sin
     new_y = y[chosen[first]][cluster] + along * sin + across * cos
-    held = np.maximum(np.abs(new_x), np.abs(new_y)) < reach[chosen]
-    moved = chosen[held]
+    inside = np.maximum(np.abs(new_x), np.abs(new_y)) < reach[chosen]
+    moved = chosen[inside]
     x, y, age = x.copy(), y.copy(), age.copy()
-    x[moved], y[moved] = new_x[held], new_y[held]
-    # One age for the whole cluster, at which even the shortest-lived of its craters is still visible.
+    x[moved], y[moved] = new_x[inside], new_y[inside]
+    # All craters of a cluster have one age, at which each of them is still visible.
     youngest = np.minimum.reduceat(oldest[chosen], first) * rng.random(n_clusters)
-    age[moved] = youngest[cluster][held]
+    age[moved] = youngest[cluster][inside]
     clustered[moved] = True
     return x, y, age, clustered
 

@@ -15,7 +15,7 @@ end of the ejecta blanket would render as a ring.
 Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solved exactly on a radial grid. With x = r/R
 it depends on K/R^2 alone, K = kappa t. The profile is linear in h_rim and d, and diffusion is linear, so one table for
 each part serves all craters. Another table holds the share of the older ground that the crater has removed. It is
-diffused likewise, so that its edge widens with wear and leaves no ridge. A bowl is steeper than its flank, so wear
+diffused too, so that its edge widens with wear and leaves no ridge. A bowl is steeper than its flank, so wear
 moves the crest outwards. `crest` holds how far, so that a crater is stamped with its current crest on its label's
 circle.
 """
@@ -71,11 +71,13 @@ def fresh_rim(x: Array, profile: str = "fassett_thomson") -> Array:
 def fresh_bowl(x: Array, profile: str = "fassett_thomson", *, flat: bool = False) -> Array:
     """Fresh bowl at x = r/R, relative to the depth: -1 at the centre, 0 from the crest outwards."""
     x = np.asarray(x, np.float64)
-    deepest = _sunk(np.zeros(1), profile, flat)
-    inside = -_sunk(x, profile, flat) / deepest
+    deepest = _depth_below_crest(np.zeros(1), profile, flat)
+    inside = -_depth_below_crest(x, profile, flat) / deepest
     edge = 0.94
     step = 1e-5
-    value, after = (float(-_sunk(np.array([at]), profile, flat)[0] / deepest[0]) for at in (edge, edge + step))
+    value, after = (
+        float(-_depth_below_crest(np.array([at]), profile, flat)[0] / deepest[0]) for at in (edge, edge + step)
+    )
     return np.select([x < edge, x < 1], [inside, _cubic(x, edge, 1.0, value, (after - value) / step, 0.0, 0.0)])
 
 
@@ -99,7 +101,7 @@ def _cubic(x: Array, low: float, high: float, y0: float, slope0: float, y1: floa
     )
 
 
-def _sunk(x: Array, profile: str, flat: bool) -> Array:
+def _depth_below_crest(x: Array, profile: str, flat: bool) -> Array:
     """Depth below the crest, before scaling to 1 at the centre."""
     inner = np.clip(x, 0, 0.98)
     if profile == "pangu":
@@ -130,7 +132,7 @@ def fresh_rim_height_m(diameter_m: Array, depth_m: Array, profile: str = "fasset
     """Height of the crest above the plain around a newly formed crater, metres.
 
     `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to Pike's depth. At 1 km this is 0.0368 D, the
-    value of the source, which is for craters of 1 km; with that share of D, small shallow craters would be mostly rim.
+    source's value for craters of 1 km. Used for all sizes, 0.0368 D would make small, shallow craters mostly rim.
     `pangu`: the smaller of the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), and Pike's rim
     height, 0.036 D^1.014 km with D in km.
     """

@@ -113,8 +113,9 @@ def stamp_craters(
 ) -> Stamped:
     """Stamp `craters` on height_m (n_vertices,) and brighten albedo (n_vertices,), both in place.
 
-    A crater first replaces the ground below it by a plane fitted to it, to a degree that falls with the crater's wear,
-    and then adds its own profile. `brightness` (N,) is the relative brightening within the rim.
+    A crater first replaces the ground below it by a plane fitted to that ground, and then adds its own profile. The
+    more worn a crater is, the less of the older ground it replaces. `brightness` (N,) is the relative brightening
+    within the rim.
     """
     tables = profile_tables(profile)
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
@@ -240,8 +241,8 @@ def _stamp_one(ground, shapes, k, profile, plane, lines, count):
         for p in range(start, stop):
             px, py = dx + p * step_x, dy + p * step_y
             distance = np.sqrt(px * px + py * py)
-            stray, uneven = _irregularity(px, py, distance, outline, crest)
-            r = distance / (radius * (1 + stray))
+            stretch, unevenness = _irregularity(px, py, distance, outline, crest)
+            r = distance / (radius * (1 + stretch))
             position = r * per_radius
             c = int(position)
             if c >= columns - 1:
@@ -249,9 +250,9 @@ def _stamp_one(ground, shapes, k, profile, plane, lines, count):
             f = position - c
             # The rim is uneven, the floor is not.
             inner = min(r, 1.0)
-            uneven *= inner * inner * (3 - 2 * inner)
+            unevenness *= inner * inner * (3 - 2 * inner)
             lost = removed[c] * (1 - f) + removed[c + 1] * f
-            crest_here = (own_rim[c] * (1 - f) + own_rim[c + 1] * f) * (1 + uneven)
+            crest_here = (own_rim[c] * (1 - f) + own_rim[c + 1] * f) * (1 + unevenness)
             here = first + p
             old = height[here]
             level = plane.level + plane.slope_x * px + plane.slope_y * py

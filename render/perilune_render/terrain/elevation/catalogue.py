@@ -43,9 +43,9 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Crater
         raise UserError(path, "catalogue", error, "a CSV file in UTF-8") from None
     longitude, latitude, diameter = np.array(rows, np.float64).reshape(-1, 3).T
     x, y = site_from_selenographic(latitude, longitude, model.latitude_deg, model.longitude_deg)
-    wanted = (np.maximum(np.abs(x), np.abs(y)) + diameter / 2 < grid.extent_m / 2) & (diameter > smallest_m)
-    wanted[wanted] = _measured(model, x[wanted], y[wanted], diameter[wanted])
-    chosen = np.flatnonzero(wanted)[np.argsort(-diameter[wanted], kind="stable")]
+    shown = (np.maximum(np.abs(x), np.abs(y)) + diameter / 2 < grid.extent_m / 2) & (diameter > smallest_m)
+    shown[shown] = _measured(model, x[shown], y[shown], diameter[shown])
+    chosen = np.flatnonzero(shown)[np.argsort(-diameter[shown], kind="stable")]
     unknown = np.full(len(chosen), np.nan)
     return Craters.round(
         x[chosen],
