@@ -64,7 +64,7 @@ def changed(copy, module, pattern, replacement):
         ("perilune_render.labels.frame_labels", "_N_RIM", {"imaging"}),
         ("perilune_shared.labels.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
         ("perilune_shared.geometry.ellipse", "_N_FITTED", {"imaging"}),
-        ("perilune_shared.geometry.camera", "_UNDISTORTED_TO", {"generator", "renderer", "imaging"}),
+        ("perilune_shared.geometry.camera", "_MAX_UNDISTORTION_ERROR", {"generator", "renderer", "imaging"}),
         ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "imaging"}),
     ],
 )
