@@ -53,7 +53,7 @@ def _unit(name: str) -> str:
 
 def _allowed(key: Key) -> str:
     limits = [
-        f"{word} {getattr(limit, kind):g}"
+        f"{word} {getattr(limit, kind)}"
         for limit in key.field.metadata or _inner_limits(key.field.annotation)
         for kind, word in LIMITS.items()
         if hasattr(limit, kind)
