@@ -30,6 +30,13 @@ BLOCKS = [
 ]
 COMMANDS = {name: command for program, app in PROGRAMS.items() for name, command in commands(program, app).items()}
 OPTIONS = {option for each in COMMANDS.values() for p in each.params for option in (*p.opts, *p.secondary_opts)}
+FOREIGN = {
+    "--help",
+    *("--nproc-per-node", "--nnodes"),  # torchrun
+    "--strict",  # mkdocs
+    *("--rm", "--userns", "--build-arg", "--shm-size", "--gpus"),  # docker and podman
+}
+"""Options of other programs that pages name."""
 GENERATED = generated_pages()
 CONFIGS = {"dataset": (DatasetConfig, "perilune_render"), **{n: (m, "perilune_train") for n, m in SECTIONS.items()}}
 KEYS = {key.name for n, (model, package) in CONFIGS.items() for key in keys(n, resolve(model, n, package, "small"))}
@@ -120,7 +127,7 @@ def test_commands_options_settings_and_files_exist(page, text):
     wrong = [f"{line}: {why}" for line, whole in shown if (why := fault(line, complete=whole))]
     for line in inline:
         option = re.match(r"--[a-z0-9-]+", line)
-        if option and option[0] not in OPTIONS | {"--help", "--nproc-per-node", "--nnodes", "--strict"}:
+        if option and option[0] not in OPTIONS | FOREIGN:
             wrong.append(f"{line}: no command has this option")
         path = re.fullmatch(rf"{FOLDERS}/[\w./*-]+", line)
         if path and not list(TOP.glob(path[0].rstrip("/"))):
@@ -131,6 +138,16 @@ def test_commands_options_settings_and_files_exist(page, text):
     ]
     wrong += [f"{name}: no such setting" for name in settings if name not in KEYS | GROUPS]
     assert not wrong
+
+
+def test_example_settings_are_valid(tmp_path):
+    blocks = [block for _, text in texts() for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]
+    assert blocks
+    for block in blocks:
+        path = tmp_path / "own.yaml"
+        path.write_text(block)
+        for name, (model, package) in CONFIGS.items():
+            resolve(model, name, package, "tiny", path)
 
 
 def test_targets_of_make_exist():
