@@ -151,7 +151,7 @@ def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
     scenes = rows_of(victim, "scenes")
     replaced(victim, "scenes", with_column(scenes, "dem_source", ["a.tif sha256:" + "1" * 64] * len(scenes)))
     (fault,) = validate(open_dataset(victim))
-    assert fault.column == "split" and "common terrain" in fault.expected
+    assert fault.column == "split" and "one split for each terrain" in fault.expected
     subset(open_dataset(victim), tmp_path / "same")
     assert open_dataset(tmp_path / "same").info.split_by == "trajectory"
     with pytest.raises(UserError, match="1 of scene"):

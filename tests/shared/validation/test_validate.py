@@ -72,7 +72,7 @@ def test_damage_is_found(tiny_detect, name):
 def test_a_terrain_in_two_splits_is_found(tiny_detect):
     rewrite(tiny_detect, "frames", put("split", "val", 2))
     rewrite(tiny_detect, "frames", put("split", "test", 3))
-    assert any("one split for each scene" in fault.expected for fault in validate(open_dataset(tiny_detect)))
+    assert any("one split for each terrain" in fault.expected for fault in validate(open_dataset(tiny_detect)))
 
 
 def test_a_flipped_byte_in_any_kind_of_file_is_found(tiny_detect):
