@@ -21,9 +21,9 @@ ROOMS = {
     "render/perilune_render/terrain": (
         "envelope grid interpolation noise relief size_frequency craters albedo boulders elevation scene cache export"
     ),
-    "train/perilune_train": "config data evaluation models training detect navigate explain cli",
+    "train/perilune_train": "config cli_options data evaluation models training detect navigate explain cli",
     "train/perilune_train/detect": (
-        "config run_config data evaluate inference train evaluate_run compare_runs images deploy cli"
+        "config finished_run data evaluate inference train evaluate_run compare_runs images deploy cli"
     ),
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""

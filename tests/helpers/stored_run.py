@@ -6,8 +6,9 @@ import numpy as np
 
 from perilune_shared.config import resolve
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.run_config import config_of_run
+from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.train.network import build_network
+from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.training import runs
 from perilune_train.training.begin import start_run
 
@@ -23,10 +24,10 @@ def store_run(root: Path, *more: str) -> Path:
     network = build_network(config, np.random.default_rng(0).uniform(4, 40, (500, 2)), root)
     architecture = {"in_channels": config.in_channels, "width": config.width, "attention": config.attention}
     runs.save_weights(run.best, {**architecture, "strides": list(config.strides)}, network)
-    runs.write_metrics(run, {"test/threshold": THRESHOLD})
+    write_metrics(run.root, {"test/threshold": THRESHOLD})
     return run.root
 
 
-def settings_of(run: Path) -> DetectConfig:
-    """The stored settings."""
-    return config_of_run(run, ())
+def settings_of(run: Path, *settings: str) -> DetectConfig:
+    """The stored settings, some of them changed."""
+    return config_of_run(run, settings)

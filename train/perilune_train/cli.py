@@ -1,6 +1,5 @@
 """`perilune-train`: train the detector and the navigators, and explain them."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -8,6 +7,7 @@ import typer
 from perilune_shared.config import Section, resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
 from perilune_shared.errors import run_command_line
+from perilune_train.cli_options import ConfigFile, Preset, Settings
 from perilune_train.detect.cli.main import app as detect
 from perilune_train.detect.config import DetectConfig
 from perilune_train.explain.command import explain
@@ -29,11 +29,9 @@ app.command("explain")(explain)
 
 @app.command()
 def config(
-    preset: Annotated[str, typer.Option(help="tiny, small, paper or large.")] = "small",
-    config: Annotated[Path | None, typer.Option(help="YAML file whose sections override the preset.")] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting, as detect.key.key=value; may be repeated.")
-    ] = None,
+    preset: Preset = "small",
+    config: ConfigFile = None,
+    settings: Settings = None,
     show: Annotated[
         bool, typer.Option("--show/--plain", help="With meaning, unit and default; or values alone.")
     ] = True,

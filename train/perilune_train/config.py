@@ -13,6 +13,6 @@ Device = Literal["auto", "cpu", "cuda"]
 Strategy = Literal["auto", "ddp", "ddp_find_unused_parameters_true"]
 """auto: no strategy for one process; ddp for several, with a search for unused parameters if some weights are
 frozen."""
-Share = Annotated[float, Field(ge=0, le=1)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
 Count = Annotated[int, Field(ge=1)]

@@ -15,7 +15,7 @@ from perilune_train.models.darknet_weights import (
     backbone_slots,
     content_of,
     count_floats,
-    fill,
+    fill_slots,
     is_darknet,
     network_slots,
     read_darknet,
@@ -66,7 +66,7 @@ def test_a_whole_network_is_what_the_cfg_makes_of_the_file(tmp_path):
     path.write_bytes(raw)
     network = YOLOv3(None, 3, WIDTH).eval()
     slots = network_slots(network)
-    fill(slots, read_darknet(path, (count_floats(slots),)), path)
+    fill_slots(slots, read_darknet(path, (count_floats(slots),)), path)
     image = torch.rand(1, 3, 64, 96, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         ours = network(image)
@@ -88,7 +88,7 @@ def test_headers_are_kept_byte_for_byte(tmp_path, backbone, values, name):
     path, again = tmp_path / "a.conv.74", tmp_path / "b.conv.74"
     path.write_bytes(header + values.tobytes())
     content = read_darknet(path, (len(values),))
-    fill(backbone_slots(backbone), content, path)
+    fill_slots(backbone_slots(backbone), content, path)
     assert content.header == header
     write_darknet(again, content)
     assert again.read_bytes() == path.read_bytes()
@@ -140,7 +140,7 @@ def test_a_negative_variance_is_refused_and_nothing_is_loaded(tmp_path, backbone
     path = tmp_path / "x.weights"
     path.write_bytes(by_hand.HEADER + spoilt.tobytes())
     with pytest.raises(UserError, match=r"x.weights: convolution 51 variance: got -0.5"):
-        fill(slots, read_darknet(path, (len(values),)), path)
+        fill_slots(slots, read_darknet(path, (len(values),)), path)
     assert all(torch.equal(value, before[key]) for key, value in backbone.state_dict().items())
 
 
@@ -185,7 +185,7 @@ def test_identity_gates_keep_a_pretrained_backbones_features(tmp_path):
     for attention in ("none", "cbam_identity", "cbam"):
         torch.manual_seed(0)
         network = AttentionDarknet53(attention=attention).eval()
-        fill(backbone_slots(network), content, path)
+        fill_slots(backbone_slots(network), content, path)
         with torch.no_grad():
             features[attention] = network(image)
     cosines = {

@@ -4,8 +4,8 @@ import pytest
 
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError
+from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.training import begin as begin_module
-from perilune_train.training import runs
 from perilune_train.training.begin import check_settings, hashes_of, start_run, state_of
 from perilune_train.training.runs import RunFolder
 
@@ -36,7 +36,7 @@ def test_only_a_run_of_the_same_task_is_replaced_and_only_when_asked(tmp_path):
     run, state = begin(tmp_path, Settings())
     assert state == "new" and run.root == tmp_path / "detect" / "a"
     assert run.config.read_text() == "detect:\n  rate: 0.1\n"
-    runs.write_metrics(run, {"test/x": 1.0})
+    write_metrics(run.root, {"test/x": 1.0})
     assert begin(tmp_path, Settings())[1] == "finished" and run.finished
     assert begin(tmp_path, Settings(rate=0.2), overwrite=True)[1] == "new" and not run.finished
     mine = tmp_path / "detect" / "mine"

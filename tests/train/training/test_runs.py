@@ -14,6 +14,7 @@ from torch import nn
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
+from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.training import fit as fitting
 from perilune_train.training import runs
 from perilune_train.training.begin import start_run
@@ -40,7 +41,7 @@ def test_a_process_that_lightning_starts_knows_at_once_that_it_is_not_the_first(
 
 def test_metrics_are_plain_json(tmp_path):
     run = runs.RunFolder(tmp_path)
-    runs.write_metrics(run, {"a": 1, "b": float("nan"), "c": "text", "d": 0.5})
+    write_metrics(run.root, {"a": 1, "b": float("nan"), "c": "text", "d": 0.5})
     found = json.loads(run.metrics.read_text())
     assert {key: found[key] for key in "abcd"} == {"a": 1, "b": None, "c": "text", "d": 0.5}
     assert found["run/commit"] == run_record().commit
@@ -56,18 +57,18 @@ def test_weights_come_back(tmp_path):
     content = runs.load_weights(path)
     assert content["architecture"] == {"width": 0.5}
     other = nn.Linear(3, 2)
-    runs.fill(other, content["state_dict"], path)
+    runs.load_state(other, content["state_dict"], path)
     assert torch.equal(other.weight, network.weight)
 
 
 def test_another_architecture_is_named(tmp_path):
     path = tmp_path / "best.ckpt"
     with pytest.raises(UserError, match=r"weight: got \(2, 3\), expected \(2, 4\)"):
-        runs.fill(nn.Linear(4, 2), nn.Linear(3, 2).state_dict(), path)
+        runs.load_state(nn.Linear(4, 2), nn.Linear(3, 2).state_dict(), path)
     with pytest.raises(UserError, match="bias: got nothing, expected"):
-        runs.fill(nn.Linear(3, 2), nn.Linear(3, 2, bias=False).state_dict(), path)
+        runs.load_state(nn.Linear(3, 2), nn.Linear(3, 2, bias=False).state_dict(), path)
     with pytest.raises(UserError, match=r"bias: .* expected no such tensor"):
-        runs.fill(nn.Linear(3, 2, bias=False), nn.Linear(3, 2).state_dict(), path)
+        runs.load_state(nn.Linear(3, 2, bias=False), nn.Linear(3, 2).state_dict(), path)
     with pytest.raises(UserError, match=r"width: got 0.5, expected 1.0"):
         runs.check_architecture(path, {"width": 0.5, "attention": "none"}, {"attention": "none", "width": 1.0})
 

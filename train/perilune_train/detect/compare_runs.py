@@ -13,8 +13,8 @@ from perilune_shared.storage.files import write_text
 from perilune_train.detect.evaluate.figures import draw_curves
 from perilune_train.detect.evaluate.metrics import Curve
 from perilune_train.detect.evaluate.report import CURVE_FILE, number, table
-from perilune_train.detect.evaluate_run import read_metrics
 from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.evaluation.provenance import Status, TerrainCheck
 from perilune_train.evaluation.spread import read_spread
 
@@ -27,7 +27,6 @@ _COLUMNS = {
     "recall": "recall",
     "f1": "F1",
 }
-Metrics = dict[str, float | int | str | None]
 _LOWEST = {f"lowest_ap50_paper_by_{by}": f"lowest AP by {by}" for by in ("radius", "altitude", "sun")}
 
 
@@ -43,7 +42,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         name = _name(folder)
         if any(key.rpartition("/")[2] == "ap50" for key in metrics):
             raise UserError(
-                folder / "metrics.json",
+                folder / METRICS_FILE,
                 "ap50",
                 "the interpolated AP of an earlier release",
                 "ap50_paper: run `perilune-train detect evaluate` again",
@@ -85,7 +84,7 @@ def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, 
     status, mark = metrics.get("terrain/status"), metrics.get("terrain/mark")
     if status == "overlap" and not allow_overlap:
         wanted = "an evaluation on other terrain; --allow-overlap allows it and marks all figures"
-        raise UserError(folder / "metrics.json", "terrain/mark", mark, wanted)
+        raise UserError(folder / METRICS_FILE, "terrain/mark", mark, wanted)
     known = status in get_args(Status) and isinstance(mark, str)
     return (str(status), str(mark)) if known else ("unknown", TerrainCheck("unknown").mark)
 

@@ -7,7 +7,10 @@ from pydantic import Field, field_validator, model_validator
 from perilune_shared.config import Section
 from perilune_shared.config_errors import nearest
 from perilune_shared.labels.thresholds import SELECTIONS, Selection
-from perilune_train.config import Attention, Count, Device, Positive, Precision, Share, Strategy
+from perilune_train.config import Attention, Count, Device, Fraction, Positive, Precision, Strategy
+
+COARSEST_STRIDE = 32
+"""Pixels; the sides of the network's input are multiples of it."""
 
 
 class LabelSettings(Selection):
@@ -50,9 +53,9 @@ class AugmentSettings(Section):
     """Apply one of the eight flips and quarter turns of a square frame, each equally likely."""
     scale: tuple[Annotated[float, Field(ge=0.25, le=4)], Annotated[float, Field(ge=0.25, le=4)]] = (1.0, 1.0)
     """Least and largest zoom factor of a frame; its logarithm is uniform."""
-    gain: Share = 0.3
+    gain: Fraction = 0.3
     """Largest change of brightness: the factor is between 1 / (1 + gain) and 1 + gain, uniform in logarithm."""
-    gamma: Share = 0.3
+    gamma: Fraction = 0.3
     """Largest absolute logarithm of the exponent of the grey values."""
     stretch: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
     """Largest fraction of the darkest pixels, and of the brightest, that become black and white. Published images are

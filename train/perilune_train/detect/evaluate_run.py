@@ -1,11 +1,8 @@
 """Evaluate a finished run on a split of any dataset."""
 
-import json
-import math
 from pathlib import Path
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import EDGE
@@ -20,39 +17,13 @@ from perilune_train.detect.evaluate.split_evaluation import (
     selection_entries,
     write_detections,
 )
-from perilune_train.detect.inference.detector import detect_split, load_detector
+from perilune_train.detect.finished_run import check_output, chosen_threshold
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.scales import detect_split
 from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.metrics_file import read_metrics, write_metrics
 from perilune_train.evaluation.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
 from perilune_train.training import runs
-
-
-def read_metrics(folder: Path) -> dict[str, float | int | str | None]:
-    """Read metrics.json of a run or of an evaluation. Raises UserError if it is missing or no flat table."""
-    path = folder / "metrics.json"
-    if not path.is_file():
-        raise UserError(path, "metrics", "no such file", "the folder of a finished run")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise UserError(path, "metrics", error, "JSON") from None
-    plain = (float, int, str, type(None))
-    if not isinstance(content, dict) or not all(isinstance(value, plain) for value in content.values()):
-        raise UserError(path, "metrics", "something else", "flat keys with numbers and text")
-    return content
-
-
-def threshold_of(metrics: dict[str, float | int | str | None], path: Path) -> float:
-    """The score threshold that a run chose on its validation split. Raises UserError if it has none."""
-    found = metrics.get("test/threshold")
-    if isinstance(found, bool) or not isinstance(found, float | int) or not math.isfinite(found):
-        raise UserError(path, "test/threshold", found, "a number; or give --threshold")
-    return float(found)
-
-
-def check_folder(folder: Path, run: Path) -> None:
-    """Refuse to write an evaluation over the run's own report and metrics."""
-    if folder.resolve() == run.resolve():
-        raise UserError(folder, "--out", "the run's own folder", "another: its figures stay as training left them")
 
 
 def evaluate_again(
@@ -71,11 +42,10 @@ def evaluate_again(
     split.
     """
     folder = out or run / "evaluation"
-    check_folder(folder, run)
-    earlier = read_metrics(run)
-    chosen = threshold_of(earlier, run / "metrics.json") if threshold is None else threshold
+    check_output(folder, run)
+    chosen = chosen_threshold(run) if threshold is None else threshold
     chosen_on = "chosen on the run's own val" if threshold is None else "given by hand"
-    known = earlier.get("dataset/name")
+    known = read_metrics(run).get("dataset/name")
     dataset = open_dataset(dataset_root)
     best = runs.RunFolder(run).best
     terrain = read_provenance(runs.load_weights(best), best)
@@ -87,17 +57,15 @@ def evaluate_again(
         protocol = f"another dataset than the run's own ({known}), of itself split by {dataset.info.split_by}"
     if split != "test":
         protocol += f"; {split} frames, which training {'saw' if split == 'train' else 'was steered by'}"
-    device = runs.choose_device(config.device)
-    bf16 = runs.choose_bf16(config.precision, device)
-    network = load_detector(best)
+    detector = open_detector(best, config)
     frames = load_split(dataset, split, config.labels, (1.0, 1 / EDGE))
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
-        seen, _ = detect_split(network, val, "val", config, device, bf16)
+        seen, _ = detect_split(detector, val, "val")
         points = curve(match_detections(val, seen, config))
         chosen, chosen_as = points.operating_threshold(config.evaluation.min_precision)
         chosen_on = f"{chosen_as} on the dataset's val"
-    found, rate = detect_split(network, frames, split, config, device, bf16)
+    found, rate = detect_split(detector, frames, split)
     evaluation = evaluate_split(frames, found, config, chosen)
     write_detections(folder / "detections.parquet", frames, found)
     told = report_head(dataset, split, config, protocol, run.resolve().name, chosen_on)
@@ -108,5 +76,5 @@ def evaluate_again(
     metrics |= {f"{split}/{key}": value for key, value in evaluation.figures().items()}
     metrics[f"{split}/images_per_s"] = round(rate, 2)
     mark_files(folder, WRITTEN, terrain_check.mark)
-    runs.write_metrics(runs.RunFolder(folder), metrics | terrain_check.metrics())
+    write_metrics(folder, metrics | terrain_check.metrics())
     return folder

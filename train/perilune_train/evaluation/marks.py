@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from perilune_shared.storage.files import write_text, written_aside
+from perilune_train.evaluation.pictures import save_image
 
 _METADATA_KEY = b"terrain_mark"
 _RED, _WHITE = (32, 32, 200), (255, 255, 255)
@@ -49,9 +50,7 @@ def mark_picture(path: Path, mark: str) -> None:
     band = np.full((_LINE_PX * len(lines) + 8, width, 3), _RED, np.uint8)
     for number, line in enumerate(lines):
         cv2.putText(band, line, (6, _LINE_PX * (number + 1) - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _WHITE, 1, cv2.LINE_AA)
-    with written_aside(path) as aside:
-        if not cv2.imwrite(str(aside), np.concatenate([band, image])):
-            raise OSError(f"{path}: not written")
+    save_image(path, np.concatenate([band, image]))
 
 
 def marked_page(text: str, mark: str) -> str:

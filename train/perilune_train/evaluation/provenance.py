@@ -17,6 +17,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.errors import UserError
 from perilune_shared.progress import say
+from perilune_train.evaluation.metrics_file import Metrics
 
 RECORD = "terrain"
 """Key of the record in a checkpoint."""
@@ -149,7 +150,7 @@ class TerrainCheck:
             return f"TERRAIN OVERLAP, no test of unseen terrain: {', '.join(self.scenes)}"
         return "TRAINING TERRAIN UNKNOWN: the checkpoint has no record of it" if self.status == "unknown" else ""
 
-    def metrics(self) -> dict[str, float | int | str | None]:
+    def metrics(self) -> Metrics:
         """Entries for metrics.json."""
         return {"terrain/status": self.status, "terrain/mark": self.mark}
 

@@ -7,23 +7,18 @@ import typer
 
 from perilune_shared.config import resolve
 from perilune_shared.terminal import console
-from perilune_train.evaluation.overlap_option import AllowOverlap
+from perilune_train.cli_options import AllowOverlap, ConfigFile, Overwrite, Preset, RunsFolder, Settings
 from perilune_train.explain.config import ExplainConfig
 
 
 def explain(
-    preset: Annotated[str, typer.Option(help="tiny, small, paper or large: the settings to start from.")] = "small",
-    config: Annotated[Path | None, typer.Option(help="YAML file whose section `explain` overrides the preset.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="One setting, for example explain.n_frames=64; wins over file and preset. Repeatable."
-        ),
-    ] = None,
+    preset: Preset = "small",
+    config: ConfigFile = None,
+    set_: Settings = None,
     dataset: Annotated[
         Path | None, typer.Option(help="Folder that holds the datasets detect and nav. [default: data/<preset>]")
     ] = None,
-    runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
+    runs: RunsFolder = Path("runs"),
     name: Annotated[
         str | None,
         typer.Option(
@@ -41,7 +36,7 @@ def explain(
         typer.Option(help="A stack navigator's best.ckpt. [default: runs/navigate/<name>-stack/checkpoints/best.ckpt]"),
     ] = None,
     allow_overlap: AllowOverlap = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of this name.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw the attention masks of both networks and compute their correlations: PCC1 to PCC4 of the paper.
 

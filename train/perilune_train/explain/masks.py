@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
-from perilune_shared.storage.files import write_bytes
 from perilune_train.data.frames import normalised
+from perilune_train.evaluation.pictures import save_image
 from perilune_train.explain.correlation import is_constant
 from perilune_train.models.darknet import AttentionDarknet53
 from perilune_train.models.navigator import StackNavigator
@@ -89,7 +89,7 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
         cells += [np.full_like(cells[0], 255)] * (-len(cells) % _COLUMNS)
         sheet += [np.hstack(cells[i : i + _COLUMNS]) for i in range(0, len(cells), _COLUMNS)]
     sheet.append(_colour_bar(sheet[0].shape[1], low, high))
-    write_bytes(path, cv2.imencode(".png", np.vstack(sheet))[1].tobytes())
+    save_image(path, np.vstack(sheet))
 
 
 def caption(block: str, mask: NDArray[np.floating]) -> str:

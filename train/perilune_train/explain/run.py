@@ -3,10 +3,6 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
@@ -17,10 +13,12 @@ from perilune_shared.terminal import console, progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.split_evaluation import selection_entries
+from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import load_detector
-from perilune_train.detect.run_config import config_of_run
 from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
+from perilune_train.explain.bars import DETECT_BARS, DETECT_TITLE, NAVIGATE_BARS, NAVIGATE_TITLE, draw_bars
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation import ground_affine, ground_truth_mask
 from perilune_train.explain.masks import Masks, detector_masks, draw_masks, navigator_masks
@@ -28,21 +26,8 @@ from perilune_train.explain.measures import PCC1_SIGN, detector_correlations, na
 from perilune_train.navigate.data import Descent, load_descents, pair_sequence
 from perilune_train.navigate.task import load_navigator
 from perilune_train.training.begin import hashes_of, start_run, state_of
-from perilune_train.training.runs import RunFolder, choose_device, load_weights, write_metrics
+from perilune_train.training.runs import RunFolder, choose_device, load_weights
 
-_DETECT_BARS = {
-    "pcc1_background": "PCC1: mask and G (1 on background)",
-    "pcc1_craterness": "craterness: mask and 1 - G",
-    "pcc2": "PCC2: masks of two frames",
-}
-_DETECT_TITLE = (
-    "G is 1 on background and 0 in craters. PCC1 above 0: the gate is weaker on craters. "
-    "Craterness above 0: the gate is stronger on craters."
-)
-_NAVIGATE_BARS = {"pcc3": "PCC3: halves", "pcc4": "PCC4: halves, lower one moved"}
-_NAVIGATE_TITLE = (
-    "Bars: over the pixels that both frames see. Dots and crosses: over all pixels (for PCC4 0 outside the overlap)."
-)
 _TABLE = "correlations.parquet"
 _PICTURES = {
     "detector": ("masks_detect.png", "pcc_detect.png"),
@@ -105,14 +90,14 @@ def explain_run(
     table = pd.DataFrame(rows)
     with written_aside(run.root / _TABLE) as aside:
         table.to_parquet(aside, index=False)
-    draw_bars(run.root / "pcc_detect.png", table, _DETECT_BARS, _DETECT_TITLE)
-    draw_bars(run.root / "pcc_navigate.png", table, _NAVIGATE_BARS, _NAVIGATE_TITLE)
+    draw_bars(run.root / "pcc_detect.png", table, DETECT_BARS, DETECT_TITLE)
+    draw_bars(run.root / "pcc_navigate.png", table, NAVIGATE_BARS, NAVIGATE_TITLE)
     console.print(PCC1_SIGN, markup=False)
     once = table[table["measure"] != "pcc1_craterness"]  # Undefined whenever pcc1_background is.
     undefined = int(once["undefined"].sum())
     if undefined:
         console.print(f"{undefined} of {int(once['count'].sum())} correlations undefined: a mask was constant")
-    metrics: dict[str, float | int | str | None] = {f"{row['measure']}/{row['block']}": row["value"] for row in rows}
+    metrics: Metrics = {f"{row['measure']}/{row['block']}": row["value"] for row in rows}
     metrics |= {
         f"{row['measure']}_all_pixels/{row['block']}": row["value_all_pixels"]
         for row in rows
@@ -130,19 +115,17 @@ def explain_run(
     for part, mark in marks.items():
         mark_files(run.root, _PICTURES[part], mark)
     mark_files(run.root, [_TABLE], "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark))
-    write_metrics(run, metrics)
+    write_metrics(run.root, metrics)
     return run
 
 
-def _check_terrain(
-    networks: Mapping[str, tuple[Path, Path]], allow_overlap: bool
-) -> tuple[dict[str, str], dict[str, float | int | str | None]]:
+def _check_terrain(networks: Mapping[str, tuple[Path, Path]], allow_overlap: bool) -> tuple[dict[str, str], Metrics]:
     """Marks and entries of metrics.json by network, from each network's checkpoint and dataset.
 
     Raises UserError if a network was fitted to terrain of its dataset's test frames, unless `allow_overlap`.
     """
     marks: dict[str, str] = {}
-    metrics: dict[str, float | int | str | None] = {}
+    metrics: Metrics = {}
     for part, (checkpoint, root) in networks.items():
         dataset = open_dataset(root)
         check = check_terrain(read_provenance(load_weights(checkpoint), checkpoint), dataset, "test", allow_overlap)
@@ -154,7 +137,7 @@ def _check_terrain(
 
 def detect_frames(
     settings: ExplainConfig, detector: DetectConfig, root: Path
-) -> tuple[np.ndarray, np.ndarray, dict[str, float | int | str | None]]:
+) -> tuple[np.ndarray, np.ndarray, Metrics]:
     """Test frames (N, height, width), the paper's masks G of them, float32 (N, height, width), and their selection.
 
     G holds the craters that the detector's own run selects, so none that is hardly visible in a frame.
@@ -197,29 +180,3 @@ def _spread(items, count: int) -> list:
 def _some(images: np.ndarray, masks: Masks, count: int) -> tuple[np.ndarray, Masks]:
     chosen = _spread(range(len(images)), count)
     return images[chosen], {name: found[chosen] for name, found in masks.items()}
-
-
-def draw_bars(path: Path, table: pd.DataFrame, measures: dict[str, str], title: str) -> None:
-    """Draw bars of several measures for each block; a block without a bar was undefined in every image.
-
-    Dots show the same measure over all pixels, for measures over part of the pixels.
-    """
-    figure, axis = plt.subplots(figsize=(12, 4.5), constrained_layout=True)
-    width = 0.8 / len(measures)
-    for i, (measure, label) in enumerate(measures.items()):
-        own = table[table["measure"] == measure]
-        place = np.arange(len(own)) + width * i
-        axis.bar(place, own["value"], width, label=label)
-        if own["value_all_pixels"].notna().any():
-            axis.plot(
-                place, own["value_all_pixels"], "ko" if i == 0 else "kx", markersize=4, label=f"{label}: all pixels"
-            )
-        axis.set_xticks(np.arange(len(own)) + 0.4 - width / 2, own["block"], rotation=60)
-    axis.axhline(0, color="black", linewidth=0.8)
-    axis.set(ylabel="Pearson correlation", ylim=(-1, 1))
-    axis.set_title(title, fontsize=9)
-    axis.grid(axis="y", alpha=0.3)
-    axis.legend(fontsize=8)
-    with written_aside(path) as aside:
-        figure.savefig(aside, dpi=120)
-    plt.close(figure)

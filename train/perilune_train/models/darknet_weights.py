@@ -124,7 +124,7 @@ def write_darknet(path: Path, content: DarknetFile) -> None:
 
 
 @torch.no_grad()
-def fill(slots: Sequence[Slot], content: DarknetFile, path: Path) -> None:
+def fill_slots(slots: Sequence[Slot], content: DarknetFile, path: Path) -> None:
     """Copy the first floats of a file into a network; output layers of another width than ours are not changed.
 
     Raises UserError (`path` is for its message) and copies nothing if a variance is negative.

@@ -7,26 +7,19 @@ import typer
 
 from perilune_shared.config import resolve
 from perilune_shared.terminal import console
-from perilune_train.evaluation.overlap_option import AllowOverlap
+from perilune_train.cli_options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
 from perilune_train.navigate.config import NavigateConfig
 
 
 def navigate(
-    preset: Annotated[str, typer.Option(help="tiny, small, paper or large: the settings to start from.")] = "small",
-    config: Annotated[
-        Path | None, typer.Option(help="YAML file whose section `navigate` overrides the preset.")
-    ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="One setting, for example navigate.fusion=warp; wins over file and preset. Repeatable."
-        ),
-    ] = None,
+    preset: Preset = "small",
+    config: ConfigFile = None,
+    set_: Settings = None,
     dataset: Annotated[Path | None, typer.Option(help="Folder of the dataset. [default: data/<preset>/nav]")] = None,
-    runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
-    name: Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")] = None,
+    runs: RunsFolder = Path("runs"),
+    name: RunName = None,
     allow_overlap: AllowOverlap = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace runs of this name.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Train the navigation networks and evaluate them beside the nominal motion, mean motions and KLT tracks.
 

@@ -2,14 +2,12 @@
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from perilune_shared.storage.files import written_aside
+from perilune_train.evaluation.pictures import save_figure
 from perilune_train.navigate.data import Descent
 from perilune_train.navigate.geometry import dead_reckoning
 from perilune_train.navigate.metrics import Motion
@@ -26,7 +24,8 @@ COLOURS = {
 
 def draw_descent(path: Path, descent: Descent, motions: dict[str, Motion], errors: dict[str, pd.DataFrame]) -> None:
     """Draw one trajectory: true and dead-reckoned paths from the side and from above, and errors by step."""
-    figure, axes = plt.subplots(2, 3, figsize=(16, 9), constrained_layout=True)
+    figure = Figure(figsize=(16, 9), layout="constrained")
+    axes = figure.subplots(2, 3)
     side, top, away = axes[0]
     true = descent.position_m
     side.plot(_along(true), true[:, 2], color="black", linewidth=3, label="true")
@@ -42,51 +41,46 @@ def draw_descent(path: Path, descent: Descent, motions: dict[str, Motion], error
         own = errors[method].query("scene_id == @descent.trajectory[0] and trajectory_id == @descent.trajectory[1]")
         axes[1, 0].plot(own["altitude_m"], own["position_error_m"], **style)
         axes[1, 1].plot(own["altitude_m"], own["orientation_error_deg"], **style)
-    _name(side, "path from the side", "distance from the site (m)", "altitude (m)")
-    _name(top, "path from above", "x, west (m)", "y, south (m)")
+    _label(side, "path from the side", "distance from the site (m)", "altitude (m)")
+    _label(top, "path from above", "x, west (m)", "y, south (m)")
     top.axis("equal")
-    _name(away, "dead-reckoned position", "step", "error (m)")
-    _name(axes[1, 0], "position error of each step", "altitude (m)", "error (m)")
-    _name(axes[1, 1], "orientation error of each step", "altitude (m)", "error (deg)")
+    _label(away, "dead-reckoned position", "step", "error (m)")
+    _label(axes[1, 0], "position error of each step", "altitude (m)", "error (m)")
+    _label(axes[1, 1], "orientation error of each step", "altitude (m)", "error (deg)")
     for axis in axes[1, :2]:
         axis.invert_xaxis()
-    for axis, image, index in ((axes[1, 2], descent.images[0], 0),):
-        axis.imshow(image, cmap="gray", vmin=0, vmax=max(1, np.percentile(image, 99.5)))
-        axis.set_title(f"frame {index} of {'/'.join(descent.trajectory)}, {true[index, 2]:.0f} m")
-        axis.axis("off")
+    frame, image = axes[1, 2], descent.images[0]
+    frame.imshow(image, cmap="gray", vmin=0, vmax=max(1, np.percentile(image, 99.5)))
+    frame.set_title(f"frame 0 of {'/'.join(descent.trajectory)}, {true[0, 2]:.0f} m")
+    frame.axis("off")
     side.legend()
-    _save(figure, path)
+    save_figure(path, figure)
 
 
 def draw_errors(path: Path, errors: dict[str, pd.DataFrame]) -> None:
     """Draw, for each method, the fraction of test pairs with an error below a bound, and the errors by axis."""
-    figure, axes = plt.subplots(1, 3, figsize=(16, 5), constrained_layout=True)
+    figure = Figure(figsize=(16, 5), layout="constrained")
+    axes = figure.subplots(1, 3)
     for method, table in errors.items():
         for axis, column in ((axes[0], "position_error_m"), (axes[1], "orientation_error_deg")):
             values = np.sort(table[column])
             axis.plot(values, np.arange(1, len(values) + 1) / len(values), color=COLOURS[method], label=method)
-    _name(axes[0], "position error of a step", "length of the error vector (m)", "share of pairs below")
-    _name(axes[1], "orientation error of a step", "angle of the rotation left over (deg)", "share of pairs below")
+    _label(axes[0], "position error of a step", "length of the error vector (m)", "share of pairs below")
+    _label(axes[1], "orientation error of a step", "angle of the rotation left over (deg)", "share of pairs below")
     place, width = np.arange(3), 0.8 / len(errors)
     for i, (method, table) in enumerate(errors.items()):
         heights = [float(np.sqrt(np.mean(table[f"error_{axis}_m"] ** 2))) for axis in "xyz"]
         axes[2].bar(place + i * width, heights, width, color=COLOURS[method], label=method)
     axes[2].set_xticks(place + 0.4 - width / 2, ["x", "y", "z (view)"])
-    _name(axes[2], "position RMSE of each component, by axis of O_C", "", "RMSE (m)")
+    _label(axes[2], "position RMSE of each component, by axis of O_C", "", "RMSE (m)")
     axes[0].legend()
-    _save(figure, path)
+    save_figure(path, figure)
 
 
 def _along(position_m: np.ndarray) -> np.ndarray:
     return np.hypot(position_m[:, 0], position_m[:, 1])
 
 
-def _name(axis: plt.Axes, title: str, x: str, y: str) -> None:
+def _label(axis: Axes, title: str, x: str, y: str) -> None:
     axis.set(title=title, xlabel=x, ylabel=y)
     axis.grid(alpha=0.3)
-
-
-def _save(figure: plt.Figure, path: Path) -> None:
-    with written_aside(path) as aside:
-        figure.savefig(aside, dpi=110)
-    plt.close(figure)

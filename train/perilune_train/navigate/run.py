@@ -14,6 +14,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import written_aside
 from perilune_shared.terminal import console, progress_bar
 from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import (
     Provenance,
     check_terrain,
@@ -41,7 +42,6 @@ from perilune_train.training.runs import (
     check_architecture,
     choose_device,
     load_weights,
-    write_metrics,
 )
 
 _PREFIX = "backbone."
@@ -194,7 +194,7 @@ def _write(
     drawn = {method: found[0] for method, found in motions.items() if method != "mean"}
     draw_descent(run.root / "descent.png", test[0], drawn, errors)
     draw_errors(run.root / "errors.png", errors)
-    metrics: dict[str, float | int | str | None] = {}
+    metrics: Metrics = {}
     for method, row in rows.items():
         place = method if method in ("stack", "warp") else f"baseline/{method}"
         place = "test" if method == fusion else place
@@ -202,7 +202,7 @@ def _write(
         for key, spread in summary_spreads(errors[method]).items():
             metrics |= spread.keys(f"{place}/{key}")
     mark_files(run.root, _WRITTEN, str(details["terrain/mark"]))
-    write_metrics(run, metrics | details)
+    write_metrics(run.root, metrics | details)
 
 
 def _write_table(path: Path, table: pd.DataFrame) -> None:

@@ -22,7 +22,7 @@ from perilune_train.navigate.geometry import (
     rotation_vectors,
 )
 from perilune_train.navigate.metrics import Motion, motion_errors, summary
-from perilune_train.training.runs import check_architecture, fill, load_weights
+from perilune_train.training.runs import check_architecture, load_state, load_weights
 
 Fusion = Literal["warp", "stack"]
 
@@ -73,7 +73,7 @@ def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:
     content = load_weights(path)
     check_architecture(path, content["architecture"], {"fusion": fusion})
     network = build(content["architecture"])
-    fill(network, content["state_dict"], path)
+    load_state(network, content["state_dict"], path)
     return network.eval(), content["architecture"]
 
 

@@ -1,11 +1,9 @@
-"""A run's folder, weights and metrics; choice of device and precision."""
+"""A run's folder and weights; choice of device and precision."""
 
 import io
-import json
-import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +11,9 @@ import torch
 from torch import nn
 
 from perilune_shared.errors import UserError
-from perilune_shared.run_record import run_record
-from perilune_shared.storage.files import write_bytes, write_text
+from perilune_shared.storage.files import write_bytes
 from perilune_train.config import Precision
+from perilune_train.evaluation.metrics_file import METRICS_FILE
 from perilune_train.evaluation.provenance import RECORD
 
 
@@ -39,7 +37,7 @@ class RunFolder:
     @property
     def metrics(self) -> Path:
         """The metrics, written last: a run that has them is finished."""
-        return self.root / "metrics.json"
+        return self.root / METRICS_FILE
 
     @property
     def best(self) -> Path:
@@ -66,16 +64,6 @@ def is_first_process() -> bool:
     from lightning.pytorch.utilities import rank_zero_only
 
     return int(rank_zero_only.rank) == 0
-
-
-def write_metrics(run: RunFolder, metrics: Mapping[str, float | int | str | None]) -> None:
-    """Write metrics.json: flat keys; values that are not finite become null. Adds the record of the run (run/...)."""
-    plain = {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in metrics.items()
-    }
-    plain |= {f"run/{key}": value for key, value in asdict(run_record()).items()}
-    plain["run/gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    write_text(run.metrics, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 
 def save_weights(
@@ -124,7 +112,7 @@ def check_architecture(path: Path, found: Mapping[str, Any], wanted: Mapping[str
             raise UserError(path, key, found.get(key), f"{value}; the checkpoint is of another architecture")
 
 
-def fill(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
+def load_state(network: nn.Module, state: Mapping[str, torch.Tensor], path: Path) -> None:
     """Load all weights into a network. Raises UserError like `check_tensors`."""
     check_tensors(path, state, network)
     network.load_state_dict(dict(state))

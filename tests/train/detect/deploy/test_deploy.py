@@ -19,7 +19,8 @@ from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.deploy import export, int8
 from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, torch_engine
 from perilune_train.detect.deploy.flight_detector import FlightDetector
-from perilune_train.detect.run_config import config_of_run
+from perilune_train.detect.finished_run import config_of_run
+from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
 
@@ -81,7 +82,7 @@ def run_folder(tmp_path_factory):
     runs.save_weights(run.best, told, lively())
     text = "detect:\n  width: 0.125\n  in_channels: 1\n  attention: cbam_identity\n  strides: [4, 8, 16]\n"
     run.config.write_text(text, encoding="utf-8")
-    runs.write_metrics(run, {"test/threshold": 0.4})
+    write_metrics(run.root, {"test/threshold": 0.4})
     return run.root
 
 

@@ -13,9 +13,9 @@ from perilune_shared.errors import UserError
 from perilune_train.cli import app
 from perilune_train.detect.compare_runs import compare_folders
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.images.evaluate import evaluate_images, judge_images
+from perilune_train.detect.images.evaluate import evaluate_detections_in_images, evaluate_images
 from perilune_train.detect.images.labelled import ImageSet, LabelledImage, read_images
-from perilune_train.detect.inference.tiles import Tiling
+from perilune_train.detect.inference.tiling import Tiling
 
 
 def given(boxes, ends_at_edges=False):
@@ -42,14 +42,14 @@ def detections(boxes):
 def test_small_and_outer_craters_do_not_count(found, precision, recall):
     # 10 px wanted, 7 px too small, the third centred off the image.
     images = given([[10, 10, 20, 20], [50, 50, 57, 57], [96, 10, 116, 30]])
-    figures = judge_images(images, detections(found), 0.1, 8.0).figures()
+    figures = evaluate_detections_in_images(images, detections(found), 0.1, 8.0).figures()
     assert (figures["precision"], figures["recall"], figures["labels"]) == (precision, recall, 1)
 
 
 def test_detections_end_at_the_edges_where_boxes_do():
     cut, whole = [[90, 40, 100, 60]], [[90, 40, 130, 60]]
-    assert judge_images(given(cut, True), detections(whole), 0.1, 8.0).figures()["recall"] == 1
-    assert judge_images(given(cut, False), detections(whole), 0.1, 8.0).figures()["recall"] == 0
+    assert evaluate_detections_in_images(given(cut, True), detections(whole), 0.1, 8.0).figures()["recall"] == 1
+    assert evaluate_detections_in_images(given(cut, False), detections(whole), 0.1, 8.0).figures()["recall"] == 0
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from perilune_train.cli import app
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.images.georeference import MOON_CRS, features, read_georeference
 from perilune_train.detect.images.predict import predict_images
-from perilune_train.detect.inference.tiles import Tiling
+from perilune_train.detect.inference.tiling import Tiling
 
 EARTH = CRS.from_epsg(4326)
 POLAR = CRS.from_proj4(f"+proj=stere +lat_0=-90 +R={MOON_RADIUS_M:.0f} +units=m +no_defs")

@@ -10,7 +10,7 @@ from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.boxes import suppress
-from perilune_train.detect.images.predict import open_detector
+from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.detect.inference.scales import detect_at_scales, multiply_adds_of_a_frame, resized, scaled_size
 from perilune_train.models.size import multiply_adds
 
@@ -36,6 +36,10 @@ class OneSpot(torch.nn.Module):
         return wide, ((wide[..., 2] - wide[..., 0]) >= 8).float() * 0.9
 
 
+def cpu(network, *settings):
+    return Detector(network, config_with(*settings), "cpu", False)
+
+
 def spot(height, width, box):
     image = np.full((height, width), 10, np.uint8)
     image[box[1] : box[3], box[0] : box[2]] = 200
@@ -48,7 +52,7 @@ def test_boxes_come_back_in_pixels_of_the_frame(factor, size):
     boxes = np.array([[40, 20, 72, 60], [8, 36, 60, 76]])
     frames = np.stack([spot(*size, box) for box in boxes])
     network = OneSpot()
-    found = detect_at_scales(network, frames, config_with(f"detect.evaluation.scales=[{factor}]"), "cpu", False)
+    found = detect_at_scales(cpu(network, f"detect.evaluation.scales=[{factor}]"), frames)
     assert network.shapes == [(2, 1, *scaled_size(*size, factor))]
     for part, box in zip(found, boxes, strict=True):
         assert part.boxes == pytest.approx(box[None], abs=1 / factor)
@@ -56,8 +60,8 @@ def test_boxes_come_back_in_pixels_of_the_frame(factor, size):
 
 def test_a_small_crater_is_seen_at_the_scale_that_enlarges_it_and_a_large_one_once():
     frames = np.stack([spot(128, 128, (60, 60, 65, 65)), spot(128, 128, (30, 30, 60, 60))])
-    plain = detect_at_scales(OneSpot(), frames, config_with(), "cpu", False)
-    both = detect_at_scales(OneSpot(), frames, config_with("detect.evaluation.scales=[1,2]"), "cpu", False)
+    plain = detect_at_scales(cpu(OneSpot()), frames)
+    both = detect_at_scales(cpu(OneSpot(), "detect.evaluation.scales=[1,2]"), frames)
     assert [len(part.scores) for part in plain] == [0, 1]
     assert [len(part.scores) for part in both] == [1, 1]
     assert both[0].boxes[0] == pytest.approx([60, 60, 65, 65], abs=0.6)
@@ -66,19 +70,13 @@ def test_a_small_crater_is_seen_at_the_scale_that_enlarges_it_and_a_large_one_on
 def test_several_scales_go_through_one_suppression(tmp_path):
     """Of a real network: the same as both looks put together by hand."""
     run = store_run(tmp_path)
-    detector = open_detector(run, settings_of(run))
+    detector = open_detector(run / "checkpoints/best.ckpt", settings_of(run))
     frames = np.random.default_rng(5).integers(0, 256, (2, 128, 128), np.uint8)
     one, two, both = (
         detect_at_scales(
-            detector.network,
-            frames,
-            detector.config.model_copy(
-                update={"evaluation": detector.config.evaluation.model_copy(update={"scales": scales})}
-            ),
-            "cpu",
-            False,
+            Detector(detector.network, settings_of(run, f"detect.evaluation.scales={scales}"), "cpu", False), frames
         )
-        for scales in ((1.0,), (2.0,), (1.0, 2.0))
+        for scales in ("[1]", "[2]", "[1,2]")
     )
     for a, b, merged in zip(one, two, both, strict=True):
         assert len(a.scores) > 20 and len(b.scores) > 20

@@ -8,11 +8,10 @@ from tests.helpers.stored_run import settings_of, store_run
 
 from perilune_shared.errors import UserError
 from perilune_train.detect.evaluate.boxes import iou_matrix, suppress
-from perilune_train.detect.images.predict import open_detector
+from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.detect.inference.scales import detect_at_scales
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.inference.tiles import (
-    Detector,
     Tiling,
     count_tiles,
     detect_image,
@@ -42,7 +41,7 @@ class Blobs(torch.nn.Module):
 @pytest.fixture(scope="module")
 def detector(tmp_path_factory):
     run = store_run(tmp_path_factory.mktemp("runs"))
-    return open_detector(run, settings_of(run))
+    return open_detector(run / "checkpoints/best.ckpt", settings_of(run))
 
 
 def discs(height, width, spacing, radius):
@@ -87,7 +86,7 @@ def test_boxes_can_get_a_margin(detector):
 
 def test_an_image_of_one_tile_gets_what_frames_get(detector):
     images = np.random.default_rng(3).integers(0, 256, (2, 128, 128), np.uint8)
-    frames = detect_at_scales(detector.network, images, detector.config, "cpu", False)
+    frames = detect_at_scales(detector, images)
     assert min(len(part.scores) for part in frames) > 20
     for image, wanted in zip(images, frames, strict=True):
         found = detect_image(detector, image, Tiling(tile_px=128))

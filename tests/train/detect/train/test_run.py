@@ -13,8 +13,8 @@ from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_shared.yaml_text import parse_yaml
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import load_detector
-from perilune_train.detect.run_config import config_of_run
 from perilune_train.detect.train.loss import detection_loss
 from perilune_train.detect.train.network import build_network
 from perilune_train.detect.train.run import run_detect

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_shared.terminal import console
-from perilune_train.evaluation.overlap_option import AllowOverlap
+from perilune_train.cli_options import AllowOverlap
 
 
 def compare(

@@ -8,10 +8,11 @@ import typer
 from perilune_shared.config import parse_setting, resolve_over
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
+from perilune_train.cli_options import AllowOverlap
 from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.run_config import config_of_run
-from perilune_train.evaluation.overlap_option import AllowOverlap
+from perilune_train.detect.finished_run import config_of_run
+from perilune_train.detect.inference.tiling import Tiling
 
 _FOR_DATASETS = ("dataset", "split", "allow_overlap")
 _FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin")
@@ -52,9 +53,9 @@ def evaluate(
         float, typer.Option(help="With --images: minimum size sqrt(w h) of a crater to find, pixels.")
     ] = 8.0,
     scale: Scales = None,
-    tile: TileSide = 256,
-    overlap: Overlap = 64,
-    box_margin: BoxMargin = 0.0,
+    tile: TileSide = Tiling.tile_px,
+    overlap: Overlap = Tiling.overlap_px,
+    box_margin: BoxMargin = Tiling.box_margin_px,
 ) -> None:
     """Evaluate a run's best weights: report.md, metrics.json, detections.parquet and pictures.
 
@@ -84,7 +85,6 @@ def evaluate(
             if keys[1] == "labels":
                 raise UserError("--set", ".".join(keys), "beside --images", "--min-size: images have no such labels")
         from perilune_train.detect.images.evaluate import evaluate_images
-        from perilune_train.detect.inference.tiles import Tiling
 
         folder = out or run / "images"
         tiling = Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)

@@ -7,7 +7,7 @@ import typer
 
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
-from perilune_train.evaluation.overlap_option import AllowOverlap
+from perilune_train.cli_options import AllowOverlap
 
 
 def export(

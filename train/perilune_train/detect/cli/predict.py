@@ -8,7 +8,8 @@ import typer
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
 from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
-from perilune_train.detect.run_config import config_of_run
+from perilune_train.detect.finished_run import config_of_run
+from perilune_train.detect.inference.tiling import Tiling
 
 
 def predict(
@@ -19,9 +20,9 @@ def predict(
         float | None, typer.Option(help="Minimum score. [default: the run's, chosen on its validation split]")
     ] = None,
     scale: Scales = None,
-    tile: TileSide = 256,
-    overlap: Overlap = 64,
-    box_margin: BoxMargin = 0.0,
+    tile: TileSide = Tiling.tile_px,
+    overlap: Overlap = Tiling.overlap_px,
+    box_margin: BoxMargin = Tiling.box_margin_px,
 ) -> None:
     """Find craters in images.
 
@@ -33,7 +34,6 @@ def predict(
     config = config_of_run(run, ())
     # Importing torch takes seconds; check the options first.
     from perilune_train.detect.images.predict import predict_images
-    from perilune_train.detect.inference.tiles import Tiling
 
     count = predict_images(
         images, run, config, out, threshold, Tiling(tile, overlap, tuple(scale or config.evaluation.scales), box_margin)

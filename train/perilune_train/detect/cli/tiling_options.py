@@ -8,16 +8,16 @@ Scales = Annotated[
     list[float] | None,
     typer.Option(
         "--scale",
-        help="Factor by which images are enlarged or shrunk before the search; repeatable, what several find is merged."
+        help="Factor by which images are resized before detection. Repeatable; detections at all scales are merged."
         " [default: those of the run]",
     ),
 ]
-TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles: that of the training frames, pixels.")]
+TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles, that of the training frames, pixels.")]
 BoxMargin = Annotated[
     float,
     typer.Option(
-        help="Pixels added to the boxes found at every side, which end at the crest of the rim: 0.5 for labels that are"
-        " boxes of whole pixels around a crater."
+        help="Margin added to every side of the detected boxes, which end at the crest of the rim, pixels. Use 0.5 for"
+        " labels that are boxes of whole pixels around a crater."
     ),
 ]
 Overlap = Annotated[int, typer.Option(help="Least overlap of two tiles, pixels.")]

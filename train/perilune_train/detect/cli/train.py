@@ -6,24 +6,19 @@ from typing import Annotated
 import typer
 
 from perilune_shared.config import resolve
+from perilune_train.cli_options import AllowOverlap, ConfigFile, Overwrite, Preset, RunName, RunsFolder, Settings
 from perilune_train.detect.config import DetectConfig
-from perilune_train.evaluation.overlap_option import AllowOverlap
 
 
 def train(
-    preset: Annotated[str, typer.Option(help="tiny, small, paper or large: the settings to start from.")] = "small",
-    config: Annotated[Path | None, typer.Option(help="YAML file whose section `detect` overrides the preset.")] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="One setting, for example detect.attention=none; wins over file and preset. Repeatable."
-        ),
-    ] = None,
+    preset: Preset = "small",
+    config: ConfigFile = None,
+    set_: Settings = None,
     dataset: Annotated[Path | None, typer.Option(help="Folder of the dataset. [default: data/<preset>/detect]")] = None,
-    runs: Annotated[Path, typer.Option("--out", "--runs", help="Folder that holds all runs.")] = Path("runs"),
-    name: Annotated[str | None, typer.Option(help="Name of the run. [default: the preset]")] = None,
+    runs: RunsFolder = Path("runs"),
+    name: RunName = None,
     allow_overlap: AllowOverlap = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run of this name.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Train the crater detector (attention YOLOv3) and evaluate it on the test split.
 

@@ -61,7 +61,7 @@ def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Ten
     return stacked.contiguous(memory_format=torch.channels_last)
 
 
-class Share(torch_data.Sampler[list[int]]):
+class ProcessBatches(torch_data.Sampler[list[int]]):
     """Positions in an epoch's order that one of `processes` takes, batch by batch.
 
     In every step the processes together take the next `size * processes` positions, each an equal part, so that all
@@ -102,12 +102,12 @@ class Collate:
 
 
 def loader(
-    frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: Share | None = None
+    frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: ProcessBatches | None = None
 ) -> torch_data.DataLoader:
     """Batches (images (N, in_channels, H, W), Targets) in the given order, or of a share if one is given."""
     return torch_data.DataLoader(
         frames,
-        batch_sampler=share or Share(len(frames), config.batch_size),
+        batch_sampler=share or ProcessBatches(len(frames), config.batch_size),
         num_workers=config.workers,
         collate_fn=Collate(config.in_channels),
     )

@@ -14,7 +14,7 @@ from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.labels.selection import label_bound_px, read_labels, selected
 from perilune_train.data.frames import FrameStore, load_frames
-from perilune_train.detect.config import LabelSettings
+from perilune_train.detect.config import COARSEST_STRIDE, LabelSettings
 
 Array = NDArray[np.float64]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
@@ -70,10 +70,10 @@ def load_split(
     """
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
-        if size % 32:
-            nearest = max(32, round(size / 32) * 32)
-            expected = f"a multiple of 32, the network's coarsest stride; render or develop the frames with {nearest}"
-            raise UserError(dataset.root, field, size, expected)
+        if size % COARSEST_STRIDE:
+            nearest = max(1, round(size / COARSEST_STRIDE)) * COARSEST_STRIDE
+            expected = f"a multiple of {COARSEST_STRIDE}, the network's coarsest stride"
+            raise UserError(dataset.root, field, size, f"{expected}; render or develop the frames with {nearest}")
     frames = load_frames(dataset, split)
     labels = read_labels(dataset, [*_BOX, *_ELLIPSE], split)
     radius_px = _judged_range(dataset, settings)

@@ -18,7 +18,7 @@ from perilune_shared.errors import UserError
 Array = NDArray[np.float32]
 Engine = Callable[[Array], tuple[Array, Array]]
 """Normalised images (N, C, H, W) in float32 to boxes (N, K, 4) in pixels and scores (N, K)."""
-Precision = Literal["f32", "bf16"]
+EnginePrecision = Literal["f32", "bf16"]
 
 
 def package(name: str) -> Any:
@@ -31,7 +31,7 @@ def package(name: str) -> Any:
         raise UserError("perilune-train", name, "not installed", "pip install 'perilune-train[export]'") from None
 
 
-def torch_engine(network: nn.Module, precision: Precision = "f32") -> Engine:
+def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engine:
     """Engine of a torch network that returns boxes and scores; channels last, with torch's number of threads."""
     network = network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
@@ -65,7 +65,9 @@ def openvino_core() -> Any:
     return package("openvino").Core()
 
 
-def openvino_engine(path: Path, precision: Precision = "f32", threads: int = 0, batch: int | None = None) -> Engine:
+def openvino_engine(
+    path: Path, precision: EnginePrecision = "f32", threads: int = 0, batch: int | None = None
+) -> Engine:
     """OpenVINO engine of an .onnx or .xml file; with `batch` for that number of images only, which is faster.
 
     By default OpenVINO uses bfloat16 if the processor has it; here `precision` decides.

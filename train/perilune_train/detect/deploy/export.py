@@ -28,8 +28,8 @@ from perilune_train.detect.deploy.engines import (
 from perilune_train.detect.deploy.flight_detector import FlightDetector
 from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
 from perilune_train.detect.deploy.readme import readme
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.detect.inference.detector import load_detector
-from perilune_train.detect.run_config import config_of_run
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import (
     Provenance,
@@ -68,18 +68,11 @@ class Trained:
 
 def load_trained(root: Path) -> Trained:
     """Load a finished run's network, settings and threshold. Raises UserError if it is none."""
-    run = RunFolder(root)
-    config = config_of_run(root)
-    if not run.finished:
-        raise UserError(root, "run", "no metrics.json", "a finished run; resume it with the command that started it")
-    try:
-        threshold = float(json.loads(run.metrics.read_text(encoding="utf-8"))["test/threshold"])
-    except (ValueError, KeyError, TypeError):
-        raise UserError(run.metrics, "test/threshold", "no number", "the metrics of a finished run") from None
-    return Trained(load_detector(run.best), config, threshold, run.best)
+    config, threshold, best = config_of_run(root), chosen_threshold(root), RunFolder(root).best
+    return Trained(load_detector(best), config, threshold, best)
 
 
-def facts(trained: Trained, size_px: int) -> dict[str, Any]:
+def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
     """All data needed to use the exported files without this code."""
     network, settings = trained.network, trained.config.evaluation
     return {
@@ -109,8 +102,8 @@ def facts(trained: Trained, size_px: int) -> dict[str, Any]:
     }
 
 
-def write_onnx(detector: FlightDetector, path: Path, told: dict[str, Any], in_channels: int, size_px: int) -> None:
-    """Write the graph for any number of images; `told` goes into its metadata, each entry as JSON."""
+def write_onnx(detector: FlightDetector, path: Path, metadata: dict[str, Any], in_channels: int, size_px: int) -> None:
+    """Write the graph for any number of images; `metadata` is stored in it, each entry as JSON."""
     onnx = package("onnx")
     names = {"images": {0: "n"}, "boxes": {0: "n"}, "scores": {0: "n"}}
     with warnings.catch_warnings(), torch.no_grad():
@@ -127,7 +120,7 @@ def write_onnx(detector: FlightDetector, path: Path, told: dict[str, Any], in_ch
             dynamo=False,
         )
     model = onnx.load(str(path))
-    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in told.items()})
+    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
     onnx.checker.check_model(model)
     onnx.save(model, str(path))
 
@@ -211,9 +204,9 @@ def export_run(
         if (camera.width_px, camera.height_px) != (size_px, size_px):
             found = f"{camera.width_px} x {camera.height_px}"
             raise UserError(opened.root, "frames", found, f"{size_px} x {size_px} pixels; --size-px gives another")
-    told = facts(trained, size_px)
+    metadata = export_metadata(trained, size_px)
     terrain, terrain_check = _terrain(trained.checkpoint, opened if int8 else None, allow_overlap)
-    told["terrain"] = {**terrain.plain(), **(terrain_check.metrics() if terrain_check is not None else {})}
+    metadata["terrain"] = {**terrain.plain(), **(terrain_check.metrics() if terrain_check is not None else {})}
     verdict = None
     with new_folder(out) as folder:
         if opened is None:
@@ -221,28 +214,29 @@ def export_run(
         else:
             val = load_split(opened, "val", trained.config.labels)
             frames = val.frames.images[np.linspace(0, len(val) - 1, min(_CHECKED_FRAMES, len(val))).astype(int)]
-        told["compared_on"] = "noise" if opened is None else "validation frames"
+        metadata["compared_on"] = "noise" if opened is None else "validation frames"
         images = network_input(normalised(frames), channels).contiguous().numpy()
         onnx_path, xml_path = folder / "detector.onnx", folder / "detector.xml"
-        write_onnx(FlightDetector(trained.network, size_px), onnx_path, told, channels, size_px)
+        write_onnx(FlightDetector(trained.network, size_px), onnx_path, metadata, channels, size_px)
         engines = [(onnx_path, "onnxruntime", onnxruntime_engine(onnx_path))]
         if "openvino" in formats:
             write_openvino(onnx_path, xml_path)
             engines.append((xml_path, "openvino", openvino_engine(xml_path)))
-        told["differences_from_torch"] = {name: check(p, name, trained, engine, images) for p, name, engine in engines}
-        for name, found in told["differences_from_torch"].items():
+        differences = {name: check(path, name, trained, engine, images) for path, name, engine in engines}
+        metadata["differences_from_torch"] = differences
+        for name, largest in differences.items():
             console.print(
-                f"{name}: boxes within {found['largest_px']:.2g} px of torch's, scores {found['largest_score']:.2g}"
+                f"{name}: boxes within {largest['largest_px']:.2g} px of torch's, scores {largest['largest_score']:.2g}"
             )
         if int8 and opened is not None:
             verdict = try_int8(onnx_path, folder / "detector-int8.onnx", opened, val, trained.config)
-            told["int8"] = verdict.as_facts()
+            metadata["int8"] = verdict.as_facts()
             console.print(verdict.words())
         if "onnx" not in formats:
             onnx_path.unlink()
-        told["files"] = {p.name: sha256_of(p) for p in sorted(folder.iterdir())}
-        write_text(folder / "detector.json", json.dumps(told, indent=2) + "\n")
-        write_text(folder / "README.md", readme(told))
+        metadata["files"] = {p.name: sha256_of(p) for p in sorted(folder.iterdir())}
+        write_text(folder / "detector.json", json.dumps(metadata, indent=2) + "\n")
+        write_text(folder / "README.md", readme(metadata))
         if terrain_check is not None:
             mark_files(folder, ("README.md",), terrain_check.mark)
     return verdict

@@ -17,7 +17,7 @@ from perilune_train.data.frames import load_frames, normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.data.split import DetectSplit
-from perilune_train.detect.deploy.engines import Array, Engine, Precision, has_bf16, openvino_engine, package
+from perilune_train.detect.deploy.engines import Array, Engine, EnginePrecision, has_bf16, openvino_engine, package
 from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.split_evaluation import match_detections
 from perilune_train.detect.inference.suppression import detections_of
@@ -42,8 +42,8 @@ class Int8Verdict:
     """Median time of one image before quantisation, in `precision`."""
     int8_s: float
     """Median time of one image in int8."""
-    precision: Precision
-    """Precision of the parts that are not int8: bf16 if the processor has it."""
+    precision: EnginePrecision
+    """EnginePrecision of the parts that are not int8: bf16 if the processor has it."""
 
     @property
     def kept(self) -> bool:
@@ -71,7 +71,7 @@ def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config
     frames = load_frames(dataset, "train").images
     some = frames[np.linspace(0, len(frames) - 1, min(_CALIBRATION_FRAMES, len(frames))).astype(int)]
     quantise(source, out, network_input(normalised(some), config.in_channels).contiguous().numpy())
-    precision: Precision = "bf16" if has_bf16() else "f32"
+    precision: EnginePrecision = "bf16" if has_bf16() else "f32"
     quick = {"float": openvino_engine(source, precision, batch=1), "int8": openvino_engine(out, precision, batch=1)}
     image = network_input(normalised(val.frames.images[:1]), config.in_channels).contiguous().numpy()
     times = interleaved(quick, image, _TIMED)

@@ -11,7 +11,7 @@ import os
 import cv2
 import numpy as np
 
-# Before the import: official builds of ONNX Runtime send events to their maker otherwise.
+# Set before the import; official builds of ONNX Runtime otherwise send telemetry.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 import onnxruntime
 
@@ -20,7 +20,7 @@ session = onnxruntime.InferenceSession("detector.onnx", providers=["CPUExecution
 
 
 def detect(grey):
-    """Boxes (D, 4) in pixels and scores (D,), best first, of a grey image."""
+    """Return boxes (D, 4) in pixels and scores (D,), highest first, for a grey image."""
     levels = grey.astype(np.float32)
     image = (levels - levels.mean()) / max(levels.std(), 1.0)
     images = np.repeat(image[None, None], facts["input"]["shape"][1], axis=1)
@@ -33,47 +33,49 @@ def detect(grey):
 '''
 
 
-def readme(told: dict[str, Any]) -> str:
-    """Markdown for users of the files with these facts (detector.json)."""
-    _, channels, size_px, _ = told["input"]["shape"]
+def readme(metadata: dict[str, Any]) -> str:
+    """Markdown for users of an export with this metadata (detector.json)."""
+    _, channels, size_px, _ = metadata["input"]["shape"]
+    threshold = f"{metadata['score_threshold']:.4f}"
     lines = [
         "# Crater detector",
         "",
-        f"In: `images`, float32, (n, {channels}, {size_px}, {size_px}). {told['input']['normalisation'].capitalize()}.",
+        f"Input: `images`, float32, (n, {channels}, {size_px}, {size_px}). "
+        f"{metadata['input']['normalisation'].capitalize()}.",
         "",
-        f"Out: `boxes` {told['outputs']['boxes']}; `scores` {told['outputs']['scores']}.",
+        f"Output: `boxes` {metadata['outputs']['boxes']}; `scores` {metadata['outputs']['scores']}.",
         "",
-        f"A crater is reported from a score of {told['score_threshold']:.4f} (highest F1 on validation frames). Many "
-        f"boxes lie on one crater: of two that overlap by an IoU above {told['nms_iou']:g} the weaker goes "
-        "(non-maximum suppression), which is not part of the graph.",
+        f"Report detections with a score of at least {threshold}, the threshold chosen on validation frames. "
+        "Apply non-maximum suppression, which is not part of the graph: of two boxes with an IoU above "
+        f"{metadata['nms_iou']:g}, drop the one with the lower score.",
         "",
-        f"{told['multiply_adds'] / 1e9:.3f} G multiply-adds an image, {told['parameters']:,} parameters.",
+        f"{metadata['multiply_adds'] / 1e9:.3f} G multiply-adds per image, {metadata['parameters']:,} parameters.",
         "",
         "| File | SHA-256 |",
         "|---|---|",
-        *(f"| {name} | `{digest}` |" for name, digest in told["files"].items()),
+        *(f"| {name} | `{digest}` |" for name, digest in metadata["files"].items()),
         "",
-        "`detector.json` holds these and all other facts, the ONNX file has them in its metadata.",
-        "OpenVINO computes in bfloat16 where the processor has it, which is faster and not exact;",
-        "`INFERENCE_PRECISION_HINT=f32` gives torch's boxes. A shape fixed to one image (`model.reshape`) is faster",
-        "too.",
+        "`detector.json` contains these values and all others; the ONNX file contains them as metadata.",
+        "OpenVINO computes in bfloat16 if the processor supports it, which is faster but less accurate;",
+        "`INFERENCE_PRECISION_HINT=f32` gives the same boxes as torch. Fixing the shape to one image (`model.reshape`)",
+        "also makes it faster.",
         "",
     ]
-    if told["scales"] != [1.0]:
+    if metadata["scales"] != [1.0]:
         lines += [
-            f"The score of {told['score_threshold']:.4f} is for images looked at {at_scales(tuple(told['scales']))}:",
-            "resized, run through the graph in pieces of its size, boxes divided by the scale, all put through one",
-            "suppression. A look at one scale alone needs a threshold of its own.",
+            f"The threshold of {threshold} is for images evaluated {at_scales(tuple(metadata['scales']))}: resize the",
+            "image to each scale, run the graph on tiles of its size, divide the boxes by the scale, and apply one",
+            "non-maximum suppression to all of them. One scale alone needs another threshold.",
             "",
         ]
-    if "detector-int8.onnx" in told["files"]:
-        int8 = told["int8"]
+    if "detector-int8.onnx" in metadata["files"]:
+        int8 = metadata["int8"]
         lines += [
-            "`detector-int8.onnx` has its convolutions, but for gates and heads, in 8-bit integers. On the validation",
-            f"frames it has an AP of {int8['ap50_paper_int8']:.4f}; in float32 {int8['ap50_paper_float']:.4f}.",
-            "Made for OpenVINO; ONNX Runtime runs it more slowly than `detector.onnx`.",
+            "`detector-int8.onnx` has its convolutions in 8-bit integers, except gates and heads. Its AP on the",
+            f"validation frames is {int8['ap50_paper_int8']:.4f}; in float32 it is {int8['ap50_paper_float']:.4f}.",
+            "It is made for OpenVINO; ONNX Runtime runs it more slowly than `detector.onnx`.",
             "",
         ]
-    if "detector.onnx" in told["files"]:
+    if "detector.onnx" in metadata["files"]:
         lines += ["```python", _PROGRAM.rstrip(), "```", ""]
     return "\n".join(lines)

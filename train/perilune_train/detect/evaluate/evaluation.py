@@ -32,6 +32,7 @@ from perilune_train.detect.evaluate.matching import (
     find_overlaps,
 )
 from perilune_train.detect.evaluate.metrics import figures, figures_of_account, figures_over_ious
+from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.spread import Resamples, Spread, draw_resamples, spreads
 
 Array = NDArray[np.float64]
@@ -72,13 +73,13 @@ class Evaluation:
         """Centre and radius errors of the found craters, see `errors_of_found`."""
         return errors_of_found(self.overlaps, self.matches, self.threshold)
 
-    def figures(self) -> dict[str, float | int | str | None]:
+    def figures(self) -> Metrics:
         """Flat keys for metrics.json; NaN where undefined.
 
         The keys are those of `metrics.figures`, `figures_over_ious` and `Spread.keys`, <bin>/ap50_paper and others,
         recall_radius_... and the errors.
         """
-        result: dict[str, float | int | str | None] = {
+        result: Metrics = {
             **figures(self.matches, self.threshold),
             **figures_of_account(self.at_edge, self.threshold, "edge/"),
             **figures_over_ious(self.by_iou),

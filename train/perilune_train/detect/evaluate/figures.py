@@ -3,30 +3,22 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Rectangle
 from numpy.typing import NDArray
 
-from perilune_shared.storage.files import written_aside
 from perilune_train.detect.evaluate.bins import BinFigures
 from perilune_train.detect.evaluate.evaluation import Evaluation
 from perilune_train.detect.evaluate.matching import FALSE, FOUND
 from perilune_train.detect.evaluate.metrics import Curve
+from perilune_train.evaluation.pictures import save_figure
 from perilune_train.evaluation.spread import LEAST_UNITS
 
-matplotlib.use("Agg")
 _LABEL, _IGNORED, _FOUND, _FALSE = "#ff4040", "#e0c030", "#19d3e0", "#ff40ff"
 _PANELS = {"radius": "radius, px", "altitude": "altitude, m", "sun": "Sun elevation, degrees"}
 _GOAL = 0.85
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG atomically."""
-    with written_aside(path) as aside:
-        figure.savefig(aside, dpi=110)
 
 
 def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] | None = None) -> None:
@@ -39,7 +31,7 @@ def draw_curves(curves: dict[str, Curve], path: Path, dashed: dict[str, Curve] |
     axes.set(xlabel="recall", ylabel="precision", xlim=(0, 1), ylim=(0, 1.02))
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8)
-    save_figure(figure, path)
+    save_figure(path, figure)
 
 
 def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
@@ -73,7 +65,7 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
         "below each bin its number of labels; dashed and blue: the goal of 0.85",
         fontsize=9,
     )
-    save_figure(figure, path)
+    save_figure(path, figure)
 
 
 def choose_frames(f1: NDArray[np.float64], groups: Sequence[str], count: int) -> dict[str, list[int]]:
@@ -127,7 +119,7 @@ def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], pat
         "not counted white",
         fontsize=10,
     )
-    save_figure(figure, path)
+    save_figure(path, figure)
 
 
 def _title(evaluation: Evaluation, index: int) -> str:

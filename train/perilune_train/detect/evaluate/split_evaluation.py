@@ -13,6 +13,7 @@ from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.matching import Detections, Matches, match_split
+from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.provenance import protocol_of
 
 WRITTEN = (
@@ -45,13 +46,13 @@ def evaluate_split(split: DetectSplit, found: list[Detections], config: DetectCo
     )
 
 
-def selection_entries(config: DetectConfig, split: DetectSplit) -> dict[str, float | int | str | None]:
+def selection_entries(config: DetectConfig, split: DetectSplit) -> Metrics:
     """The label selection for metrics.json: its name and thresholds; null means no limit."""
     used = {f"labels/{key}": value for key, value in config.labels.model_dump(exclude={"radius_px"}).items()}
     return used | {"labels/min_radius_px": split.radius_px[0], "labels/max_radius_px": split.radius_px[1]}
 
 
-def dataset_entries(dataset: Dataset, split: str, config: DetectConfig) -> dict[str, float | int | str | None]:
+def dataset_entries(dataset: Dataset, split: str, config: DetectConfig) -> Metrics:
     """Dataset, split and settings of an evaluation, for metrics.json."""
     return {
         "dataset/name": dataset.info.name,
@@ -73,13 +74,13 @@ def report_head(
         f"wanted: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
         f"threshold {chosen_on}",
         f"detections below a score of {settings.min_score:g} are dropped, suppression at IoU {settings.nms_iou:g}, "
-        f"at most {settings.max_detections} are kept in a frame; frames looked at {at_scales(settings.scales)}",
+        f"at most {settings.max_detections} are kept in a frame; frames evaluated {at_scales(settings.scales)}",
     ]
 
 
 def at_scales(scales: tuple[float, ...]) -> str:
     """Scales in words, for a report."""
-    return "as they are" if scales == (1.0,) else "at scale " + " and ".join(f"{factor:g}" for factor in scales)
+    return "at scale " + " and ".join(f"{factor:g}" for factor in scales)
 
 
 def write_detections(path: Path, split: DetectSplit, found: list[Detections]) -> None:

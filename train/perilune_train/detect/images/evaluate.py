@@ -23,11 +23,15 @@ from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detec
 from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.evaluate.report import write_evaluation
-from perilune_train.detect.evaluate_run import check_folder, read_metrics, threshold_of
+from perilune_train.detect.finished_run import check_output, chosen_threshold
 from perilune_train.detect.images.labelled import ImageSet, LabelledImage, read_images
-from perilune_train.detect.images.predict import draw_boxes, open_detector, table_of
+from perilune_train.detect.images.predict import draw_boxes, table_of
 from perilune_train.detect.images.read import read_grey
-from perilune_train.detect.inference.tiles import Detector, Tiling, count_tiles, detect_image
+from perilune_train.detect.inference.detector import Detector, open_detector
+from perilune_train.detect.inference.tiles import count_tiles, detect_image
+from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.evaluation.metrics_file import Metrics, write_metrics
+from perilune_train.evaluation.pictures import save_image
 from perilune_train.training import runs
 
 _CROP_PX = 200
@@ -44,13 +48,13 @@ def evaluate_images(
     tiling: Tiling,
     min_size_px: float = 8.0,
     threshold: float | None = None,
-) -> dict[str, float | int | str | None]:
+) -> Metrics:
     """Evaluate a run on labelled images (a folder or a COCO file); returns the metrics written to `out`/metrics.json.
 
     Also writes report.md, detections.parquet, precision_recall.png, bins.png, detections.png and crops.png into `out`.
     Raises UserError if any input cannot be read; then nothing is written.
     """
-    check_folder(out, run)
+    check_output(out, run)
     tiling.check()
     if not 0 < min_size_px < np.inf:
         raise UserError("--min-size", "pixels", min_size_px, "above 0")
@@ -58,10 +62,10 @@ def evaluate_images(
     if not any(image.wanted(min_size_px).any() for image in given.images):
         raise UserError(place, "boxes", f"none of {min_size_px:g} px or more", "at least one to be found")
     chosen_on = "chosen on the run's validation split" if threshold is None else "given by hand"
-    threshold = threshold_of(read_metrics(run), run / "metrics.json") if threshold is None else threshold
+    threshold = chosen_threshold(run) if threshold is None else threshold
     images = [read_grey(image.path) for image in given.images]
-    found = _detect(open_detector(run, config), images, tiling)
-    evaluation = judge_images(given, found, threshold, min_size_px, config.evaluation.match_iou)
+    found = _detect(open_detector(runs.RunFolder(run).best, config), images, tiling)
+    evaluation = evaluate_detections_in_images(given, found, threshold, min_size_px, config.evaluation.match_iou)
     best = curve(evaluation.matches).best_threshold()
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
     about = [
@@ -87,7 +91,7 @@ def evaluate_images(
         "box_margin_px": tiling.box_margin_px,
         "scales": " ".join(map(str, tiling.scales)),
     }
-    runs.write_metrics(runs.RunFolder(out), figures)
+    write_metrics(out, figures)
     return figures
 
 
@@ -99,7 +103,7 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
     return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, image.wanted(min_size_px), every)
 
 
-def judge_images(
+def evaluate_detections_in_images(
     given: ImageSet, found: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
 ) -> Evaluation:
     """Evaluate the detections of all images; clip detections at the image's edge if the labels' boxes are clipped."""
@@ -140,9 +144,7 @@ def write_crops(path: Path, images: list[NDArray[np.uint8]], evaluation: Evaluat
     pairs += [np.zeros_like(pairs[0])] * (-len(pairs) % min(_PAIRS_A_ROW, len(pairs)))
     columns = min(_PAIRS_A_ROW, len(pairs))
     rows = [np.concatenate(pairs[k : k + columns], axis=1) for k in range(0, len(pairs), columns)]
-    with written_aside(path) as aside:
-        if not cv2.imwrite(str(aside), np.concatenate(rows)):
-            raise OSError(f"{path}: not written")
+    save_image(path, np.concatenate(rows))
 
 
 def _crop_pair(image: NDArray[np.uint8], evaluation: Evaluation, index: int) -> NDArray[np.uint8]:

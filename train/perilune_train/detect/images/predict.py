@@ -14,7 +14,7 @@ from perilune_shared.storage.files import new_folder
 from perilune_shared.terminal import console, progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.evaluate_run import read_metrics, threshold_of
+from perilune_train.detect.finished_run import chosen_threshold
 from perilune_train.detect.images.georeference import (
     Georeference,
     can_read_georeferences,
@@ -23,21 +23,16 @@ from perilune_train.detect.images.georeference import (
     read_georeference,
 )
 from perilune_train.detect.images.read import picture_size, read_grey
-from perilune_train.detect.inference.detector import load_detector
-from perilune_train.detect.inference.tiles import Detector, Tiling, count_tiles, detect_image
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.tiles import count_tiles, detect_image
+from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.evaluation.pictures import save_image
 from perilune_train.training import runs
 
 _DETECTED = (227, 211, 25)
 """Cyan, in OpenCV's order blue, green, red."""
 _LARGEST_OVERLAY_PX = 4096
 _SMALLEST_OVERLAY_PX = 1600
-
-
-def open_detector(root: Path, config: DetectConfig) -> Detector:
-    """Load the best network of a run's folder. Raises UserError if it has none."""
-    device = runs.choose_device(config.device)
-    network = load_detector(runs.RunFolder(root).best).to(device)
-    return Detector(network, config, device, runs.choose_bf16(config.precision, device))
 
 
 def predict_images(
@@ -62,8 +57,8 @@ def predict_images(
             references.append(_reference(path))
             n_tiles += count_tiles(height, width, tiling)
             progress.advance(check)
-        threshold = threshold_of(read_metrics(run), run / "metrics.json") if threshold is None else threshold
-        detector = open_detector(run, config)
+        threshold = chosen_threshold(run) if threshold is None else threshold
+        detector = open_detector(runs.RunFolder(run).best, config)
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes = [], []
         for path, reference in zip(paths, references, strict=True):
@@ -127,8 +122,7 @@ def write_overlay(path: Path, image: NDArray[np.uint8], found: Detections) -> No
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     canvas = cv2.cvtColor(cv2.resize(image, size, interpolation=how), cv2.COLOR_GRAY2BGR)
     draw_boxes(canvas, found.boxes * factor, _DETECTED)
-    if not cv2.imwrite(str(path), canvas):
-        raise OSError(f"{path}: not written")
+    save_image(path, canvas)
 
 
 def draw_boxes(canvas: NDArray[np.uint8], boxes: NDArray[np.float64], colour: tuple[int, int, int]) -> None:

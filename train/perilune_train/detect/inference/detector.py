@@ -1,18 +1,40 @@
-"""A trained detector and its detections of a split."""
+"""A trained detector: its network, settings and device."""
 
-import time
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from perilune_shared.errors import UserError
-from perilune_shared.terminal import progress_bar
+from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.split import DetectSplit
-from perilune_train.detect.evaluate.matching import Detections
-from perilune_train.detect.inference.scales import detect_at_scales
+from perilune_train.detect.data.batches import network_input
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A trained network and how to run it."""
+
+    network: YOLOv3
+    """The network, in evaluation mode, on the device."""
+    config: DetectConfig
+    """The run's settings."""
+    device: str
+    """cpu or cuda."""
+    bf16: bool
+    """Whether it computes in bfloat16."""
+
+    @torch.no_grad()
+    def predict(self, images: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
+        """Boxes (N, K, 4) in pixels and scores (N, K) of all predictors, for images (N, height, width)."""
+        given = network_input(normalised(images), self.config.in_channels).to(self.device)
+        with torch.autocast(self.device, torch.bfloat16, enabled=self.bf16):
+            return self.network.detect(given)
 
 
 def load_detector(path: Path) -> YOLOv3:
@@ -22,21 +44,12 @@ def load_detector(path: Path) -> YOLOv3:
     if set(architecture) != {"in_channels", "width", "attention", "strides"}:
         raise UserError(path, "architecture", sorted(architecture), "a detect run's checkpoint")
     network = YOLOv3(None, **architecture)
-    runs.fill(network, content["state_dict"], path)
+    runs.load_state(network, content["state_dict"], path)
     return network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
-def detect_split(
-    network: YOLOv3, split: DetectSplit, name: str, config: DetectConfig, device: str, bf16: bool
-) -> tuple[list[Detections], float]:
-    """Detections of all frames of a split, and frames per second."""
-    with progress_bar() as progress:
-        bar = progress.add_task(f"detect {name}", total=len(split), unit="frames", note="")
-        started = time.perf_counter()
-        network = network.to(device).eval()
-        found: list[Detections] = []
-        for start in range(0, len(split), config.batch_size):
-            frames = split.frames.images[start : start + config.batch_size]
-            found += detect_at_scales(network, frames, config, device, bf16)
-            progress.advance(bar, len(frames))
-        return found, len(split) / (time.perf_counter() - started)
+def open_detector(checkpoint: Path, config: DetectConfig) -> Detector:
+    """Load a detect run's best.ckpt onto the device of the settings. Raises UserError like `load_detector`."""
+    device = runs.choose_device(config.device)
+    network = load_detector(checkpoint).to(device)
+    return Detector(network, config, device, runs.choose_bf16(config.precision, device))

@@ -1,20 +1,20 @@
 """Detection on resized frames: enlarging brings small craters to the sizes that a network finds best."""
 
+import time
+
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from perilune_train.data.frames import normalised
-from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.batches import network_input
+from perilune_shared.terminal import progress_bar
+from perilune_train.detect.config import COARSEST_STRIDE, DetectConfig
+from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
-
-_STEP = 32
-"""Coarsest stride of the network; the sides of its input are multiples of it."""
 
 
 def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
@@ -30,8 +30,8 @@ def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]
     """Height and width, pixels, nearest to `factor` times those of a frame that the network accepts."""
     if factor == 1:
         return height_px, width_px
-    height, width = (max(_STEP, round(side * factor / _STEP) * _STEP) for side in (height_px, width_px))
-    return height, width
+    height, width = (max(1, round(side * factor / COARSEST_STRIDE)) for side in (height_px, width_px))
+    return COARSEST_STRIDE * height, COARSEST_STRIDE * width
 
 
 def multiply_adds_of_a_frame(network: YOLOv3, config: DetectConfig, height_px: int, width_px: int) -> int:
@@ -40,22 +40,31 @@ def multiply_adds_of_a_frame(network: YOLOv3, config: DetectConfig, height_px: i
     return sum(multiply_adds(network, (1, config.in_channels, *size)) for size in sizes)
 
 
-@torch.no_grad()
-def detect_at_scales(
-    network: YOLOv3, frames: NDArray[np.uint8], config: DetectConfig, device: str, bf16: bool
-) -> list[Detections]:
+def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Detections]:
     """Detections of frames (N, height, width), one entry per frame, in pixels of the frames.
 
     The network runs once for each of `detect.evaluation.scales`; one suppression merges the detections of all scales.
     """
     height, width = frames.shape[1:]
     boxes, scores = [], []
-    for factor in config.evaluation.scales:
+    for factor in detector.config.evaluation.scales:
         to_height, to_width = scaled_size(height, width, factor)
-        images = np.stack([resized(frame, to_width, to_height) for frame in frames])
-        with torch.autocast(device, torch.bfloat16, enabled=bf16):
-            found = network.detect(network_input(normalised(images), config.in_channels).to(device))
-        ratio = torch.tensor([to_width / width, to_height / height] * 2, device=device)
+        found = detector.predict(np.stack([resized(frame, to_width, to_height) for frame in frames]))
+        ratio = torch.tensor([to_width / width, to_height / height] * 2, device=detector.device)
         boxes.append(found[0] / ratio)
         scores.append(found[1])
-    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), config.evaluation)
+    return detections_of(torch.cat(boxes, 1), torch.cat(scores, 1), detector.config.evaluation)
+
+
+def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[list[Detections], float]:
+    """Detections of all frames of a split, and frames per second."""
+    with progress_bar() as progress:
+        bar = progress.add_task(f"detect {name}", total=len(split), unit="frames", note="")
+        started = time.perf_counter()
+        found: list[Detections] = []
+        batch_size = detector.config.batch_size
+        for start in range(0, len(split), batch_size):
+            frames = split.frames.images[start : start + batch_size]
+            found += detect_at_scales(detector, frames)
+            progress.advance(bar, len(frames))
+        return found, len(split) / (time.perf_counter() - started)

@@ -7,71 +7,24 @@ hold more false positives than the rest of the image.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from perilune_shared.errors import UserError
-from perilune_train.data.frames import normalised
-from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.batches import network_input
+from perilune_train.detect.config import COARSEST_STRIDE
 from perilune_train.detect.evaluate.boxes import suppress
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.scales import resized
 from perilune_train.detect.inference.suppression import detections_of
-from perilune_train.models.yolo import YOLOv3
+from perilune_train.detect.inference.tiling import Tiling
 
 Array = NDArray[np.float64]
-_STEP = 32
-"""Coarsest stride of the network; the sides of its input are multiples of it."""
 _AT_ONCE = 5_000
 """Largest number of boxes that are suppressed together; above it, block by block."""
 _TOLERANCE_PX = 2.0
 """Tolerance of the distance to a tile's border. Two tiles place a crater slightly differently; without a tolerance each
 could leave it to the other."""
-
-
-@dataclass(frozen=True)
-class Tiling:
-    """How to cut an image into tiles, and the margin of the boxes."""
-
-    tile_px: int = 256
-    """Side of a tile, pixels: that of the training frames."""
-    overlap_px: int = 64
-    """Least overlap of two neighbouring tiles, pixels: craters up to this size are whole in at least one tile."""
-    scales: tuple[float, ...] = (1.0,)
-    """Factors by which the image is resized before it is cut; detections at all scales are merged. Above 1 for smaller
-    craters than those trained on, below 1 for larger ones."""
-    box_margin_px: float = 0.0
-    """Margin added to the found boxes at every side, pixels. Our boxes end at the crest of the rim, to fractions of a
-    pixel; the smallest box of whole pixels around a crater is on average half a pixel larger at every side."""
-
-    def check(self) -> None:
-        """Raise UserError on values that cannot be used."""
-        if self.tile_px < _STEP or self.tile_px % _STEP:
-            raise UserError("--tile", "pixels", self.tile_px, f"a multiple of {_STEP}")
-        if not 0 <= self.overlap_px < self.tile_px:
-            raise UserError("--overlap", "pixels", self.overlap_px, f"0 to {self.tile_px - 1}, less than a tile")
-        if not self.scales or not all(0.05 <= scale <= 8 for scale in self.scales):
-            raise UserError("--scale", "factor", list(self.scales), "0.05 to 8")
-        if not 0 <= self.box_margin_px <= 10:
-            raise UserError("--box-margin", "pixels", self.box_margin_px, "0 to 10")
-
-
-@dataclass(frozen=True)
-class Detector:
-    """A trained network and how to run it."""
-
-    network: YOLOv3
-    """The network, in evaluation mode, on the device."""
-    config: DetectConfig
-    """The run's settings."""
-    device: str
-    """cpu or cuda."""
-    bf16: bool
-    """Whether it computes in bfloat16."""
 
 
 def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
@@ -87,7 +40,7 @@ def padded(image: NDArray[np.uint8], tile_px: int) -> NDArray[np.uint8]:
 
     Only sides that are shorter than a tile and no multiple of 32 are padded.
     """
-    more = [max(0, min(tile_px, -(-side // _STEP) * _STEP) - side) for side in image.shape]
+    more = [max(0, min(tile_px, -(-side // COARSEST_STRIDE) * COARSEST_STRIDE) - side) for side in image.shape]
     return np.pad(image, [(0, more[0]), (0, more[1])], mode="reflect") if any(more) else image
 
 
@@ -158,7 +111,8 @@ def _detect_tiles(
     for first in range(0, len(places), detector.config.batch_size):
         batch = places[first : first + detector.config.batch_size]
         tiles = np.stack([image[top : top + tile_h, left : left + tile_w] for top, left in batch])
-        for place, found in zip(batch, detect_batch(detector, tiles), strict=True):
+        predictions = detections_of(*detector.predict(tiles), detector.config.evaluation)
+        for place, found in zip(batch, predictions, strict=True):
             boxes = found.boxes + np.tile(place[::-1], 2)
             clear = [
                 _clearance(boxes[:, [axis, axis + 2]], starts, length, image.shape[1 - axis])
@@ -177,12 +131,3 @@ def _clearance(spans: Array, starts: NDArray[np.intp], tile_px: int, length_px: 
     low = np.where(starts > 0, spans[:, :1] - starts, np.inf)
     high = np.where(starts + tile_px < length_px, starts + tile_px - spans[:, 1:], np.inf)
     return np.minimum(low, high)
-
-
-@torch.no_grad()
-def detect_batch(detector: Detector, tiles: NDArray[np.uint8]) -> list[Detections]:
-    """Detections of tiles (N, height, width), one entry per tile."""
-    images = network_input(normalised(tiles), detector.config.in_channels).to(detector.device)
-    with torch.autocast(detector.device, torch.bfloat16, enabled=detector.bf16):
-        boxes, scores = detector.network.detect(images)
-    return detections_of(boxes, scores, detector.config.evaluation)

@@ -20,8 +20,8 @@ from perilune_train.detect.evaluate.split_evaluation import (
     selection_entries,
     write_detections,
 )
-from perilune_train.detect.inference.detector import detect_split, load_detector
-from perilune_train.detect.inference.scales import multiply_adds_of_a_frame
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.scales import detect_split, multiply_adds_of_a_frame
 from perilune_train.detect.train.anchors import best_possible_recall, mean_best_iou
 from perilune_train.detect.train.network import (
     anchor_report,
@@ -33,6 +33,7 @@ from perilune_train.detect.train.network import (
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.transfer import inherited_terrain, start_from
 from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, training_provenance
 from perilune_train.training import runs
 from perilune_train.training.begin import hashes_of, start_run, state_of
@@ -65,7 +66,6 @@ def run_detect(
     terrain = training_provenance(dataset).joined(inherited_terrain(config, run.last if resume else None))
     terrain_check = check_terrain(terrain, dataset, "test", allow_overlap)
     device = runs.choose_device(config.device)
-    bf16 = runs.choose_bf16(config.precision, device)
     scale = {"train": config.augment.scale, "val": (1.0, 1.0), "test": (1.0, 1 / EDGE)}
     splits = {split: load_split(dataset, split, config.labels, scale[split]) for split in ("train", "val", "test")}
     processes = math.prod(machines(config.devices, config.num_nodes))
@@ -99,7 +99,7 @@ def run_detect(
         resume=resume,
         gradient_clip=config.gradient_clip,
         precision=config.precision,
-        device=config.device,
+        device=device,
         devices=config.devices,
         num_nodes=config.num_nodes,
         strategy="ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy,
@@ -108,7 +108,7 @@ def run_detect(
     if not runs.is_first_process():
         return run
     anchors = anchor_sizes(network)
-    metrics: dict[str, float | int | str | None] = {
+    metrics: Metrics = {
         "train/seconds": round(seconds, 1),
         "train/epochs": config.epochs,
         "train/images_per_s": round(task.images_seen / seconds, 2),
@@ -118,10 +118,10 @@ def run_detect(
         "multiply_adds": multiply_adds_of_a_frame(network, config, *splits["test"].frames.images.shape[1:]),
     }
     metrics |= selection_entries(config, splits["test"])
-    metrics |= dataset_entries(dataset, "test", config) | evaluate(run, config, dataset, splits, device, bf16)
+    metrics |= dataset_entries(dataset, "test", config) | evaluate(run, config, dataset, splits)
     mark_files(run.root, WRITTEN, terrain_check.mark)
     metrics |= terrain_check.metrics()
-    runs.write_metrics(run, metrics)
+    write_metrics(run.root, metrics)
     console.print(f"{run.root}: metrics.json, report.md, detections.png, precision_recall.png, bins.png")
     return run
 
@@ -131,22 +131,18 @@ def evaluate(
     config: DetectConfig,
     dataset: Dataset,
     splits: dict[str, DetectSplit],
-    device: str,
-    bf16: bool,
-) -> dict[str, float | int | str | None]:
+) -> Metrics:
     """Evaluate the best weights on val and test; write tables and pictures. The threshold is chosen on val only."""
-    network = load_detector(run.best)
-    found_val, _ = detect_split(network, splits["val"], "val", config, device, bf16)
-    found, rate = detect_split(network, splits["test"], "test", config, device, bf16)
+    detector = open_detector(run.best, config)
+    found_val, _ = detect_split(detector, splits["val"], "val")
+    found, rate = detect_split(detector, splits["test"], "test")
     matches = match_detections(splits["val"], found_val, config)
     threshold, chosen_as = curve(matches).operating_threshold(config.evaluation.min_precision)
     evaluation = evaluate_split(splits["test"], found, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found)
     told = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{chosen_as} on val")
-    told.append(anchor_report(network, label_sizes(splits["train"]), config.anchor_ratio))
+    told.append(anchor_report(detector.network, label_sizes(splits["train"]), config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), told)
-    metrics: dict[str, float | int | str | None] = {
-        f"val/{key}": value for key, value in figures(matches, threshold).items()
-    }
+    metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}
     metrics |= {f"test/{key}": value for key, value in evaluation.figures().items()}
     return metrics | {"test/images_per_s": round(rate, 2)}

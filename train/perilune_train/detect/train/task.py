@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.batches import Batch, EvaluationFrames, Share, TrainingFrames, loader
+from perilune_train.detect.data.batches import Batch, EvaluationFrames, ProcessBatches, TrainingFrames, loader
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections, match_split
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
@@ -102,7 +102,7 @@ class DetectTask(lightning.LightningModule):
         frames = TrainingFrames(self.splits["train"], self.config.augment, self.config.seed, self.current_epoch)
         epoch, batches = self.resumed
         start = batches if epoch == self.current_epoch else 0
-        return loader(frames, self.config, Share(len(frames), self.config.batch_size, *self.process, start))
+        return loader(frames, self.config, ProcessBatches(len(frames), self.config.batch_size, *self.process, start))
 
     def val_dataloader(self) -> Any:
         return loader(EvaluationFrames(self.splits["val"], *self.process), self.config)
@@ -130,7 +130,9 @@ class DetectTask(lightning.LightningModule):
             fused=True,
         )
         # Lightning's own count would load the batches of an epoch before it knows the position of a resumed run.
-        total = self.config.epochs * len(Share(len(self.splits["train"]), self.config.batch_size, *self.process))
+        total = self.config.epochs * len(
+            ProcessBatches(len(self.splits["train"]), self.config.batch_size, *self.process)
+        )
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda step: learning_rate_factor(step, self.config.warmup_steps, total)
         )

@@ -15,7 +15,7 @@ from perilune_train.models.darknet_weights import (
     backbone_slots,
     content_of,
     count_floats,
-    fill,
+    fill_slots,
     is_darknet,
     network_slots,
     read_darknet,
@@ -73,7 +73,7 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
         return (whole or key.startswith("backbone.")) and (gates or not key.startswith(_GATES))
 
     kept = {key: value for key, value in network.state_dict().items() if not taken(key)}
-    runs.fill(network, kept | {key: value for key, value in content["state_dict"].items() if taken(key)}, path)
+    runs.load_state(network, kept | {key: value for key, value in content["state_dict"].items() if taken(key)}, path)
 
 
 def check_gates(path: Path, config: DetectConfig) -> None:
@@ -124,9 +124,9 @@ def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> Non
     content = read_darknet(path, (n_backbone, n_ours, n_coco))
     n = len(content.values)
     if n == n_backbone or network.strides != whole.strides:
-        fill(backbone, content, path)
+        fill_slots(backbone, content, path)
     else:
-        fill(network_slots(network, COCO_FILTERS) if n == n_coco else network_slots(network), content, path)
+        fill_slots(network_slots(network, COCO_FILTERS) if n == n_coco else network_slots(network), content, path)
     rescale_input(network.backbone, "normalised")
 
 

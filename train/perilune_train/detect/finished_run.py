@@ -1,10 +1,12 @@
-"""Settings that a detect run was trained with, read from its config.yaml."""
+"""What the folder of a finished detect run says: settings and threshold."""
 
+import math
 from pathlib import Path
 
 from perilune_shared.config import parse_setting, read_config_file, resolve_over
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
+from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
 
 _MAY_CHANGE = ("evaluation", "labels", "device", "precision", "batch_size")
 
@@ -32,3 +34,17 @@ def config_of_run(run: Path, settings: tuple[str, ...] = ()) -> DetectConfig:
         # The run stores every threshold of its own selection; another name sets its own thresholds.
         section = {key: value for key, value in section.items() if key != "labels"}
     return resolve_over(DetectConfig, "detect", str(path), section, None, settings)
+
+
+def chosen_threshold(run: Path) -> float:
+    """The score threshold that a run chose on its validation split. Raises UserError if it has none."""
+    found = read_metrics(run).get("test/threshold")
+    if isinstance(found, bool) or not isinstance(found, float | int) or not math.isfinite(found):
+        raise UserError(run / METRICS_FILE, "test/threshold", found, "a number; or give --threshold")
+    return float(found)
+
+
+def check_output(folder: Path, run: Path) -> None:
+    """Raise UserError if an evaluation would overwrite the run's own report and metrics."""
+    if folder.resolve() == run.resolve():
+        raise UserError(folder, "--out", "the run's own folder", "another: its metrics stay as training wrote them")

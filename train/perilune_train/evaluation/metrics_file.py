@@ -1,0 +1,43 @@
+"""metrics.json: the metrics of a run or an evaluation, with flat keys."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+from perilune_shared.errors import UserError
+from perilune_shared.run_record import run_record
+from perilune_shared.storage.files import write_text
+
+METRICS_FILE = "metrics.json"
+Metrics = dict[str, float | int | str | None]
+
+
+def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None]) -> None:
+    """Write metrics.json; values that are not finite become null. Adds the record of the run (run/...)."""
+    # Imported here, so that reading metrics does not need torch.
+    import torch
+
+    plain = {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in metrics.items()
+    }
+    plain |= {f"run/{key}": value for key, value in asdict(run_record()).items()}
+    plain["run/gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    write_text(folder / METRICS_FILE, json.dumps(plain, indent=2, allow_nan=False) + "\n")
+
+
+def read_metrics(folder: Path) -> Metrics:
+    """Read metrics.json of a run or of an evaluation. Raises UserError if it is missing or no flat table."""
+    path = folder / METRICS_FILE
+    if not path.is_file():
+        expected = "the metrics of a finished run; resume it with the command that started it"
+        raise UserError(path, "metrics", "no such file", expected)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UserError(path, "metrics", error, "JSON") from None
+    plain = (float, int, str, type(None))
+    if not isinstance(content, dict) or not all(isinstance(value, plain) for value in content.values()):
+        raise UserError(path, "metrics", "something else", "flat keys with numbers and text")
+    return content
