@@ -43,7 +43,7 @@ DISTORTION = (-0.06, 0.0, 0.001, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class Measured:
     """Measurements of one pose."""
 
     altitude_m: float
@@ -91,10 +91,10 @@ def main() -> None:
             scene = grow_scene(config, plan.view, scene_plan.seed)
             for tilt_deg in TILTS_DEG:
                 pose = altitude_m, tilt_deg, *view(scene, altitude_m, tilt_deg, rng)
-                main_run.append(judge(Path(folder), scene, plan.camera, SCALE, 16, *pose))
-                native.append(judge(Path(folder), scene, plan.camera, 1, 256, *pose))
+                main_run.append(measure(Path(folder), scene, plan.camera, SCALE, 16, *pose))
+                native.append(measure(Path(folder), scene, plan.camera, 1, 256, *pose))
                 if tilt_deg in (0.0, 30.0):
-                    through_lens.append(judge(Path(folder), scene, distorted, SCALE, 16, *pose))
+                    through_lens.append(measure(Path(folder), scene, distorted, SCALE, 16, *pose))
                 bar.advance(task)
     corner = distorted.project(plan.camera.rays([0.0, 0.0]))
     figures = {
@@ -125,7 +125,7 @@ def view(scene: Scene, altitude_m: float, tilt_deg: float, rng: np.random.Genera
     return target - altitude_m * rotation[2] / abs(rotation[2, 2]), rotation
 
 
-def judge(
+def measure(
     folder: Path,
     scene: Scene,
     camera: Camera,
@@ -135,7 +135,7 @@ def judge(
     tilt_deg: float,
     position_m: Array,
     rotation: Array,
-) -> Judged:
+) -> Measured:
     """Label, render and compare one pose; lens distortion is applied to the picture as to frames."""
     circles = RimCircles.of_scene(scene)
     labels = rings.labels_of(circles, camera, position_m, rotation)
@@ -145,16 +145,16 @@ def judge(
     ellipses = rings.rows_of(labels.ellipses, rows)
     offsets = rings.ring_offsets(resample(image, refined(camera, scale), source), scale, ellipses)
     n_too_narrow = int((~rings.wide_enough(labels.ellipses, scale)).sum())
-    return Judged(altitude_m, tilt_deg, ellipses.radius_px(), offsets, scale, len(labels.crater_id), n_too_narrow)
+    return Measured(altitude_m, tilt_deg, ellipses.radius_px(), offsets, scale, len(labels.crater_id), n_too_narrow)
 
 
-def summary(judged: list[Judged], low_px: float = 0.0, high_px: float = np.inf) -> dict[str, float]:
+def summary(measured: list[Measured], low_px: float = 0.0, high_px: float = np.inf) -> dict[str, float]:
     """Figures over the craters of several poses whose radius lies within bounds."""
-    radius = np.concatenate([j.radius_px for j in judged])
+    radius = np.concatenate([j.radius_px for j in measured])
     chosen = (radius >= low_px) & (radius < high_px)
-    error = np.concatenate([j.error_px for j in judged])[chosen]
-    offset = np.concatenate([j.offset_px for j in judged])[chosen]
-    ellipse = np.concatenate([j.ellipse_error_px for j in judged])[chosen]
+    error = np.concatenate([j.error_px for j in measured])[chosen]
+    offset = np.concatenate([j.offset_px for j in measured])[chosen]
+    ellipse = np.concatenate([j.ellipse_error_px for j in measured])[chosen]
     return {
         "mean_px": float(error.mean()),
         "max_px": float(error.max()),
@@ -169,18 +169,18 @@ def summary(judged: list[Judged], low_px: float = 0.0, high_px: float = np.inf) 
     }
 
 
-def by_radius(judged: list[Judged]) -> dict[str, dict[str, float]]:
+def by_radius(measured: list[Measured]) -> dict[str, dict[str, float]]:
     """Figures for each range of radii."""
-    return {f"{low:g}-{high:g}": summary(judged, low, high) for low, high in pairwise(RADII_PX)}
+    return {f"{low:g}-{high:g}": summary(measured, low, high) for low, high in pairwise(RADII_PX)}
 
 
-def draw_histogram(path: Path, judged: list[Judged]) -> None:
+def draw_histogram(path: Path, measured: list[Measured]) -> None:
     """Draw errors of all craters, stacked by the view's tilt: total, and the part up to the second harmonic."""
     figure, panels = plt.subplots(1, 2, figsize=(8.4, 2.6), layout="constrained")
     colours = plt.get_cmap("viridis")(np.linspace(0.1, 0.9, len(TILTS_DEG)))
     bins = np.linspace(0, 0.011, 45)
-    wholes = [[j.error_px for j in judged if j.tilt_deg == tilt] for tilt in TILTS_DEG]
-    ellipses = [[j.ellipse_error_px for j in judged if j.tilt_deg == tilt] for tilt in TILTS_DEG]
+    wholes = [[j.error_px for j in measured if j.tilt_deg == tilt] for tilt in TILTS_DEG]
+    ellipses = [[j.ellipse_error_px for j in measured if j.tilt_deg == tilt] for tilt in TILTS_DEG]
     titles = ("all 64 directions", "shift, size, flattening and turn alone")
     for axes, parts, title in zip(panels, (wholes, ellipses), titles, strict=True):
         values = [np.minimum(np.concatenate(part), bins[-1]) for part in parts]

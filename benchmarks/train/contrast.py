@@ -93,7 +93,7 @@ def measure(dataset: Dataset, detections: dict[str, Detections], threshold: floa
     return {"auc": table, "found_by_contrast": shares}
 
 
-def judge(dataset: Dataset, detections: dict[str, Detections], threshold: float) -> dict:
+def evaluate(dataset: Dataset, detections: dict[str, Detections], threshold: float) -> dict:
     """Evaluate the detections with each selection, and with `visible` without its contrast threshold."""
     settings = {name: LabelSettings(selection=name) for name in ("visible", "paper")}
     settings["visible without contrast"] = LabelSettings(selection="visible", min_contrast=None)
@@ -104,7 +104,7 @@ def judge(dataset: Dataset, detections: dict[str, Detections], threshold: float)
         found = [detections.get(frame, none) for frame in split.frames.table["frame_id"]]
         height, width = split.frames.images.shape[1:]
         matches = match_split(found, split.labels, (width, height), 0.5, split.radius_px)
-        result[name] = {"labels": len(matches.wanted_frame), **figures(matches, threshold)}
+        result[name] = {"labels": len(matches.selected_frame), **figures(matches, threshold)}
     return result
 
 
@@ -140,7 +140,7 @@ def main(
         for name, rows in table.groupby("frame_id")
     }
     threshold = json.loads((run / "metrics.json").read_text())["test/threshold"]
-    result = {**measure(opened, detections, threshold), "judged": judge(opened, detections, threshold)}
+    result = {**measure(opened, detections, threshold), "judged": evaluate(opened, detections, threshold)}
     write_figures(out / "contrast.json", result)
     if picture:
         draw(opened, picture, out / "contrast.jpg")

@@ -95,14 +95,14 @@ def recalibrate(network: YOLOv3, split: DetectSplit, config: DetectConfig) -> No
 @torch.no_grad()
 def likeness(network: YOLOv3, plain: YOLOv3, images: Tensor) -> dict[str, list[float]]:
     """Cosine of the features to those of the plain backbone and ratio of their RMS, for each stage."""
-    wanted = plain.backbone(images)
+    expected = plain.backbone(images)
     kept = {key: value.clone() for key, value in network.state_dict().items()}
     found = network.backbone(images)
     network.load_state_dict(kept)
     cosine = nn.functional.cosine_similarity
     return {
-        "cosine": [float(cosine(a.flatten(), b.flatten(), dim=0)) for a, b in zip(found, wanted, strict=True)],
-        "size": [float(a.norm() / b.norm()) for a, b in zip(found, wanted, strict=True)],
+        "cosine": [float(cosine(a.flatten(), b.flatten(), dim=0)) for a, b in zip(found, expected, strict=True)],
+        "size": [float(a.norm() / b.norm()) for a, b in zip(found, expected, strict=True)],
     }
 
 
@@ -114,7 +114,7 @@ def compare(train_split: DetectSplit, val_split: DetectSplit, config: DetectConf
     plain.eval()
     backbone = {key: value for key, value in plain.state_dict().items() if key.startswith("backbone.")}
     val = list(loader(EvaluationFrames(val_split), config))
-    told = {}
+    results = {}
     for choice, attention in CHOICES.items():
         network = build_network(config.model_copy(update={"attention": attention}), sizes, Path())
         network.load_state_dict({**network.state_dict(), **backbone})
@@ -130,8 +130,8 @@ def compare(train_split: DetectSplit, val_split: DetectSplit, config: DetectConf
         network.eval()
         with torch.no_grad():
             val_loss = statistics.fmean(float(loss_of(network, batch, config)) for batch in val)
-        told[choice] = {**similar, "loss": statistics.fmean(losses[-_LAST:]), "val_loss": val_loss}
-    return told
+        results[choice] = {**similar, "loss": statistics.fmean(losses[-_LAST:]), "val_loss": val_loss}
+    return results
 
 
 def main() -> None:

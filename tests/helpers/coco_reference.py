@@ -19,7 +19,7 @@ def coco_evaluation(found, labels, copies=1):
     for frame, (ours, truth) in enumerate(zip(found, labels, strict=True), start=1):
         images.append({"id": frame})
         repeats = _matchable(ours.boxes, truth.boxes) if copies is None else np.full(len(truth.boxes), copies)
-        for (x0, y0, x1, y1), wanted, repeat in zip(truth.boxes.tolist(), truth.wanted, repeats, strict=True):
+        for (x0, y0, x1, y1), wanted, repeat in zip(truth.boxes.tolist(), truth.selected, repeats, strict=True):
             for _ in range(1 if wanted else repeat):
                 box, area = [x0, y0, x1 - x0, y1 - y0], (x1 - x0) * (y1 - y0) if wanted else IGNORED_AREA
                 number = len(annotations) + 1
@@ -35,7 +35,7 @@ def coco_evaluation(found, labels, copies=1):
         evaluation = COCOeval(truth_set, truth_set.loadRes(results), "bbox")
         evaluation.params.maxDets = [100_000]
         evaluation.params.areaRng, evaluation.params.areaRngLbl = [[0, 1e10]], ["all"]
-        wanted = sum(int(part.wanted.sum()) for part in labels)
+        wanted = sum(int(part.selected.sum()) for part in labels)
         # Matching does not depend on the recalls.
         evaluation.evaluate()
         # At the 101 recalls; and at every recall that can be reached, over which the mean is the area under all points.

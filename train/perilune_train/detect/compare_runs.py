@@ -49,28 +49,29 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
             )
         if "images/name" in metrics:
             # An evaluation on real images; its keys have no split as prefix.
-            split, figures, wanted = "images", metrics, f"from {metrics.get('min_size_px')} px"
-            told: list[object] = [metrics.get("images/name"), split, None, wanted, metrics.get("scales")]
+            split, figures, selection = "images", metrics, f"from {metrics.get('min_size_px')} px"
+            entries: list[object] = [metrics.get("images/name"), split, None, selection, metrics.get("scales")]
         else:
             split = str(metrics.get("evaluation/split", "test"))
             figures = {key.removeprefix(f"{split}/"): metrics[key] for key in metrics if key.startswith(f"{split}/")}
-            told = [metrics.get("dataset/name"), split, metrics.get("dataset/protocol")]
-            told += [metrics.get("labels/selection"), metrics.get("evaluation/scales", 1)]
+            entries = [metrics.get("dataset/name"), split, metrics.get("dataset/protocol")]
+            entries += [metrics.get("labels/selection"), metrics.get("evaluation/scales", 1)]
         status, mark = _terrain(folder, metrics, allow_overlap)
         marks += [f"{name}: {mark}"] if mark else []
-        told.insert(3, status)
-        cells = [name, *map(_text, (*told, figures.get("frames"), figures.get("labels")))]
+        entries.insert(3, status)
+        cells = [name, *map(_text, (*entries, figures.get("frames"), figures.get("labels")))]
         cells += [_cell(figures, key) for key in _COLUMNS]
         rows.append(cells + [number(figures.get(key)) for key in _LOWEST])
         # AP of the whole curve, not of the saved points.
         label = f"{len(rows)} {name}, {split}: AP {number(figures.get('ap50_paper'))}"
         curves[label] = read_curve(folder / CURVE_FILE)
-    head = ["run", "dataset", "split", "protocol", "terrain", "wanted", "scales", "frames", "labels"]
+    head = ["run", "dataset", "split", "protocol", "terrain", "selection", "scales", "frames", "labels"]
     head += [*_COLUMNS.values(), *_LOWEST.values()]
     text = "\n".join(table(head, rows)) + "\n"
     write_text(
         out / "compare.md",
-        "# Runs side by side\n\nIn brackets: 95 % intervals; with fewer than five units the value of each.\n\n" + text,
+        "# Comparison of runs\n\n"
+        "In brackets: 95 % intervals, or the value of each unit if there are fewer than five.\n\n" + text,
     )
     draw_curves(curves, out / "precision_recall.png")
     mark_files(out, ("compare.md", "precision_recall.png"), "; ".join(marks))
@@ -83,8 +84,8 @@ def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, 
         return "real images", ""
     status, mark = metrics.get("terrain/status"), metrics.get("terrain/mark")
     if status == "overlap" and not allow_overlap:
-        wanted = "an evaluation on other terrain; --allow-overlap allows it and marks all figures"
-        raise UserError(folder / METRICS_FILE, "terrain/mark", mark, wanted)
+        expected = "an evaluation on other terrain; --allow-overlap allows it and marks all figures"
+        raise UserError(folder / METRICS_FILE, "terrain/mark", mark, expected)
     known = status in get_args(Status) and isinstance(mark, str)
     return (str(status), str(mark)) if known else ("unknown", TerrainCheck("unknown").mark)
 

@@ -68,8 +68,8 @@ def evaluate_again(
     found, rate = detect_split(detector, frames, split)
     evaluation = evaluate_split(frames, found, config, chosen)
     write_detections(folder / "detections.parquet", frames, found)
-    told = report_head(dataset, split, config, protocol, run.resolve().name, chosen_on)
-    write_evaluation(folder, evaluation, list(frames.frames.images), told)
+    about = report_head(dataset, split, config, protocol, run.resolve().name, chosen_on)
+    write_evaluation(folder, evaluation, list(frames.frames.images), about)
     metrics = (
         selection_entries(config, frames) | dataset_entries(dataset, split, config) | {"dataset/protocol": protocol}
     )

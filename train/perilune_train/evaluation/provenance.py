@@ -79,16 +79,16 @@ def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
     """Read the record in a checkpoint's content; `UNKNOWN` if it has none. Raises UserError on a malformed one."""
     if RECORD not in content:
         return UNKNOWN
-    record, wanted = content[RECORD], "a record of scenes, as training writes it"
+    record, expected = content[RECORD], "a record of scenes, as training writes it"
     if not isinstance(record, dict) or set(record) != {"known", "uses"} or not isinstance(record["known"], bool):
-        raise UserError(path, RECORD, type(record).__name__, wanted)
+        raise UserError(path, RECORD, type(record).__name__, expected)
     rows = record["uses"]
     if not isinstance(rows, list) or len(rows) > _MOST_USES:
-        raise UserError(path, f"{RECORD}.uses", type(rows).__name__, wanted)
+        raise UserError(path, f"{RECORD}.uses", type(rows).__name__, expected)
     for number, row in enumerate(rows):
         sound = isinstance(row, list) and len(row) == 5 and all(isinstance(cell, str) for cell in row)
         if not sound or row[2] not in get_args(Use) or not _SHA256.fullmatch(row[3]):
-            raise UserError(path, f"{RECORD}.uses.{number}", "another form", wanted)
+            raise UserError(path, f"{RECORD}.uses.{number}", "another form", expected)
         if not all(_PLAIN.fullmatch(row[k]) for k in (0, 1, 4)):
             raise UserError(path, f"{RECORD}.uses.{number}", "odd characters", "plain names of dataset and scene")
     return Provenance(frozenset(TerrainUse(*row) for row in rows), record["known"])
@@ -205,8 +205,8 @@ def _compared(
         more = len(overlapping) - _MOST_NAMED
         named = (*overlapping[:_MOST_NAMED], *([f"{more} more"] if more > 0 else []))
         if not allow_overlap:
-            wanted = "test terrain that nothing was fitted to; --allow-overlap allows it and marks all figures"
-            raise UserError(dataset.root, "test terrain", ", ".join(named), wanted)
+            expected = "test terrain that nothing was fitted to; --allow-overlap allows it and marks all figures"
+            raise UserError(dataset.root, "test terrain", ", ".join(named), expected)
         return _reported(TerrainCheck("overlap", named))
     if not known:
         return _reported(TerrainCheck("unknown"))

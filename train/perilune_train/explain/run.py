@@ -150,7 +150,7 @@ def detect_frames(
     height, width = split.frames.images.shape[1:]
     masks = []
     for own in (split.labels[i] for i in chosen):
-        centres, radii = own.ellipses[own.wanted, :2], own.radius_px[own.wanted]
+        centres, radii = own.ellipses[own.selected, :2], own.radius_px[own.selected]
         masks.append(ground_truth_mask(width, height, centres, radii, settings.ring_factors).astype(np.float32))
     return split.frames.images[chosen], np.stack(masks), selection_entries(detector, split)
 

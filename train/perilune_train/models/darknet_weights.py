@@ -93,8 +93,8 @@ def is_darknet(path: Path) -> bool:
     return len(start) == _VERSION.size and all(0 <= number < 1000 for number in _VERSION.unpack(start))
 
 
-def read_darknet(path: Path, wanted: Sequence[int]) -> DarknetFile:
-    """Read a file that holds one of the `wanted` numbers of floats; checks its size before reading.
+def read_darknet(path: Path, expected: Sequence[int]) -> DarknetFile:
+    """Read a file that holds one of the `expected` numbers of floats; checks its size before reading.
 
     Raises UserError if it is missing, has another size, or holds a number that is not finite.
     """
@@ -106,10 +106,10 @@ def read_darknet(path: Path, wanted: Sequence[int]) -> DarknetFile:
         length = _header_bytes(path, version)
         header = version + stream.read(length - len(version))
         whole, rest = divmod(size - length, 4)
-        if size < length or rest or whole not in wanted:
+        if size < length or rest or whole not in expected:
             content = "no whole header" if size < length else f"a header and {whole} floats and {rest} bytes"
             found = f"{size} bytes: {content.removesuffix(' and 0 bytes')}"
-            raise UserError(path, "size", found, f"{' or '.join(map(str, wanted))} floats")
+            raise UserError(path, "size", found, f"{' or '.join(map(str, expected))} floats")
         values = np.fromfile(stream, "<f4", whole).astype(np.float32, copy=False)
     finite = np.isfinite(values)
     if not finite.all():

@@ -69,14 +69,14 @@ def navigate_run(
     processes = os.environ.get("WORLD_SIZE", "1")
     if processes != "1":
         raise UserError("torchrun", "processes", processes, "1: its descents are not shared out among several")
-    wanted: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
-    backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in wanted else (None, "", [])
+    fusions: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
+    backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in fusions else (None, "", [])
     inputs: dict[Fusion, dict[str, str | None]] = {"warp": hashes_of({"dataset": dataset})}
     used = None if backbone is None else settings.detector or detector
     inputs["stack"] = inputs["warp"] | hashes_of({"detector": used})
     names = {"warp": name, "stack": f"{name}-stack"}
-    folders = {fusion: RunFolder(runs / "navigate" / names[fusion]) for fusion in wanted}
-    states = {fusion: state_of(folders[fusion], "navigate", settings, inputs[fusion], overwrite) for fusion in wanted}
+    folders = {fusion: RunFolder(runs / "navigate" / names[fusion]) for fusion in fusions}
+    states = {fusion: state_of(folders[fusion], "navigate", settings, inputs[fusion], overwrite) for fusion in fusions}
     if set(states.values()) == {"finished"}:
         return list(folders.values())
     opened = open_dataset(dataset)
@@ -153,13 +153,17 @@ def _detector_backbone(
         console.print(f"stack: backbone {why}")
         return None, why, []
     content = load_weights(path)
-    wanted = {"in_channels": settings.in_channels, "width": settings.stack.width, "attention": settings.stack.attention}
-    other = [key for key, value in wanted.items() if content["architecture"].get(key) != value]
+    expected = {
+        "in_channels": settings.in_channels,
+        "width": settings.stack.width,
+        "attention": settings.stack.attention,
+    }
+    other = [key for key, value in expected.items() if content["architecture"].get(key) != value]
     if other and settings.detector is None:
         why = f"from scratch: {path} differs in {', '.join(other)}"
         console.print(f"stack: backbone {why}")
         return None, why, []
-    check_architecture(path, content["architecture"], wanted)
+    check_architecture(path, content["architecture"], expected)
     weights = content["state_dict"].items()
     state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
     stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)

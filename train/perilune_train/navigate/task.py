@@ -195,10 +195,10 @@ class NavigationTask(lightning.LightningModule):
     def training_step(self, batch: list[Sequence], batch_idx: int) -> Tensor:
         output, flow_px = estimated(self.network, batch, self.device)
         reference, unit = translation_units(batch, self.scales, self.fusion)
-        wanted = (_stacked([s.translation_m for s in batch]) - reference) / unit
+        expected = (_stacked([s.translation_m for s in batch]) - reference) / unit
         angles = euler_from_rotation(_stacked([s.rotation_c2_from_c1 for s in batch])) / self.scales.rotation_rad
         found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
-        position = (output[..., :3] - wanted.to(self.device)).square().sum(-1).mean()
+        position = (output[..., :3] - expected.to(self.device)).square().sum(-1).mean()
         orientation = (found - angles.to(self.device)).square().sum(-1).mean()
         if self.coarse:
             loss = position + self.settings.kappa * orientation

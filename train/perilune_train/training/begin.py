@@ -52,8 +52,8 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
         # Lightning starts these processes on the first process's machine, after the first has prepared the folder.
         state = "resume" if run.last.is_file() else "new"
     if state == "resume" and not run.last.is_file():
-        wanted = "that of the first process: share the runs folder between the machines, or copy it"
-        raise UserError(run.last, "last state", "no such file", wanted)
+        expected = "that of the first process: share the runs folder between the machines, or copy it"
+        raise UserError(run.last, "last state", "no such file", expected)
     if state == "finished":
         console.print(f"{run.root}: finished, left as it is; --overwrite replaces it", soft_wrap=True)
     elif state == "resume":
@@ -102,15 +102,15 @@ def _is_used(run: RunFolder) -> bool:
 
 def _check_own(run: RunFolder, task: str) -> None:
     """Raise UserError unless the folder is a run of this task: its config.yaml has this section and no other."""
-    wanted = f"another name: only a {task} run is resumed or replaced"
+    expected = f"another name: only a {task} run is resumed or replaced"
     if not run.config.is_file():
         # A folder with only inputs.json is a run that was killed before it wrote its configuration.
         if [path.name for path in run.root.iterdir() if not path.name.startswith(".")] == [run.inputs.name]:
             return
-        raise UserError(run.root, "--name", "a folder that is no run (no config.yaml)", wanted)
+        raise UserError(run.root, "--name", "a folder that is no run (no config.yaml)", expected)
     sections = list(read_config_file(run.config))
     if sections != [task]:
-        raise UserError(run.config, "--name", f"the sections {', '.join(sections) or 'none'}", wanted)
+        raise UserError(run.config, "--name", f"the sections {', '.join(sections) or 'none'}", expected)
 
 
 def check_settings(run: RunFolder, task: str, config: Section) -> None:

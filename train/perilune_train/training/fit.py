@@ -177,13 +177,13 @@ def fit(
     devices, num_nodes = machines(devices, num_nodes)
     resume_from = run.last if resume and run.last.is_file() else None
     if resume_from is not None:
-        wanted = "the state of an interrupted run; --overwrite replaces it"
-        state = read_saved(resume_from, "last state", _STATE, wanted)
+        expected = "the state of an interrupted run; --overwrite replaces it"
+        state = read_saved(resume_from, "last state", _STATE, expected)
         check_tensors(resume_from, state["state_dict"], task)
         began = state.get(_PROCESSES, 1)
         if began != devices * num_nodes:
-            wanted = f"{began}, with which the run began; --overwrite replaces the run"
-            raise UserError(resume_from, "processes", devices * num_nodes, wanted)
+            expected = f"{began}, with which the run began; --overwrite replaces the run"
+            raise UserError(resume_from, "processes", devices * num_nodes, expected)
     keep_last = KeepLast(run, checkpoint_minutes)
     device = choose_device(device)
     for name in ("lightning.pytorch", "lightning.fabric"):

@@ -90,7 +90,7 @@ def load_weights(path: Path) -> dict[str, Any]:
     return read_saved(path, "checkpoint", {"architecture", "state_dict"}, "checkpoints/best.ckpt of a run")
 
 
-def read_saved(path: Path, field: str, keys: set[str], wanted: str) -> dict[str, Any]:
+def read_saved(path: Path, field: str, keys: set[str], expected: str) -> dict[str, Any]:
     """Read a dictionary saved by torch, on the CPU. Raises UserError if the file is damaged or lacks `keys`."""
     try:
         with warnings.catch_warnings():
@@ -98,16 +98,16 @@ def read_saved(path: Path, field: str, keys: set[str], wanted: str) -> dict[str,
             content = torch.load(path, map_location="cpu", weights_only=True)
     # Torch documents no error types; damaged bytes raise a dozen.
     except Exception as error:
-        raise UserError(path, field, str(error) or type(error).__name__, wanted) from None
+        raise UserError(path, field, str(error) or type(error).__name__, expected) from None
     missing = keys - content.keys() if isinstance(content, dict) else keys
     if missing:
-        raise UserError(path, field, f"no {', '.join(sorted(missing))}", wanted)
+        raise UserError(path, field, f"no {', '.join(sorted(missing))}", expected)
     return content
 
 
-def check_architecture(path: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise UserError naming the first setting of `wanted` that differs in a checkpoint's architecture."""
-    for key, value in wanted.items():
+def check_architecture(path: Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Raise UserError naming the first setting of `expected` that differs in a checkpoint's architecture."""
+    for key, value in expected.items():
         if found.get(key) != value:
             raise UserError(path, key, found.get(key), f"{value}; the checkpoint is of another architecture")
 
@@ -123,9 +123,9 @@ def check_tensors(path: Path, state: Mapping[str, torch.Tensor], network: nn.Mod
     own = network.state_dict()
     for key in sorted(own.keys() | state.keys()):
         found = tuple(state[key].shape) if key in state else "nothing"
-        wanted = str(tuple(own[key].shape)) if key in own else "no such tensor"
-        if str(found) != wanted:
-            raise UserError(path, key, found, f"{wanted}; the checkpoint is of another architecture")
+        expected = str(tuple(own[key].shape)) if key in own else "no such tensor"
+        if str(found) != expected:
+            raise UserError(path, key, found, f"{expected}; the checkpoint is of another architecture")
 
 
 def choose_device(device: str) -> str:

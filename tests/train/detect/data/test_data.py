@@ -32,17 +32,17 @@ def test_worn_craters_are_ignored_and_no_others(dataset_detect, split):
     # In this dataset every fourth crater is worn to a depth of 0.01 diameters.
     for name, part in zip(split.frames.table["frame_id"], split.labels, strict=True):
         rows = labels[labels["frame_id"] == name]
-        assert part.wanted[part.labelled].tolist() == (rows["crater_id"] % 4 != 3).tolist()
+        assert part.selected[part.labelled].tolist() == (rows["crater_id"] % 4 != 3).tolist()
         np.testing.assert_array_equal(part.boxes[part.labelled, 0], rows["bbox_x0_px"])
-    assert any((~part.wanted).any() for part in split.labels)
+    assert any((~part.selected).any() for part in split.labels)
     everything = load_split(dataset, "train", LabelSettings(min_depth_ratio=0.0, min_contrast=0.0))
-    assert all(part.wanted[part.labelled].all() for part in everything.labels)
+    assert all(part.selected[part.labelled].all() for part in everything.labels)
     paper = load_split(dataset, "train", LabelSettings(selection="paper"))
-    assert [part.wanted.tolist() for part in paper.labels] == [part.wanted.tolist() for part in everything.labels]
+    assert [part.selected.tolist() for part in paper.labels] == [part.selected.tolist() for part in everything.labels]
     large = load_split(dataset, "train", LabelSettings(selection="paper", radius_px=(10.0, 50.0)))
     assert large.radius_px == (10.0, 50.0)
     for part in large.labels:
-        np.testing.assert_array_equal(part.wanted[part.labelled], part.radius_px[part.labelled] >= 10)
+        np.testing.assert_array_equal(part.selected[part.labelled], part.radius_px[part.labelled] >= 10)
 
 
 def test_craters_that_show_too_little_are_ignored(dataset_detect):
@@ -52,7 +52,7 @@ def test_craters_that_show_too_little_are_ignored(dataset_detect):
     shares = []
     for least in (None, 1.0, 1.1, 20.0, 20.1):
         split = load_split(dataset, "train", LabelSettings(**{**plain, "min_contrast": least}))
-        shares.append(np.mean(np.concatenate([part.wanted[part.labelled] for part in split.labels])))
+        shares.append(np.mean(np.concatenate([part.selected[part.labelled] for part in split.labels])))
     assert shares[0] == shares[1] == 1 > shares[2] == shares[3] > 0.5 and shares[4] == 0
 
 
@@ -61,7 +61,7 @@ def test_without_a_range_of_radii_that_of_the_whole_dataset_is_judged(dataset_de
     radius_px = dataset.table("labels").to_pandas()["radius_px"]
     splits = [load_split(dataset, name, LabelSettings(selection="all")) for name in ("train", "test")]
     assert {split.radius_px for split in splits} == {(radius_px.min(), radius_px.max())}
-    assert all(part.wanted[part.labelled].all() for part in splits[0].labels)
+    assert all(part.selected[part.labelled].all() for part in splits[0].labels)
 
 
 def test_craters_just_outside_the_labelled_range_are_ignored():
@@ -80,7 +80,7 @@ def test_craters_just_outside_the_labelled_range_are_ignored():
     np.testing.assert_allclose(rows["radius_px"], [1.8, 65.0, 10.0], rtol=1e-6)
     np.testing.assert_allclose(rows[["ellipse_cx_px", "ellipse_cy_px"]], [[70, 50], [30, 50], [102, 50]], atol=1e-6)
     np.testing.assert_allclose(rows["bbox_x0_px"], [68.2, -35, 92], atol=1e-6)
-    assert not rows["wanted"].any() and not rows["labelled"].any()
+    assert not rows["selected"].any() and not rows["labelled"].any()
 
 
 def test_what_is_ignored_reaches_as_far_as_frames_are_resized():
@@ -137,7 +137,7 @@ def test_the_eight_turns_differ():
 def changed(split, settings, seed=0, index=0):
     image, labels = split.frames.images[index], split.labels[index]
     pixels, boxes, wanted = augment(
-        image, labels.boxes, labels.wanted, split.radius_px, settings, np.random.default_rng(seed)
+        image, labels.boxes, labels.selected, split.radius_px, settings, np.random.default_rng(seed)
     )
     return image, labels, pixels, boxes, wanted
 
@@ -146,7 +146,7 @@ def test_augmentation_off_changes_nothing(split):
     image, labels, pixels, boxes, wanted = changed(split, PLAIN)
     np.testing.assert_allclose(pixels, image, atol=1e-3)
     np.testing.assert_array_equal(boxes, labels.boxes)
-    np.testing.assert_array_equal(wanted, labels.wanted)
+    np.testing.assert_array_equal(wanted, labels.selected)
 
 
 @pytest.mark.parametrize("setting", [{"gain": 0.5}, {"gamma": 0.5}, {"blur_px": 3.0}, {"noise": 5.0}])
@@ -154,7 +154,7 @@ def test_each_augmentation_changes_the_pixels_alone(split, setting):
     image, labels, pixels, boxes, wanted = changed(split, PLAIN.model_copy(update=setting), 1)
     assert np.abs(pixels - image).mean() > 0.3
     np.testing.assert_array_equal(boxes, labels.boxes)
-    np.testing.assert_array_equal(wanted, labels.wanted)
+    np.testing.assert_array_equal(wanted, labels.selected)
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.0, 1.37, 2.5])
@@ -235,7 +235,7 @@ def test_batches(split):
     assert torch.equal(images[:, 0], images[:, 2])
     assert torch.bincount(targets.frame, minlength=5).tolist() == [len(part.boxes) for part in split.labels[5:10]]
     np.testing.assert_allclose(targets.boxes[targets.frame == 2], split.labels[7].boxes, rtol=1e-6)
-    assert targets.wanted[targets.frame == 2].tolist() == split.labels[7].wanted.tolist()
+    assert targets.selected[targets.frame == 2].tolist() == split.labels[7].selected.tolist()
 
 
 def test_workers_under_spawn_give_the_same_batches(split):

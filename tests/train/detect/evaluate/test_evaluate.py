@@ -171,7 +171,7 @@ def test_a_networks_detections_by_pycocotools(run, dataset_detect):
     for frame, part in zip(split.frames.table["frame_id"], split.labels, strict=True):
         own = table[table["frame_id"] == frame]
         found.append(Detections(own[["x0_px", "y0_px", "x1_px", "y1_px"]].to_numpy(), own["score"].to_numpy()))
-        kept = part.wanted
+        kept = part.selected
         labels.append(FrameLabels(part.boxes[kept], part.radius_px[kept], part.ellipses[kept], kept[kept], kept[kept]))
     overlaps = find_overlaps(found, labels, facts_of(split.frames).sizes_px)
     # COCO knows nothing of centres off the image.

@@ -151,13 +151,13 @@ def test_resampled_average_precision_is_that_of_the_frames_repeated(n_detections
     drawn = average_precisions(matches, resamples)
     for weights, value in zip(resamples.weights, drawn, strict=True):
         times = weights[resamples.of_row].astype(int)
-        rows, wanted = (np.repeat(np.arange(len(f)), times[f]) for f in (matches.frame, matches.wanted_frame))
+        rows, wanted = (np.repeat(np.arange(len(f)), times[f]) for f in (matches.frame, matches.selected_frame))
         repeated = Matches(
             matches.scores[rows],
             matches.outcome[rows],
             matches.label[rows],
             matches.frame[rows],
-            matches.wanted_frame[wanted],
+            matches.selected_frame[wanted],
         )
         assert value == pytest.approx(curve(repeated).ap_paper(), abs=tolerance)
 
@@ -227,7 +227,7 @@ def test_the_report_of_images_of_which_nothing_is_known(tmp_path: Path):
     report = (tmp_path / "report.md").read_text()
     assert (
         "made by hand" in report
-        and "3 frames, 3 wanted labels" in report
+        and "3 frames, 3 selected labels" in report
         and "the value of each image; 3 of them" in report
     )
     assert "| precision | 0.333" in report

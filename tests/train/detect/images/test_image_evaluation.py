@@ -74,7 +74,7 @@ def test_a_folder_is_judged(run, folder, tmp_path):
     figures = evaluate_images(run, settings_of(run), folder, out, Tiling(tile_px=96, overlap_px=32))
     written = json.loads((out / "metrics.json").read_text())
     assert written["threshold"] == THRESHOLD and written["frames"] == 2
-    wanted = [image.wanted(8.0).sum() for image in read_images(folder).images]
+    wanted = [image.selected(8.0).sum() for image in read_images(folder).images]
     assert written["labels"] == sum(wanted) > 40
     assert 0 < written["ap50_paper"] < 1 and written["oracle/f1"] >= written["f1"] > 0
     assert written["ap50_paper"] == pytest.approx(figures["ap50_paper"])

@@ -37,8 +37,8 @@ def test_tables_with_commas_and_tabs(tmp_path, separator):
     assert image.boxes.tolist() == [[-5, 2, 15, 12], [30, 20, 38, 28], [35, 10, 55, 30]]
     assert image.sizes_px == pytest.approx([200**0.5, 8, 20])
     # The third is centred off the image.
-    assert image.wanted(8.0).tolist() == [True, True, False]
-    assert image.wanted(8.1).tolist() == [True, False, False]
+    assert image.selected(8.0).tolist() == [True, True, False]
+    assert image.selected(8.1).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_coco(tmp_path):
         assert image.name == "pictures/a b.png"
         assert image.path == tmp_path.resolve() / "pictures" / "a b.png"
         assert image.boxes.tolist() == [[2, 3, 12, 15], [1, 1, 21, 21], [4, 4, 13, 13.5]]
-        assert image.wanted(8.0).tolist() == [True, False, False]
+        assert image.selected(8.0).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,12 @@ class Targets:
     """x0, y0, x1, y1 in pixels (T, 4)."""
     frame: Tensor
     """Index in the batch of each label's frame (T,)."""
-    wanted: Tensor
+    selected: Tensor
     """False for a label to ignore, such as a hardly visible crater (T,)."""
 
     def to(self, device: torch.device) -> "Targets":
         """The same on another device."""
-        return Targets(self.boxes.to(device), self.frame.to(device), self.wanted.to(device))
+        return Targets(self.boxes.to(device), self.frame.to(device), self.selected.to(device))
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ def assign(
         at = centre[label] / stride
         limit = at.new_tensor([width, height])
         grid = (frames, anchors.shape[1], height, width)
-        wanted = targets.wanted[label]
-        ignored = label[~wanted]
-        free = _cells_touched(targets.frame[ignored], anchor[~wanted], at[~wanted], size[ignored] / stride, grid)
-        label, anchor, at = label[wanted], anchor[wanted], at[wanted]
+        selected = targets.selected[label]
+        ignored = label[~selected]
+        free = _cells_touched(targets.frame[ignored], anchor[~selected], at[~selected], size[ignored] / stride, grid)
+        label, anchor, at = label[selected], anchor[selected], at[selected]
         cell = at.floor()
         side = torch.where(at - cell < 0.5, -1.0, 1.0)
         zero = torch.zeros_like(side[:, 0])

@@ -59,7 +59,7 @@ def grey_levels(image: NDArray[np.uint8], settings: AugmentSettings, rng: np.ran
 def augment(
     image: NDArray[np.uint8],
     boxes: Array,
-    wanted: NDArray[np.bool_],
+    selected: NDArray[np.bool_],
     radius_px: tuple[float, float],
     settings: AugmentSettings,
     rng: np.random.Generator,
@@ -80,9 +80,9 @@ def augment(
         size = np.array(turned.shape[::-1])
         centre, radius = (boxes[:, :2] + boxes[:, 2:]) / 2, np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(1)) / 2
         seen = ((boxes[:, 2:] > 0) & (boxes[:, :2] < size)).all(1) & (radius >= radius_px[0] * MARGIN)
-        boxes, wanted, centre, radius = boxes[seen], wanted[seen], centre[seen], radius[seen]
+        boxes, selected, centre, radius = boxes[seen], selected[seen], centre[seen], radius[seen]
         inside = ((centre >= 0) & (centre < size)).all(1)
-        wanted = wanted & inside & (radius >= radius_px[0]) & (radius <= radius_px[1])
+        selected = selected & inside & (radius >= radius_px[0]) & (radius <= radius_px[1])
     pixels = grey_levels(turned, settings, rng)[turned]
     sigma_px = rng.uniform(0, settings.blur_px)
     if sigma_px > 0.3:
@@ -90,4 +90,4 @@ def augment(
     noise = rng.uniform(0, settings.noise)
     if noise > 0:
         pixels = pixels + np.float32(noise) * rng.standard_normal(pixels.shape, np.float32)
-    return pixels, boxes, wanted
+    return pixels, boxes, selected

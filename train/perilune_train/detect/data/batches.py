@@ -36,8 +36,8 @@ class TrainingFrames(torch_data.Dataset):
         labels = self.split.labels[index]
         rng = np.random.default_rng([*self.key, index])
         image, split = self.split.frames.images[index], self.split
-        pixels, boxes, wanted = augment(image, labels.boxes, labels.wanted, split.radius_px, self.settings, rng)
-        return normalised(pixels), boxes, wanted
+        pixels, boxes, selected = augment(image, labels.boxes, labels.selected, split.radius_px, self.settings, rng)
+        return normalised(pixels), boxes, selected
 
 
 class EvaluationFrames(torch_data.Dataset):
@@ -52,7 +52,7 @@ class EvaluationFrames(torch_data.Dataset):
     def __getitem__(self, place: int) -> Sample:
         index = self.own[place]
         labels = self.split.labels[index]
-        return normalised(self.split.frames.images[index]), labels.boxes, labels.wanted
+        return normalised(self.split.frames.images[index]), labels.boxes, labels.selected
 
 
 def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Tensor:
@@ -92,12 +92,12 @@ class Collate:
     """Input channels of the network."""
 
     def __call__(self, samples: list[Sample]) -> Batch:
-        images, boxes, wanted = zip(*samples, strict=True)
+        images, boxes, selected = zip(*samples, strict=True)
         counts = torch.tensor([len(part) for part in boxes])
         return network_input(np.stack(images), self.in_channels), Targets(
             torch.as_tensor(np.concatenate(boxes), dtype=torch.float32),
             torch.repeat_interleave(torch.arange(len(samples)), counts),
-            torch.as_tensor(np.concatenate(wanted)),
+            torch.as_tensor(np.concatenate(selected)),
         )
 
 

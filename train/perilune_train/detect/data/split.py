@@ -37,7 +37,7 @@ class FrameLabels:
     """Radius of the circle of equal area, pixels (M,)."""
     ellipses: Array
     """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5), for drawing."""
-    wanted: NDArray[np.bool_]
+    selected: NDArray[np.bool_]
     """False for a crater to ignore: hardly visible, or not labelled (M,)."""
     labelled: NDArray[np.bool_]
     """False for a crater that is not in the manifest's labels: slightly too small, too large, or off the image (M,)."""
@@ -76,9 +76,10 @@ def load_split(
             raise UserError(dataset.root, field, size, f"{expected}; render or develop the frames with {nearest}")
     frames = load_frames(dataset, split)
     labels = read_labels(dataset, [*_BOX, *_ELLIPSE], split)
-    radius_px = _judged_range(dataset, settings)
+    radius_px = _evaluated_range(dataset, settings)
     shapes, ids = labels[_SHAPE].to_numpy(np.float64), labels["crater_id"].to_numpy()
-    wanted, depth_ratio = selected(labels, settings), (labels["depth_m"] / labels["diameter_m"]).to_numpy(np.float64)
+    is_selected = selected(labels, settings)
+    depth_ratio = (labels["depth_m"] / labels["diameter_m"]).to_numpy(np.float64)
     rows_of = labels.groupby("frame_id").indices
     craters = dataset.table("craters", _CRATER).to_pandas()
     by_scene = {str(name): (part, *_places(part)) for name, part in craters.groupby("scene_id")}
@@ -95,7 +96,7 @@ def load_split(
         shape = np.concatenate([shapes[rows], ignored[_SHAPE].to_numpy(np.float64)])
         labelled = np.arange(len(shape)) < len(rows)
         chosen = np.zeros(len(shape), np.bool_)
-        chosen[: len(rows)] = wanted[rows]
+        chosen[: len(rows)] = is_selected[rows]
         ratio = np.concatenate([depth_ratio[rows], np.full(len(ignored), np.nan)])
         parts.append(FrameLabels(shape[:, :4], shape[:, 4], shape[:, 5:], chosen, labelled, ratio))
     return DetectSplit(frames, parts, radius_px)
@@ -123,7 +124,7 @@ def _right_size(
     return (depth_m > 0) & (scaled > 0.8 * range_px[0] * depth_m) & (scaled < 2 * range_px[1] * depth_m)
 
 
-def _judged_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
+def _evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
     """Least and largest selected radius, pixels; the dataset's labels give limits that the selection leaves open."""
     if settings.radius_px is None:
         return _labelled_range(dataset)
@@ -166,7 +167,7 @@ def unlabelled_craters(
     shapes = project_circles(camera, centre[near], normals, radius_m[near])
     columns = [*shapes.bounding_boxes().T, shapes.cx_px, shapes.cy_px, shapes.a_px, shapes.b_px, shapes.theta_rad]
     rows = pd.DataFrame(dict(zip([*_BOX, *_ELLIPSE], columns, strict=True)))
-    rows["radius_px"], rows["wanted"], rows["labelled"] = shapes.radius_px(), False, False
+    rows["radius_px"], rows["selected"], rows["labelled"] = shapes.radius_px(), False, False
     box = rows[_BOX].to_numpy(np.float64)
     seen = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
     return rows[seen & rows["radius_px"].between(low, high).to_numpy()]

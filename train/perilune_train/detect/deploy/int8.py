@@ -56,11 +56,11 @@ class Int8Verdict:
 
     def words(self) -> str:
         """Summary in one line."""
-        told = (
+        comparison = (
             f"AP {self.ap50_paper_int8:.4f} (float32 {self.ap50_paper_float:.4f}) on the validation split, "
             f"{1000 * self.int8_s:.1f} ms an image ({self.precision} {1000 * self.float_s:.1f} ms)"
         )
-        return f"int8 {'kept' if self.kept else 'not kept'}: {told}"
+        return f"int8 {'kept' if self.kept else 'not kept'}: {comparison}"
 
 
 def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config: DetectConfig) -> Int8Verdict:
@@ -75,8 +75,8 @@ def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config
     quick = {"float": openvino_engine(source, precision, batch=1), "int8": openvino_engine(out, precision, batch=1)}
     image = network_input(normalised(val.frames.images[:1]), config.in_channels).contiguous().numpy()
     times = interleaved(quick, image, _TIMED)
-    ap_float = average_precision(openvino_engine(source, "f32", batch=1), val, config, "judge float32")
-    ap_int8 = average_precision(quick["int8"], val, config, "judge int8")
+    ap_float = average_precision(openvino_engine(source, "f32", batch=1), val, config, "evaluate float32")
+    ap_int8 = average_precision(quick["int8"], val, config, "evaluate int8")
     verdict = Int8Verdict(
         ap_float, ap_int8, statistics.median(times["float"]), statistics.median(times["int8"]), precision
     )

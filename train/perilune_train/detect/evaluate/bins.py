@@ -94,8 +94,8 @@ def figures_by_bin(
         # A radius of exactly 50 px belongs to the paper's largest bin.
         own = within(overlaps.label_radius_px, low, high, high == _PAPERS_LARGEST_PX)
         own &= (low < _PAPERS_LARGEST_PX) | (overlaps.label_radius_px > low)
-        judged = max(low, radius_px[0]), min(high, radius_px[1])
-        part = overlaps.match(match_iou, judged, overlaps.label_wanted & own)
+        evaluated = max(low, radius_px[0]), min(high, radius_px[1])
+        part = overlaps.match(match_iou, evaluated, overlaps.label_selected & own)
         made.append(_of_matches("radius", "px", low, high, part, threshold, resamples))
     margins = {ALTITUDE_BINS_M[0]: 1 - _ALTITUDE_MARGIN, ALTITUDE_BINS_M[-1]: 1 + _ALTITUDE_MARGIN}
     for low, high in pairwise(ALTITUDE_BINS_M):
@@ -105,7 +105,7 @@ def figures_by_bin(
         chosen = within(facts.sun_elevation_deg, low, high, high == SUN_BINS_DEG[-1])
         made.append(_of_matches("sun", "deg", low, high, matches.of_frames(chosen), threshold, resamples))
     for low, high in pairwise(DEPTH_RATIO_BINS):
-        own = within(overlaps.label_depth_ratio, low, high, high == DEPTH_RATIO_BINS[-1]) & overlaps.label_wanted
+        own = within(overlaps.label_depth_ratio, low, high, high == DEPTH_RATIO_BINS[-1]) & overlaps.label_selected
         made.append(_of_labels(low, high, own, overlaps, matches, threshold, resamples))
     return [one for one in made if one.labels]
 
@@ -119,7 +119,7 @@ def _of_matches(
             "ap50_paper": average_precisions(matches, drawn),
             "recall": at_threshold_resampled(matches, threshold, drawn)["recall"],
         },
-        matches.wanted_frame,
+        matches.selected_frame,
         resamples,
     )
     return BinFigures(
@@ -127,8 +127,8 @@ def _of_matches(
         unit,
         low,
         high,
-        len(np.unique(matches.wanted_frame)),
-        len(matches.wanted_frame),
+        len(np.unique(matches.selected_frame)),
+        len(matches.selected_frame),
         curve(matches).ap_paper(),
         spread["ap50_paper"],
         precision,
@@ -153,8 +153,8 @@ def _of_labels(
     frames = overlaps.label_frame[own]
 
     def recalls(drawn: Resamples) -> dict[str, Array]:
-        found, wanted = drawn.totals(overlaps.label_frame[own & hit]), drawn.totals(frames)
-        return {"recall": np.divide(found, wanted, out=np.full(len(wanted), np.nan), where=wanted > 0)}
+        found, n_labels = drawn.totals(overlaps.label_frame[own & hit]), drawn.totals(frames)
+        return {"recall": np.divide(found, n_labels, out=np.full(len(n_labels), np.nan), where=n_labels > 0)}
 
     nan = float("nan")
     recall = float(hit[own].mean()) if own.any() else nan

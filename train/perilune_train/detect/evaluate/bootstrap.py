@@ -28,10 +28,10 @@ def average_precisions(matches: Matches, resamples: Resamples) -> Array:
     np.add.at(hits, place, matches.outcome[order] == FOUND)
     np.add.at(every, place, 1.0)
     hits, every = (np.cumsum(resamples.weights @ part, axis=1) for part in (hits, every))
-    wanted = resamples.totals(matches.wanted_frame)
+    n_labels = resamples.totals(matches.selected_frame)
     precision = hits / np.maximum(every, 1)
     area = (np.diff(hits, axis=1, prepend=0.0) * precision).sum(axis=1)
-    return np.divide(area, wanted, out=np.full(len(wanted), np.nan), where=wanted > 0)
+    return np.divide(area, n_labels, out=np.full(len(n_labels), np.nan), where=n_labels > 0)
 
 
 def at_threshold_resampled(matches: Matches, threshold: float, resamples: Resamples) -> dict[str, Array]:
@@ -41,10 +41,10 @@ def at_threshold_resampled(matches: Matches, threshold: float, resamples: Resamp
         resamples.totals(matches.frame[strong & chosen])
         for chosen in (matches.outcome == FOUND, matches.outcome != IGNORED)
     )
-    wanted = resamples.totals(matches.wanted_frame)
-    undefined = np.where(wanted > 0, 0.0, np.nan)
+    n_labels = resamples.totals(matches.selected_frame)
+    undefined = np.where(n_labels > 0, 0.0, np.nan)
     return {
         "precision": hits / np.maximum(counted, 1) + undefined,
-        "recall": hits / np.maximum(wanted, 1) + undefined,
-        "f1": 2 * hits / np.maximum(counted + wanted, 1) + undefined,
+        "recall": hits / np.maximum(n_labels, 1) + undefined,
+        "f1": 2 * hits / np.maximum(counted + n_labels, 1) + undefined,
     }

@@ -86,7 +86,7 @@ class Evaluation:
             "threshold": self.threshold,
             "match_iou": self.match_iou,
             "frames": len(self.facts),
-            "labels": len(self.matches.wanted_frame),
+            "labels": len(self.matches.selected_frame),
             "intervals_over": self.resamples.unit,
             "intervals_units": self.resamples.count,
             **self.errors,
@@ -113,8 +113,8 @@ class Evaluation:
             np.bincount(self.matches.frame[strong & (self.matches.outcome == kind)], minlength=n_frames)
             for kind in (FOUND, FALSE)
         )
-        wanted = np.bincount(self.matches.wanted_frame, minlength=n_frames)
-        return np.divide(2 * hits, hits + false + wanted, out=np.full(n_frames, np.nan), where=wanted > 0)
+        n_labels = np.bincount(self.matches.selected_frame, minlength=n_frames)
+        return np.divide(2 * hits, hits + false + n_labels, out=np.full(n_frames, np.nan), where=n_labels > 0)
 
 
 def evaluate_detections(
@@ -158,7 +158,7 @@ def evaluate_detections(
         at_edge,
         by_iou,
         figures_by_bin(overlaps, matches, facts, match_iou, radius_px, threshold, resamples),
-        spreads(statistics, matches.wanted_frame, resamples),
+        spreads(statistics, matches.selected_frame, resamples),
         resamples,
     )
 

@@ -135,12 +135,12 @@ def _title(evaluation: Evaluation, index: int) -> str:
 def _draw_marks(axes: Axes, evaluation: Evaluation, index: int) -> None:
     labels, matches, overlaps = evaluation.labels[index], evaluation.matches, evaluation.overlaps
     own = (matches.frame == index) & (matches.scores >= evaluation.threshold)
-    missed = labels.wanted.copy()
+    missed = labels.selected.copy()
     missed[matches.label[own & (matches.label >= 0)] - np.searchsorted(overlaps.label_frame, index)] = False
     known = labels.labelled
-    for ellipse, wanted, lost in zip(labels.ellipses[known], labels.wanted[known], missed[known], strict=True):
+    for ellipse, selected, lost in zip(labels.ellipses[known], labels.selected[known], missed[known], strict=True):
         cx, cy, a, b, theta = ellipse
-        colour, width = (_LABEL, 1.4 if lost else 0.5) if wanted else (_IGNORED, 0.6)
+        colour, width = (_LABEL, 1.4 if lost else 0.5) if selected else (_IGNORED, 0.6)
         axes.add_patch(
             Ellipse((cx, cy), 2 * a, 2 * b, angle=np.degrees(theta), fill=False, linewidth=width, color=colour)
         )

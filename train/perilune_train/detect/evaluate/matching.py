@@ -7,7 +7,7 @@ Evaluate detections against labels of rendered or real images with::
     curve(matches).ap_paper()                                  # metrics.py
 
 Detections are matched in order of score. Each takes the free selected label of highest IoU, if that is at least the
-given IoU. Only selected labels (`wanted`) count in recall. Three accounts differ in which unmatched detections are
+given IoU. Only selected labels count in recall. Three accounts differ in which unmatched detections are
 false positives:
 
 - Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the
@@ -19,7 +19,7 @@ false positives:
 - Strict: every unmatched detection is a false positive.
 
 Two things differ from COCO (COCOeval without crowds). There an ignored label absorbs one detection, here any number,
-since none of several detections on an ignored crater can be evaluated; COCO gives the same metrics if each ignored
+since detections on an ignored crater cannot be evaluated; COCO gives the same metrics if each ignored
 label is repeated once for every detection (a test does that). COCO counts a detection whose centre is off the image as
 a false positive, because the labels given to it have no such centres.
 """
@@ -70,7 +70,7 @@ class Matches:
     """Matched label, a row of Overlaps; NO_LABEL or ON_IGNORED if there is none (D,)."""
     frame: Rows
     """Frame of each detection (D,)."""
-    wanted_frame: Rows
+    selected_frame: Rows
     """Frame of each selected label (L,)."""
 
     def strict(self) -> "Matches":
@@ -85,7 +85,7 @@ class Matches:
             self.outcome[own],
             self.label[own],
             self.frame[own],
-            self.wanted_frame[chosen[self.wanted_frame]],
+            self.selected_frame[chosen[self.selected_frame]],
         )
 
 
@@ -107,7 +107,7 @@ class Overlaps:
     """Radius of each label, pixels (L,)."""
     label_depth_ratio: Array
     """Depth over diameter of each label, NaN if unknown (L,)."""
-    label_wanted: Flags
+    label_selected: Flags
     """Whether each label is selected (L,)."""
     label_frame: Rows
     """Frame of each label (L,)."""
@@ -123,28 +123,28 @@ class Overlaps:
         """Radius sqrt(w h) / 2 of every detection, pixels (D,)."""
         return np.sqrt(np.prod(np.maximum(self.boxes[:, 2:] - self.boxes[:, :2], 0), axis=1)) / 2
 
-    def match(self, match_iou: float, radius_px: tuple[float, float], wanted: Flags | None = None) -> Matches:
+    def match(self, match_iou: float, radius_px: tuple[float, float], selected: Flags | None = None) -> Matches:
         """Match every detection at one IoU, at least that of `find_overlaps`.
 
-        `radius_px` is the evaluated range of radii; unmatched detections outside it are ignored. `wanted` (L,) replaces
-        `label_wanted`.
+        `radius_px` is the evaluated range of radii; unmatched detections outside it are ignored. `selected` (L,)
+        replaces `label_selected`.
         """
-        wanted = self.label_wanted if wanted is None else wanted
+        selected = self.label_selected if selected is None else selected
         label = np.full(len(self.scores), NO_LABEL, np.intp)
         enough = self.pair_iou >= match_iou
         detection, other = self.pair_detection[enough], self.pair_label[enough]
-        on_wanted = wanted[other]
-        label[detection[~on_wanted]] = ON_IGNORED
+        on_selected = selected[other]
+        label[detection[~on_selected]] = ON_IGNORED
         found, taken = {}, set()
-        for one, its_label in zip(detection[on_wanted].tolist(), other[on_wanted].tolist(), strict=True):
+        for one, its_label in zip(detection[on_selected].tolist(), other[on_selected].tolist(), strict=True):
             if one not in found and its_label not in taken:
                 found[one] = its_label
                 taken.add(its_label)
         label[list(found.keys())] = list(found.values())
         radius = self.radius_px()
-        unjudged = (label == ON_IGNORED) | (radius < radius_px[0]) | (radius > radius_px[1]) | self.off_image
-        outcome = np.where(label >= 0, FOUND, np.where(unjudged, IGNORED, FALSE)).astype(np.int8)
-        return Matches(self.scores, outcome, label, self.frame, self.label_frame[wanted])
+        ignored = (label == ON_IGNORED) | (radius < radius_px[0]) | (radius > radius_px[1]) | self.off_image
+        outcome = np.where(label >= 0, FOUND, np.where(ignored, IGNORED, FALSE)).astype(np.int8)
+        return Matches(self.scores, outcome, label, self.frame, self.label_frame[selected])
 
 
 def find_overlaps(
@@ -176,7 +176,7 @@ def find_overlaps(
         np.concatenate([part.boxes.reshape(-1, 4) for part in labels]) if labels else np.empty((0, 4)),
         _joined([part.radius_px for part in labels]),
         _joined([_depth_ratio(part) for part in labels]),
-        _joined([part.wanted for part in labels]).astype(np.bool_),
+        _joined([part.selected for part in labels]).astype(np.bool_),
         np.repeat(np.arange(len(labels)), [len(part.boxes) for part in labels]),
         _joined(detections).astype(np.intp),
         _joined(others).astype(np.intp),

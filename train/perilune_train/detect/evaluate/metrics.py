@@ -78,8 +78,8 @@ def curve(matches: Matches) -> Curve:
     counted = matches.outcome != IGNORED
     order = np.argsort(-matches.scores[counted], kind="stable")
     hits = np.cumsum(matches.outcome[counted][order] == FOUND)
-    wanted = max(len(matches.wanted_frame), 1)
-    return Curve(matches.scores[counted][order], hits / np.arange(1, len(hits) + 1), hits / wanted)
+    n_labels = max(len(matches.selected_frame), 1)
+    return Curve(matches.scores[counted][order], hits / np.arange(1, len(hits) + 1), hits / n_labels)
 
 
 def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, float]:
@@ -87,7 +87,7 @@ def at_threshold(matches: Matches, threshold: float) -> tuple[float, float, floa
     strong = matches.scores >= threshold
     hits, false = (int((matches.outcome[strong] == kind).sum()) for kind in (FOUND, FALSE))
     precision = hits / max(hits + false, 1)
-    recall = hits / max(len(matches.wanted_frame), 1)
+    recall = hits / max(len(matches.selected_frame), 1)
     return precision, recall, float(f1_score(np.array(precision), np.array(recall)))
 
 

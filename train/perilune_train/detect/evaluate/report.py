@@ -78,13 +78,14 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     """The whole report."""
     figures, spreads = evaluation.figures(), evaluation.spreads
     fullest = max((len(part.scores) for part in evaluation.found), default=0)
-    lines = ["# Crater detection, judged", "", *[f"- {line}" for line in about]]
+    lines = ["# Evaluation of crater detection", "", *[f"- {line}" for line in about]]
     lines += [
-        f"- {figures['frames']} frames, {figures['labels']} wanted labels; most detections in a frame: {fullest}",
+        f"- {figures['frames']} frames, {figures['labels']} selected labels; most detections in one frame: {fullest}",
         f"- match at IoU {evaluation.match_iou:g}; precision, recall and F1 at a score of {evaluation.threshold:.4f}",
         f"- {_of_brackets(evaluation.resamples)}",
-        "- usual account: finds on ignored craters, outside the range of radii or centred off the image do not count; "
-        f"edge: from {EDGE:g} of the least radius on, those on no crater at all are false; strict: all are false",
+        "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored; "
+        f"edge: those from {EDGE:g} of the least radius on that overlap no crater are false positives; "
+        "strict: every unmatched detection is a false positive",
         "",
         "## All frames",
         "",

@@ -71,7 +71,7 @@ def report_head(
     thresholds = config.labels.model_dump(exclude={"selection"}, exclude_none=True)
     return [
         f"run `{run}`, best weights; dataset `{dataset.info.name}`, split {split}; protocol: {protocol}",
-        f"wanted: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
+        f"labels: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
         f"threshold {chosen_on}",
         f"detections below a score of {settings.min_score:g} are dropped, suppression at IoU {settings.nms_iou:g}, "
         f"at most {settings.max_detections} are kept in a frame; frames evaluated {at_scales(settings.scales)}",

@@ -59,7 +59,7 @@ def evaluate_images(
     if not 0 < min_size_px < np.inf:
         raise UserError("--min-size", "pixels", min_size_px, "above 0")
     given = read_images(place)
-    if not any(image.wanted(min_size_px).any() for image in given.images):
+    if not any(image.selected(min_size_px).any() for image in given.images):
         raise UserError(place, "boxes", f"none of {min_size_px:g} px or more", "at least one to be found")
     chosen_on = "chosen on the run's validation split" if threshold is None else "given by hand"
     threshold = chosen_threshold(run) if threshold is None else threshold
@@ -70,11 +70,11 @@ def evaluate_images(
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
     about = [
         f"run `{run.resolve().name}`, best weights; {len(images)} images of `{place.name}`",
-        f"wanted: boxes of {min_size_px:g} px or more (sqrt(w h)), centred in the image",
+        f"labels: boxes of {min_size_px:g} px or more (sqrt(w h)), centred in the image",
         f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
         + ("" if tiling.box_margin_px == 0 else f"; boxes enlarged by {tiling.box_margin_px:g} px at every side"),
         f"threshold {chosen_on}",
-        f"oracle, with the threshold ({best:.4f}) of best F1 on these very images, which nobody knows beforehand: "
+        f"oracle: with the threshold of best F1 on these images ({best:.4f}), which cannot be known without labels: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
     about += [given.categories] * bool(given.categories)
@@ -100,7 +100,7 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
     centre, half = (image.boxes[:, :2] + image.boxes[:, 2:]) / 2, (image.boxes[:, 2:] - image.boxes[:, :2]) / 2
     ellipses = np.column_stack([centre, half, np.zeros(len(half))])
     every = np.ones(len(half), bool)
-    return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, image.wanted(min_size_px), every)
+    return FrameLabels(image.boxes, image.sizes_px / 2, ellipses, image.selected(min_size_px), every)
 
 
 def evaluate_detections_in_images(
@@ -156,8 +156,8 @@ def _crop_pair(image: NDArray[np.uint8], evaluation: Evaluation, index: int) -> 
     left, right = np.array(large, np.uint8), np.array(large, np.uint8)
     shift = np.tile(corner[::-1], 2)
     truth, matches = evaluation.labels[index], evaluation.matches
-    draw_boxes(left, 2 * (truth.boxes[~truth.wanted] - shift), _SMALL)
-    draw_boxes(left, 2 * (truth.boxes[truth.wanted] - shift), _LABEL)
+    draw_boxes(left, 2 * (truth.boxes[~truth.selected] - shift), _SMALL)
+    draw_boxes(left, 2 * (truth.boxes[truth.selected] - shift), _LABEL)
     strong = (matches.frame == index) & (matches.scores >= evaluation.threshold)
     for outcome, colour in _COLOURS.items():
         boxes = evaluation.overlaps.boxes[strong & (matches.outcome == outcome)]

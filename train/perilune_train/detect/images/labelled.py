@@ -49,7 +49,7 @@ class LabelledImage:
         """Side of the square of equal area, sqrt(w h), pixels (M,): the size of a crater here."""
         return np.sqrt(np.prod(self.boxes[:, 2:] - self.boxes[:, :2], axis=1))
 
-    def wanted(self, min_size_px: float) -> NDArray[np.bool_]:
+    def selected(self, min_size_px: float) -> NDArray[np.bool_]:
         """Which boxes are ground truth (M,): marked, centred in the image, and of at least this size."""
         centre = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
         inside = ((centre >= 0) & (centre < [self.width_px, self.height_px])).all(axis=1)
@@ -163,9 +163,11 @@ def _read_coco(path: Path) -> ImageSet:
     for k, image in enumerate(images):
         picture = _picture(path, image.get("file_name"), f"images[{k}].file_name")
         size = picture_size(picture)
-        told = image.get("width", size[0]), image.get("height", size[1])
-        if told != size:
-            raise UserError(picture, "size", f"{size[0]} x {size[1]}", f"{told[0]} x {told[1]}, as {path.name} says")
+        stated = image.get("width", size[0]), image.get("height", size[1])
+        if stated != size:
+            raise UserError(
+                picture, "size", f"{size[0]} x {size[1]}", f"{stated[0]} x {stated[1]}, as {path.name} says"
+            )
         own = np.array(boxes[k], np.float64).reshape(-1, 4)
         result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(marked[k], bool)))
     if n_empty:

@@ -73,8 +73,8 @@ def predict_images(
                 shapes += own
                 if len(own) < len(found.boxes):
                     left_out = len(found.boxes) - len(own)
-                    told = f"{path.name}: {left_out} craters lie off its map: not in detections.geojson"
-                    console.print(told, markup=False)
+                    message = f"{path.name}: {left_out} craters are off its map and not in detections.geojson"
+                    console.print(message, markup=False)
         table = pd.concat(tables, ignore_index=True)
         table.to_parquet(folder / "detections.parquet", index=False)
         table.round(4).to_csv(folder / "detections.csv", index=False)

@@ -83,19 +83,19 @@ def _opened(path: Path) -> Any:
 
 
 def _opened_by_rasterio(path: Path) -> Any:
-    found, wanted = "a file that does not decode", "a PNG, TIFF or JPEG"
+    found, expected = "a file that does not decode", "a PNG, TIFF or JPEG"
     try:
         import rasterio
         from rasterio.errors import RasterioError
     except ImportError:
         hint = "; float64 and deep colours in TIFF need rasterio (pip install 'perilune-train[geo]')"
-        raise UserError(path, "image", found, wanted + hint) from None
+        raise UserError(path, "image", found, expected + hint) from None
     try:
         # By default GDAL would open a text file named .tif that refers to other files; PAM files can do so too.
         with rasterio.Env(GDAL_PAM_ENABLED="NO"):
             return rasterio.open(path.resolve(), driver="GTiff")
     except RasterioError:
-        raise UserError(path, "image", found, wanted) from None
+        raise UserError(path, "image", found, expected) from None
 
 
 def _by_pillow(path: Path, picture: Any) -> NDArray:

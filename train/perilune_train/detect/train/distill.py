@@ -37,15 +37,15 @@ def distill_loss(
     and strides, so that their predictors correspond.
     """
     box, weights, confidence, predictors = student[0].new_zeros(()), student[0].new_zeros(()), [], 0
-    for raw, told, prior, stride in zip(student, teacher, anchors, strides, strict=True):
-        told = told.detach().float()
-        score = told[..., 4].sigmoid()
+    for raw, target, prior, stride in zip(student, teacher, anchors, strides, strict=True):
+        target = target.detach().float()
+        score = target[..., 4].sigmoid()
         sure = score >= _SURE
-        own, wanted = (decode_grid(part.float(), prior, stride)[sure] for part in (raw, told))
-        box = box + (score[sure] * ciou_loss(own, wanted, "standard")).sum()
+        own, expected = (decode_grid(part.float(), prior, stride)[sure] for part in (raw, target))
+        box = box + (score[sure] * ciou_loss(own, expected, "standard")).sum()
         weights = weights + score[sure].sum()
         # Cross-entropy minus the teacher's own entropy.
-        logits = told[..., 4]
+        logits = target[..., 4]
         confidence.append(F.binary_cross_entropy_with_logits(raw[..., 4].float(), score, reduction="sum"))
         confidence.append(-F.binary_cross_entropy_with_logits(logits, score, reduction="sum"))
         predictors += score.numel()

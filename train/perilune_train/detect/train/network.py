@@ -20,7 +20,7 @@ _ANCHOR_STREAM = 1
 
 def label_sizes(split: DetectSplit) -> np.ndarray:
     """Widths and heights (N, 2) in pixels of all selected labels of a split."""
-    boxes = np.concatenate([part.boxes[part.wanted] for part in split.labels])
+    boxes = np.concatenate([part.boxes[part.selected] for part in split.labels])
     return boxes[:, 2:] - boxes[:, :2]
 
 
@@ -38,8 +38,8 @@ def build_network(config: DetectConfig, sizes_px: np.ndarray, where: Path) -> YO
 def load_teacher(path: Path, config: DetectConfig) -> Teacher:
     """Load the teacher. Raises UserError if its input channels or strides differ from the student's."""
     network = load_detector(path)
-    wanted = {"in_channels": config.in_channels, "strides": list(config.strides)}
-    runs.check_architecture(path, runs.load_weights(path)["architecture"], wanted)
+    expected = {"in_channels": config.in_channels, "strides": list(config.strides)}
+    runs.check_architecture(path, runs.load_weights(path)["architecture"], expected)
     return Teacher(network.requires_grad_(False))
 
 

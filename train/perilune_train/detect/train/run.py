@@ -71,8 +71,8 @@ def run_detect(
     processes = math.prod(machines(config.devices, config.num_nodes))
     for split in ("train", "val"):
         if len(splits[split]) < processes:
-            wanted = f"at least {processes}, one for each process"
-            raise UserError(dataset.root, f"{split} frames", len(splits[split]), wanted)
+            expected = f"at least {processes}, one for each process"
+            raise UserError(dataset.root, f"{split} frames", len(splits[split]), expected)
     sizes = label_sizes(splits["train"])
     network = build_network(config, sizes, dataset.root)
     if config.init_from is not None and not resume:
@@ -140,9 +140,9 @@ def evaluate(
     threshold, chosen_as = curve(matches).operating_threshold(config.evaluation.min_precision)
     evaluation = evaluate_split(splits["test"], found, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found)
-    told = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{chosen_as} on val")
-    told.append(anchor_report(detector.network, label_sizes(splits["train"]), config.anchor_ratio))
-    write_evaluation(run.root, evaluation, list(splits["test"].frames.images), told)
+    about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{chosen_as} on val")
+    about.append(anchor_report(detector.network, label_sizes(splits["train"]), config.anchor_ratio))
+    write_evaluation(run.root, evaluation, list(splits["test"].frames.images), about)
     metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}
     metrics |= {f"test/{key}": value for key, value in evaluation.figures().items()}
     return metrics | {"test/images_per_s": round(rate, 2)}

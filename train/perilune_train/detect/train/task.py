@@ -88,7 +88,7 @@ class DetectTask(lightning.LightningModule):
             "strides": list(config.strides),
         }
         self.splits = {"train": train, "val": val}
-        self.judged: list[Detections] = []
+        self.detections: list[Detections] = []
         self.images_seen = 0
         self.terrain: dict[str, Any] | None = None
         self.resumed = (0, 0)
@@ -157,8 +157,8 @@ class DetectTask(lightning.LightningModule):
         self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(images))
         loss = settings.lambda_iou * box + settings.lambda_obj * confidence
         if self.teacher is not None:
-            told = self.teacher(images)
-            box, confidence = distill_loss(outputs, told, self.network.anchors, self.network.strides)
+            teacher_outputs = self.teacher(images)
+            box, confidence = distill_loss(outputs, teacher_outputs, self.network.anchors, self.network.strides)
             self.log_dict({"train/teacher_ciou": box, "train/teacher_objectness": confidence}, batch_size=len(images))
             loss = loss + settings.lambda_teacher * (settings.lambda_iou * box + settings.lambda_obj * confidence)
         return loss
@@ -188,7 +188,7 @@ class DetectTask(lightning.LightningModule):
         return batch[0].to(device), batch[1].to(device)
 
     def on_validation_epoch_start(self) -> None:
-        self.judged = []
+        self.detections = []
         if self.process[1] > 1:
             # Weights are equal in all processes; batch statistics differ, and those of the first process are used.
             for value in self.evaluated.buffers():
@@ -196,17 +196,18 @@ class DetectTask(lightning.LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         boxes, scores = self.evaluated.detect(batch[0])
-        self.judged += detections_of(boxes, scores, self.config.evaluation)
+        self.detections += detections_of(boxes, scores, self.config.evaluation)
 
     def on_validation_epoch_end(self) -> None:
-        split, judged = self.splits["val"], self.judged
+        split, detections = self.splits["val"], self.detections
         processes = self.process[1]
         if processes > 1:
             parts: list[Any] = [None] * processes
-            torch.distributed.all_gather_object(parts, judged)
-            judged = [parts[i % processes][i // processes] for i in range(len(split))]
+            torch.distributed.all_gather_object(parts, detections)
+            detections = [parts[i % processes][i // processes] for i in range(len(split))]
         height, width = split.frames.images.shape[1:]
-        matches = match_split(judged, split.labels, (width, height), self.config.evaluation.match_iou, split.radius_px)
+        match_iou = self.config.evaluation.match_iou
+        matches = match_split(detections, split.labels, (width, height), match_iou, split.radius_px)
         points = curve(matches)
         _, recall, f1 = at_threshold(matches, points.best_threshold())
         self.log_dict({"val/ap50_paper": points.ap_paper(), "val/f1": f1, "val/recall": recall})

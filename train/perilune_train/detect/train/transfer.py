@@ -83,10 +83,10 @@ def check_gates(path: Path, config: DetectConfig) -> None:
     their cosine similarity to those of the plain backbone falls to about 0.5 (`make bench-transfer`).
     """
     if config.frozen_epochs and config.attention == "cbam":
-        wanted = (
+        expected = (
             "cbam_identity, whose gates start at 1 and keep the features of the frozen backbone, or frozen_epochs=0"
         )
-        raise UserError(path, "detect.attention", "cbam with frozen_epochs and no gates in this file", wanted)
+        raise UserError(path, "detect.attention", "cbam with frozen_epochs and no gates in this file", expected)
 
 
 def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenance]:
@@ -135,9 +135,9 @@ def darknet_content(network: YOLOv3, architecture: dict[str, Any], checkpoint: P
 
     These files cannot hold attention gates. Raises UserError if the network does not have the file's shape.
     """
-    wanted: dict[str, Any] = dict(DARKNET_SHAPE)
+    expected: dict[str, Any] = dict(DARKNET_SHAPE)
     if whole:
-        wanted |= {"strides": [8, 16, 32], "attention": "none"}
-    runs.check_architecture(checkpoint, architecture, wanted)
+        expected |= {"strides": [8, 16, 32], "attention": "none"}
+    runs.check_architecture(checkpoint, architecture, expected)
     rescale_input(network.backbone, "grey")
     return content_of(network_slots(network) if whole else backbone_slots(network.backbone))
