@@ -25,6 +25,7 @@ ROOMS = {
     "train/perilune_train/detect": (
         "config finished_run data evaluate inference train evaluate_run compare_runs images deploy cli"
     ),
+    "train/perilune_train/navigate": "config geometry data network evaluate train command",
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""
 MOST_FILES = 15

@@ -32,7 +32,7 @@ from perilune_train.evaluation.provenance import (
     training_provenance,
 )
 from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.run import navigate_run
+from perilune_train.navigate.train.run import navigate_run
 from perilune_train.training import runs
 
 QUICK = ("detect.epochs=1", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")

@@ -11,26 +11,27 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
-from perilune_train.navigate import data
-from perilune_train.navigate.data import Jitter, load_descents, mirrored, pair_sequence
-from perilune_train.navigate.epochs import EpochBatches
+from perilune_train.navigate.data import sequences
+from perilune_train.navigate.data.epochs import EpochBatches
+from perilune_train.navigate.data.sequences import Jitter, mirrored, pair_sequence
+from perilune_train.navigate.data.trajectories import load_trajectories
 from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography
 
 
 @pytest.fixture(scope="module")
-def descents(dataset_nav):
-    return load_descents(open_dataset(dataset_nav))
+def trajectories(dataset_nav):
+    return load_trajectories(open_dataset(dataset_nav))
 
 
-def _misfit(sequence, descent, pair):
+def _misfit(sequence, trajectory, pair):
     """Root mean square difference of the later frame, laid onto the earlier by the stated motion, in the middle."""
-    down = -descent.rotation_camera_from_site[pair][:, 2]
+    down = -trajectory.rotation_camera_from_site[pair][:, 2]
     homography = plane_homography(
-        descent.camera.matrix,
+        trajectory.camera.matrix,
         sequence.translation_m[pair],
         sequence.rotation_c2_from_c1[pair],
         down,
-        descent.position_m[pair, 2],
+        trajectory.position_m[pair, 2],
     )
     laid = cv2.warpPerspective(
         sequence.second[pair],
@@ -49,30 +50,30 @@ def test_distorted_images_are_refused(dataset_nav, tmp_path):
     info["camera"]["distortion"][0] = -0.1
     (root / "dataset.json").write_text(json.dumps(info))
     with pytest.raises(UserError, match=r"camera\.distortion.*expected zeros"):
-        load_descents(open_dataset(root))
+        load_trajectories(open_dataset(root))
 
 
-def test_descents_hold_poses_and_nominal_motion(descents):
-    assert [d.split for d in descents] == ["train"] * 4 + ["val", "test"]
-    d = descents[0]
+def test_trajectories_hold_poses_and_nominal_motion(trajectories):
+    assert [d.split for d in trajectories] == ["train"] * 4 + ["val", "test"]
+    d = trajectories[0]
     assert d.images.shape == (8, 96, 96) and d.images.dtype == np.uint8 and d.n_pairs == 7
     translation, rotation = d.nominal_motion
     np.testing.assert_allclose(rotation, np.broadcast_to(np.eye(3), (7, 3, 3)), atol=1e-12)
-    # The nominal descent sinks evenly from 1400 to 400 m, and the camera's z axis looks down.
+    # The nominal trajectory sinks evenly from 1400 to 400 m, and the camera's z axis looks down.
     np.testing.assert_allclose(translation[:, 2], 1000 / 7)
     np.testing.assert_allclose(d.down_c, [0, 0, 1])
     assert np.abs(d.motion[0] - translation).max() < 40
 
 
-def test_shrinking_keeps_the_rays(descents):
-    small = descents[0].shrunk(32)
+def test_shrinking_keeps_the_rays(trajectories):
+    small = trajectories[0].shrunk(32)
     assert small.images.shape[1:] == (32, 32)
-    np.testing.assert_allclose(small.camera.rays([16.0, 4.0]), descents[0].camera.rays([48.0, 12.0]))
+    np.testing.assert_allclose(small.camera.rays([16.0, 4.0]), trajectories[0].camera.rays([48.0, 12.0]))
 
 
-def test_warping_by_the_nominal_motion_brings_frames_together(descents):
-    plain = pair_sequence(descents[0], 0, 7, warp=False)
-    warped = pair_sequence(descents[0], 0, 7, warp=True)
+def test_warping_by_the_nominal_motion_brings_frames_together(trajectories):
+    plain = pair_sequence(trajectories[0], 0, 7, warp=False)
+    warped = pair_sequence(trajectories[0], 0, 7, warp=True)
     middle = (slice(None), slice(30, -30), slice(30, -30))
 
     def apart(s):
@@ -82,8 +83,8 @@ def test_warping_by_the_nominal_motion_brings_frames_together(descents):
     np.testing.assert_array_equal(warped.first, plain.first)
 
 
-def test_the_stated_motion_lays_the_later_frame_onto_the_earlier(descents):
-    d = descents[0]
+def test_the_stated_motion_lays_the_later_frame_onto_the_earlier(trajectories):
+    d = trajectories[0]
     plain = pair_sequence(d, 0, 3, warp=False)
     wrong = pair_sequence(d, 0, 3, warp=False)
     wrong.translation_m[:, 0] += 60
@@ -91,9 +92,9 @@ def test_the_stated_motion_lays_the_later_frame_onto_the_earlier(descents):
         assert _misfit(plain, d, pair) < 0.5 * _misfit(wrong, d, pair)
 
 
-def test_jitter_moves_image_and_truth_alike(descents, monkeypatch):
-    d = descents[0]
-    monkeypatch.setattr(data, "mirrored", lambda sequence, camera, rng: sequence)
+def test_jitter_moves_image_and_truth_alike(trajectories, monkeypatch):
+    d = trajectories[0]
+    monkeypatch.setattr(sequences, "mirrored", lambda sequence, camera, rng: sequence)
     plain = pair_sequence(d, 0, 3, warp=False)
     moved = pair_sequence(d, 0, 3, warp=False, rng=np.random.default_rng(5), jitter=Jitter(np.full(3, 30.0), 0.01))
     assert np.linalg.norm(moved.translation_m - plain.translation_m, axis=1).min() > 5
@@ -126,8 +127,8 @@ def test_jitter_off_the_nominal_pose_is_wrong_by_a_few_hundredths_of_a_pixel():
     assert np.sqrt(np.mean(wrong_px)) == pytest.approx(0.04, abs=0.01)
 
 
-def test_mirrored_pairs_obey_the_mirrored_motion(descents):
-    d = descents[0]
+def test_mirrored_pairs_obey_the_mirrored_motion(trajectories):
+    d = trajectories[0]
     plain = pair_sequence(d, 0, 2, warp=False)
     level = np.broadcast_to(np.eye(3), (2, 3, 3))
     # With an exactly level camera the ground's normal is the same in the mirror.
@@ -144,11 +145,11 @@ def test_mirrored_pairs_obey_the_mirrored_motion(descents):
     assert len(seen) == 8
 
 
-def test_residual_flow_is_zero_for_the_nominal_motion_and_a_shift_by_hand(descents):
+def test_residual_flow_is_zero_for_the_nominal_motion_and_a_shift_by_hand(trajectories):
     d = replace(
-        descents[0],
-        position_m=descents[0].nominal_position_m,
-        rotation_camera_from_site=np.stack([descents[0].nominal_rotation_camera_from_site] * 8),
+        trajectories[0],
+        position_m=trajectories[0].nominal_position_m,
+        rotation_camera_from_site=np.stack([trajectories[0].nominal_rotation_camera_from_site] * 8),
     )
     np.testing.assert_allclose(pair_sequence(d, 0, 3, warp=True).flow_px, 0, atol=1e-9)
     # 14 m more along x, seen from 1400 m: the ground moves back by 1 % of the focal length, in frame 1's pixels.
@@ -158,10 +159,10 @@ def test_residual_flow_is_zero_for_the_nominal_motion_and_a_shift_by_hand(descen
     np.testing.assert_allclose(flow[0], np.broadcast_to([-0.01 * d.camera.fx_px, 0], (12, 12, 2)), atol=1e-9)
 
 
-def test_flow_labels_of_a_mirrored_pair_are_the_mirrored_labels(descents):
+def test_flow_labels_of_a_mirrored_pair_are_the_mirrored_labels(trajectories):
     """Also where the camera is tilted by 20 degrees, so that the ground's normal changes in the mirror."""
     tilt = matrix_from_rotation_vector(np.radians([16.0, 12.0, 0.0]))
-    d = descents[0]
+    d = trajectories[0]
     d = replace(
         d,
         rotation_camera_from_site=tilt @ d.rotation_camera_from_site,
@@ -187,14 +188,14 @@ def test_flow_labels_of_a_mirrored_pair_are_the_mirrored_labels(descents):
     assert len(seen) == 8
 
 
-def test_epoch_follows_from_the_key_alone(descents):
-    training = [d for d in descents if d.split == "train"]
+def test_epoch_follows_from_the_key_alone(trajectories):
+    training = [d for d in trajectories if d.split == "train"]
 
     def epoch(key):
         return list(EpochBatches(training, 3, 2, warp=True, augmented=True, jitter=None, key=key))
 
     one, again, other = epoch((3, 0)), epoch((3, 0)), epoch((3, 1))
-    assert [len(batch) for batch in one] == [2, 2, 2, 2]  # 4 descents of 7 pairs: 2 runs of 3 each
+    assert [len(batch) for batch in one] == [2, 2, 2, 2]  # 4 trajectories of 7 pairs: 2 runs of 3 each
     np.testing.assert_array_equal(one[1][0].second, again[1][0].second)
     assert not np.array_equal(one[0][0].first, other[0][0].first)
     assert len(EpochBatches(training, 3, 3, warp=True, augmented=True, jitter=None, key=(0, 0))) == 3
@@ -202,4 +203,4 @@ def test_epoch_follows_from_the_key_alone(descents):
 
 def test_a_detection_dataset_is_refused(dataset_detect):
     with pytest.raises(UserError, match="nav"):
-        load_descents(open_dataset(dataset_detect))
+        load_trajectories(open_dataset(dataset_detect))

@@ -3,15 +3,16 @@ import pytest
 
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
-from perilune_train.navigate.data import Descent
-from perilune_train.navigate.metrics import mean_motion, mean_motion_at_step, motion_errors, summary, summary_spreads
+from perilune_train.navigate.data.trajectories import Trajectory
+from perilune_train.navigate.evaluate.baselines import mean_motion, mean_motion_at_step
+from perilune_train.navigate.evaluate.metrics import motion_errors, summary, summary_spreads
 
 
-def _descent(steps_m, name="t0"):
+def _trajectory(steps_m, name="t0"):
     """A level camera that moves by the given steps in O_L."""
     positions = np.cumsum([[0, 0, 1000.0], *steps_m], axis=0)
     n = len(positions)
-    return Descent(
+    return Trajectory(
         ("s", name),
         "test",
         np.zeros((n, 4, 4), np.uint8),
@@ -24,21 +25,21 @@ def _descent(steps_m, name="t0"):
 
 
 def test_baselines_by_hand():
-    training = [_descent([[0, 0, -10], [0, 0, -30]]), _descent([[2, 0, -20], [0, 0, -40], [0, 4, -50]])]
+    training = [_trajectory([[0, 0, -10], [0, 0, -30]]), _trajectory([[2, 0, -20], [0, 0, -40], [0, 4, -50]])]
     # In O_C: x as x_L, y and z against y_L and z_L.
-    translation, rotation = mean_motion(training, _descent([[0, 0, -1]] * 2))
+    translation, rotation = mean_motion(training, _trajectory([[0, 0, -1]] * 2))
     np.testing.assert_allclose(translation, [[0.4, -0.8, 30]] * 2)
     np.testing.assert_allclose(rotation, [np.eye(3)] * 2, atol=1e-12)
-    translation, _ = mean_motion_at_step(training, _descent([[0, 0, -1]] * 4))
+    translation, _ = mean_motion_at_step(training, _trajectory([[0, 0, -1]] * 4))
     np.testing.assert_allclose(translation, [[1, 0, 15], [0, 0, 35], [0, -4, 50], [0, -4, 50]])
 
 
 def test_errors_and_drift_by_hand():
-    descent = _descent([[0, 0, -10], [0, 0, -10]])
-    translation, rotation = (values.copy() for values in descent.motion)
+    trajectory = _trajectory([[0, 0, -10], [0, 0, -10]])
+    translation, rotation = (values.copy() for values in trajectory.motion)
     translation += [[3, 0, 4], [3, 0, 0]]
     rotation[1] = matrix_from_rotation_vector(np.radians([0.3, 0, 0.4]))
-    errors = motion_errors([descent], [(translation, rotation)])
+    errors = motion_errors([trajectory], [(translation, rotation)])
     np.testing.assert_allclose(errors["position_error_m"], [5, 3])
     np.testing.assert_allclose(errors["orientation_error_deg"], [0, 0.5], atol=1e-9)
     np.testing.assert_allclose(errors["error_z_deg"], [0, 0.4], atol=1e-6)
@@ -57,10 +58,10 @@ def test_errors_and_drift_by_hand():
 
 
 def errors_of(n_trajectories):
-    """Descents of two steps, the k-th off by k metres in x in every step."""
-    descents = [_descent([[0, 0, -10]] * 2, f"t{k}") for k in range(n_trajectories)]
-    motions = [(d.motion[0] + [k, 0, 0], d.motion[1]) for k, d in enumerate(descents)]
-    return motion_errors(descents, motions)
+    """Trajectories of two steps, the k-th off by k metres in x in every step."""
+    trajectories = [_trajectory([[0, 0, -10]] * 2, f"t{k}") for k in range(n_trajectories)]
+    motions = [(d.motion[0] + [k, 0, 0], d.motion[1]) for k, d in enumerate(trajectories)]
+    return motion_errors(trajectories, motions)
 
 
 def test_an_interval_needs_five_trajectories():
@@ -73,8 +74,8 @@ def test_an_interval_needs_five_trajectories():
 
 
 def test_a_rotation_error_bends_the_dead_reckoned_path():
-    descent = _descent([[0, 0, -10], [0, 0, -10]])
-    translation, rotation = (values.copy() for values in descent.motion)
+    trajectory = _trajectory([[0, 0, -10], [0, 0, -10]])
+    translation, rotation = (values.copy() for values in trajectory.motion)
     rotation[0] = matrix_from_rotation_vector([0, np.pi / 2, 0]) @ rotation[0]
-    drift = motion_errors([descent], [(translation, rotation)])["drift_m"].to_numpy()
+    drift = motion_errors([trajectory], [(translation, rotation)])["drift_m"].to_numpy()
     np.testing.assert_allclose(drift, [0, np.hypot(10, 10)], atol=1e-9)

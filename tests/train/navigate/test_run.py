@@ -9,9 +9,11 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.data import load_descents, pair_sequence
-from perilune_train.navigate.run import navigate_run
-from perilune_train.navigate.task import NavigationTask, Scales, load_navigator, predict, translation_units
+from perilune_train.navigate.data.sequences import pair_sequence
+from perilune_train.navigate.data.trajectories import load_trajectories
+from perilune_train.navigate.network import Scales, load_navigator, predict, translation_units
+from perilune_train.navigate.train.run import navigate_run
+from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.training.runs import save_weights
 
 _NETWORK = {
@@ -33,8 +35,8 @@ def _settings(**changes):
 
 
 @pytest.fixture(scope="module")
-def descents(dataset_nav):
-    return load_descents(open_dataset(dataset_nav))
+def trajectories(dataset_nav):
+    return load_trajectories(open_dataset(dataset_nav))
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +85,9 @@ def test_the_table_of_pairs_agrees_with_the_summary(runs):
         )
 
 
-def test_the_saved_network_gives_the_figures_again(runs, descents):
+def test_the_saved_network_gives_the_figures_again(runs, trajectories):
     network, architecture = load_navigator(runs / "tiny" / "checkpoints" / "best.ckpt", "warp")
-    test = next(d for d in descents if d.split == "test")
+    test = next(d for d in trajectories if d.split == "test")
     translation, rotation = predict(network, architecture, test)
     own = pd.read_parquet(runs / "tiny" / "errors.parquet").query("method == 'warp'")
     np.testing.assert_allclose(np.linalg.norm(translation - test.motion[0], axis=1), own["position_error_m"], rtol=1e-4)
@@ -165,8 +167,8 @@ def test_several_processes_are_refused_before_anything_is_written(dataset_nav, t
     assert not (tmp_path / "runs").exists()
 
 
-def test_scales_by_hand(descents):
-    training = [d for d in descents if d.split == "train"]
+def test_scales_by_hand(trajectories):
+    training = [d for d in trajectories if d.split == "train"]
     translation = np.concatenate([d.motion[0] for d in training])
     stack = Scales.measured(training, "stack")
     np.testing.assert_allclose(stack.mean_m, translation.mean(0))
@@ -180,10 +182,10 @@ def test_scales_by_hand(descents):
     np.testing.assert_allclose(unit, [across, across, np.sqrt((residual[:, 2] ** 2).mean())], rtol=1e-5)
 
 
-def test_outputs_made_from_the_truth_have_no_loss(descents, monkeypatch):
+def test_outputs_made_from_the_truth_have_no_loss(trajectories, monkeypatch):
     """The loss agrees with `Scales` on what an output means."""
-    task = NavigationTask(_settings(), "stack", descents)
-    sequence = pair_sequence(descents[0].shrunk(64), 0, 4, warp=False)
+    task = NavigationTask(_settings(), "stack", trajectories)
+    sequence = pair_sequence(trajectories[0].shrunk(64), 0, 4, warp=False)
     columns = np.concatenate([sequence.rotation_c2_from_c1[:, :, 0], sequence.rotation_c2_from_c1[:, :, 1]], axis=1)
     truth = np.concatenate(
         [

@@ -23,8 +23,9 @@ from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation import ground_affine, ground_truth_mask
 from perilune_train.explain.masks import Masks, detector_masks, draw_masks, navigator_masks
 from perilune_train.explain.measures import PCC1_SIGN, detector_correlations, navigator_correlations
-from perilune_train.navigate.data import Descent, load_descents, pair_sequence
-from perilune_train.navigate.task import load_navigator
+from perilune_train.navigate.data.sequences import pair_sequence
+from perilune_train.navigate.data.trajectories import Trajectory, load_trajectories
+from perilune_train.navigate.network import load_navigator
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.runs import RunFolder, choose_device, load_weights
 
@@ -69,13 +70,13 @@ def explain_run(
     )
     own = config_of_run(detector.parent.parent, ())
     frames, truth, labels = detect_frames(settings, own, detect_data)
-    test = [descent for descent in load_descents(open_dataset(nav_data)) if descent.split == "test"]
-    pairs = _spread([(descent, step) for descent in test for step in range(descent.n_pairs)], settings.n_pairs)
+    test = [trajectory for trajectory in load_trajectories(open_dataset(nav_data)) if trajectory.split == "test"]
+    pairs = _spread([(trajectory, step) for trajectory in test for step in range(trajectory.n_pairs)], settings.n_pairs)
     start_run(run, "explain", settings, inputs, state)
     detected = detector_masks(network, frames, detector)
     draw_masks(run.root / "masks_detect.png", *_some(frames, detected, settings.n_drawn))
-    shrunk = {id(descent): descent.shrunk(architecture["size_px"]) for descent in test}
-    sequences = [pair_sequence(shrunk[id(descent)], step, 1, warp=False) for descent, step in pairs]
+    shrunk = {id(trajectory): trajectory.shrunk(architecture["size_px"]) for trajectory in test}
+    sequences = [pair_sequence(shrunk[id(trajectory)], step, 1, warp=False) for trajectory, step in pairs]
     size = test[0].images.shape[1:]
     stacked = navigator_masks(
         stack.to(device),
@@ -155,12 +156,12 @@ def detect_frames(
     return split.frames.images[chosen], np.stack(masks), selection_entries(detector, split)
 
 
-def _navigator_rows(masks: Masks, pairs: list[tuple[Descent, int]]) -> list[dict]:
+def _navigator_rows(masks: Masks, pairs: list[tuple[Trajectory, int]]) -> list[dict]:
     affines = []
-    for descent, step in pairs:
-        position, rotation = descent.position_m, descent.rotation_camera_from_site
+    for trajectory, step in pairs:
+        position, rotation = trajectory.position_m, trajectory.rotation_camera_from_site
         affines.append(
-            ground_affine(descent.camera, position[step], rotation[step], position[step + 1], rotation[step + 1])
+            ground_affine(trajectory.camera, position[step], rotation[step], position[step + 1], rotation[step + 1])
         )
     rows = []
     with progress_bar() as progress:

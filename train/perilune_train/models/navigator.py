@@ -64,7 +64,7 @@ class WarpNavigator(nn.Module):
     output.
 
     Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes (batch,
-    pairs) in metres, to the motion (batch, pairs, 9) in the units of navigate/task.py and the flow (batch, pairs,
+    pairs) in metres, to the motion (batch, pairs, 9) in the units of navigate/network.py and the flow (batch, pairs,
     height / 8, width / 8, 2), pixels.
     """
 

@@ -31,7 +31,7 @@ def navigate(
     """
     settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.navigate.run import navigate_run
+    from perilune_train.navigate.train.run import navigate_run
 
     name = name or preset
     detector = runs / "detect" / name / "checkpoints" / "best.ckpt"

@@ -20,7 +20,7 @@ class FrameFacts:
     """Width and height (N, 2)."""
     scene: list[str]
     """Terrain, the unit of the bootstrap intervals (spread.py); "" if unknown (N)."""
-    descent: list[str]
+    trajectory: list[str]
     """Trajectory over the terrain, with a unique name; "" if unknown (N)."""
     altitude_m: Array
     """Altitude of the camera above the site's ground plane; NaN if unknown (N,)."""

@@ -136,7 +136,7 @@ def evaluate_detections(
     matches = overlaps.match(match_iou, radius_px)
     at_edge = overlaps.match(match_iou, edge_range(radius_px))
     by_iou = [overlaps.match(iou, radius_px) for iou in COCO_IOUS]
-    resamples = draw_resamples(facts.scene, facts.descent, facts.name, np.random.default_rng(seed))
+    resamples = draw_resamples(facts.scene, facts.trajectory, facts.name, np.random.default_rng(seed))
 
     def statistics(drawn: Resamples) -> dict[str, Array]:
         return {

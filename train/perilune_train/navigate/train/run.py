@@ -23,18 +23,13 @@ from perilune_train.evaluation.provenance import (
     training_provenance,
 )
 from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.data import Descent, load_descents
-from perilune_train.navigate.figures import draw_descent, draw_errors
-from perilune_train.navigate.klt import klt_descent
-from perilune_train.navigate.metrics import (
-    Motion,
-    mean_motion,
-    mean_motion_at_step,
-    motion_errors,
-    summary,
-    summary_spreads,
-)
-from perilune_train.navigate.task import Fusion, NavigationTask, load_navigator, predict
+from perilune_train.navigate.data.trajectories import Motion, Trajectory, load_trajectories
+from perilune_train.navigate.evaluate.baselines import mean_motion, mean_motion_at_step
+from perilune_train.navigate.evaluate.figures import draw_errors, draw_trajectory
+from perilune_train.navigate.evaluate.klt import klt_trajectory
+from perilune_train.navigate.evaluate.metrics import motion_errors, summary, summary_spreads
+from perilune_train.navigate.network import Fusion, load_navigator, predict
+from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.fit import fit
 from perilune_train.training.runs import (
@@ -68,7 +63,7 @@ def navigate_run(
     """
     processes = os.environ.get("WORLD_SIZE", "1")
     if processes != "1":
-        raise UserError("torchrun", "processes", processes, "1: its descents are not shared out among several")
+        raise UserError("torchrun", "processes", processes, "1: its trajectories are not shared out among several")
     fusions: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
     backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in fusions else (None, "", [])
     inputs: dict[Fusion, dict[str, str | None]] = {"warp": hashes_of({"dataset": dataset})}
@@ -84,22 +79,22 @@ def navigate_run(
     terrain = {"warp": own, "stack": own.joined(inherited)}
     # One check for both, because the table of the warp run includes the metrics of stack.
     terrain_check = check_terrain(terrain["stack"], opened, "test", allow_overlap)
-    descents = load_descents(opened)
-    test = [descent for descent in descents if descent.split == "test"]
-    motions = _baselines([descent for descent in descents if descent.split == "train"], test)
+    trajectories = load_trajectories(opened)
+    test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
+    motions = _baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
     # stack comes first, so that the run of warp, finished last, has the table of both.
     for fusion, run in folders.items():
         seconds = None
         if states[fusion] != "finished":
             start_run(run, "navigate", settings, inputs[fusion], states[fusion])
             start, resume = backbone if fusion == "stack" else None, states[fusion] == "resume"
-            seconds = _train(run, settings, fusion, descents, start, resume, terrain[fusion])
+            seconds = _train(run, settings, fusion, trajectories, start, resume, terrain[fusion])
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
-        motions = {fusion: [predict(network, architecture, descent) for descent in test], **motions}
+        motions = {fusion: [predict(network, architecture, trajectory) for trajectory in test], **motions}
         if seconds is None:
             continue
-        pairs = sum(descent.n_pairs for descent in test)
+        pairs = sum(trajectory.n_pairs for trajectory in test)
         details = {
             "train/seconds": round(seconds, 1),
             "test/pairs": pairs,
@@ -117,14 +112,14 @@ def _train(
     run: RunFolder,
     settings: NavigateConfig,
     fusion: Fusion,
-    descents: list[Descent],
+    trajectories: list[Trajectory],
     backbone: dict[str, Tensor] | None,
     resume: bool,
     terrain: Provenance,
 ) -> float:
     """Train one network; returns the training time in seconds."""
     lightning.seed_everything(settings.seed, verbose=False)
-    task = NavigationTask(settings, fusion, descents, backbone)
+    task = NavigationTask(settings, fusion, trajectories, backbone)
     task.terrain = terrain.plain()
     own = task.own
     return fit(
@@ -172,23 +167,23 @@ def _detector_backbone(
     return state, source, [read_provenance(content, path)]
 
 
-def _baselines(training: list[Descent], test: list[Descent]) -> dict[str, list[Motion]]:
+def _baselines(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Motion]]:
     with progress_bar() as progress:
-        task = progress.add_task("KLT baseline", total=len(test), unit="descents", note="")
+        task = progress.add_task("KLT baseline", total=len(test), unit="trajectories", note="")
         tracked = []
-        for descent in test:
-            tracked.append(klt_descent(descent))
+        for trajectory in test:
+            tracked.append(klt_trajectory(trajectory))
             progress.advance(task)
     return {
         "klt": tracked,
-        "nominal": [descent.nominal_motion for descent in test],
-        "mean_at_step": [mean_motion_at_step(training, descent) for descent in test],
-        "mean": [mean_motion(training, descent) for descent in test],
+        "nominal": [trajectory.nominal_motion for trajectory in test],
+        "mean_at_step": [mean_motion_at_step(training, trajectory) for trajectory in test],
+        "mean": [mean_motion(training, trajectory) for trajectory in test],
     }
 
 
 def _write(
-    run: RunFolder, fusion: Fusion, test: list[Descent], motions: dict[str, list[Motion]], details: dict[str, Any]
+    run: RunFolder, fusion: Fusion, test: list[Trajectory], motions: dict[str, list[Motion]], details: dict[str, Any]
 ) -> None:
     errors = {method: motion_errors(test, found) for method, found in motions.items()}
     rows = {method: summary(table) for method, table in errors.items()}
@@ -196,7 +191,7 @@ def _write(
     pairs = pd.concat([table.assign(method=method) for method, table in errors.items()], ignore_index=True)
     _write_table(run.root / "errors.parquet", pairs)
     drawn = {method: found[0] for method, found in motions.items() if method != "mean"}
-    draw_descent(run.root / "descent.png", test[0], drawn, errors)
+    draw_trajectory(run.root / "descent.png", test[0], drawn, errors)
     draw_errors(run.root / "errors.png", errors)
     metrics: Metrics = {}
     for method, row in rows.items():

@@ -12,7 +12,7 @@ import numpy as np
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
 from perilune_train.data.frames import normalised
-from perilune_train.navigate.data import Descent
+from perilune_train.navigate.data.trajectories import Motion, Trajectory
 from perilune_train.navigate.geometry import (
     apply_homography,
     pixel_index_homography,
@@ -33,28 +33,28 @@ _ITERATIONS = 15
 _LEAST_TRACKS = 8
 
 
-def klt_descent(descent: Descent) -> tuple[Array, Array]:
+def klt_trajectory(trajectory: Trajectory) -> Motion:
     """Motions of a whole trajectory: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3).
 
     One pair gives the translation only relative to the altitude. The altitude is the true one at the first frame, then
     updated with the estimated motions; the attitude is assumed level.
     """
-    nominal_translation, nominal_rotation = descent.nominal_motion
+    nominal_translation, nominal_rotation = trajectory.nominal_motion
     # OpenCV tracks 8-bit images and rejects flat windows by a fixed threshold, so stretch dim frames first.
-    images = np.clip(110 + 45 * normalised(descent.images), 0, 255).astype(np.uint8)
-    altitude_m = float(descent.position_m[0, 2])
+    images = np.clip(110 + 45 * normalised(trajectory.images), 0, 255).astype(np.uint8)
+    altitude_m = float(trajectory.position_m[0, 2])
     translations, rotations = [], []
-    for i in range(descent.n_pairs):
+    for i in range(trajectory.n_pairs):
         translation, rotation, _ = klt_motion(
-            descent.camera,
+            trajectory.camera,
             images[i],
             images[i + 1],
             nominal_translation[i],
             nominal_rotation[i],
-            descent.down_c,
+            trajectory.down_c,
             altitude_m,
         )
-        altitude_m -= float(descent.down_c @ translation)
+        altitude_m -= float(trajectory.down_c @ translation)
         translations.append(translation)
         rotations.append(rotation)
     return np.stack(translations), np.stack(rotations)

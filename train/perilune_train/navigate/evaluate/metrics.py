@@ -1,40 +1,15 @@
-"""Errors of estimated motions, the baselines that use no image, and the table of all methods."""
+"""Errors of estimated motions, and their summary."""
 
 import numpy as np
 import pandas as pd
 
 from perilune_shared.geometry.frames import Array
 from perilune_train.evaluation.spread import Resamples, Spread, draw_resamples, spreads
-from perilune_train.navigate.data import Descent
+from perilune_train.navigate.data.trajectories import Motion, Trajectory
 from perilune_train.navigate.geometry import dead_reckoning, rotation_vectors
 
-Motion = tuple[Array, Array]
-"""translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one trajectory."""
 
-
-def mean_motion(training: list[Descent], descent: Descent) -> Motion:
-    """The training set's mean motion, for every pair of the trajectory."""
-    translation = np.concatenate([d.motion[0] for d in training]).mean(0)
-    rotation = _mean_rotation(np.concatenate([d.motion[1] for d in training]))
-    return np.tile(translation, (descent.n_pairs, 1)), np.tile(rotation, (descent.n_pairs, 1, 1))
-
-
-def mean_motion_at_step(training: list[Descent], descent: Descent) -> Motion:
-    """The training set's mean motion at each step; beyond its longest trajectory, that of its last step."""
-    translations, rotations = [], []
-    longest = max(d.n_pairs for d in training)
-    for step in range(descent.n_pairs):
-        motions = [
-            (d.motion[0][min(step, longest - 1)], d.motion[1][min(step, longest - 1)])
-            for d in training
-            if d.n_pairs > min(step, longest - 1)
-        ]
-        translations.append(np.mean([t for t, _ in motions], axis=0))
-        rotations.append(_mean_rotation(np.stack([r for _, r in motions])))
-    return np.stack(translations), np.stack(rotations)
-
-
-def motion_errors(descents: list[Descent], motions: list[Motion]) -> pd.DataFrame:
+def motion_errors(trajectories: list[Trajectory], motions: list[Motion]) -> pd.DataFrame:
     """Errors of the motion, and of the position dead reckoned from the true first pose; one row per pair.
 
     Columns: scene_id, trajectory_id, step, altitude_m (nominal), position_error_m (length) with its components
@@ -42,17 +17,19 @@ def motion_errors(descents: list[Descent], motions: list[Motion]) -> pd.DataFram
     with its components error_x_deg ... (rotation vector, O_C of the later frame), drift_m and drift_x_m ... (O_L).
     """
     tables = []
-    for descent, (translation, rotation) in zip(descents, motions, strict=True):
-        true_translation, true_rotation = descent.motion
+    for trajectory, (translation, rotation) in zip(trajectories, motions, strict=True):
+        true_translation, true_rotation = trajectory.motion
         shift = translation - true_translation
         turn = np.degrees(rotation_vectors(rotation @ np.swapaxes(true_rotation, 1, 2)))
-        path, _ = dead_reckoning(descent.position_m[0], descent.rotation_camera_from_site[0], translation, rotation)
-        drift = (path - descent.position_m)[1:]
+        path, _ = dead_reckoning(
+            trajectory.position_m[0], trajectory.rotation_camera_from_site[0], translation, rotation
+        )
+        drift = (path - trajectory.position_m)[1:]
         columns = {
-            "scene_id": descent.trajectory[0],
-            "trajectory_id": descent.trajectory[1],
-            "step": np.arange(descent.n_pairs),
-            "altitude_m": descent.altitude_m,
+            "scene_id": trajectory.ids[0],
+            "trajectory_id": trajectory.ids[1],
+            "step": np.arange(trajectory.n_pairs),
+            "altitude_m": trajectory.altitude_m,
             "position_error_m": np.linalg.norm(shift, axis=1),
             "orientation_error_deg": np.linalg.norm(turn, axis=1),
             "drift_m": np.linalg.norm(drift, axis=1),
@@ -109,9 +86,3 @@ def summary_spreads(errors: pd.DataFrame, seed: int = 0) -> dict[str, Spread]:
 
 def _rms(values: pd.Series) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _mean_rotation(rotations: Array) -> Array:
-    """The rotation nearest to the mean of the matrices (Moakher 2002, doi 10.1137/S0895479801383877)."""
-    u, _, vt = np.linalg.svd(rotations.mean(0))
-    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt

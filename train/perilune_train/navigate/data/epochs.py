@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from perilune_train.navigate.data import Descent, Jitter, Sequence, pair_sequence
+from perilune_train.navigate.data.sequences import Jitter, Sequence, pair_sequence
+from perilune_train.navigate.data.trajectories import Trajectory
 
 
 class EpochBatches:
@@ -17,7 +18,7 @@ class EpochBatches:
 
     def __init__(
         self,
-        descents: list[Descent],
+        trajectories: list[Trajectory],
         n_pairs: int,
         batch: int,
         *,
@@ -26,14 +27,16 @@ class EpochBatches:
         jitter: Jitter | None,
         key: tuple[int, ...],
     ):
-        self.descents, self.batch, self.warp, self.augmented = descents, batch, warp, augmented
+        self.trajectories, self.batch, self.warp, self.augmented = trajectories, batch, warp, augmented
         self.jitter, self.key = jitter, key
-        self.n_pairs = min(n_pairs, *(descent.n_pairs for descent in descents))
+        self.n_pairs = min(n_pairs, *(trajectory.n_pairs for trajectory in trajectories))
         rng = np.random.default_rng(key)
         self.places = [
             (number, int(start))
-            for number, descent in enumerate(descents)
-            for start in rng.integers(0, descent.n_pairs - self.n_pairs + 1, round(descent.n_pairs / self.n_pairs))
+            for number, trajectory in enumerate(trajectories)
+            for start in rng.integers(
+                0, trajectory.n_pairs - self.n_pairs + 1, round(trajectory.n_pairs / self.n_pairs)
+            )
         ]
         rng.shuffle(self.places)
 
@@ -47,4 +50,6 @@ class EpochBatches:
     def _sequence(self, i: int) -> Sequence:
         number, start = self.places[i]
         rng = np.random.default_rng([*self.key, i]) if self.augmented else None
-        return pair_sequence(self.descents[number], start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)
+        return pair_sequence(
+            self.trajectories[number], start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter
+        )

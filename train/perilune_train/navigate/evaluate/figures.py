@@ -8,9 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from perilune_train.evaluation.pictures import save_figure
-from perilune_train.navigate.data import Descent
+from perilune_train.navigate.data.trajectories import Motion, Trajectory
 from perilune_train.navigate.geometry import dead_reckoning
-from perilune_train.navigate.metrics import Motion
 
 COLOURS = {
     "warp": "tab:red",
@@ -22,23 +21,25 @@ COLOURS = {
 }
 
 
-def draw_descent(path: Path, descent: Descent, motions: dict[str, Motion], errors: dict[str, pd.DataFrame]) -> None:
+def draw_trajectory(
+    path: Path, trajectory: Trajectory, motions: dict[str, Motion], errors: dict[str, pd.DataFrame]
+) -> None:
     """Draw one trajectory: true and dead-reckoned paths from the side and from above, and errors by step."""
     figure = Figure(figsize=(16, 9), layout="constrained")
     axes = figure.subplots(2, 3)
     side, top, away = axes[0]
-    true = descent.position_m
+    true = trajectory.position_m
     side.plot(_along(true), true[:, 2], color="black", linewidth=3, label="true")
     top.plot(true[:, 0], true[:, 1], color="black", linewidth=3, label="true")
     away.axhline(0, color="black", linewidth=1)
     steps = np.arange(1, len(true))
     for method, (translation, rotation) in motions.items():
-        found, _ = dead_reckoning(true[0], descent.rotation_camera_from_site[0], translation, rotation)
+        found, _ = dead_reckoning(true[0], trajectory.rotation_camera_from_site[0], translation, rotation)
         style = {"color": COLOURS[method], "label": method}
         side.plot(_along(found), found[:, 2], **style)
         top.plot(found[:, 0], found[:, 1], **style)
         away.plot(steps, np.linalg.norm(found - true, axis=1)[1:], **style)
-        own = errors[method].query("scene_id == @descent.trajectory[0] and trajectory_id == @descent.trajectory[1]")
+        own = errors[method].query("scene_id == @trajectory.ids[0] and trajectory_id == @trajectory.ids[1]")
         axes[1, 0].plot(own["altitude_m"], own["position_error_m"], **style)
         axes[1, 1].plot(own["altitude_m"], own["orientation_error_deg"], **style)
     _label(side, "path from the side", "distance from the site (m)", "altitude (m)")
@@ -49,9 +50,9 @@ def draw_descent(path: Path, descent: Descent, motions: dict[str, Motion], error
     _label(axes[1, 1], "orientation error of each step", "altitude (m)", "error (deg)")
     for axis in axes[1, :2]:
         axis.invert_xaxis()
-    frame, image = axes[1, 2], descent.images[0]
+    frame, image = axes[1, 2], trajectory.images[0]
     frame.imshow(image, cmap="gray", vmin=0, vmax=max(1, np.percentile(image, 99.5)))
-    frame.set_title(f"frame 0 of {'/'.join(descent.trajectory)}, {true[0, 2]:.0f} m")
+    frame.set_title(f"frame 0 of {'/'.join(trajectory.ids)}, {true[0, 2]:.0f} m")
     frame.axis("off")
     side.legend()
     save_figure(path, figure)

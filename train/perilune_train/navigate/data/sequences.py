@@ -1,125 +1,15 @@
-"""Trajectories as arrays, and sequences of image pairs for the networks."""
+"""Sequences of image pairs for the networks, and their augmentation."""
 
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.names import SPLITS
-from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array, matrix_from_quaternion, matrix_from_rotation_vector
-from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
-from perilune_train.data.frames import load_frames, normalised
-from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography, relative_poses
-
-
-@dataclass(frozen=True, slots=True)
-class Descent:
-    """One trajectory of n frames, with the nominal motion known before the flight."""
-
-    trajectory: tuple[str, str]
-    """scene_id and trajectory_id."""
-    split: str
-    """train, val or test."""
-    images: np.ndarray
-    """8-bit grey frames (n, height, width)."""
-    camera: Camera
-    """Intrinsics of `images`."""
-    position_m: Array
-    """True camera positions (n, 3), metres, O_L."""
-    rotation_camera_from_site: Array
-    """True attitudes (n, 3, 3)."""
-    nominal_position_m: Array
-    """Positions (n, 3), metres, on the nominal curve at the frames' times, O_L."""
-    nominal_rotation_camera_from_site: Array
-    """Nominal attitude (3, 3): the camera on a level body, the same for all frames."""
-
-    @property
-    def n_pairs(self) -> int:
-        """Number of pairs of consecutive frames."""
-        return len(self.images) - 1
-
-    @property
-    def motion(self) -> tuple[Array, Array]:
-        """True motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3)."""
-        return relative_poses(self.position_m, self.rotation_camera_from_site)
-
-    @property
-    def nominal_motion(self) -> tuple[Array, Array]:
-        """Nominal motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3), which is the identity."""
-        attitudes = np.broadcast_to(self.nominal_rotation_camera_from_site, (len(self.images), 3, 3))
-        return relative_poses(self.nominal_position_m, attitudes)
-
-    @property
-    def altitude_m(self) -> Array:
-        """Nominal altitude (n - 1,), metres, above the ground plane at the earlier frame of each pair."""
-        return self.nominal_position_m[:-1, 2]
-
-    @property
-    def down_c(self) -> Array:
-        """Unit vector (3,) towards the ground in O_C of a level body."""
-        return -self.nominal_rotation_camera_from_site[:, 2]
-
-    def shrunk(self, size_px: int) -> "Descent":
-        """The same trajectory with images shrunk to `size_px` wide by area averaging; itself if they have that size."""
-        height, width = self.images.shape[1:]
-        if width == size_px:
-            return self
-        scale = size_px / width
-        new_height = round(height * scale)
-        size = (size_px, new_height)
-        images = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self.images])
-        c, down = self.camera, new_height / height
-        camera = Camera(size_px, new_height, c.fx_px * scale, c.fy_px * down, c.cx_px * scale, c.cy_px * down)
-        return replace(self, images=images, camera=camera)
-
-
-def load_descents(dataset: Dataset) -> list[Descent]:
-    """Load all trajectories of a navigation dataset: train, then val, then test, each in the order of their ids.
-
-    Raises UserError if the dataset is of another kind, its images are distorted or a frame is missing.
-    """
-    if dataset.info.kind != "nav":
-        raise UserError(dataset.root, "kind", dataset.info.kind, "nav, a dataset of descents")
-    if any(dataset.info.camera.distortion):
-        raise UserError(dataset.root, "camera.distortion", dataset.info.camera.distortion, "zeros")
-    rows = dataset.table("trajectories").to_pylist()
-    curves = {(row["scene_id"], row["trajectory_id"]): row for row in rows}
-    descents = [descent for split in SPLITS for descent in _split_descents(dataset, split, curves)]
-    if len({descent.trajectory for descent in descents}) < len(descents):
-        raise UserError(dataset.root, "split", "a descent in two splits", "one split for each descent")
-    return descents
-
-
-def _split_descents(dataset: Dataset, split: str, curves: dict[tuple[str, str], dict]) -> list[Descent]:
-    store = load_frames(dataset, split)
-    descents = []
-    for key, rows in store.table.groupby(["scene_id", "trajectory_id"]):
-        scene_id, trajectory_id = (str(part) for part in key)
-        curve = curves[scene_id, trajectory_id]
-        nominal = NominalTrajectory(
-            tuple(curve["nominal_position_m"]),
-            tuple(curve["nominal_velocity_mps"]),
-            tuple(curve["nominal_acceleration_mps2"]),
-            float(curve["duration_s"]),
-        )
-        if len(rows) < 2:
-            raise UserError(dataset.root, f"{scene_id}/{trajectory_id}", "one frame", "descents of at least two frames")
-        descents.append(
-            Descent(
-                (scene_id, trajectory_id),
-                split,
-                store.images[rows.index],
-                dataset.camera,
-                np.array(rows["position_m"].tolist()),
-                matrix_from_quaternion(rows["rotation_wxyz"].tolist()),
-                nominal.position_at(rows["time_s"].to_numpy()),
-                np.array(dataset.info.camera.rotation_camera_from_body),
-            )
-        )
-    return descents
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
+from perilune_train.data.frames import normalised
+from perilune_train.navigate.data.trajectories import Trajectory
+from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +45,7 @@ class Sequence:
 
 
 def pair_sequence(
-    descent: Descent,
+    trajectory: Trajectory,
     start: int,
     n_pairs: int,
     *,
@@ -174,24 +64,24 @@ def pair_sequence(
     in tests/train/navigate/test_data.py).
     """
     span = slice(start, start + n_pairs)
-    translation, rotation = (values[span] for values in descent.motion)
-    nominal_translation, nominal_rotation = (values[span] for values in descent.nominal_motion)
-    altitude = descent.altitude_m[span]
-    images = descent.images[start : start + n_pairs + 1]
+    translation, rotation = (values[span] for values in trajectory.motion)
+    nominal_translation, nominal_rotation = (values[span] for values in trajectory.nominal_motion)
+    altitude = trajectory.altitude_m[span]
+    images = trajectory.images[start : start + n_pairs + 1]
     translation, rotation, seconds = translation.copy(), rotation.copy(), []
     for i in range(n_pairs):
         change = np.eye(3)
         if rng is not None and jitter is not None:
             shift = rng.normal(size=3) * jitter.translation_m
             turn = matrix_from_rotation_vector(rng.normal(size=3) * jitter.rotation_rad)
-            true = _homography(descent.camera, descent.down_c, translation[i], rotation[i], altitude[i])
+            true = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
             translation[i], rotation[i] = translation[i] + shift, turn @ rotation[i]
             # Second image of the moved camera: new image 2 -> image 1 over the plane -> old image 2.
-            moved = _homography(descent.camera, descent.down_c, translation[i], rotation[i], altitude[i])
+            moved = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
             change = true @ np.linalg.inv(moved)
         if warp:
             change = change @ _homography(
-                descent.camera, descent.down_c, nominal_translation[i], nominal_rotation[i], altitude[i]
+                trajectory.camera, trajectory.down_c, nominal_translation[i], nominal_rotation[i], altitude[i]
             )
         seconds.append(_normalised(images[i + 1], change))
     sequence = Sequence(
@@ -201,11 +91,11 @@ def pair_sequence(
         rotation,
         nominal_translation,
         altitude,
-        descent.down_c,
+        trajectory.down_c,
     )
     if rng is not None:
-        sequence = mirrored(sequence, descent.camera, rng)
-    return replace(sequence, flow_px=_residual_flow(sequence, descent.camera)) if warp else sequence
+        sequence = mirrored(sequence, trajectory.camera, rng)
+    return replace(sequence, flow_px=_residual_flow(sequence, trajectory.camera)) if warp else sequence
 
 
 def mirrored(sequence: Sequence, camera: Camera, rng: np.random.Generator) -> Sequence:

@@ -1,0 +1,1 @@
+"""Trajectories, sequences of image pairs, batches."""

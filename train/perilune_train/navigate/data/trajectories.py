@@ -1,0 +1,127 @@
+"""Trajectories as arrays, with the nominal motion."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
+from perilune_train.data.frames import load_frames
+from perilune_train.navigate.geometry import relative_poses
+
+Motion = tuple[Array, Array]
+"""translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one trajectory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """One trajectory of n frames, with the nominal motion known before the flight."""
+
+    ids: tuple[str, str]
+    """scene_id and trajectory_id."""
+    split: str
+    """train, val or test."""
+    images: np.ndarray
+    """8-bit grey frames (n, height, width)."""
+    camera: Camera
+    """Intrinsics of `images`."""
+    position_m: Array
+    """True camera positions (n, 3), metres, O_L."""
+    rotation_camera_from_site: Array
+    """True attitudes (n, 3, 3)."""
+    nominal_position_m: Array
+    """Positions (n, 3), metres, on the nominal curve at the frames' times, O_L."""
+    nominal_rotation_camera_from_site: Array
+    """Nominal attitude (3, 3): the camera on a level body, the same for all frames."""
+
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs of consecutive frames."""
+        return len(self.images) - 1
+
+    @property
+    def motion(self) -> Motion:
+        """True motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3)."""
+        return relative_poses(self.position_m, self.rotation_camera_from_site)
+
+    @property
+    def nominal_motion(self) -> Motion:
+        """Nominal motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3), which is the identity."""
+        attitudes = np.broadcast_to(self.nominal_rotation_camera_from_site, (len(self.images), 3, 3))
+        return relative_poses(self.nominal_position_m, attitudes)
+
+    @property
+    def altitude_m(self) -> Array:
+        """Nominal altitude (n - 1,), metres, above the ground plane at the earlier frame of each pair."""
+        return self.nominal_position_m[:-1, 2]
+
+    @property
+    def down_c(self) -> Array:
+        """Unit vector (3,) towards the ground in O_C of a level body."""
+        return -self.nominal_rotation_camera_from_site[:, 2]
+
+    def shrunk(self, size_px: int) -> "Trajectory":
+        """The same trajectory with images shrunk to `size_px` wide by area averaging; itself if they have that size."""
+        height, width = self.images.shape[1:]
+        if width == size_px:
+            return self
+        scale = size_px / width
+        new_height = round(height * scale)
+        size = (size_px, new_height)
+        images = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self.images])
+        c, down = self.camera, new_height / height
+        camera = Camera(size_px, new_height, c.fx_px * scale, c.fy_px * down, c.cx_px * scale, c.cy_px * down)
+        return replace(self, images=images, camera=camera)
+
+
+def load_trajectories(dataset: Dataset) -> list[Trajectory]:
+    """Load all trajectories of a navigation dataset: train, then val, then test, each in the order of their ids.
+
+    Raises UserError if the dataset is of another kind, its images are distorted or a frame is missing.
+    """
+    if dataset.info.kind != "nav":
+        raise UserError(dataset.root, "kind", dataset.info.kind, "nav, a dataset of trajectories")
+    if any(dataset.info.camera.distortion):
+        raise UserError(dataset.root, "camera.distortion", dataset.info.camera.distortion, "zeros")
+    rows = dataset.table("trajectories").to_pylist()
+    curves = {(row["scene_id"], row["trajectory_id"]): row for row in rows}
+    trajectories = [trajectory for split in SPLITS for trajectory in _split_trajectories(dataset, split, curves)]
+    if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):
+        raise UserError(dataset.root, "split", "a trajectory in two splits", "one split for each trajectory")
+    return trajectories
+
+
+def _split_trajectories(dataset: Dataset, split: str, curves: dict[tuple[str, str], dict]) -> list[Trajectory]:
+    store = load_frames(dataset, split)
+    trajectories = []
+    for key, rows in store.table.groupby(["scene_id", "trajectory_id"]):
+        scene_id, trajectory_id = (str(part) for part in key)
+        curve = curves[scene_id, trajectory_id]
+        nominal = NominalTrajectory(
+            tuple(curve["nominal_position_m"]),
+            tuple(curve["nominal_velocity_mps"]),
+            tuple(curve["nominal_acceleration_mps2"]),
+            float(curve["duration_s"]),
+        )
+        if len(rows) < 2:
+            raise UserError(
+                dataset.root, f"{scene_id}/{trajectory_id}", "one frame", "trajectories of at least two frames"
+            )
+        trajectories.append(
+            Trajectory(
+                (scene_id, trajectory_id),
+                split,
+                store.images[rows.index],
+                dataset.camera,
+                np.array(rows["position_m"].tolist()),
+                matrix_from_quaternion(rows["rotation_wxyz"].tolist()),
+                nominal.position_at(rows["time_s"].to_numpy()),
+                np.array(dataset.info.camera.rotation_camera_from_body),
+            )
+        )
+    return trajectories

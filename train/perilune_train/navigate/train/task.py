@@ -1,0 +1,159 @@
+"""Training of the navigation networks."""
+
+import math
+from typing import Any
+
+import lightning
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from perilune_train.models.navigator import WarpNavigator
+from perilune_train.navigate.config import FusionConfig, NavigateConfig
+from perilune_train.navigate.data.epochs import EpochBatches
+from perilune_train.navigate.data.sequences import Jitter, Sequence
+from perilune_train.navigate.data.trajectories import Motion, Trajectory
+from perilune_train.navigate.evaluate.metrics import motion_errors, summary
+from perilune_train.navigate.geometry import euler_from_rotation
+from perilune_train.navigate.network import (
+    Fusion,
+    Scales,
+    build,
+    decoded_rotation,
+    estimated,
+    predict,
+    stacked,
+    translation_units,
+)
+
+
+class NavigationTask(lightning.LightningModule):
+    """Training of one network: the paper's coarse, then fine stage; AdamW, short warm-up, cosine to zero.
+
+    Errors are standardised: P over the unit of the translation, phi (Euler angles) over the spread of the rotation.
+    Coarse: L^(S1) = |dP|^2 + kappa |dphi|^2. Fine: L^(S2) = e^-s_p |dP|^2 + e^-s_phi |dphi|^2 + s_p + s_phi with learnt
+    s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles; warp's pairs are
+    mirrored and jittered (see data/sequences.py).
+    """
+
+    def __init__(
+        self,
+        settings: NavigateConfig,
+        fusion: Fusion,
+        trajectories: list[Trajectory],
+        pretrained: dict[str, Tensor] | None = None,
+    ):
+        super().__init__()
+        self.settings, self.fusion = settings, fusion
+        self.own: FusionConfig = getattr(settings, fusion)
+        self.scales = Scales.measured([d for d in trajectories if d.split == "train"], fusion)
+        self.architecture = {
+            "fusion": fusion,
+            "size_px": self.own.size_px,
+            "width": self.own.width,
+            "attention": self.own.attention,
+            "hidden": self.own.hidden,
+            "in_channels": settings.in_channels if fusion == "stack" else WarpNavigator.CHANNELS,
+            "focal_over_width": trajectories[0].camera.fx_px / trajectories[0].camera.width_px,
+            "scales": {
+                "mean_m": self.scales.mean_m,
+                "spread_m": self.scales.spread_m,
+                "rotation_rad": self.scales.rotation_rad,
+            },
+        }
+        network: Any = build(self.architecture)
+        self.network = network.to(memory_format=torch.channels_last)
+        self.pretrained = frozenset(pretrained or ())
+        if pretrained:
+            self.network.backbone.load_state_dict(pretrained, strict=False)
+        self.terrain: dict[str, Any] | None = None
+        self.log_weights = nn.Parameter(torch.zeros(2))
+        self.training_trajectories = [d.shrunk(self.own.size_px) for d in trajectories if d.split == "train"]
+        self.validation_trajectories = [d.shrunk(self.own.size_px) for d in trajectories if d.split == "val"]
+        jitter, scales = self.own.jitter, self.scales
+        self.jitter = Jitter(jitter * np.array(scales.spread_m), jitter * scales.rotation_rad) if jitter else None
+
+    @property
+    def evaluated(self) -> nn.Module:
+        """The network to evaluate and save."""
+        return self.network
+
+    @property
+    def coarse(self) -> bool:
+        """Whether this epoch belongs to the coarse stage."""
+        return self.current_epoch < self.own.coarse_epochs
+
+    def train_dataloader(self) -> EpochBatches:
+        return EpochBatches(
+            self.training_trajectories,
+            self.own.sequence_pairs,
+            self.own.batch_sequences,
+            warp=self.fusion == "warp",
+            augmented=self.fusion == "warp",
+            jitter=self.jitter,
+            key=(self.settings.seed, self.current_epoch),
+        )
+
+    def val_dataloader(self) -> DataLoader:
+        return DataLoader(self.validation_trajectories, batch_size=None)  # type: ignore[arg-type]
+
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        return batch  # Sequences are NumPy arrays; the steps move what they need.
+
+    def on_train_epoch_start(self) -> None:
+        for name, parameter in self.network.backbone.named_parameters():
+            parameter.requires_grad_(not (self.coarse and name in self.pretrained))
+        for name, module in self.network.backbone.named_modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.train(not (self.coarse and f"{name}.weight" in self.pretrained))
+
+    def training_step(self, batch: list[Sequence], batch_idx: int) -> Tensor:
+        output, flow_px = estimated(self.network, batch, self.device)
+        reference, unit = translation_units(batch, self.scales, self.fusion)
+        expected = (stacked([s.translation_m for s in batch]) - reference) / unit
+        angles = euler_from_rotation(stacked([s.rotation_c2_from_c1 for s in batch])) / self.scales.rotation_rad
+        found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
+        position = (output[..., :3] - expected.to(self.device)).square().sum(-1).mean()
+        orientation = (found - angles.to(self.device)).square().sum(-1).mean()
+        if self.coarse:
+            loss = position + self.settings.kappa * orientation
+        else:
+            weighted = torch.stack([position, orientation]) * torch.exp(-self.log_weights)
+            loss = (weighted + self.log_weights).sum()
+        if flow_px is not None:
+            true_px = stacked([s.flow_px for s in batch if s.flow_px is not None]).to(self.device)
+            flow_error = (flow_px - true_px).square().sum(-1).add(1e-4).sqrt().mean()
+            self.log("train/flow_px", flow_error, batch_size=len(batch))
+            loss = loss + self.settings.flow_weight * flow_error
+        self.log_dict(
+            {"train/loss": loss, "train/position": position, "train/orientation": orientation}, batch_size=len(batch)
+        )
+        return loss
+
+    def on_validation_epoch_start(self) -> None:
+        self.validation_motions: list[Motion] = []
+
+    def validation_step(self, batch: Trajectory, batch_idx: int) -> None:
+        self.validation_motions.append(predict(self.network, self.architecture, batch))
+
+    def on_validation_epoch_end(self) -> None:
+        errors = motion_errors(self.validation_trajectories, self.validation_motions)
+        figures = summary(errors)
+        for key in ("position_rmse_vector_m", "orientation_rmse_angle_deg"):
+            self.log(f"val/{key}", figures[key], batch_size=1)
+
+    def configure_optimizers(self) -> Any:
+        total = max(1, (self.own.coarse_epochs + self.own.fine_epochs) * len(self.train_dataloader()))
+        warm = max(1, min(50, total // 10))
+        # The two loss weights have to change by about 1 within the run, whatever learning rate suits the network.
+        optimizer = torch.optim.AdamW(
+            [
+                {"params": list(self.network.parameters()), "lr": self.own.learning_rate, "weight_decay": 1e-3},
+                {"params": [self.log_weights], "lr": 1e-2, "weight_decay": 0.0},
+            ]
+        )
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda step: min((step + 1) / warm, 0.5 * (1 + math.cos(math.pi * min(step / total, 1))))
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
