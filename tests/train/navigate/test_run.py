@@ -123,7 +123,7 @@ def test_finished_runs_are_left_as_they_are(runs, dataset_nav, dataset_detect, d
     before = files()
     folders = navigate_run(_settings(), dataset_nav, runs.parent, "tiny", detector)
     assert [run.root.name for run in folders] == ["tiny-stack", "tiny"]
-    assert " ".join(capsys.readouterr().err.split()).count("finished, left as it is") == 2
+    assert " ".join(capsys.readouterr().err.split()).count("finished, left unchanged") == 2
     with pytest.raises(UserError, match=r"tiny-stack.*inputs.json: dataset: got SHA-256 .*--overwrite"):
         navigate_run(_settings(), dataset_detect, runs.parent, "tiny", detector)
     with pytest.raises(UserError, match=r"navigate.kappa: got 2.0, expected 1.0, with which the run began"):

@@ -69,7 +69,7 @@ class AugmentSettings(Section):
     @model_validator(mode="after")
     def _ordered(self) -> "AugmentSettings":
         if self.scale[0] > self.scale[1]:
-            raise ValueError("scale: least first, largest second")
+            raise ValueError("scale: expected the smaller factor first")
         return self
 
 
@@ -179,7 +179,7 @@ class DetectConfig(Section):
     @model_validator(mode="after")
     def _check(self) -> "DetectConfig":
         if self.strides not in ((8, 16, 32), (4, 8, 16)):
-            raise ValueError("strides 8, 16, 32 or 4, 8, 16")
+            raise ValueError("expected strides 8, 16, 32 or 4, 8, 16")
         if self.frozen_epochs >= self.epochs:
-            raise ValueError("fewer frozen_epochs than epochs")
+            raise ValueError("frozen_epochs must be less than epochs")
         return self

@@ -44,7 +44,7 @@ def evaluate_again(
     folder = out or run / "evaluation"
     check_output(folder, run)
     chosen = chosen_threshold(run) if threshold is None else threshold
-    chosen_on = "chosen on the run's own val" if threshold is None else "given by hand"
+    chosen_on = "of the run, chosen on its validation split" if threshold is None else "given on the command line"
     known = read_metrics(run).get("dataset/name")
     dataset = open_dataset(dataset_root)
     best = runs.RunFolder(run).best
@@ -54,9 +54,9 @@ def evaluate_again(
     terrain_check = check_terrain(terrain, dataset, split, allow_overlap)
     protocol = protocol_of(dataset.info)
     if known is not None and known != dataset.info.name:
-        protocol = f"another dataset than the run's own ({known}), of itself split by {dataset.info.split_by}"
+        protocol = f"not the run's dataset ({known}); split by {dataset.info.split_by}"
     if split != "test":
-        protocol += f"; {split} frames, which training {'saw' if split == 'train' else 'was steered by'}"
+        protocol += f"; {split} frames, used to {'train' if split == 'train' else 'select'} the network"
     detector = open_detector(best, config)
     frames = load_split(dataset, split, config.labels, (1.0, 1 / EDGE))
     if choose_threshold:

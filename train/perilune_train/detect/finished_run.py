@@ -47,4 +47,6 @@ def chosen_threshold(run: Path) -> float:
 def check_output(folder: Path, run: Path) -> None:
     """Raise UserError if an evaluation would overwrite the run's own report and metrics."""
     if folder.resolve() == run.resolve():
-        raise UserError(folder, "--out", "the run's own folder", "another: its metrics stay as training wrote them")
+        raise UserError(
+            folder, "--out", "the run's own folder", "another folder; a run keeps the metrics of its training"
+        )

@@ -39,5 +39,5 @@ def read_metrics(folder: Path) -> Metrics:
         raise UserError(path, "metrics", error, "JSON") from None
     plain = (float, int, str, type(None))
     if not isinstance(content, dict) or not all(isinstance(value, plain) for value in content.values()):
-        raise UserError(path, "metrics", "something else", "flat keys with numbers and text")
+        raise UserError(path, "metrics", "another structure", "flat keys with numbers and text")
     return content

@@ -88,9 +88,9 @@ def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
     for number, row in enumerate(rows):
         sound = isinstance(row, list) and len(row) == 5 and all(isinstance(cell, str) for cell in row)
         if not sound or row[2] not in get_args(Use) or not _SHA256.fullmatch(row[3]):
-            raise UserError(path, f"{RECORD}.uses.{number}", "another form", expected)
+            raise UserError(path, f"{RECORD}.uses.{number}", "a malformed row", expected)
         if not all(_PLAIN.fullmatch(row[k]) for k in (0, 1, 4)):
-            raise UserError(path, f"{RECORD}.uses.{number}", "odd characters", "plain names of dataset and scene")
+            raise UserError(path, f"{RECORD}.uses.{number}", "special characters", "plain names of dataset and scene")
     return Provenance(frozenset(TerrainUse(*row) for row in rows), record["known"])
 
 

@@ -17,7 +17,7 @@ DETECT_TITLE = (
     "G is 1 on background and 0 in craters. PCC1 above 0: the gate is weaker on craters. "
     "Craterness above 0: the gate is stronger on craters."
 )
-NAVIGATE_BARS = {"pcc3": "PCC3: halves", "pcc4": "PCC4: halves, lower one moved"}
+NAVIGATE_BARS = {"pcc3": "PCC3: halves", "pcc4": "PCC4: halves, lower one aligned to the upper"}
 NAVIGATE_TITLE = (
     "Bars: over the pixels that both frames see. Dots and crosses: over all pixels (for PCC4 0 outside the overlap)."
 )

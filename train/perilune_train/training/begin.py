@@ -55,7 +55,7 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
         expected = "that of the first process: share the runs folder between the machines, or copy it"
         raise UserError(run.last, "last state", "no such file", expected)
     if state == "finished":
-        console.print(f"{run.root}: finished, left as it is; --overwrite replaces it", soft_wrap=True)
+        console.print(f"{run.root}: finished, left unchanged; --overwrite replaces it", soft_wrap=True)
     elif state == "resume":
         console.print(f"{run.root}: resume", soft_wrap=True)
     return state
@@ -87,7 +87,7 @@ def _decide(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrit
     if not _is_used(run):
         return "new"
     _check_own(run, task)
-    # A run that stopped before saving a state has nothing to lose, whatever its settings were.
+    # A run without a saved state may be replaced, whatever its settings were.
     if overwrite or not (run.finished or run.last.is_file()):
         return "new"
     check_settings(run, task, config)
@@ -116,7 +116,7 @@ def _check_own(run: RunFolder, task: str) -> None:
 def check_settings(run: RunFolder, task: str, config: Section) -> None:
     """Raise UserError naming the first setting in which an older run, if there is one, differs from `config`.
 
-    A setting missing in config.yaml is newer than the run; it has its default.
+    A setting that config.yaml lacks is newer than the run and has its default.
     """
     if not run.config.is_file():
         return

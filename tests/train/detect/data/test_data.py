@@ -207,7 +207,7 @@ def test_one_scale_for_all_frames(split):
 
 
 def test_scales_are_least_and_largest():
-    with pytest.raises(ValueError, match="least first"):
+    with pytest.raises(ValueError, match="smaller factor first"):
         AugmentSettings(scale=(2.0, 1.0))
 
 

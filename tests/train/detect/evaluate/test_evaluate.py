@@ -66,7 +66,7 @@ def test_other_labels_another_threshold_another_split(run, dataset_detect, tmp_p
     call("evaluate", "--run", run, "--dataset", dataset_detect, "--split", "val", "--threshold", 0.3, "--out", tmp_path)
     plain = figures(tmp_path)
     assert plain["val/threshold"] == 0.3 and plain["labels/selection"] == "visible"
-    assert "given by hand" in (tmp_path / "report.md").read_text()
+    assert "given on the command line" in (tmp_path / "report.md").read_text()
     everything = ("--set", "detect.labels.selection=paper", "--set", "detect.evaluation.max_detections=7")
     call("evaluate", "--run", run, "--dataset", dataset_detect, "--split", "val", *everything, "--out", tmp_path)
     assert figures(tmp_path)["labels/min_contrast"] is None
@@ -84,7 +84,7 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
     assert own["test/threshold"] == figures(run)["test/threshold"] != chosen["test/threshold"]
     assert own["test/ap50_paper"] == chosen["test/ap50_paper"] != figures(run)["test/ap50_paper"]
     assert own["evaluation/scales"] == "1 2" and figures(run)["evaluation/scales"] == "1"
-    assert "of best F1 on the dataset's val" in (tmp_path / "chosen/report.md").read_text()
+    assert "of highest F1 on the dataset's val" in (tmp_path / "chosen/report.md").read_text()
     assert "evaluated at scale 1 and 2" in (tmp_path / "chosen/report.md").read_text()
     table = call("compare", run, tmp_path / "chosen", "--out", tmp_path / "both")
     assert "| 1 |" in table and "| 1 2 |" in table
@@ -94,13 +94,13 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
     # Another operating point on the same val: the words, the precision wished, and no less recall.
     wished = ("--set", f"detect.evaluation.min_precision={val['val/precision'] / 2}")
     call(*judged, "--choose-threshold", *wished, "--out", tmp_path / "recall")
-    assert "of most recall at a precision of" in (tmp_path / "recall/report.md").read_text()
+    assert "of highest recall at a precision of at least" in (tmp_path / "recall/report.md").read_text()
     more = figures(tmp_path / "recall")
     call(*judged, "--split", "val", "--threshold", more["test/threshold"], "--out", tmp_path / "val-recall")
     assert figures(tmp_path / "val-recall")["val/precision"] >= val["val/precision"] / 2
     assert figures(tmp_path / "val-recall")["val/recall"] >= val["val/recall"]
     for other in (("--threshold", 0.5), ("--split", "val"), ("--images", tmp_path)):
-        with pytest.raises(UserError, match="--choose-threshold: beside"):
+        with pytest.raises(UserError, match="--choose-threshold: options"):
             call("evaluate", "--run", run, "--choose-threshold", *other)
 
 
@@ -134,10 +134,10 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
         (["--out", "."], "the run's own folder"),
         (["--scale", "9"], "--scale: detect.evaluation.scales.0: got 9.0, expected"),
         (["--scale", "nan"], "--scale: detect.evaluation.scales.0"),
-        (["--tile", "256"], "--tile: beside: got no --images, expected --images, or no --tile"),
-        (["--overlap", "32"], "--overlap: beside: got no --images"),
-        (["--box-margin", "0.5"], "--box-margin: beside: got no --images"),
-        (["--min-size", "8"], "--min-size: beside: got no --images"),
+        (["--tile", "256"], "--tile: options: got no --images, expected also --images, or no --tile"),
+        (["--overlap", "32"], "--overlap: options: got no --images"),
+        (["--box-margin", "0.5"], "--box-margin: options: got no --images"),
+        (["--min-size", "8"], "--min-size: options: got no --images"),
     ],
 )
 def test_wrong_options_in_one_line(run, dataset_detect, options, told, monkeypatch):

@@ -124,14 +124,14 @@ def test_threshold_of_best_f1():
 
 def test_threshold_of_most_recall_at_a_precision():
     points = Curve(np.array([0.9, 0.8, 0.7, 0.6]), np.array([1.0, 0.5, 2 / 3, 0.5]), np.array([0.25, 0.25, 0.5, 0.5]))
-    assert points.operating_threshold(None) == (0.7, "of best F1")
+    assert points.operating_threshold(None) == (0.7, "of highest F1")
     # Precision falls below 0.6 and rises again: the later point has more recall.
-    assert points.operating_threshold(0.6) == (0.7, "of most recall at a precision of 0.6")
-    assert points.operating_threshold(0.9) == (0.9, "of most recall at a precision of 0.9")
+    assert points.operating_threshold(0.6) == (0.7, "of highest recall at a precision of at least 0.6")
+    assert points.operating_threshold(0.9) == (0.9, "of highest recall at a precision of at least 0.9")
     tied = Curve(np.array([0.9, 0.8, 0.8]), np.array([1.0, 1.0, 2 / 3]), np.array([0.25, 0.5, 0.5]))
     assert tied.operating_threshold(0.9)[0] == 0.9
     without = Curve(points.scores[1:], points.precision[1:], points.recall[1:])
-    assert without.operating_threshold(0.9) == (0.7, "of best F1, since none has a precision of 0.9,")
+    assert without.operating_threshold(0.9) == (0.7, "of highest F1 (no threshold reaches a precision of 0.9)")
 
 
 def test_nothing_found_and_nothing_wanted():

@@ -66,7 +66,7 @@ def test_tables_that_are_missing_or_no_text(tmp_path):
     with pytest.raises(UserError, match=r"a\.txt: boxes: got no such file"):
         read_images(tmp_path)
     (tmp_path / "a.txt").write_bytes(b"X,Y,W,H\n\xff\xfe")
-    with pytest.raises(UserError, match=r"a\.txt: boxes: got bytes that are no text"):
+    with pytest.raises(UserError, match=r"a\.txt: boxes: got bytes that are not UTF-8 text"):
         read_images(tmp_path)
 
 

@@ -138,7 +138,7 @@ def test_a_finished_run_is_left_as_it_is(finished, few, tmp_path, capsys):
 
     before = files()
     run_detect(settings("detect.workers=1"), tmp_path / "absent", finished.root.parents[1], "a")
-    assert "finished, left as it is; --overwrite replaces it" in " ".join(capsys.readouterr().err.split())
+    assert "finished, left unchanged; --overwrite replaces it" in " ".join(capsys.readouterr().err.split())
     with pytest.raises(UserError, match=r"config.yaml: detect.learning_rate: got 0.01, expected 0.005, .*--overwrite"):
         other = settings("detect.learning_rate=0.01")
         run_detect(other, tmp_path / "absent", finished.root.parents[1], "a")

@@ -1,13 +1,11 @@
 """Export of a trained detector for flight: ONNX and OpenVINO files, checked against torch."""
 
 import json
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
@@ -17,14 +15,9 @@ from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
 from perilune_train.detect.data.split import load_split
-from perilune_train.detect.deploy.engines import (
-    Array,
-    Engine,
-    onnxruntime_engine,
-    openvino_core,
-    openvino_engine,
-    package,
-)
+from perilune_train.detect.deploy.compare import check, noise_frames
+from perilune_train.detect.deploy.engines import onnxruntime_engine, openvino_engine, package
+from perilune_train.detect.deploy.files import write_onnx, write_openvino
 from perilune_train.detect.deploy.flight_detector import FlightDetector
 from perilune_train.detect.deploy.int8 import Int8Verdict, try_int8
 from perilune_train.detect.deploy.readme import readme
@@ -43,13 +36,7 @@ from perilune_train.models.yolo import YOLOv3
 from perilune_train.training.runs import RunFolder, load_weights
 
 FORMATS = ("onnx", "openvino")
-MOST_PX = 1e-3
-"""Largest allowed difference of a box coordinate from torch's float32, pixels, of the boxes compared."""
-MOST_SCORE = 1e-3
-"""Largest allowed difference of a score, of all predictors."""
-_OPSET = 17
 _CHECKED_FRAMES = 8
-_CHECKED_BOXES = 100
 
 
 @dataclass(frozen=True)
@@ -100,68 +87,6 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
         "multiply_adds": multiply_adds(network, (1, trained.config.in_channels, size_px, size_px)),
         "checkpoint_sha256": sha256_of(trained.checkpoint),
     }
-
-
-def write_onnx(detector: FlightDetector, path: Path, metadata: dict[str, Any], in_channels: int, size_px: int) -> None:
-    """Write the graph for any number of images; `metadata` is stored in it, each entry as JSON."""
-    onnx = package("onnx")
-    names = {"images": {0: "n"}, "boxes": {0: "n"}, "scores": {0: "n"}}
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")
-        # The tracing exporter: the newer one needs two more packages and gives the same graph.
-        torch.onnx.export(
-            detector,
-            (torch.zeros(1, in_channels, size_px, size_px),),
-            str(path),
-            input_names=["images"],
-            output_names=["boxes", "scores"],
-            dynamic_axes=names,
-            opset_version=_OPSET,
-            dynamo=False,
-        )
-    model = onnx.load(str(path))
-    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
-    onnx.checker.check_model(model)
-    onnx.save(model, str(path))
-
-
-def write_openvino(onnx_path: Path, path: Path) -> None:
-    """Convert an ONNX file to OpenVINO's format: `path` (.xml) and, beside it, the weights (.bin) in float32."""
-    openvino = package("openvino")
-    # Read with the runtime: the converter sends telemetry.
-    openvino.save_model(openvino_core().read_model(str(onnx_path)), str(path), compress_to_fp16=False)
-
-
-@torch.no_grad()
-def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float) -> tuple[float, float]:
-    """Largest differences from torch's float32: of box coordinates in pixels, and of scores.
-
-    Compares all scores, and the boxes with a score of at least `min_score` or among the best 100 of their image.
-    """
-    boxes, scores = (part.numpy() for part in network.detect(torch.as_tensor(images)))
-    found_boxes, found_scores = engine(images)
-    if found_boxes.shape != boxes.shape or found_scores.shape != scores.shape:
-        return float("inf"), float("inf")
-    # Always compare some boxes, also if the network detects nothing in these frames.
-    best = np.sort(scores, axis=1)[:, -_CHECKED_BOXES:, None].min(axis=1)
-    counts = scores >= np.minimum(best, min_score)
-    apart = np.abs(found_boxes - boxes)[counts]
-    return float(apart.max(initial=0.0)), float(np.abs(found_scores - scores).max())
-
-
-def check(path: Path, name: str, trained: Trained, engine: Engine, images: Array) -> dict[str, float]:
-    """Largest differences of a written file over all images. Raises UserError if one exceeds its limit."""
-    px, score = difference(trained.network, engine, images, trained.config.evaluation.min_score)
-    if not (px <= MOST_PX and score <= MOST_SCORE):
-        raise UserError(
-            path.name, name, f"boxes {px:.2g} px and scores {score:.2g} from torch's", f"{MOST_PX} px, {MOST_SCORE}"
-        )
-    return {"frames": len(images), "largest_px": px, "largest_score": score}
-
-
-def noise_frames(count: int, size_px: int) -> np.ndarray:
-    """Grey frames (count, size_px, size_px) of seeded noise, used if there are no real frames to compare on."""
-    return np.random.default_rng(0).integers(0, 256, (count, size_px, size_px)).astype(np.uint8)
 
 
 def _terrain(
@@ -222,7 +147,10 @@ def export_run(
         if "openvino" in formats:
             write_openvino(onnx_path, xml_path)
             engines.append((xml_path, "openvino", openvino_engine(xml_path)))
-        differences = {name: check(path, name, trained, engine, images) for path, name, engine in engines}
+        min_score = trained.config.evaluation.min_score
+        differences = {
+            name: check(path, name, trained.network, engine, images, min_score) for path, name, engine in engines
+        }
         metadata["differences_from_torch"] = differences
         for name, largest in differences.items():
             console.print(

@@ -61,8 +61,8 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
         axes.set(xlabel=title, ylim=(0, 1), ylabel="AP" if place == 0 else "")
         axes.set_xticks(range(len(parts)), [f"{part.label}\n{part.labels}" for part in parts], fontsize=8)
     figure.suptitle(
-        f"AP (the paper's sum) with 95 % intervals; dots: single {unit}s where they are fewer than {LEAST_UNITS}; "
-        "below each bin its number of labels; dashed and blue: the goal of 0.85",
+        f"AP (the paper's definition) with 95 % intervals, or a dot per {unit} if there are fewer than {LEAST_UNITS}; "
+        "below each bin: number of labels; dashed line: goal of 0.85, reached by blue bars",
         fontsize=9,
     )
     save_figure(path, figure)
@@ -115,8 +115,8 @@ def draw_frames(evaluation: Evaluation, images: Sequence[NDArray[np.uint8]], pat
         drawn.set_title(_title(evaluation, index), fontsize=8)
         _draw_marks(drawn, evaluation, index)
     figure.suptitle(
-        "labels (circles): red, bold where missed; ignored yellow. Detections (boxes): found cyan, false magenta, "
-        "not counted white",
+        "labels (ellipses): red, bold if missed; ignored ones yellow. Detections (boxes): matched cyan, "
+        "false positives magenta, ignored ones white",
         fontsize=10,
     )
     save_figure(path, figure)

@@ -60,11 +60,11 @@ class Curve:
         If no threshold reaches that precision, highest F1 is used, and the description says so.
         """
         if min_precision is None:
-            return self.best_threshold(), "of best F1"
+            return self.best_threshold(), "of highest F1"
         precise = np.flatnonzero(self._thresholds() & (self.precision >= min_precision))
         if not len(precise):
-            return self.best_threshold(), f"of best F1, since none has a precision of {min_precision:g},"
-        return float(self.scores[precise[-1]]), f"of most recall at a precision of {min_precision:g}"
+            return self.best_threshold(), f"of highest F1 (no threshold reaches a precision of {min_precision:g})"
+        return float(self.scores[precise[-1]]), f"of highest recall at a precision of at least {min_precision:g}"
 
 
 def f1_score(precision: Array, recall: Array) -> Array:

@@ -104,7 +104,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     for by, title in (("radius", "Radius"), ("altitude", "Altitude"), ("sun", "Sun elevation")):
         lines += _bins(title, [part for part in evaluation.bins if part.by == by])
     lines += _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
-    lines += ["## Errors of found craters", ""]
+    lines += ["## Errors of detected craters", ""]
     errors = evaluation.errors
     rows = [
         [name, *(number(errors[f"{key}_{ending}{which}"]) for ending in ("px", "relative"))]
@@ -113,7 +113,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
             ("centre, 95th percentile", "centre_error", "_p95"),
             ("radius, median", "radius_error", "_median"),
             ("radius, 95th percentile", "radius_error", "_p95"),
-            ("radius, bias (found less true)", "radius_bias", ""),
+            ("radius, bias (detected minus true)", "radius_bias", ""),
         )
     ]
     lines += [*table(["", "px", "over the radius"], rows), ""]
@@ -170,7 +170,7 @@ def _freshness(parts: list[BinFigures]) -> list[str]:
     return [
         "## Freshness",
         "",
-        "Depth over diameter. A false detection has none, so only recall is defined.",
+        "Depth over diameter. It is unknown for false positives, so only recall is defined.",
         "",
         *table(["depth over diameter", "labels", "recall"], rows),
         "",

@@ -61,7 +61,7 @@ def evaluate_images(
     given = read_images(place)
     if not any(image.selected(min_size_px).any() for image in given.images):
         raise UserError(place, "boxes", f"none of {min_size_px:g} px or more", "at least one to be found")
-    chosen_on = "chosen on the run's validation split" if threshold is None else "given by hand"
+    chosen_on = "of the run, chosen on its validation split" if threshold is None else "given on the command line"
     threshold = chosen_threshold(run) if threshold is None else threshold
     images = [read_grey(image.path) for image in given.images]
     found = _detect(open_detector(runs.RunFolder(run).best, config), images, tiling)
@@ -74,7 +74,7 @@ def evaluate_images(
         f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
         + ("" if tiling.box_margin_px == 0 else f"; boxes enlarged by {tiling.box_margin_px:g} px at every side"),
         f"threshold {chosen_on}",
-        f"oracle: with the threshold of best F1 on these images ({best:.4f}), which cannot be known without labels: "
+        f"oracle: with the threshold of highest F1 on these images ({best:.4f}), which cannot be known without labels: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
     about += [given.categories] * bool(given.categories)

@@ -113,7 +113,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise UserError(path, "boxes", "bytes that are no text", "rows of ID,X,Y,W,H,C_X,CY") from None
+        raise UserError(path, "boxes", "bytes that are not UTF-8 text", "rows of ID,X,Y,W,H,C_X,CY") from None
     return ((n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip())
 
 
@@ -142,7 +142,7 @@ def _read_coco(path: Path) -> ImageSet:
     images = _records(content, "images", path)
     place = {_identity(image, "id", f"images[{k}]", path): k for k, image in enumerate(images)}
     if not images or len(place) < len(images):
-        raise UserError(path, "images", "none" if not images else "two of one id", "images with an id each")
+        raise UserError(path, "images", "none" if not images else "duplicate ids", "images with an id each")
     boxes: list[list] = [[] for _ in images]
     marked: list[list[bool]] = [[] for _ in images]
     n_empty = 0

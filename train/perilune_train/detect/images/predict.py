@@ -50,7 +50,7 @@ def predict_images(
         names: set[str] = set()
         for path in paths:
             if path.name in names:
-                raise UserError(path, "name", "a second image of this name", "names that tell the images apart")
+                raise UserError(path, "name", "a second image of this name", "unique file names")
             names.add(path.name)
             width, height = picture_size(path)
             read_grey(path)

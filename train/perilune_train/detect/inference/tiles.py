@@ -2,8 +2,8 @@
 
 The network was trained on frames of one size, each normalised by its own mean and standard deviation. So an image is
 cut into tiles of that size, each normalised separately. Where tiles overlap, a box is taken from the tile whose borders
-are farthest from it. Near a border the network has to guess what is outside, and the boxes of both tiles together would
-hold more false positives than the rest of the image.
+are farthest from it. Near a border the network does not see whole craters, and keeping the boxes of both
+tiles would add false positives.
 """
 
 from collections.abc import Callable, Iterator
@@ -45,7 +45,7 @@ def padded(image: NDArray[np.uint8], tile_px: int) -> NDArray[np.uint8]:
 
 
 def count_tiles(height_px: int, width_px: int, tiling: Tiling) -> int:
-    """Number of tiles of an image at all scales."""
+    """Number of tiles of an image, summed over all scales."""
     return sum(
         len(tile_starts(round(height_px * s), tiling.tile_px, tiling.overlap_px))
         * len(tile_starts(round(width_px * s), tiling.tile_px, tiling.overlap_px))

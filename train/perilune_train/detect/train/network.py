@@ -52,6 +52,6 @@ def anchor_report(network: YOLOv3, sizes_px: np.ndarray, ratio: float) -> str:
     """State how well a network's anchors fit labels of these sizes (N, 2): the best recall that training can reach."""
     recall = best_possible_recall(sizes_px, anchor_sizes(network), ratio)
     return (
-        f"anchors: best possible recall {recall:.4f}, the share of the training labels that have one within a factor "
+        f"anchors: best possible recall {recall:.4f}, the fraction of training labels with an anchor within a factor "
         f"of {ratio:g} in width and height"
     )

@@ -83,7 +83,9 @@ def run_detect(
     start_run(run, "detect", config, inputs, state)
     frozen_epochs = config.frozen_epochs if config.init_from is not None else 0
     if config.frozen_epochs and not frozen_epochs:
-        console.print("frozen_epochs without init_from: nothing to freeze, the whole network trains from the start")
+        console.print(
+            "detect.frozen_epochs is ignored without detect.init_from: the whole network is trained from the start"
+        )
     # The anchors of a resumed run are in its state and may differ.
     if not resume:
         console.print(anchor_report(network, sizes, config.anchor_ratio))

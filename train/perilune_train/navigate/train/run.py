@@ -63,7 +63,7 @@ def navigate_run(
     """
     processes = os.environ.get("WORLD_SIZE", "1")
     if processes != "1":
-        raise UserError("torchrun", "processes", processes, "1: its trajectories are not shared out among several")
+        raise UserError("torchrun", "processes", processes, "1: navigation is trained in one process")
     fusions: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
     backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in fusions else (None, "", [])
     inputs: dict[Fusion, dict[str, str | None]] = {"warp": hashes_of({"dataset": dataset})}
