@@ -71,7 +71,7 @@ def test_other_labels_another_threshold_another_split(run, dataset_detect, tmp_p
     call("evaluate", "--run", run, "--dataset", dataset_detect, "--split", "val", *everything, "--out", tmp_path)
     assert figures(tmp_path)["labels/min_contrast"] is None
     assert figures(tmp_path)["val/labels"] > plain["val/labels"]
-    assert "most detections in a frame: 7" in (tmp_path / "report.md").read_text()
+    assert "most detections in one frame: 7" in (tmp_path / "report.md").read_text()
 
 
 @pytest.mark.usefixtures("no_pictures")

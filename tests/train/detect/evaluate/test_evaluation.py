@@ -127,7 +127,7 @@ def test_errors_of_found_craters():
 
 
 def resamples_of(known):
-    return draw_resamples(known.scene, known.descent, known.name, np.random.default_rng(1))
+    return draw_resamples(known.scene, known.trajectory, known.name, np.random.default_rng(1))
 
 
 def random_matches(seed, n_frames, n_detections, n_wanted):
