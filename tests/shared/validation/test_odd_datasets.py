@@ -154,7 +154,7 @@ def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
     assert fault.column == "split" and "one split for each terrain" in fault.expected
     subset(open_dataset(victim), tmp_path / "same")
     assert open_dataset(tmp_path / "same").info.split_by == "trajectory"
-    with pytest.raises(UserError, match="1 of scene"):
+    with pytest.raises(UserError, match="got 1 terrain,"):
         split_dataset(open_dataset(victim), tmp_path / "split", by="scene", val_share=0.5, test_share=0)
 
 
