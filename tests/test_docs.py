@@ -64,8 +64,7 @@ def words(line: str) -> list[str]:
 
 def fault(line: str, *, complete: bool) -> str | None:
     """What is wrong with a command line; a complete one has everything that its command requires."""
-    given = words(line.removeprefix("$ "))
-    given = given[next(i for i, word in enumerate(given) if word.startswith("perilune-")) :]
+    given = words(line[line.index("perilune-") :])
     name = next((" ".join(given[:n]) for n in (3, 2) if " ".join(given[:n]) in COMMANDS), None)
     if name is None:
         groups = {word for known in COMMANDS for word in (known.split()[0], " ".join(known.split()[:2]))}
@@ -122,7 +121,7 @@ def test_links_between_pages_lead_somewhere():
 @pytest.mark.parametrize(("page", "text"), texts(), ids=lambda value: value if value.endswith(("md", "ipynb")) else "")
 def test_commands_options_settings_and_files_exist(page, text):
     lines, inline = code(text)
-    shown = [(line, True) for line in lines if re.match(r"(\$ |time )?perilune-\w+ \w", line)]
+    shown = [(line, True) for line in lines if re.match(r"(\$ |time |\S*bin/)?perilune-\w+ \w", line)]
     shown += [(line, False) for line in inline if re.match(r"perilune-\w+ \w", line)]
     wrong = [f"{line}: {why}" for line, whole in shown if (why := fault(line, complete=whole))]
     for line in inline:
