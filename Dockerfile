@@ -8,7 +8,7 @@ RUN apt-get update -qq \
  && /tmp/system-libraries \
  && rm -r /var/lib/apt/lists/* /tmp/system-libraries
 
-# Frames, runs and datasets written into mounted folders belong to the user with this number.
+# Frames, runs and datasets written into mounted folders belong to the user with this ID.
 ARG UID=1000
 RUN useradd --create-home --uid "$UID" perilune && install -d -o perilune /perilune /perilune/data /perilune/runs
 USER $UID
@@ -29,7 +29,7 @@ COPY --chown=perilune train/perilune_train/__init__.py train/perilune_train/
 RUN make setup
 
 COPY --chown=perilune . .
-# The copied files may be newer than the installation that they describe.
+# The copied files may be newer than .ready; without this, make would install again.
 RUN touch .venv/.ready
 
 VOLUME ["/perilune/data", "/perilune/runs"]

@@ -7,7 +7,7 @@ NAME ?= $(PRESET)
 VENV := .venv
 BIN := $(VENV)/bin
 
-# OUT moves what the target makes: datasets for `make dataset`, runs for the others.
+# OUT is the folder of the target's output: datasets for `make dataset`, runs for the others.
 DATA := data/$(PRESET)
 RUNS := runs
 ifneq ($(OUT),)
@@ -18,9 +18,9 @@ ifneq ($(OUT),)
   endif
 endif
 
-# One argument of a shell command, whatever it holds.
+# Quote a value as one argument of a shell command.
 quoted = '$(subst ','\'',$(1))'
-# SET holds shell words, so that quotes keep a value with spaces together.
+# SET is split into shell words, so quotes keep a value with spaces together.
 SETTINGS := $(if $(SET),$(shell set -f; for setting in $(SET); do \
   [[ $$setting == *.*=* ]] || exit 2; printf -- '--set %q ' "$$setting"; done))
 ifneq ($(if $(SET),$(.SHELLSTATUS),0),0)
@@ -46,10 +46,10 @@ help: ## list the targets
 	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""
 
-setup: $(VENV)/.ready ## make the environment (.venv) with everything in it
+setup: $(VENV)/.ready ## create the environment (.venv) with all packages
 
 $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pyproject.toml train/pyproject.toml scripts/system-libraries
-	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is not here: Blender's module needs Python 3.11 (sudo apt-get install -y python3.11 python3.11-venv)" >&2; exit 2; }
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON): not found: Blender's module needs Python 3.11 (sudo apt-get install -y python3.11 python3.11-venv)" >&2; exit 2; }
 	@scripts/system-libraries
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV) (some minutes the first time)"
@@ -57,7 +57,7 @@ $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pypr
 	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[export]" -r requirements-dev.txt
 	@touch $@
 
-demo: setup ## everything: set-up, datasets, detection, navigation, explanation (PRESET=small)
+demo: setup ## run all steps: set-up, datasets, detection, navigation, explanation (PRESET=small)
 	@$(MAKE) --no-print-directory train-detect
 	@$(MAKE) --no-print-directory train-nav
 	@$(MAKE) --no-print-directory explain
@@ -67,10 +67,10 @@ demo: setup ## everything: set-up, datasets, detection, navigation, explanation 
 	@echo "Navigation  $(RUNS)/navigate/$(NAME)[-stack]      metrics.json, *.png, navigation.parquet"
 	@echo "Explanation $(RUNS)/explain/$(NAME)               metrics.json, *.png, correlations.parquet"
 
-dataset: setup ## render the preset's datasets (KIND=detect|nav for one); again to resume
+dataset: setup ## render the preset's datasets (KIND=detect|nav for one); run again to resume
 	@$(RENDER) --kind $(KIND)
 
-# A dataset.json may be that of a stopped rendering: then the command resumes it.
+# An interrupted rendering has a dataset.json too; the command then resumes it.
 .PHONY: detect-frames nav-frames
 detect-frames: setup
 	@grep -qs '"complete": true' "$(DATA)/detect/dataset.json" || $(RENDER) --kind detect
@@ -79,16 +79,16 @@ nav-frames: setup
 
 # OVERWRITE=1 replaces the runs of the targets named on the command line, and no others.
 OVER = $(if $(OVERWRITE),$(if $(filter $@,$(MAKECMDGOALS)),--overwrite))
-train-detect: detect-frames ## train and evaluate crater detection; again to resume (OVERWRITE=1 replaces)
+train-detect: detect-frames ## train and evaluate crater detection; run again to resume (OVERWRITE=1 replaces)
 	@$(BIN)/perilune-train detect train $(TRAIN) --dataset "$(DATA)/detect" $(OVER)
 
 train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
 	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out "$(RUNS)" --name $(NAME)-none --dataset "$(DATA)/detect" $(OVER)
 
-# The same seeds, one change each; <name>-<change>. The first is the run of train-detect itself.
+# Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
 ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
 ABLATED = "$(RUNS)/detect/$(NAME)" $(foreach one,$(ABLATION),"$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))")
-ablate-detect: train-detect ## train without attention, with plain CBAM, other strides, other widths; one table
+ablate-detect: train-detect ## train with one change each (no attention, plain CBAM, other strides, other widths) and compare
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
 	  --out "$(RUNS)" --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset "$(DATA)/detect" $(OVER) &&) true
 	@$(BIN)/perilune-train detect compare $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"
@@ -117,50 +117,50 @@ docs: docs-build ## build and serve the documentation (http://127.0.0.1:8000)
 docs-build: setup ## build the documentation into site/; a broken link or name is an error
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-bench-render: setup ## time of a frame against a bare Blender loop; writes runs/bench/render.json
+bench-render: setup ## time of a frame, compared with a bare Blender loop; writes runs/bench/render.json
 	@$(BIN)/python -m benchmarks.dataset.render
 
-compare-nac: setup ## rendered frames beside real NAC crops (NAC=folder); writes runs/nac/
+compare-nac: setup ## compare rendered frames with real NAC crops (NAC=folder); writes runs/nac/
 	@$(BIN)/python -m benchmarks.nac.compare "$(NAC)" $(COMMON) --out "$(RUNS)/nac"
 
-bench-terrain: setup ## speed of growing the ground on one core; writes runs/bench/terrain.json
+bench-terrain: setup ## time and memory of generating terrain on one core; writes runs/bench/terrain.json
 	@$(BIN)/python -m benchmarks.scene.terrain
 
-bench-photometry: setup ## rendered radiance against the formulas; writes runs/bench/photometry.json
+bench-photometry: setup ## rendered radiance, compared with the formulas; writes runs/bench/photometry.json
 	@$(BIN)/python -m benchmarks.scene.photometry
 
-bench-manifest: setup ## reads of 100,000 frames and 5 million labels; writes runs/bench/manifest.json
+bench-manifest: setup ## time and memory of reading 100,000 frames and 5 million labels; writes runs/bench/manifest.json
 	@$(BIN)/python -m benchmarks.dataset.manifest
 
-bench-develop: setup ## frames a second of developing on one core; writes runs/bench/develop.json
+bench-develop: setup ## frames developed per second on one core; writes runs/bench/develop.json
 	@$(BIN)/python -m benchmarks.dataset.develop
 
-bench-regenerate: setup ## frames that come out equal from a manifest alone; writes runs/bench/regenerate.json
+bench-regenerate: setup ## number of frames that are identical when rendered again from the manifest; writes runs/bench/regenerate.json
 	@$(BIN)/python -m benchmarks.dataset.regenerate
 
-bench-labels: setup ## label ellipses against rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
+bench-labels: setup ## label ellipses, compared with rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
 	@$(BIN)/python -m benchmarks.scene.labels --picture docs/pictures/labels_histogram.png
 
-bench-truth: setup ## depth and normals of EXRs against cast rays; writes runs/bench/truth.json
+bench-truth: setup ## depth and normals of EXRs, compared with cast rays; writes runs/bench/truth.json
 	@$(BIN)/python -m benchmarks.scene.truth
 
-bench-contrast: setup ## how well contrast tells craters that the detector finds; writes runs/bench/contrast.json
+bench-contrast: setup ## AUC of contrast for the craters that the detector finds; writes runs/bench/contrast.json
 	@$(BIN)/python -m benchmarks.train.contrast "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"
 
-bench-infer: setup ## time of the detector by engine, one image, two cores; writes runs/bench/infer.json
+bench-infer: setup ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer
 
-bench-train: detect-frames ## training speed beside memory-fed and bare loops; writes runs/bench/train.json
+bench-train: detect-frames ## training speed, compared with training from memory and with a bare loop; writes runs/bench/train.json
 	@$(BIN)/python -m benchmarks.train.train --dataset "$(DATA)/detect" --preset $(PRESET)
 
-bench-transfer: detect-frames ## ways to start from a frozen backbone, compared; writes runs/bench/transfer.json
-	@$(BIN)/python -m benchmarks.train.transfer --dataset $(DATA)/detect
+bench-transfer: detect-frames ## compare four ways to start from a frozen backbone; writes runs/bench/transfer.json
+	@$(BIN)/python -m benchmarks.train.transfer --dataset "$(DATA)/detect"
 
-bench-suppress: setup ## suppression of a batch against OpenCV's, frame by frame; writes runs/bench/suppress.json
+bench-suppress: setup ## time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress
 
-# RECORD=files keeps the JSON of runs or benchmarks first.
-results: setup ## headline figures into docs/results.md and README.md (RECORD="runs/bench/labels.json ...")
+# With RECORD=files, first copy these JSON files of runs or benchmarks into results/.
+results: setup ## write the headline figures into docs/results.md and README.md (RECORD="runs/bench/labels.json ...")
 	@$(if $(RECORD),$(BIN)/python scripts/results.py record $(RECORD))
 	@$(BIN)/python scripts/results.py write
 

@@ -1,14 +1,18 @@
-"""The pages are true: examples run; links, commands, options, settings and files that they name exist."""
+"""Pages agree with the code: examples run; links, commands, options, settings and files that they name exist."""
 
 import re
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import nbformat
 import pytest
+import yaml
 from nbclient import NotebookClient
 from scripts.pages.command_page import commands
-from scripts.pages.hooks import PROGRAMS, generated_pages
+from scripts.pages.hooks import PROGRAMS, generated_pages, on_config
 from scripts.pages.notebook_page import notebook_page
 
 from perilune_render.config import DatasetConfig
@@ -22,7 +26,7 @@ DOCS = TOP / "docs"
 NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
 PAGES = [*sorted(DOCS.rglob("*.md")), *sorted(TOP.glob("*.md")), TOP / "data_manifests/README.md"]
 CURRENT = [page for page in PAGES if "notebook" not in page.parts and page.name != "CHANGELOG.md"]
-"""Pages that describe the present code; the dated notebook and the changelog tell what was."""
+"""Pages that describe the current code. The dated notebook and the changelog describe earlier states."""
 BLOCKS = [
     (page.relative_to(TOP).as_posix(), block)
     for page in sorted(DOCS.rglob("*.md"))
@@ -51,7 +55,7 @@ def texts() -> list[tuple[str, str]]:
 
 
 def code(text: str) -> tuple[list[str], list[str]]:
-    """Lines of the code blocks of a page, with continued lines joined, and its inline code."""
+    """Return the lines of the code blocks of a page, with continued lines joined, and its inline code."""
     fenced = re.findall(r"^```.*?\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
     fenced += re.findall(r"(?:^    .*\n)+", text, re.MULTILINE)
     inline = re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
@@ -63,7 +67,7 @@ def words(line: str) -> list[str]:
 
 
 def fault(line: str, *, complete: bool) -> str | None:
-    """What is wrong with a command line; a complete one has everything that its command requires."""
+    """Return what is wrong with a command line, or None. A complete one has every required option and argument."""
     given = words(line[line.index("perilune-") :])
     name = next((" ".join(given[:n]) for n in (3, 2) if " ".join(given[:n]) in COMMANDS), None)
     if name is None:
@@ -147,6 +151,29 @@ def test_example_settings_are_valid(tmp_path):
         path.write_text(block)
         for name, (model, package) in CONFIGS.items():
             resolve(model, name, package, "tiny", path)
+
+
+def leaves(nav: Any) -> Iterator[str]:
+    """Yield the pages of a navigation tree of mkdocs.yml."""
+    if isinstance(nav, str):
+        yield nav
+    else:
+        for each in nav.values() if isinstance(nav, dict) else nav:
+            yield from leaves(each)
+
+
+def test_every_page_is_in_the_navigation_once():
+    nav = yaml.safe_load((TOP / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
+    listed = sorted(leaves(on_config(SimpleNamespace(nav=nav)).nav))
+    pages = [path.relative_to(DOCS).with_suffix(".md").as_posix() for path in (*DOCS.rglob("*.md"), *NOTEBOOKS)]
+    assert listed == sorted([*pages, *GENERATED])
+
+
+def test_every_folder_of_the_packages_is_in_contributing():
+    page = (TOP / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    folders = [path.parent.relative_to(TOP).as_posix() for path in TOP.glob("*/perilune_*/*/__init__.py")]
+    assert len(folders) > 15
+    assert [folder for folder in folders if f"| `{folder}` |" not in page] == []
 
 
 def test_targets_of_make_exist():

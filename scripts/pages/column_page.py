@@ -1,4 +1,4 @@
-"""Reference of the manifest's columns as Markdown, from the schema."""
+"""Generate the reference page of the manifest's columns from the schema."""
 
 import pyarrow as pa
 

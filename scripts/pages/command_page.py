@@ -1,4 +1,4 @@
-"""Reference of a command line as Markdown: every command, argument and option, from the typer app itself."""
+"""Generate the reference page of a command line: every command, argument and option, from the typer app."""
 
 import enum
 import re
@@ -19,7 +19,7 @@ def command_page(program: str, app: typer.Typer) -> str:
 
 
 def commands(program: str, app: typer.Typer) -> dict[str, Any]:
-    """Every command by its full name, as "perilune-train detect train"."""
+    """Return every command by its full name, for example "perilune-train detect train"."""
     return dict(_leaves(program, typer.main.get_command(app)))
 
 
@@ -53,12 +53,12 @@ def _row(parameter: Any) -> str:
 
 
 def _text(text: str) -> str:
-    """Escape what Markdown would read as HTML or as the end of a cell."""
+    """Escape characters that Markdown would read as HTML or as the end of a table cell."""
     return text.replace("<", "&lt;").replace("|", "\\|")
 
 
 def _meaning(parameter: Any) -> tuple[str, str]:
-    """Split a help text into meaning and default, which some options state in words."""
+    """Split a help text into meaning and default; some help texts end with [default: ...] in words."""
     text = " ".join((parameter.help or "").split())
     words = re.search(r" ?\[default: (.*)\]$", text)
     return _text(text[: words.start()] if words else text), _text(words[1]) if words else ""
@@ -76,7 +76,7 @@ def _value(parameter: Any) -> str:
 
 
 def _plain(kind: Any) -> list[Any]:
-    """Kinds of a value, without Annotated, list and None around them."""
+    """Return the types of a value, without Annotated, list and unions around them."""
     if typing.get_origin(kind) is typing.Literal or not typing.get_args(kind):
         return [kind]
     inside = typing.get_args(kind)

@@ -1,4 +1,4 @@
-"""Reference of the configuration keys as Markdown, from the pydantic models behind `config --show`."""
+"""Generate the reference page of the configuration keys from the pydantic models, as `config --show` does."""
 
 import typing
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ UNITS = {
     "_s": "s",
     "_e": "e",
 }
-"""Ends of names, longest first, and their units; a key with another name has no unit or states it in its meaning."""
+"""Units by the end of a key's name, longest ends first. Other keys have no unit or state it in their meaning."""
 LIMITS = {"gt": "above", "ge": "from", "lt": "below", "le": "to", "multiple_of": "multiple of"}
 
 
@@ -71,7 +71,7 @@ def _inner_limits(kind: Any) -> list[Any]:
 
 
 def _presets(section: str, presets: dict[str, list[Key]]) -> Iterator[str]:
-    """Yield a table of the keys that a preset sets: those without default, and those that differ from it."""
+    """Yield a table of the keys that have no default or differ from it in any preset, with the value of each preset."""
     yield f"## Presets of {section}\n\n| Key | {' | '.join(PRESETS)} |\n|---|{'---|' * len(PRESETS)}"
     for same in zip(*presets.values(), strict=True):
         if any(key.value != key.default for key in same):

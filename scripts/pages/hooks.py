@@ -1,6 +1,6 @@
-"""Pages of the documentation that are made from the code when the site is built (hooks of MkDocs).
+"""Hooks of MkDocs: generate pages of the documentation from the code when the site is built.
 
-They are never committed, so they cannot differ from the code.
+Generated pages are not committed, so they cannot differ from the code.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ PROGRAMS = {"perilune-render": render, "perilune-manifest": manifest, "perilune-
 
 
 def generated_pages() -> dict[str, str]:
-    """Every generated page, by its path in the documentation folder."""
+    """Return the text of every generated page, by its path in the documentation folder."""
     pages = {f"reference/commands/{name}.md": command_page(name, app) for name, app in PROGRAMS.items()}
     pages["reference/configuration/render.md"] = configuration_page(
         "Settings of the renderer", "perilune_render", {"dataset": DatasetConfig}
@@ -36,14 +36,14 @@ def generated_pages() -> dict[str, str]:
 
 
 def on_config(config: Any) -> Any:
-    """Append the pages of the notebook (docs/notebook), the latest first."""
+    """Append the pages of the notebook (docs/notebook) to the navigation, the latest first."""
     dated = [f"notebook/{path.name}" for path in sorted((DOCS / "notebook").glob("2*.md"), reverse=True)]
     config.nav = [*config.nav, {"Notebook": ["notebook/index.md", *dated]}]
     return config
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the generated pages, and replace Jupyter notebooks by pages."""
+    """Add the generated pages, and replace each Jupyter notebook by a page."""
     for path, text in generated_pages().items():
         files.append(File.generated(config, path, content=text))
     for notebook in [each for each in files if each.src_uri.endswith(".ipynb")]:
@@ -57,7 +57,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Point links to notebooks at their pages."""
+    """Redirect links from Jupyter notebooks to their pages."""
     return markdown.replace(".ipynb)", ".md)")
 
 

@@ -1,4 +1,4 @@
-"""A Jupyter notebook as Markdown, with the outputs that it was saved with."""
+"""Convert a Jupyter notebook, with its saved outputs, to Markdown."""
 
 import base64
 import re
@@ -8,7 +8,7 @@ import nbformat
 
 
 def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
-    """Return a notebook's Markdown, and the pictures beside it by file name."""
+    """Return a notebook's Markdown, and its pictures (PNG bytes) by file name."""
     pieces: list[str] = []
     pictures: dict[str, bytes] = {}
     for cell in nbformat.read(path, as_version=4).cells:
@@ -30,5 +30,5 @@ def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
 
 
 def _plain_table(html: str) -> str:
-    """Remove a table's own style, so that it looks like the tables of the site."""
+    """Remove the style from an HTML table, so that it looks like the other tables of the site."""
     return re.sub(r"<style.*?</style>|(?<=<table)[^>]*", "", html, flags=re.DOTALL)
