@@ -118,7 +118,7 @@ def test_ctrl_c_is_answered_in_one_line(tmp_path):
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     told = process.communicate(timeout=60)[1]
-    assert process.returncode == 130 and "Traceback" not in told and "can be resumed" in told
+    assert process.returncode == 130 and "Traceback" not in told and "again to resume" in told
 
 
 def test_a_finished_dataset_is_reused_and_other_settings_are_refused(tmp_path):
@@ -167,7 +167,7 @@ def test_a_full_disk_leaves_what_was_finished(tmp_path):
 
     command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit)
-    assert result.returncode == 2 and "Traceback" not in result.stderr and "stays valid" in result.stderr
+    assert result.returncode == 2 and "Traceback" not in result.stderr and "stay valid" in result.stderr
     dataset = open_dataset(tmp_path / "detect")
     for fault in validate(dataset):
         assert "readable part" not in fault.expected, fault

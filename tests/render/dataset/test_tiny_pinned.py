@@ -1,8 +1,10 @@
 """The preset `tiny` is as it was when tiny_pinned.json was written: ground, plan, and every byte of tables and images.
 
-Bytes are compared only on the kind of processor and with the libraries with which they were written, since others
-differ in the last digits. To pin an intended change, with FOLDER from `perilune-render dataset --preset tiny --out
-FOLDER`: `python -m tests.render.dataset.test_tiny_pinned FOLDER > tests/render/dataset/tiny_pinned.json`.
+Bytes are compared only on the kind of processor and with the libraries with which they were written, and with one BLAS
+thread, since others differ in the last digits. To pin an intended change:
+
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 perilune-render dataset --preset tiny --out FOLDER
+    python -m tests.render.dataset.test_tiny_pinned FOLDER > tests/render/dataset/tiny_pinned.json
 """
 
 import hashlib
