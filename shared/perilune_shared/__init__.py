@@ -1,10 +1,12 @@
-"""Read, validate, edit and export datasets of labelled lunar descents. Use::
+"""Read, validate, edit and export datasets of labelled lunar landing trajectories.
 
-import perilune_shared as ps
+Use::
 
-dataset = ps.open_dataset("data/small/detect")
-frame = dataset[0]
-frame.image, frame.labels["radius_px"], frame.row["position_m"]
+    import perilune_shared as ps
+
+    dataset = ps.open_dataset("data/small/detect")
+    frame = dataset[0]
+    frame.image, frame.labels["radius_px"], frame.row["position_m"]
 """
 
 from typing import TYPE_CHECKING, Any

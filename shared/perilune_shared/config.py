@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from perilune_shared.config_errors import explained, nearest
+from perilune_shared.config_errors import nearest, user_error_of
 from perilune_shared.errors import UserError
 from perilune_shared.yaml_text import parse_yaml, to_yaml_text
 
@@ -91,7 +91,7 @@ def resolve_over(
     config_file: Path | None = None,
     settings: tuple[str, ...] = (),
 ) -> SectionType:
-    """Resolve like `resolve`, with plain data `base` instead of a preset; errors call it `base_name`."""
+    """Resolve like `resolve`, with plain data `base` instead of a preset; `base_name` names it in error messages."""
     sources: list[tuple[str, dict]] = [(base_name, base)]
     if config_file is not None:
         sources.append((str(config_file), read_config_file(config_file).get(section, {})))
@@ -105,7 +105,7 @@ def resolve_over(
     try:
         return model.model_validate_json(json.dumps(merged))
     except ValidationError as error:
-        raise explained(error, model, section, sources) from None
+        raise user_error_of(error, model, section, sources) from None
     except (TypeError, ValueError) as error:
         raise UserError(sources[-1][0], section, error, "numbers, text, lists and mappings") from None
 

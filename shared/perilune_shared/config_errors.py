@@ -12,8 +12,8 @@ from pydantic_core import ErrorDetails
 
 from perilune_shared.errors import UserError
 
-_LEAST_LIKENESS = 0.75
-"""Minimum similarity (difflib's ratio) of a known name that is suggested."""
+_MIN_SIMILARITY = 0.75
+"""Minimum similarity (ratio of difflib) of a name that is suggested."""
 
 # Expected value by pydantic's error type; fields in braces come from the error's context.
 _EXPECTED = {
@@ -42,15 +42,15 @@ _EXPECTED = {
     "literal_error": "{expected}",
     "enum": "{expected}",
     "value_error": "{error}",
-    "extra_forbidden": "no such key",
+    "extra_forbidden": "only known keys",
 }
 _COUNTED = {"too_short": ("at least", "min_length"), "too_long": ("at most", "max_length")}
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return what to suggest for an unknown name: the most similar known name, otherwise all known names."""
+    """Return a suggestion for an unknown name: the most similar known name, or all known names if none is similar."""
     known = list(known)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=_LEAST_LIKENESS)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=_MIN_SIMILARITY)
     return f"{close[0]} (nearest known)" if close else "one of " + ", ".join(known)
 
 
@@ -70,28 +70,31 @@ def expected_of(fault: ErrorDetails) -> str:
     return text[0].lower() + text[1:]
 
 
-def shown(value: Any) -> str:
+def formatted(value: Any) -> str:
     """Format a value for a message, with YAML's true, false and null."""
     if isinstance(value, bool) or value is None:
         return json.dumps(value)
     return repr(value)
 
 
-def explained(
+def user_error_of(
     error: ValidationError, model: type[BaseModel], section: str, sources: list[tuple[str, dict[str, Any]]]
 ) -> UserError:
-    """Return the first error of a section merged from `sources` (name, content), where later sources override."""
+    """Return the first error as a UserError.
+
+    The section was merged from `sources` (name, content); later sources override.
+    """
     fault = error.errors(include_url=False)[0]
     location = [str(part) for part in fault["loc"]]
-    where = next((name for name, content in reversed(sources) if _holds(content, location)), sources[-1][0])
+    where = next((name for name, content in reversed(sources) if _contains(content, location)), sources[-1][0])
     field = ".".join([section, *location])
     if fault["type"] == "extra_forbidden":
         return UserError(where, field, "an unknown key", nearest(location[-1], _fields_at(model, location[:-1])))
-    got = "nothing" if fault["type"] == "missing" else shown(fault["input"])
+    got = "nothing" if fault["type"] == "missing" else formatted(fault["input"])
     return UserError(where, field, got, expected_of(fault))
 
 
-def _holds(content: Any, location: list[str]) -> bool:
+def _contains(content: Any, location: list[str]) -> bool:
     for key in location:
         if isinstance(content, list):
             return True

@@ -16,24 +16,24 @@ _WIDTH = 118
 
 @dataclass(frozen=True)
 class Key:
-    """One key of a configuration, described."""
+    """Description of one key of a configuration."""
 
     name: str
     """Full name, as dataset.camera.width_px."""
     field: FieldInfo
-    """pydantic's field: limits and kind."""
+    """Field of pydantic: type and limits."""
     meaning: str
     """Its docstring, on one line."""
     choices: tuple[str, ...]
-    """Values of a Literal; empty for any other kind."""
+    """Values of a Literal; empty for any other type."""
     default: str | None
-    """Value without a preset, as YAML on one line; None if it must be given."""
+    """Default value, as YAML on one line; None if the key is required."""
     value: str
     """Value in this configuration, as YAML on one line."""
 
 
 def keys(section: str, config: Section) -> Iterator[Key]:
-    """Yield every key of a resolved section, in the order of the file."""
+    """Yield every key of a resolved section, in the order of the configuration file."""
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
         value, full = getattr(config, name), f"{section}.{name}"
@@ -86,13 +86,13 @@ def _one_of(field: FieldInfo) -> str:
 
 def _default(field: FieldInfo) -> str:
     if field.is_required():
-        return "none, it must be given"
+        return "none (required)"
     value: Any = field.get_default(call_default_factory=True)
     return _flow(value.model_dump(mode="json") if isinstance(value, Section) else value)
 
 
 def _flow(value: Any) -> str:
-    """Format a value on one line of YAML: as JSON, but without quotes around keys and single words."""
+    """Format a value as YAML on one line: JSON without quotes around keys and single words."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
     if isinstance(value, list | tuple):

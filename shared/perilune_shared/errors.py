@@ -40,10 +40,10 @@ def one_line(text: object) -> str:
     return "".join(c if c.isprintable() else "?" for c in " ".join(str(text).split()))
 
 
-def shortened(value: object, most: int = 120) -> str:
-    """Return a value as text of at most `most` characters."""
+def shortened(value: object, max_length: int = 120) -> str:
+    """Return a value as text of at most `max_length` characters."""
     text = str(value)
-    return text if len(text) <= most else text[: most - 3] + "..."
+    return text if len(text) <= max_length else text[: max_length - 3] + "..."
 
 
 def run_command_line(app: Callable[[], object]) -> None:
@@ -51,11 +51,11 @@ def run_command_line(app: Callable[[], object]) -> None:
     try:
         app()
     except UserError as error:
-        fail = f"error: {error}"
+        message = f"error: {error}"
     except OSError as error:
         if error.errno not in _DISK_FAULTS:
             raise
-        fail = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; finished files stay valid"
+        message = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; finished files stay valid"
     except (KeyboardInterrupt, SystemExit) as stop:
         # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
         if isinstance(stop, SystemExit) and stop.code != _EXIT_INTERRUPTED:
@@ -64,5 +64,5 @@ def run_command_line(app: Callable[[], object]) -> None:
         sys.exit(_EXIT_INTERRUPTED)
     else:
         return
-    print(fail, file=sys.stderr)
+    print(message, file=sys.stderr)
     sys.exit(EXIT_USER_ERROR)

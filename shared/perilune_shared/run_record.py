@@ -1,4 +1,4 @@
-"""What a run or a benchmark records about itself: commit, hardware, command, date."""
+"""Record how a run or a benchmark was made: commit, hardware, command, date."""
 
 import functools
 import os
@@ -17,23 +17,23 @@ _MODEL, _BFLOAT16 = re.compile(r"^model name\s*:\s*(.+)$", re.MULTILINE), "avx51
 
 @dataclass(frozen=True, slots=True)
 class RunRecord:
-    """How the figures of a run were made."""
+    """Commit, hardware, load, command and date of a run."""
 
     commit: str
-    """Commit of this repository, 40 digits; with " modified" after it if tracked files differ; else "unknown"."""
+    """Commit (40 digits), followed by " modified" if tracked files were changed; "unknown" outside a checkout."""
     hardware: str
     """Number of cores, processor, memory."""
     load: float
-    """Load average of the last minute when the program started: other work beside it."""
+    """Load average of the minute before the program started; shows other work on the machine."""
     command: str
     """The command line."""
     date: str
-    """When it started, UTC, for example 2026-01-31."""
+    """Start date, UTC, for example 2026-01-31."""
 
 
 @functools.cache
 def run_record() -> RunRecord:
-    """The record of this process; the first call decides, so make it at the start."""
+    """Return the record of this process. It is made in the first call: call it when the program starts."""
     return RunRecord(_commit(), _hardware(), round(_load(), 1), _command(), f"{datetime.now(UTC):%Y-%m-%d}")
 
 

@@ -1,4 +1,4 @@
-"""The console on standard error and the progress bar of command lines, by Rich."""
+"""Console on standard error and progress bar of the command lines, both from Rich."""
 
 from rich.console import Console
 from rich.progress import (
@@ -12,7 +12,7 @@ from rich.progress import (
 from rich.text import Text
 
 console = Console(stderr=True)
-"""Print through it while a progress bar is shown: the bar then moves below the text."""
+"""Console for messages; text that it prints appears above a running progress bar."""
 
 
 class _Rate(ProgressColumn):

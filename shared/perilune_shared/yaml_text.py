@@ -1,8 +1,10 @@
 """Parse untrusted YAML 1.2 with the core schema (specification 1.2.2, section 10.3), and write YAML.
 
-Only the core schema's forms are numbers, booleans and null. `yes`, `off`, `1:30`, `1_000` and `2024-01-17` are text;
-`012` is 12 (octal is `0o14`); `1e-4` is a number. Stricter than YAML: a repeated key, an alias, an anchor, a tag, a
-directive, a second document and a key that is not a scalar are errors, and size and depth are limited. Keys stay text.
+Only values in the core schema's forms become numbers, booleans or null. `yes`, `off`, `1:30`, `1_000` and `2024-01-17`
+are text; `012` is 12 (octal is `0o14`); `1e-4` is a number. Keys are always text.
+
+The parser is stricter than YAML. A repeated key, an alias, an anchor, a tag, a directive, a second document and a key
+that is not a scalar are errors. Size and depth are limited.
 """
 
 import io
@@ -30,8 +32,8 @@ from ruamel.yaml.representer import SafeRepresenter
 
 from perilune_shared.errors import UserError, shortened
 
-_LARGEST_CHARACTERS = 100_000
-_DEEPEST = 20
+_MAX_CHARACTERS = 100_000
+_MAX_DEPTH = 20
 _EXPECTED = "YAML 1.2 with plain values"
 _CORE_SCHEMA: tuple[tuple[re.Pattern, Callable[[str], Any]], ...] = (
     (re.compile(r"null|Null|NULL|~|"), lambda text: None),
@@ -48,7 +50,7 @@ _PLAIN_TEXT = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null)$)[A-Za-z][\w
 
 
 class _Refused(ValueError):
-    """Valid YAML that this parser refuses: what was found and what is expected."""
+    """Valid YAML that this parser does not accept, with what was found and what is expected."""
 
     def __init__(self, event: Event, got: str, expected: str = _EXPECTED):
         self.got, self.expected = f"{got} at line {event.start_mark.line + 1}", expected
@@ -57,22 +59,22 @@ class _Refused(ValueError):
 def parse_yaml(text: str, where: object) -> Any:
     """Parse YAML text to plain data (dict, list, str, int, float, bool, None); empty text gives None.
 
-    Raises UserError about `where` if the text is not YAML or if this parser refuses it.
+    Raises UserError about `where` if the text is not YAML or if this parser does not accept it.
     """
-    if len(text) > _LARGEST_CHARACTERS:
-        raise UserError(where, "size", f"{len(text)} characters", f"at most {_LARGEST_CHARACTERS}")
+    if len(text) > _MAX_CHARACTERS:
+        raise UserError(where, "size", f"{len(text)} characters", f"at most {_MAX_CHARACTERS}")
     try:
         return _document(iter(YAML(typ="safe", pure=True).parse(io.StringIO(text))))
     except _Refused as error:
         raise UserError(where, "syntax", error.got, error.expected) from None
     except (YAMLError, ValueError, RecursionError) as error:
         raise UserError(
-            where, "syntax", f"text that is not YAML ({shortened(_one_problem(error))})", _EXPECTED
+            where, "syntax", f"text that is not YAML ({shortened(_problem_with_line(error))})", _EXPECTED
         ) from None
 
 
 def to_yaml_text(data: dict[str, Any]) -> str:
-    """Format plain data as block YAML, keys in order; text is quoted if YAML 1.1 would not read it as text."""
+    """Format plain data as block YAML, keys in order; text that YAML 1.1 could read as another type is quoted."""
     yaml = YAML(typ="safe", pure=True)
     yaml.Representer = _Representer
     yaml.default_flow_style = False
@@ -119,8 +121,8 @@ def _node(event: Event, events: Iterator[Event], depth: int) -> Any:
     tag = getattr(event, "tag", None)
     if tag:
         raise _Refused(event, f"a tag ({tag})")
-    if depth > _DEEPEST:
-        raise _Refused(event, f"more than {_DEEPEST} levels")
+    if depth > _MAX_DEPTH:
+        raise _Refused(event, f"more than {_MAX_DEPTH} levels")
     if isinstance(event, ScalarEvent):
         return _scalar(event)
     if isinstance(event, SequenceStartEvent):
@@ -158,7 +160,7 @@ def _scalar(event: ScalarEvent) -> Any:
     return event.value
 
 
-def _one_problem(error: Exception) -> str:
+def _problem_with_line(error: Exception) -> str:
     problem, mark = getattr(error, "problem", None), getattr(error, "problem_mark", None)
     at = f" at line {mark.line + 1}" if mark is not None else ""
     return f"{problem}{at}" if problem else str(error)

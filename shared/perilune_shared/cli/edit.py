@@ -93,8 +93,8 @@ def split(
     by: Annotated[
         SplitUnit, typer.Option(help="Unit of the split. frame is the paper's protocol: its splits share terrain.")
     ] = "scene",
-    val: Annotated[float, typer.Option(help="Share of units for validation.")] = 0.1,
-    test: Annotated[float, typer.Option(help="Share of units for the test.")] = 0.1,
+    val: Annotated[float, typer.Option(help="Share of units in the split val.")] = 0.1,
+    test: Annotated[float, typer.Option(help="Share of units in the split test.")] = 0.1,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the split.")] = 0,
     images: ImagesOption = "copy",
     link: LinkOption = False,
@@ -156,7 +156,7 @@ def unpack(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -
 
 def attach(
     manifest: DatasetArgument,
-    frames: Annotated[Path, typer.Option(help="Folder that `perilune-render regenerate --out` filled.")],
+    frames: Annotated[Path, typer.Option(help="Folder written by `perilune-render regenerate --out`.")],
     out: OutOption,
     rehash: Annotated[
         bool, typer.Option("--rehash", help="Accept frames with other hashes and record their hashes.")

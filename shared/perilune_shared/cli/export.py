@@ -1,4 +1,4 @@
-"""`perilune-manifest export` and `card`: convert a dataset to other formats, and write a page about it."""
+"""`perilune-manifest export` and `card`: convert a dataset to other formats, and write its dataset card."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -45,7 +45,7 @@ def export(
     ] = "all",
     link: LinkOption = False,
 ) -> None:
-    """Write labels, trajectories or metadata in the format of other tools."""
+    """Write labels, trajectories or metadata in formats of other tools."""
     from perilune_shared.config_errors import nearest
     from perilune_shared.dataset.keys import check_keys
     from perilune_shared.dataset.names import SPLITS
@@ -102,7 +102,7 @@ def card(
         Path | None, typer.Option(help="Markdown file beside its picture, by default README.md in the dataset.")
     ] = None,
 ) -> None:
-    """Write a dataset card: counts, histograms, labelled frames, licence and the command that makes the dataset."""
+    """Write a dataset card: counts, histograms, labelled frames, licence and the command that reproduces it."""
     from perilune_shared.export.card import write_card
 
     with progress_bar() as progress:

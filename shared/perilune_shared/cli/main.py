@@ -1,6 +1,6 @@
 """`perilune-manifest`: validate, inspect, edit and export datasets, without Blender and without torch.
 
-Commands import what they run with, so that `--help` does not wait for pandas and pyarrow.
+Commands import their modules only when they run, so that `--help` does not load pandas and pyarrow.
 """
 
 from typing import Annotated

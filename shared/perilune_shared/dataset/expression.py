@@ -23,7 +23,7 @@ from perilune_shared.errors import UserError
 
 _SEARCHED = ("frames", "labels", "scenes", "craters", "trajectories")
 """Tables in which a column name without a table is looked up, in this order."""
-_COMPARED: dict[type, Callable] = {
+_COMPARISONS: dict[type, Callable] = {
     ast.Eq: operator.eq,
     ast.NotEq: operator.ne,
     ast.Lt: operator.lt,
@@ -33,9 +33,9 @@ _COMPARED: dict[type, Callable] = {
 }
 _ARITHMETIC: dict[type, Callable] = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
 _FUNCTIONS: dict[str, Callable] = {"abs": pc.abs, "sqrt": pc.sqrt, "log10": pc.log10}
-_LONGEST = 2000
-_FORMS = "columns, numbers, text, + - * / %, abs, sqrt, log10, comparisons, in, and, or, not"
-_Kind = Literal["integer", "real", "text", "truth", "vector"]
+_MAX_LENGTH = 2000
+_SUPPORTED = "columns, numbers, text, + - * / %, abs, sqrt, log10, comparisons, in, and, or, not"
+_Kind = Literal["integer", "real", "text", "boolean", "vector"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class Condition:
 
     @property
     def on_labels(self) -> bool:
-        """Whether the condition selects labels rather than frames."""
+        """Whether the condition selects labels, not frames."""
         return any(table in ("labels", "craters") for table, _ in self.columns)
 
     def columns_of_only(self, table: str) -> list[str] | None:
@@ -88,11 +88,11 @@ class Condition:
         mask[found[""].to_numpy()] = True
         return mask
 
-    def _compiled(self, named: Callable[[str, str], str]) -> Any:
+    def _compiled(self, name_of: Callable[[str, str], str]) -> Any:
         try:
-            if len(self.text) > _LONGEST:
+            if len(self.text) > _MAX_LENGTH:
                 raise ValueError(f"{len(self.text)} characters")
-            value = self._walk(ast.parse(self.text.strip(), mode="eval").body, named)
+            value = self._walk(ast.parse(self.text.strip(), mode="eval").body, name_of)
         except (
             SyntaxError,
             TypeError,
@@ -104,27 +104,27 @@ class Condition:
         ) as error:
             expected = f"a condition such as radius_px > 5 and split == 'test' ({error})"
             raise self._fault(self.text, expected) from None
-        if value.kind != "truth":
+        if value.kind != "boolean":
             raise self._fault(self.text, "a condition that is true or false for each row")
         return value.expression
 
-    def _walk(self, node: ast.expr, named: Callable[[str, str], str]) -> _Value:
+    def _walk(self, node: ast.expr, name_of: Callable[[str, str], str]) -> _Value:
         def walk(child: ast.expr) -> _Value:
-            return self._walk(child, named)
+            return self._walk(child, name_of)
 
         match node:
             case ast.Name() | ast.Attribute():
                 table, name = self._column(node)
                 self.columns.add((table, name))
-                return _column_value(TABLES[table].field(name).type, pc.field(named(table, name)))
+                return _column_value(TABLES[table].field(name).type, pc.field(name_of(table, name)))
             case ast.Constant(value=bool() | int() | float() | str() as constant):
                 return _constant(constant)
             case ast.BoolOp():
                 join = operator.and_ if isinstance(node.op, ast.And) else operator.or_
-                values = [self._truth(walk(value), value) for value in node.values]
-                return _Value("truth", functools.reduce(join, values))
+                values = [self._boolean(walk(value), value) for value in node.values]
+                return _Value("boolean", functools.reduce(join, values))
             case ast.UnaryOp(op=ast.Not()):
-                return _Value("truth", ~self._truth(walk(node.operand), node.operand))
+                return _Value("boolean", ~self._boolean(walk(node.operand), node.operand))
             case ast.UnaryOp(op=ast.USub()):
                 value = self._number(walk(node.operand), node.operand)
                 return _Value(value.kind, pc.negate_checked(value.expression))
@@ -133,26 +133,26 @@ class Condition:
                 return self._arithmetic(node, left, right)
             case ast.Compare():
                 return self._compare(node, walk)
-            case ast.Subscript(slice=ast.Constant(value=int() as place)) if not isinstance(place, bool):
+            case ast.Subscript(slice=ast.Constant(value=int() as index)) if not isinstance(index, bool):
                 value = walk(node.value)
-                if value.kind != "vector" or place >= value.length:
+                if value.kind != "vector" or index >= value.length:
                     raise self._fault(
-                        ast.unparse(node), f"an element 0 to {value.length - 1}" if value.length else _FORMS
+                        ast.unparse(node), f"an element 0 to {value.length - 1}" if value.length else _SUPPORTED
                     )
-                return _Value("real", pc.list_element(value.expression, place))
+                return _Value("real", pc.list_element(value.expression, index))
             case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
                 value = self._number(walk(argument), argument)
                 if name == "abs":
                     return _Value(value.kind, pc.abs_checked(value.expression))
                 return _Value("real", _FUNCTIONS[name](value.expression.cast(pa.float64())))
             case ast.Call(func=ast.Name(id=name)) if name in _FUNCTIONS:
-                raise self._fault(ast.unparse(node), f"one argument of {name}, positional")
-        raise self._fault(ast.unparse(node), _FORMS)
+                raise self._fault(ast.unparse(node), f"one positional argument of {name}")
+        raise self._fault(ast.unparse(node), _SUPPORTED)
 
     def _arithmetic(self, node: ast.BinOp, left: _Value, right: _Value) -> _Value:
         a, b = left.expression, right.expression
-        whole = left.kind == right.kind == "integer"
-        kind: _Kind = "integer" if whole else "real"
+        integers = left.kind == right.kind == "integer"
+        kind: _Kind = "integer" if integers else "real"
         if type(node.op) in _ARITHMETIC:
             return _Value(kind, _ARITHMETIC[type(node.op)](a, b))
         if isinstance(node.right, ast.Constant) and node.right.value == 0:
@@ -160,51 +160,56 @@ class Condition:
         real_a, real_b = a.cast(pa.float64()), b.cast(pa.float64())
         if isinstance(node.op, ast.Div):
             return _Value("real", pc.divide(real_a, real_b))
-        if isinstance(node.op, ast.Mod) and whole:
+        if isinstance(node.op, ast.Mod) and integers:
             # Arrow's division truncates towards zero; give the remainder the divisor's sign, as in Python.
-            rest = a - b * pc.divide(a, b)
-            return _Value(kind, pc.if_else((rest != 0) & pc.xor(rest < 0, b < 0), rest + b, rest))
+            remainder = a - b * pc.divide(a, b)
+            return _Value(kind, pc.if_else((remainder != 0) & pc.xor(remainder < 0, b < 0), remainder + b, remainder))
         if isinstance(node.op, ast.Mod):
             return _Value(kind, real_a - pc.floor(pc.divide(real_a, real_b)) * real_b)
-        raise self._fault(ast.unparse(node), _FORMS)
+        raise self._fault(ast.unparse(node), _SUPPORTED)
 
     def _compare(self, node: ast.Compare, walk: Callable[[ast.expr], _Value]) -> _Value:
         sides = [node.left, *node.comparators]
         found = []
         for op, left, right in zip(node.ops, sides, sides[1:], strict=False):
             if isinstance(op, ast.In | ast.NotIn):
-                inside = self._inside(walk(left), left, right)
-                found.append(inside if isinstance(op, ast.In) else ~inside)
-            elif type(op) in _COMPARED:
+                is_in = self._is_in(walk(left), left, right)
+                found.append(is_in if isinstance(op, ast.In) else ~is_in)
+            elif type(op) in _COMPARISONS:
                 a, b = walk(left), walk(right)
                 if not ((a.is_number and b.is_number) or a.kind == b.kind == "text"):
                     raise self._fault(
                         f"{ast.unparse(left)} ({a.kind}) with {ast.unparse(right)} ({b.kind})",
                         "comparisons of numbers with numbers and text with text",
                     )
-                found.append(_COMPARED[type(op)](a.expression, b.expression))
+                found.append(_COMPARISONS[type(op)](a.expression, b.expression))
             else:
-                raise self._fault(ast.unparse(node), "comparisons by == != < <= > >= in")
-        return _Value("truth", functools.reduce(operator.and_, found))
+                raise self._fault(ast.unparse(node), "one of == != < <= > >= in")
+        return _Value("boolean", functools.reduce(operator.and_, found))
 
-    def _inside(self, value: _Value, left: ast.expr, right: ast.expr) -> Any:
+    def _is_in(self, value: _Value, left: ast.expr, right: ast.expr) -> Any:
         if not isinstance(right, ast.Tuple | ast.List) or not right.elts:
             raise self._fault(ast.unparse(right), "a list after `in`, such as split in ('val', 'test')")
         try:
-            words = [ast.literal_eval(word) for word in right.elts]
+            values_in_list = [ast.literal_eval(value_in_list) for value_in_list in right.elts]
         except ValueError:
             raise self._fault(ast.unparse(right), "a list of numbers or of text") from None
-        texts = all(isinstance(word, str) for word in words)
-        numbers = all(isinstance(word, int | float) and not isinstance(word, bool) for word in words)
+        texts = all(isinstance(value_in_list, str) for value_in_list in values_in_list)
+        numbers = all(
+            isinstance(value_in_list, int | float) and not isinstance(value_in_list, bool)
+            for value_in_list in values_in_list
+        )
         if not ((texts and value.kind == "text") or (numbers and value.is_number)):
             expected = "comparisons of numbers with numbers and text with text"
             raise self._fault(f"{ast.unparse(left)} ({value.kind}) in {ast.unparse(right)}", expected)
         if texts:
-            found = value.expression.isin(pa.array(words, pa.string()))
-        elif value.kind == "integer" and all(isinstance(word, int) for word in words):
-            found = value.expression.isin(pa.array(words, pa.int64()))
+            found = value.expression.isin(pa.array(values_in_list, pa.string()))
+        elif value.kind == "integer" and all(isinstance(value_in_list, int) for value_in_list in values_in_list):
+            found = value.expression.isin(pa.array(values_in_list, pa.int64()))
         else:
-            found = value.expression.cast(pa.float64()).isin(pa.array([float(word) for word in words]))
+            found = value.expression.cast(pa.float64()).isin(
+                pa.array([float(value_in_list) for value_in_list in values_in_list])
+            )
         # pyarrow evaluates `null in list` as false, so `null not in list` would be true; return null.
         return pc.if_else(value.expression.is_valid(), found, pa.scalar(None, pa.bool_()))
 
@@ -214,8 +219,8 @@ class Condition:
             raise self._fault(f"{ast.unparse(node)} ({value.kind})", f"a number{hint}")
         return value
 
-    def _truth(self, value: _Value, node: ast.expr) -> Any:
-        if value.kind != "truth":
+    def _boolean(self, value: _Value, node: ast.expr) -> Any:
+        if value.kind != "boolean":
             raise self._fault(f"{ast.unparse(node)} ({value.kind})", "conditions as operands of and, or, not")
         return value.expression
 
@@ -246,7 +251,7 @@ def _column_value(kind: pa.DataType, expression: Any) -> _Value:
 
 
 def _constant(value: bool | float | str) -> _Value:
-    kinds: dict[type, _Kind] = {bool: "truth", int: "integer", float: "real", str: "text"}
+    kinds: dict[type, _Kind] = {bool: "boolean", int: "integer", float: "real", str: "text"}
     return _Value(kinds[type(value)], pc.scalar(value))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from perilune_shared.config_errors import expected_of, shown
+from perilune_shared.config_errors import expected_of, formatted
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.errors import UserError, shortened
@@ -26,7 +26,7 @@ def read_object(path: Path) -> dict[str, Any]:
         raise UserError(path, "size", f"{n_bytes} bytes", f"at most {_LARGEST_INFO_BYTES}")
     try:
         content = json.loads(
-            path.read_bytes(), object_pairs_hook=_each_once, parse_constant=_finite, parse_float=_finite
+            path.read_bytes(), object_pairs_hook=_with_unique_names, parse_constant=_finite, parse_float=_finite
         )
     except (ValueError, RecursionError) as error:
         raise UserError(path, "content", error, "JSON") from None
@@ -35,8 +35,8 @@ def read_object(path: Path) -> dict[str, Any]:
     return content
 
 
-def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Build a dict from members; duplicate names are refused, since readers differ in which one they use."""
+def _with_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Build a dict from members. Raises ValueError on a duplicate name, since readers differ in which one they use."""
     members: dict[str, Any] = {}
     for name, value in pairs:
         if name in members:
@@ -71,7 +71,7 @@ def checked_info(content: dict[str, Any], path: Path) -> DatasetInfo:
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in fault["loc"])
-        raise UserError(path, field or "content", shown(fault["input"]), expected_of(fault)) from None
+        raise UserError(path, field or "content", formatted(fault["input"]), expected_of(fault)) from None
     except RecursionError as error:
         raise UserError(path, "content", error, "JSON with fewer levels") from None
     _check_texts(info, path)
@@ -84,19 +84,19 @@ def checked_info(content: dict[str, Any], path: Path) -> DatasetInfo:
 def _check_texts(info: DatasetInfo, path: Path) -> None:
     """Check the texts of recipes, since settings are untrusted and are shown on pages and terminals."""
     for recipe in info.recipes.values():
-        odd = _odd_text([recipe.config, recipe.developed_from.camera_config if recipe.developed_from else None])
-        if odd is not None:
-            raise UserError(path, "recipes", repr(odd), "plain text, without <, >, &, $, ` and control characters")
+        unsafe = _unsafe_text([recipe.config, recipe.developed_from.camera_config if recipe.developed_from else None])
+        if unsafe is not None:
+            raise UserError(path, "recipes", repr(unsafe), "plain text, without <, >, &, $, ` and control characters")
 
 
-def _odd_text(tree: object) -> str | None:
+def _unsafe_text(tree: object) -> str | None:
     """Return the first text or member name in plain data that contains unsafe characters; None if there is none."""
     if isinstance(tree, str):
         return None if tree.isprintable() and not set(tree) & set("<>&`$") else tree
     if isinstance(tree, dict):
         tree = [*tree, *tree.values()]
     if isinstance(tree, list):
-        return next((odd for odd in map(_odd_text, tree) if odd is not None), None)
+        return next((unsafe for unsafe in map(_unsafe_text, tree) if unsafe is not None), None)
     return None
 
 

@@ -26,7 +26,7 @@ def check_keys(dataset: Dataset) -> None:
     Reads labels one row group at a time and keeps 8 bytes of memory per label.
     """
     check = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
-    _check_numbered(dataset, "boulders", check.scene_of)
+    _checked_ids_and_keys(dataset, "boulders", check.scene_of)
     for part in dataset.parts("labels"):
         opened = Part(part, "labels")
         for group in range(opened.n_groups):
@@ -52,13 +52,15 @@ class KeyCheck:
         _check_known(dataset, "trajectories", "scene_id", trajectories["scene_id"], self.scene_of)
         self._scene_of_frame = _check_known(dataset, "frames", "scene_id", frames["scene_id"], self.scene_of)
         known = set(zip(*(trajectories[name].to_pylist() for name in KEYS["trajectories"]), strict=True))
-        odd = set(zip(*(frames[name].to_pylist() for name in KEYS["trajectories"]), strict=True)) - known
-        if odd:
-            raise UserError(dataset.root, "frames: trajectory_id", f"no {'/'.join(min(odd))}", f"trajectories; {_HINT}")
+        missing = set(zip(*(frames[name].to_pylist() for name in KEYS["trajectories"]), strict=True)) - known
+        if missing:
+            raise UserError(
+                dataset.root, "frames: trajectory_id", f"no {'/'.join(min(missing))}", f"trajectories; {_HINT}"
+            )
         self._frame_of = {name: place for place, name in enumerate(frames["frame_id"].to_pylist())}
         if len(self._frame_of) != len(frames):
             _check_unique(dataset, "frames", frames.select(KEYS["frames"]).to_pandas())
-        self._numbers, self._keys = _check_numbered(dataset, "craters", self.scene_of)
+        self._numbers, self._keys = _checked_ids_and_keys(dataset, "craters", self.scene_of)
         self._seen: list[NDArray[np.int64]] = []
 
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
@@ -83,18 +85,18 @@ class KeyCheck:
 
     def finish(self) -> None:
         """Raise UserError if two labels have the same frame and crater."""
-        both = np.concatenate(self._seen) if self._seen else np.empty(0, np.int64)
-        if not (np.diff(both) > 0).all():
-            both.sort()
-        twice = np.flatnonzero(np.diff(both) == 0)
-        if len(twice):
-            frame_place, number_place = divmod(int(both[twice[0]]), len(self._numbers))
+        keys = np.concatenate(self._seen) if self._seen else np.empty(0, np.int64)
+        if not (np.diff(keys) > 0).all():
+            keys.sort()
+        repeated = np.flatnonzero(np.diff(keys) == 0)
+        if len(repeated):
+            frame_place, number_place = divmod(int(keys[repeated[0]]), len(self._numbers))
             frame_id = next(name for name, place in self._frame_of.items() if place == frame_place)
             found = f"crater {self._numbers[number_place]} of {frame_id} twice"
             raise UserError(self._dataset.root, "labels: frame_id+crater_id", found, f"unique keys; {_HINT}")
 
 
-def _places(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
+def _looked_up(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
     """Look up each text of a column (N,) in `place_of`; -1 if it is missing. Each distinct text is looked up once."""
     found = []
     for chunk in column.chunks:
@@ -104,10 +106,10 @@ def _places(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.
     return np.concatenate(found) if found else np.empty(0, np.int64)
 
 
-def _check_numbered(
+def _checked_ids_and_keys(
     dataset: Dataset, table: str, scene_of: Mapping[str, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all ids of craters or boulders, and all keys (scene and id combined in one integer), both sorted."""
+    """Check the keys of craters or boulders; return all ids and all keys (scene and id as one integer), sorted."""
     rows = dataset.table(table, KEYS[table])
     scene = _check_known(dataset, table, "scene_id", rows["scene_id"], scene_of)
     numbers, place = np.unique(rows[KEYS[table][1]].to_numpy(), return_inverse=True)
@@ -120,7 +122,7 @@ def _check_numbered(
 def _check_known(
     dataset: Dataset, table: str, name: str, column: pa.ChunkedArray, place_of: Mapping[str, int]
 ) -> NDArray[np.int64]:
-    found = _places(column, place_of)
+    found = _looked_up(column, place_of)
     if (found < 0).any():
         missing = column[int(np.argmin(found))].as_py()
         raise UserError(dataset.root, f"{table}: {name}", f"no {missing}", f"{name.removesuffix('_id')}s; {_HINT}")
@@ -128,7 +130,7 @@ def _check_known(
 
 
 def _check_unique(dataset: Dataset, table: str, rows: pd.DataFrame) -> None:
-    twice = rows.duplicated(KEYS[table])
-    if twice.any():
-        found = " ".join(map(str, rows[KEYS[table]].iloc[int(np.argmax(twice))])) + " twice"
+    repeated = rows.duplicated(KEYS[table])
+    if repeated.any():
+        found = " ".join(map(str, rows[KEYS[table]].iloc[int(np.argmax(repeated))])) + " twice"
         raise UserError(dataset.root, f"{table}: {'+'.join(KEYS[table])}", found, f"unique keys; {_HINT}")

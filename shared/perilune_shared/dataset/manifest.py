@@ -22,7 +22,7 @@ from perilune_shared.dataset.info_file import read_info
 from perilune_shared.dataset.metadata import Counts, DatasetInfo
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.packed import read_packed, shards_of
-from perilune_shared.dataset.part_rows import may_hold, rows_of_part
+from perilune_shared.dataset.part_rows import may_contain, rows_of_part
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
@@ -31,7 +31,7 @@ from perilune_shared.storage import files
 
 LARGEST_FRAME_BYTES = 2**30
 """Maximum size of a PNG or EXR, bytes."""
-_MOST_KEPT_OPEN = 32
+_MAX_KEPT_OPEN = 32
 
 
 class Dataset:
@@ -61,7 +61,7 @@ class Dataset:
             return Part(path, table)
         if path not in self._opened:
             part = Part(path, table)
-            while len(self._opened) >= _MOST_KEPT_OPEN:
+            while len(self._opened) >= _MAX_KEPT_OPEN:
                 del self._opened[next(iter(self._opened))]
             self._opened[path] = part
         return self._opened[path]
@@ -127,7 +127,7 @@ class Dataset:
         """Return a table's part files, sorted by name; with ids, those that may contain matching rows."""
         files = self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet")
         found = sorted(files, key=lambda part: part.stem)
-        return [part for part in found if may_hold(part.stem, scene_id, trajectory_id)]
+        return [part for part in found if may_contain(part.stem, scene_id, trajectory_id)]
 
     def table(
         self,

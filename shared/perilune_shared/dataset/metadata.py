@@ -14,7 +14,7 @@ from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 LARGEST_IMAGE_PX = 2**27
 """Largest image that is decompressed, pixels."""
 _FAR = 1e9
-_ROTATION = 1e-6
+_ROTATION_TOLERANCE = 1e-6
 # Names appear in tables, pages and shell commands: only letters, digits and characters without a meaning there.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$")]
 _Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -62,7 +62,7 @@ class CameraRecord(_Info):
         if self.width_px * self.height_px > LARGEST_IMAGE_PX:
             raise ValueError(f"width_px times height_px should be at most {LARGEST_IMAGE_PX}")
         rows = np.array(self.rotation_camera_from_body)
-        if not (np.abs(rows @ rows.T - np.eye(3)) < _ROTATION).all() or np.linalg.det(rows) < 0:
+        if not (np.abs(rows @ rows.T - np.eye(3)) < _ROTATION_TOLERANCE).all() or np.linalg.det(rows) < 0:
             raise ValueError("rotation_camera_from_body should be a rotation")
         return self
 
@@ -103,11 +103,11 @@ class Origin(_Info):
     sha256: _Sha256
     """SHA-256 of its dataset.json."""
     camera_config: dict[str, Any] | None
-    """Its section `dataset.camera`, for which terrain and EXRs were made; null if not known."""
+    """Section `dataset.camera` of its configuration, to which terrain and EXRs are adapted; null if not known."""
 
 
 class Recipe(_Info):
-    """Everything besides their seeds that determines scenes and frames: enough to reproduce them."""
+    """Settings, random seed and versions. Together with the seeds in the tables, they determine scenes and frames."""
 
     preset: Name
     """Preset on which the settings are based."""
@@ -163,7 +163,7 @@ class DatasetInfo(_Info):
         return "" if self.split_by == "scene" else ": splits share terrain, so test metrics are optimistic"
 
     def recipe(self) -> Recipe:
-        """The recipe of a dataset with exactly one. Raises ValueError if there are more."""
+        """Return the recipe of a dataset with exactly one. Raises ValueError if there are more."""
         (recipe,) = self.recipes.values()
         return recipe
 

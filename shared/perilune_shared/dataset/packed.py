@@ -11,7 +11,7 @@ from perilune_shared.dataset.schema import IMAGES
 from perilune_shared.errors import UserError
 
 MOST_IMAGES_WRITTEN = 1_000_000
-"""Maximum number of frames of a shard: 7,813 row groups; readers accept 10,000."""
+"""Maximum number of frames of a shard; it gives 7,813 row groups, and readers accept 10,000."""
 _IMAGES_PER_GROUP, _BYTES_PER_GROUP = 128, 2**28
 
 
@@ -65,17 +65,17 @@ class _ShardWriter:
     def __init__(self, folder: Path, number: int):
         self.number, self.n_images, self.n_bytes = number, 0, 0
         self._path = folder / f"{number:05d}.parquet"
-        self._waiting: list[dict] = []
-        self._waiting_bytes = 0
+        self._buffer: list[dict] = []
+        self._buffer_bytes = 0
         self._writer: pq.ParquetWriter | None = None
 
     def add(self, frame_id: str, path: str, png: bytes) -> None:
         """Add a frame; write a row group whenever it is full."""
-        self._waiting.append({"frame_id": frame_id, "image": {"bytes": png, "path": path}})
+        self._buffer.append({"frame_id": frame_id, "image": {"bytes": png, "path": path}})
         self.n_images += 1
         self.n_bytes += len(png)
-        self._waiting_bytes += len(png)
-        if len(self._waiting) == _IMAGES_PER_GROUP or self._waiting_bytes > _BYTES_PER_GROUP:
+        self._buffer_bytes += len(png)
+        if len(self._buffer) == _IMAGES_PER_GROUP or self._buffer_bytes > _BYTES_PER_GROUP:
             self._flush()
 
     def close(self) -> None:
@@ -85,10 +85,10 @@ class _ShardWriter:
             self._writer.close()
 
     def _flush(self) -> None:
-        if not self._waiting:
+        if not self._buffer:
             return
         if self._writer is None:
             # PNG is already compressed, and all frames differ.
             self._writer = pq.ParquetWriter(self._path, IMAGES, compression="none", use_dictionary=["frame_id"])
-        self._writer.write_table(pa.Table.from_pylist(self._waiting, schema=IMAGES))
-        self._waiting, self._waiting_bytes = [], 0
+        self._writer.write_table(pa.Table.from_pylist(self._buffer, schema=IMAGES))
+        self._buffer, self._buffer_bytes = [], 0

@@ -10,7 +10,7 @@ from perilune_shared.dataset.parts import Part, is_whole
 from perilune_shared.errors import UserError
 
 
-def may_hold(stem: str, scene_id: str | None, trajectory_id: str | None) -> bool:
+def may_contain(stem: str, scene_id: str | None, trajectory_id: str | None) -> bool:
     """Whether a part of this name may contain rows of a scene, and of a trajectory in it."""
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem) or scene_id is None:
@@ -44,8 +44,8 @@ def rows_of_part(
     if where is not None:
         expression = where.within_table()
         needed += [name for _, name in sorted(where.columns)]
-        may_hold = set(part.groups_where(expression))
-        groups = [group for group in (range(part.n_groups) if groups is None else groups) if group in may_hold]
+        may_contain = set(part.groups_where(expression))
+        groups = [group for group in (range(part.n_groups) if groups is None else groups) if group in may_contain]
     rows = part.read(list(dict.fromkeys(needed)), groups)
     if expression is not None:
         try:

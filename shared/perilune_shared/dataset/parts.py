@@ -1,7 +1,7 @@
 """One Parquet part of a table: written once and atomically, and read with limits, since parts are untrusted input.
 
-The name of a part says which rows it contains: `<scene_id>` or `<scene_id>.<trajectory_id>`. A table in one file is the
-part `all`, whose row groups contain one scene or a few trajectories each. A table above the limits continues in
+The name of a part states which rows it contains: `<scene_id>` or `<scene_id>.<trajectory_id>`. A table in one file is
+the part `all`, whose row groups contain one scene or a few trajectories each. A table above the limits continues in
 `all.0001` and so on.
 """
 
@@ -24,19 +24,19 @@ from perilune_shared.storage import files
 from perilune_shared.storage.pages import pages_of
 
 WHOLE_TABLE = "all"
-"""Name of the part that contains all rows of its table, or the first rows."""
+"""Name of the part that contains all rows of its table, or the first ones of a table with several parts."""
 MOST_ROWS_WRITTEN = 10_000_000
 """Maximum number of rows of a written part; below the reader's limits for every table."""
-_MOST_ROWS = 50_000_000
-_MOST_GROUP_ROWS = 2**21
-_LONGEST_TEXT = 1000
-_MOST_BYTES = 8 * 2**30
-# Limit of the length of lists in a footer: a schema nested deeper than this can crash the process.
-_LONGEST_LIST = 10_000
-_LONGEST_FOOTER_TEXT = 10_000_000
+_MAX_ROWS = 50_000_000
+_MAX_GROUP_ROWS = 2**21
+_MAX_TEXT_BYTES = 1000
+_MAX_BYTES = 8 * 2**30
+# Maximum length of lists in a footer. It also limits the depth of the schema: deep nesting can crash the process.
+_MAX_LIST = 10_000
+_MAX_FOOTER_TEXT_BYTES = 10_000_000
 # Bounds on compression: no row of any table takes fewer bytes, and no data compresses by a larger factor.
 _SPARE_ROWS, _BYTES_PER_ROW = 10_000, 4
-_SPARE_BYTES, _MOST_COMPRESSION = 2**26, 200
+_SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
 _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
@@ -88,8 +88,8 @@ class Part:
         source = self.path if self._content is None else pa.BufferReader(self._content)
         options = {
             "pre_buffer": False,
-            "thrift_string_size_limit": _LONGEST_FOOTER_TEXT,
-            "thrift_container_size_limit": _LONGEST_LIST,
+            "thrift_string_size_limit": _MAX_FOOTER_TEXT_BYTES,
+            "thrift_container_size_limit": _MAX_LIST,
         }
         with contextlib.suppress(KeyError):  # a text column that the file lacks
             return pq.ParquetFile(source, read_dictionary=texts, **options)
@@ -109,13 +109,13 @@ class Part:
 
     def _check_size(self) -> None:
         footer = self.file.metadata
-        most_rows = min(_MOST_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_PER_ROW)
+        most_rows = min(_MAX_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_PER_ROW)
         n_bytes, n_rows = 0, 0
         for group in range(footer.num_row_groups):
             rows = footer.row_group(group)
             n_rows += rows.num_rows
-            if not 0 <= rows.num_rows <= min(_MOST_GROUP_ROWS, most_rows):
-                expected = f"at most {min(_MOST_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
+            if not 0 <= rows.num_rows <= min(_MAX_GROUP_ROWS, most_rows):
+                expected = f"at most {min(_MAX_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
                 raise UserError(self.path, "rows", f"{rows.num_rows} in a row group", expected)
             for place in range(rows.num_columns):
                 column = rows.column(place)
@@ -130,7 +130,7 @@ class Part:
         if footer.num_rows != n_rows or n_rows > most_rows:
             expected = f"{n_rows}, the sum of the row groups, at most {most_rows} for {self._n_bytes} bytes"
             raise UserError(self.path, "rows", footer.num_rows, expected)
-        most = min(_MOST_BYTES, _SPARE_BYTES + _MOST_COMPRESSION * self._n_bytes)
+        most = min(_MAX_BYTES, _SPARE_BYTES + _MAX_COMPRESSION * self._n_bytes)
         if n_bytes > most:
             raise UserError(
                 self.path, "size", f"{n_bytes} bytes after decompression", f"at most {most} for {self._n_bytes} bytes"
@@ -182,8 +182,8 @@ class Part:
             if name.split(".")[0] not in names or (group, name) in self._checked:
                 continue
             pages = pages_of(stream, column)
-            if pages.unpacked_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
-                found = f"{pages.unpacked_bytes} bytes after decompression and {pages.n_values} values"
+            if pages.uncompressed_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
+                found = f"{pages.uncompressed_bytes} bytes after decompression and {pages.n_values} values"
                 expected = f"at most {column.total_uncompressed_size} and {column.num_values}, as in the footer"
                 raise UserError(self.path, name, found, expected)
             # With a dictionary, a small file could repeat one image and decompress to any size.
@@ -195,11 +195,11 @@ class Part:
         for chunk in column.chunks:
             words = chunk.dictionary if pa.types.is_dictionary(chunk.type) else chunk
             longest = pc.max(pc.binary_length(words)).as_py() or 0
-            if longest > _LONGEST_TEXT:
-                raise UserError(self.path, name, f"text of {longest} bytes", f"at most {_LONGEST_TEXT}")
-            odd = _first_odd(words, pattern) if pattern is not None else None
-            if odd is not None:
-                raise UserError(self.path, name, repr(odd), f"text like {pattern}")
+            if longest > _MAX_TEXT_BYTES:
+                raise UserError(self.path, name, f"text of {longest} bytes", f"at most {_MAX_TEXT_BYTES}")
+            mismatch = _first_mismatch(words, pattern) if pattern is not None else None
+            if mismatch is not None:
+                raise UserError(self.path, name, repr(mismatch), f"text like {pattern}")
 
     def groups_within(self, column: str, low: str, high: str) -> list[int]:
         """Return the row groups that may contain texts in [low, high), by their statistics."""
@@ -210,10 +210,12 @@ class Part:
         for group in range(footer.num_row_groups):
             known = footer.row_group(group).column(place).statistics if place >= 0 else None
             try:
-                far = known is not None and known.has_min_max and not (str(known.min) < high and str(known.max) >= low)
+                excluded = (
+                    known is not None and known.has_min_max and not (str(known.min) < high and str(known.max) >= low)
+                )
             except (pa.ArrowException, ValueError):  # statistics of another type, or not UTF-8
-                far = False
-            if not far:
+                excluded = False
+            if not excluded:
                 chosen.append(group)
         return chosen
 
@@ -227,7 +229,7 @@ class Part:
             return list(range(self.n_groups))
 
 
-def _first_odd(words: pa.Array, pattern: str) -> str | None:
+def _first_mismatch(words: pa.Array, pattern: str) -> str | None:
     """Return the first text that does not match a pattern, or None if all match."""
     if len(words) <= _FEW_WORDS:  # faster for few texts: Arrow compiles the pattern in every call
         fitting = re.compile(pattern)
@@ -241,7 +243,7 @@ def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> p
     return Part(path, table).read(columns)
 
 
-def write_part(root: Path, table: str, name: str, rows: pa.Table, rows_a_group: int | None = None) -> Path:
+def write_part(root: Path, table: str, name: str, rows: pa.Table, rows_per_group: int | None = None) -> Path:
     """Write the part `manifest/<table>/<name>.parquet`. Raises FileExistsError if it exists.
 
     Raises UserError if the name, which may come from the rows of an untrusted dataset, is not a valid part name.
@@ -252,5 +254,5 @@ def write_part(root: Path, table: str, name: str, rows: pa.Table, rows_a_group: 
     if part.exists():
         raise FileExistsError(part)
     with files.written_aside(part) as aside:
-        pq.write_table(complete(table, rows), aside, compression="zstd", row_group_size=rows_a_group)
+        pq.write_table(complete(table, rows), aside, compression="zstd", row_group_size=rows_per_group)
     return part

@@ -184,7 +184,7 @@ IMAGES = pa.schema(
     metadata={
         "perilune.table": "images",
         "perilune.schema_version": SCHEMA_VERSION,
-        # Tells Hugging Face `datasets` to decode the column as an image.
+        # Makes the library `datasets` of Hugging Face decode the column as an image.
         "huggingface": '{"info": {"features": {"frame_id": {"dtype": "string", "_type": "Value"}, '
         '"image": {"_type": "Image"}}}}',
     },

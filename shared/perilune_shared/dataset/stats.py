@@ -1,4 +1,4 @@
-"""Statistics of a dataset. Labels are read one row group at a time to limit memory."""
+"""Statistics of a dataset. Labels are read one row group at a time, to limit memory."""
 
 import numpy as np
 import pandas as pd

@@ -39,7 +39,7 @@ class DatasetWriter:
         self.whole_tables, self._most_rows = whole_tables, most_rows
         self._n_whole = dict.fromkeys(TABLES, 0)
         self._rows = dict.fromkeys(TABLES, 0)
-        self._kept: dict[str, list[pa.Table]] = defaultdict(list)
+        self._buffered: dict[str, list[pa.Table]] = defaultdict(list)
         self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
         self._splits_of_trajectory: dict[tuple[str, int], set[str]] = defaultdict(set)
         self._has_exr = False
@@ -69,7 +69,7 @@ class DatasetWriter:
             self._rows[name] += len(rows)
             rows = complete(name, rows)
             if self.whole_tables:
-                self._keep(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
+                self._buffer(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
             elif name in _PER_TRAJECTORY:
                 for trajectory_id in pc.unique(frames["trajectory_id"]).to_pylist():
                     own = pc.starts_with(rows["frame_id"], f"{scene_id}/{trajectory_id}/")
@@ -77,18 +77,18 @@ class DatasetWriter:
             else:
                 write_part(self.root, name, scene_id, rows)
 
-    def _keep(self, name: str, rows: pa.Table) -> None:
+    def _buffer(self, name: str, rows: pa.Table) -> None:
         """Buffer rows of a table; write a part whenever it reaches the maximum number of rows."""
         while len(rows):
-            free = self._most_rows - sum(map(len, self._kept[name]))
+            free = self._most_rows - sum(map(len, self._buffered[name]))
             if not free:
                 self._write_whole(name)
                 continue
-            self._kept[name].append(rows[:free])
+            self._buffered[name].append(rows[:free])
             rows = rows[free:]
 
     def _write_whole(self, name: str) -> None:
-        rows = pa.concat_tables([TABLES[name].empty_table(), *self._kept.pop(name, [])])
+        rows = pa.concat_tables([TABLES[name].empty_table(), *self._buffered.pop(name, [])])
         stem = f"{WHOLE_TABLE}.{self._n_whole[name]:04d}" if self._n_whole[name] else WHOLE_TABLE
         write_part(self.root, name, stem, rows, max(1000, len(rows) // 200))
         self._n_whole[name] += 1
@@ -116,12 +116,12 @@ class DatasetWriter:
         if not self._rows["frames"]:
             raise UserError(out, "frames", "none left", "conditions that select at least one frame")
         for name in TABLES if self.whole_tables else ():
-            if self._kept[name] or not self._n_whole[name]:
+            if self._buffered[name] or not self._n_whole[name]:
                 self._write_whole(name)
-        # A trajectory may occur twice: rendered, and developed again with another sensor.
-        torn = any(len(splits) > 1 for splits in self._splits_of_trajectory.values())
-        shared = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
-        unit: SplitUnit = "frame" if torn else "trajectory" if shared else "scene"
+        # One flight may occur twice: rendered, and developed again with another sensor.
+        trajectory_in_two_splits = any(len(splits) > 1 for splits in self._splits_of_trajectory.values())
+        terrain_in_two_splits = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
+        unit: SplitUnit = "frame" if trajectory_in_two_splits else "trajectory" if terrain_in_two_splits else "scene"
         exr_camera = self.info.exr_camera if self._has_exr else None
         recipes = {key: recipe for key, recipe in self.info.recipes.items() if key in self._recipes}
         info = self.info.model_copy(
@@ -140,7 +140,7 @@ def new_dataset(
     most_rows: int = MOST_ROWS_WRITTEN,
     progress: Progress = NO_PROGRESS,
 ) -> Iterator[DatasetWriter]:
-    """Give a writer for a new dataset; it appears at `out` only when the block succeeds.
+    """Yield a writer for a new dataset; it appears at `out` only when the block succeeds.
 
     With `whole_tables` each table is one part, or several of at most `most_rows` rows. `info` provides the metadata
     that is not computed from the rows. Raises UserError if there are no frames or `out` is not empty.

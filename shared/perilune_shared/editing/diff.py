@@ -10,7 +10,8 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.schema import KEYS, TABLES
 from perilune_shared.errors import one_line, shortened
 
-_NUMBER = "copy"
+_COPY_NUMBER = "copy"
+"""Added key column: number of the row among rows with equal keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +33,14 @@ class Difference:
 
 
 def differences(first: Dataset, second: Dataset) -> list[Difference]:
-    """Return all differences. None means equal content; how parts and frames are stored does not matter."""
+    """Return all differences; the list is empty if the content is equal, however parts and frames are stored."""
     found = list(_info(_plain(first), _plain(second), ""))
     one, two = set(first.scene_ids()), set(second.scene_ids())
-    for there, other, only in ((one, two, True), (two, one, False)):
-        alone = sorted(there - other)
-        if alone:
+    for here, other, only in ((one, two, True), (two, one, False)):
+        missing = sorted(here - other)
+        if missing:
             present = ("present", "-") if only else ("-", "present")
-            found.append(Difference("scenes", "", len(alone), alone[0], *present))
+            found.append(Difference("scenes", "", len(missing), missing[0], *present))
     gathered: dict[tuple[str, str], Difference] = {}
     for scene_id in sorted(one & two):
         for name in TABLES:
@@ -73,24 +74,24 @@ def _rows(table: str, one: pd.DataFrame, two: pd.DataFrame) -> Iterator[Differen
     if any(frame.duplicated(keys).any() for frame in (one, two)):
         # Number rows with equal keys, in an order that does not depend on how they are stored.
         one, two = (_numbered(frame, keys) for frame in (one, two))
-        keys = [*keys, _NUMBER]
+        keys = [*keys, _COPY_NUMBER]
     one, two = (frame.set_index(keys).sort_index() for frame in (one, two))
-    for there, other, present in ((one, two, ("present", "-")), (two, one, ("-", "present"))):
-        alone = there.index.difference(other.index)
-        if len(alone):
-            yield Difference(table, "", len(alone), _text(alone[0]), *present)
+    for here, other, present in ((one, two, ("present", "-")), (two, one, ("-", "present"))):
+        missing = here.index.difference(other.index)
+        if len(missing):
+            yield Difference(table, "", len(missing), _text(missing[0]), *present)
     common = one.index.intersection(two.index)
     one, two = one.loc[common], two.loc[common]
     for column in one.columns:
         a, b = one[column], two[column]
         if a.map(np.ndim).gt(0).any() if a.dtype == object else False:
-            apart = np.array([not np.array_equal(x, y, equal_nan=True) for x, y in zip(a, b, strict=True)], bool)
+            differs = np.array([not np.array_equal(x, y, equal_nan=True) for x, y in zip(a, b, strict=True)], bool)
         else:
-            apart = ~((a == b) | (a.isna() & b.isna())).fillna(False).to_numpy(bool)
-        if apart.any():
-            row = int(np.argmax(apart))
+            differs = ~((a == b) | (a.isna() & b.isna())).fillna(False).to_numpy(bool)
+        if differs.any():
+            row = int(np.argmax(differs))
             yield Difference(
-                table, column, int(apart.sum()), _text(common[row]), _text(a.iloc[row]), _text(b.iloc[row])
+                table, column, int(differs.sum()), _text(common[row]), _text(a.iloc[row]), _text(b.iloc[row])
             )
 
 
@@ -98,7 +99,7 @@ def _numbered(rows: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
     """Add a column that numbers the rows of each key from 0."""
     plain = [name for name in rows.columns if not (rows[name].dtype == object and rows[name].map(np.ndim).gt(0).any())]
     rows = rows.sort_values(plain, kind="stable", ignore_index=True)
-    return rows.assign(**{_NUMBER: rows.groupby(keys).cumcount()})
+    return rows.assign(**{_COPY_NUMBER: rows.groupby(keys).cumcount()})
 
 
 def _text(value: object) -> str:

@@ -9,11 +9,11 @@ from perilune_shared.dataset.manifest import Dataset
 
 
 def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
-    """Return all frames, by frame_id, with the units that splits must not share: `terrain`, `flight` and `pose`.
+    """Return the table of all frames, sorted by frame_id, with their `terrain`, `flight` and `pose`.
 
-    Terrain is the content of the terrain (`terrain_of`); pose is a position and rotation over a terrain. Trajectories
-    over one terrain are one flight if they have the same random seed or a common pose. So copies of a flight that was
-    developed again, or rendered under another Sun, are one flight.
+    Terrain is the key from `terrain_of`; pose numbers each position and rotation over a terrain. Trajectories over one
+    terrain are the same flight if they have the same random seed or a common pose. So a flight that was developed again
+    or rendered with another Sun is the same flight. Splits must not share the unit by which a dataset is split.
     """
     columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
     rows = dataset.table("frames", columns).sort_by("frame_id")
@@ -32,12 +32,12 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
     frames["pose"] = poses.groupby(list(poses.columns), dropna=False).ngroup().to_numpy()
     trajectory = frames.groupby(["scene_id", "trajectory_id"], sort=False).ngroup().to_numpy()
     by_seed = frames.groupby(["terrain", "seed"], dropna=False).ngroup().to_numpy()
-    frames["flight"] = _joined(trajectory, [by_seed, frames["pose"].to_numpy()])
+    frames["flight"] = _connected_groups(trajectory, [by_seed, frames["pose"].to_numpy()])
     return frames[["frame_id", "terrain", "flight", "pose"]]
 
 
-def _joined(unit: NDArray[np.int64], keys: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Number the rows (N,): rows whose units (N,) are connected by equal values of any key (N,) get equal numbers."""
+def _connected_groups(unit: NDArray[np.int64], keys: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Number groups of rows (N,). Rows with the same unit, or the same value of a key, are in the same group."""
     root = np.arange(unit.max(initial=-1) + 1)
 
     def find(one: int) -> int:

@@ -9,7 +9,7 @@ from license_expression import ExpressionError, Licensing, get_spdx_licensing
 
 from perilune_shared.errors import UserError
 
-_OWN = re.compile(r"(LicenseRef-|AdditionRef-)[A-Za-z0-9.-]+")
+_CUSTOM = re.compile(r"(LicenseRef-|AdditionRef-)[A-Za-z0-9.-]+")
 
 
 @functools.cache
@@ -21,7 +21,8 @@ def _spdx() -> Licensing:
 def joined_licence(licences: Iterable[tuple[object, str]]) -> str:
     """Return the SPDX expression for data under all of the given licences (pairs of place and licence).
 
-    Equal licences appear once, alternatives in parentheses. Name licences that SPDX does not list LicenseRef-<name>.
+    Equal licences appear once; alternatives are in parentheses. A licence that SPDX does not list needs a name of the
+    form LicenseRef-<name>.
     Raises UserError about the place on an invalid SPDX expression or an unknown licence.
     """
     spdx = _spdx()
@@ -41,16 +42,16 @@ def _terms(spdx: Licensing, place: object, text: str) -> list[Any]:
         expression = spdx.parse(text)
         if expression is None:
             raise UserError(place, "licence", "nothing", expected)
-        odd = [key for key in spdx.unknown_license_keys(expression) if not _OWN.fullmatch(key)]
+        unknown = [key for key in spdx.unknown_license_keys(expression) if not _CUSTOM.fullmatch(key)]
     except (ExpressionError, ValueError, TypeError, RecursionError) as error:
         raise UserError(place, "licence", f"{text!r} ({error})", expected) from None
-    if odd:
-        raise UserError(place, "licence", ", ".join(odd), expected)
-    waiting, terms = [expression], []
-    while waiting:
-        term = waiting.pop(0)
+    if unknown:
+        raise UserError(place, "licence", ", ".join(unknown), expected)
+    pending, terms = [expression], []
+    while pending:
+        term = pending.pop(0)
         if isinstance(term, spdx.AND):
-            waiting = [*term.args, *waiting]
+            pending = [*term.args, *pending]
         else:
             terms.append(term)
     return terms

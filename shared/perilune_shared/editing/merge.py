@@ -11,14 +11,14 @@ from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
 from perilune_shared.dataset.names import ImageMode, frame_id_of
 from perilune_shared.dataset.writer import SceneTables, check_scene, new_dataset, with_column
 from perilune_shared.editing.licence import joined_licence
-from perilune_shared.editing.rewrite import bare, check_source, state_of
+from perilune_shared.editing.rewrite import check_source, state_of, without_derived_rows
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 
-_GROUND = ("scenes", "craters", "boulders")
-_CHANGING = ("scene_id", "trajectory_id", "n_frames", "split")
+_TERRAIN_TABLES = ("scenes", "craters", "boulders")
+_FREE_IN_TRAJECTORIES = ("scene_id", "trajectory_id", "n_frames", "split")
 """Columns that may differ between two copies of the same trajectory."""
-_RENDERED = ("position_m", "rotation_wxyz", "time_s", "png_sha256")
+_FIXED_IN_FRAMES = ("position_m", "rotation_wxyz", "time_s", "png_sha256")
 """Columns that must be equal in two copies of the same frame."""
 
 
@@ -31,8 +31,8 @@ def merge(
 ) -> None:
     """Write the frames of all sources, each once, as one dataset.
 
-    Equal scenes (recipe, seed, Sun, craters) are merged; different scenes with the same name are renamed. The same
-    holds for trajectories. A frame in several sources is taken from the first, with its split and labels. Counts,
+    Equal scenes (recipe, seed, Sun, craters) are merged; different scenes with the same name are renamed. Trajectories
+    are treated in the same way. A frame in several sources is taken from the first, with its split and labels. Counts,
     splits and the split unit are recomputed from the rows. Raises UserError if kinds, cameras or EXR cameras differ, a
     licence is not an SPDX expression, or two copies of a frame were rendered differently.
     """
@@ -45,9 +45,9 @@ def merge(
     task = progress.add_task("merging", total=len(groups), unit="scenes")
     with new_dataset(out, info, progress=progress) as writer:
         for scene_id, members in groups.items():
-            tables, brought = _join(scene_id, [(sources[i], own) for i, own in members])
-            writer.add_scene(bare(tables) if info.images == "planned" else tables)
-            for source, frames, names in brought:
+            tables, used_frames = _join(scene_id, [(sources[i], own) for i, own in members])
+            writer.add_scene(without_derived_rows(tables) if info.images == "planned" else tables)
+            for source, frames, names in used_frames:
                 if info.images == "files" and len(frames):
                     writer.add_images(source, frames, names, link=images == "link")
             progress.advance(task)
@@ -58,7 +58,7 @@ def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetI
     for source in sources:
         for field in ("kind", "camera"):
             if getattr(source.info, field) != getattr(first, field):
-                raise UserError(source.root, field, "another", f"the {field} of {sources[0].root}")
+                raise UserError(source.root, field, f"a different {field}", f"the {field} of {sources[0].root}")
     info = first.model_copy(
         update={
             "name": name,
@@ -78,7 +78,7 @@ def _exr_camera(sources: Sequence[Dataset]) -> CameraRecord | None:
     for source in with_exrs:
         if source.info.exr_camera != with_exrs[0].info.exr_camera:
             expected = f"the exr_camera of {with_exrs[0].root}; `perilune-manifest pack` leaves EXRs out"
-            raise UserError(source.root, "exr_camera", "another", expected)
+            raise UserError(source.root, "exr_camera", "a different camera", expected)
     return with_exrs[0].info.exr_camera if with_exrs else None
 
 
@@ -88,9 +88,9 @@ def _has_exrs(source: Dataset) -> bool:
 
 
 def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list[tuple[int, str]]]:
-    """Return, for each scene of the result, the sources (by index) that contain it and its name in each.
+    """Return by scene_id of the result: the index of each source that contains the scene, and its scene_id there.
 
-    In a plan, which has no labels, crater ids are not compared.
+    Crater ids are not compared for plans, which have no labels.
     """
     groups: dict[str, list[tuple[int, str]]] = {}
     known: dict[tuple, str] = {}
@@ -119,9 +119,9 @@ def free_name(name: str, taken: Container[str]) -> str:
 def _join(
     scene_id: str, members: Sequence[tuple[Dataset, str]]
 ) -> tuple[SceneTables, list[tuple[Dataset, pa.Table, dict[str, str]]]]:
-    """Return the tables of a merged scene and, for each member, its frames that are used and their new names."""
+    """Return the tables of a merged scene and, for each member, the frames taken from it and their new frame_ids."""
     joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels")}
-    brought: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
+    used_frames: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
     known_trajectories: list[tuple[dict, str]] = []
     taken: dict[str, dict] = {}
     first: SceneTables = {}
@@ -129,57 +129,61 @@ def _join(
         tables = source.scene(own)
         check_scene(source.root, tables)
         if not first:
-            first = {name: with_column(tables[name], "scene_id", [scene_id] * len(tables[name])) for name in _GROUND}
+            first = {
+                name: with_column(tables[name], "scene_id", [scene_id] * len(tables[name])) for name in _TERRAIN_TABLES
+            }
         new_ids, rows = _trajectories(tables["trajectories"], known_trajectories)
         rows = with_column(rows, "scene_id", [scene_id] * len(rows))
         joined["trajectories"].append(rows)
         frames = tables["frames"]
-        old = frames.select(["frame_id", "trajectory_id", "frame_index", *_RENDERED]).to_pylist()
+        old = frames.select(["frame_id", "trajectory_id", "frame_index", *_FIXED_IN_FRAMES]).to_pylist()
         names = {
             row["frame_id"]: frame_id_of(scene_id, new_ids[row["trajectory_id"]], row["frame_index"]) for row in old
         }
-        fresh = []
+        is_new = []
         for row in old:
-            before = taken.get(names[row["frame_id"]])
-            fresh.append(before is None)
-            if before is None:
+            earlier = taken.get(names[row["frame_id"]])
+            is_new.append(earlier is None)
+            if earlier is None:
                 taken[names[row["frame_id"]]] = row
             else:
-                _check_same(source, row, before)
-        chosen = frames.filter(pa.array(fresh, pa.bool_()))
+                _check_same(source, row, earlier)
+        chosen = frames.filter(pa.array(is_new, pa.bool_()))
         labels = tables["labels"].filter(pc.is_in(tables["labels"]["frame_id"], chosen["frame_id"].combine_chunks()))
         joined["frames"].append(_renamed(chosen, scene_id, new_ids, names))
         labelled = [names[frame_id] for frame_id in labels["frame_id"].to_pylist()]
         joined["labels"].append(with_column(labels, "frame_id", labelled))
-        brought.append((source, chosen, names))
-    return first | {name: pa.concat_tables(pieces) for name, pieces in joined.items()}, brought
+        used_frames.append((source, chosen, names))
+    return first | {name: pa.concat_tables(pieces) for name, pieces in joined.items()}, used_frames
 
 
 def _trajectories(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tuple[dict[str, str], pa.Table]:
-    """Map a member's trajectory ids to new ids; also return the renamed rows of trajectories not yet in `known`.
+    """Return the new id of each trajectory of a member, and the renamed rows of trajectories not yet in `known`.
 
     `known` contains the trajectories of earlier members (content and new id); new ones are added to it.
     """
     names: dict[str, str] = {}
     new = []
     for row in trajectories.to_pylist():
-        content = {name: value for name, value in row.items() if name not in _CHANGING}
-        same = [name for found, name in known if found == content and name not in names.values()]
-        if not same:
-            same = [free_name(row["trajectory_id"], {name for _, name in known})]
-            known.append((content, same[0]))
+        content = {name: value for name, value in row.items() if name not in _FREE_IN_TRAJECTORIES}
+        matching_ids = [name for found, name in known if found == content and name not in names.values()]
+        if not matching_ids:
+            matching_ids = [free_name(row["trajectory_id"], {name for _, name in known})]
+            known.append((content, matching_ids[0]))
             new.append(True)
         else:
             new.append(False)
-        names[row["trajectory_id"]] = same[0]
+        names[row["trajectory_id"]] = matching_ids[0]
     renamed = with_column(trajectories, "trajectory_id", [names[n] for n in trajectories["trajectory_id"].to_pylist()])
     return names, renamed.filter(pa.array(new, pa.bool_()))
 
 
-def _check_same(source: Dataset, row: dict, before: dict) -> None:
-    for name in _RENDERED:
-        if None not in (row[name], before[name]) and row[name] != before[name]:
-            raise UserError(source.root, row["frame_id"], f"another {name}", "the same frame as in the other dataset")
+def _check_same(source: Dataset, row: dict, earlier: dict) -> None:
+    for name in _FIXED_IN_FRAMES:
+        if None not in (row[name], earlier[name]) and row[name] != earlier[name]:
+            raise UserError(
+                source.root, row["frame_id"], f"a different {name}", "the same value as in the other dataset"
+            )
 
 
 def _renamed(frames: pa.Table, scene_id: str, new_ids: dict[str, str], names: dict[str, str]) -> pa.Table:

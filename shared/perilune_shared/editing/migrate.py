@@ -39,20 +39,20 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
 def migrate(root: Path, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Convert a dataset of schema version 1 or 2 to the current version; frames are copied, or hard-linked with `link`.
 
-    The contrast of labels, which older versions did not record, becomes null. Raises UserError if the dataset has the
-    current version already, is damaged or is not complete.
+    Older versions did not record the contrast of labels; it becomes null. Raises UserError if the dataset already has
+    the current version, is damaged or is not complete.
     """
     path = root / INFO_NAME
     content = read_object(path)
     version = content.get("schema_version")
     if version == SCHEMA_VERSION:
-        raise UserError(path, "schema_version", version, "an older version; this one is current")
+        raise UserError(path, "schema_version", version, "an older version: this is the current one")
     if not isinstance(version, str) or version not in OLD_TABLES:
         raise UserError(path, "schema_version", version, f"one of {', '.join(OLD_TABLES)}")
     if content.get("complete") is not True:
         raise UserError(path, "complete", content.get("complete"), "a finished dataset")
     info = _info(content, path)
-    source = _Old(root, info, version)
+    source = _OldDataset(root, info, version)
     scene_ids = sorted(source.rows("scenes")["scene_id"].to_pylist())
     task = progress.add_task("migrating", total=len(scene_ids), unit="scenes")
     with new_dataset(out, info, progress=progress) as writer:
@@ -70,12 +70,12 @@ def _info(content: dict[str, Any], path: Path) -> DatasetInfo:
     missing = [name for name in ("preset", "kind", "seed", "config", "versions") if name not in content]
     if missing:
         raise UserError(path, missing[0], "nothing", f"a value, as in every dataset of version {version}")
-    made = {name: content.pop(name) for name in ("preset", "seed", "config", "versions")}
+    recipe_fields = {name: content.pop(name) for name in ("preset", "seed", "config", "versions")}
     origin = content.pop("developed_from", None)
     if isinstance(origin, dict):
         origin = {**origin, "camera_config": None}
     try:
-        recipe = Recipe.model_validate({**made, "kind": content["kind"], "developed_from": origin})
+        recipe = Recipe.model_validate({**recipe_fields, "kind": content["kind"], "developed_from": origin})
     except ValueError as error:
         raise UserError(path, "config", str(error).splitlines()[0], "the settings of a dataset") from None
     return checked_info(
@@ -90,8 +90,8 @@ def _info(content: dict[str, Any], path: Path) -> DatasetInfo:
     )
 
 
-class _Old(Dataset):
-    """A dataset of an older version, read as the current version."""
+class _OldDataset(Dataset):
+    """A dataset of an older schema version; its rows are converted to the current version on reading."""
 
     def __init__(self, root: Path, info: DatasetInfo, version: str):
         super().__init__(root, info)

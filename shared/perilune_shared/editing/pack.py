@@ -15,8 +15,8 @@ from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 
-_EXR = ("exr_path", "exr_sha256", "exr_bytes")
-_LARGEST_SHARD_MB = 8000
+_EXR_COLUMNS = ("exr_path", "exr_sha256", "exr_bytes")
+_MAX_SHARD_MB = 8000
 """Maximum shard size, 10^6 bytes: larger files are refused on reading (perilune_shared.dataset.parts)."""
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
 
@@ -33,12 +33,12 @@ def pack(
     """Write a packed dataset: frames in shards of about `shard_mb` megabytes, readable by Hugging Face `datasets`.
 
     A table of more than `most_rows` rows becomes several parts, and a shard contains at most `most_images` frames, to
-    stay within the limits of readers (perilune_shared.dataset.parts). Of a dataset without frames, only the tables are
+    stay within the limits of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are
     packed. EXRs are not packed: their columns become null.
     """
     check_source(source, out, progress)
-    if not 0 < shard_mb <= _LARGEST_SHARD_MB:
-        raise UserError("--shard-mb", "size", shard_mb, f"above 0, at most {_LARGEST_SHARD_MB}")
+    if not 0 < shard_mb <= _MAX_SHARD_MB:
+        raise UserError("--shard-mb", "size", shard_mb, f"above 0, at most {_MAX_SHARD_MB}")
     packed = source.info.images in ("files", "packed")
     info = source.info
     if packed:
@@ -70,6 +70,6 @@ def unpack(source: Dataset, out: Path, progress: Progress = NO_PROGRESS, *, link
 
 
 def _without_exr(frames: pa.Table) -> pa.Table:
-    for name in _EXR:
+    for name in _EXR_COLUMNS:
         frames = with_column(frames, name, [None] * len(frames))
     return frames

@@ -14,7 +14,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums
 
-_FOLLOWING = ("craters", "boulders", "labels")
+_DERIVED_TABLES = ("craters", "boulders", "labels")
 
 
 def rewrite(
@@ -40,7 +40,7 @@ def rewrite(
             if len(frames):
                 own = pc.is_in(tables["labels"]["frame_id"], frames["frame_id"].combine_chunks())
                 tables = {**tables, "labels": tables["labels"].filter(own)}
-                writer.add_scene(bare(tables) if info.images == "planned" else tables)
+                writer.add_scene(without_derived_rows(tables) if info.images == "planned" else tables)
                 if info.images == "files":
                     names = {name: name for name in frames["frame_id"].to_pylist()}
                     writer.add_images(source, frames, names, link=images == "link")
@@ -50,8 +50,8 @@ def rewrite(
 def check_source(source: Dataset, out: Path, progress: Progress = NO_PROGRESS) -> None:
     """Raise UserError if a dataset must not be rewritten into `out`.
 
-    That is if the dataset is not complete, if its files do not match SHA256SUMS (new sums would hide the damage), if
-    its keys are broken, or if `out` is inside its folder.
+    A dataset is refused if it is not complete, if its files do not match SHA256SUMS (new sums would hide the damage),
+    if its keys are broken, or if `out` is inside its folder.
     """
     if not source.info.complete:
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
@@ -63,12 +63,12 @@ def check_source(source: Dataset, out: Path, progress: Progress = NO_PROGRESS) -
 
 
 def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
-    """Return where the result's frames will be. Raises UserError if only some of the sources have frames."""
+    """Return how the result stores its frames. Raises UserError if only some of the sources have frames."""
     states = {source.info.images for source in sources}
     if states == {"planned"} or images == "plan":
         return "planned"
     if "planned" in states:
-        raise UserError(sources[0].root, "images", ", ".join(sorted(states)), "datasets that are all planned, or none")
+        raise UserError(sources[0].root, "images", ", ".join(sorted(states)), "either only planned datasets or none")
     if images == "none" or states == {"absent"}:
         return "absent"
     if "absent" in states:
@@ -77,6 +77,6 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
     return "files"
 
 
-def bare(tables: SceneTables) -> SceneTables:
-    """Return a scene without the rows that its seed and poses reproduce."""
-    return tables | {name: tables[name].slice(0, 0) for name in _FOLLOWING}
+def without_derived_rows(tables: SceneTables) -> SceneTables:
+    """Return a scene without craters, boulders and labels: its seed and poses reproduce them."""
+    return tables | {name: tables[name].slice(0, 0) for name in _DERIVED_TABLES}

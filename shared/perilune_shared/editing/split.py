@@ -24,14 +24,14 @@ def split_dataset(
     images: ImageMode = "copy",
     progress: Progress = NO_PROGRESS,
 ) -> None:
-    """Write a dataset whose whole scenes, trajectories or single frames are assigned to train, val and test at random.
+    """Write a dataset whose scenes, trajectories or frames are randomly assigned to train, val and test.
 
-    Units are identified by content, not by name (`perilune_shared.editing.flights`). Scenes with the same terrain stay
-    together, whatever their names and Suns, as do all scenes on one elevation model. Trajectories of one flight stay
-    together, also if the flight was rendered or developed again, and so do frames of one pose. `frame` with shares of
-    0.1 is the paper's protocol: all three splits contain the same terrain, so test metrics are optimistic; `split_by`
-    in dataset.json records it. Each split with a share above 0 gets at least one unit. Raises UserError if there are
-    too few units.
+    Units are identified by content, not by name (`perilune_shared.editing.flights`). Scenes with the same terrain are
+    one unit, even if their names or Suns differ; so are all scenes on one elevation model. Trajectories of one flight
+    are one unit, also if the flight was rendered or developed again. Frames with one pose are one unit. `frame` with
+    shares of 0.1 is the paper's protocol: all three splits contain the same terrain, so test metrics are optimistic;
+    `split_by` in dataset.json records it. Each split with a share above 0 gets at least one unit. Raises UserError if
+    there are too few units.
     """
     if not (0 <= val_share < 1 and 0 <= test_share < 1 and val_share + test_share < 1):
         raise UserError("--val and --test", "shares", f"{val_share}, {test_share}", "at least 0, with a sum below 1")

@@ -29,9 +29,9 @@ def subset(
     """Write the frames and labels that fulfil all conditions, up to a number of frames or a size of the PNGs.
 
     A condition on columns of frames, trajectories and scenes selects frames. One that uses labels or craters selects
-    labels and keeps all frames. Scenes keep all their craters and boulders, since these identify the terrain. Up to
-    `n_frames` or `megabytes` (10^6 bytes), whole trajectories are taken in turn from each scene, to keep the terrain
-    varied; the last trajectory is truncated. Raises UserError if nothing is left.
+    labels and keeps all frames. Scenes keep all their craters and boulders, since these identify the terrain. With
+    `n_frames` or `megabytes` (10^6 bytes), each scene in turn gives one trajectory until the limit is reached, so that
+    the subset has many terrains; the last trajectory is truncated. Raises UserError if no frame is left.
     """
     conditions = [Condition(text) for text in where]
     on_frames = [condition for condition in conditions if not condition.on_labels]
@@ -47,10 +47,10 @@ def subset(
 
     def change(tables: SceneTables) -> SceneTables:
         frames = tables["frames"]
-        mask = _holds(on_frames, tables, frames)
+        mask = _all_hold(on_frames, tables, frames)
         if kept is not None:
             mask = mask & np.asarray(pc.is_in(frames["frame_id"], kept), bool)
-        labels = tables["labels"].filter(pa.array(_holds(on_labels, tables, tables["labels"])))
+        labels = tables["labels"].filter(pa.array(_all_hold(on_labels, tables, tables["labels"])))
         return {**tables, "frames": frames.filter(pa.array(mask)), "labels": labels}
 
     steps = [*(f"where {text}" for text in where)]
@@ -62,7 +62,7 @@ def subset(
 
 
 def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
-    """Return scenes in which a frame may be selected; for the others only statistics or few columns are read."""
+    """Return the scenes that may contain a selected frame, so that the tables of the others are not read."""
     scene_ids = set(source.scene_ids())
     for condition in on_frames:
         if condition.columns_of_only("frames") is not None:
@@ -73,13 +73,13 @@ def _scenes_with(source: Dataset, on_frames: Sequence[Condition]) -> list[str]:
 def _first_frames(
     source: Dataset, on_frames: Sequence[Condition], n_frames: int | None, megabytes: float | None
 ) -> pa.Array:
-    """Return frame_ids of whole trajectories, in turn from each scene, up to a number or size."""
+    """Return the frame_ids of trajectories, taken from each scene in turn, up to a number of frames or a size."""
     if (n_frames is not None and n_frames < 1) or (megabytes is not None and not megabytes > 0):
         raise UserError("--frames or --mb", "size", n_frames if n_frames is not None else megabytes, "above 0")
     pieces = []
     for scene_id in source.scene_ids():
         tables = {name: source.table(name, scene_id=scene_id) for name in ("scenes", "trajectories", "frames")}
-        frames = tables["frames"].filter(pa.array(_holds(on_frames, tables, tables["frames"])))
+        frames = tables["frames"].filter(pa.array(_all_hold(on_frames, tables, tables["frames"])))
         pieces.append(frames.select(["frame_id", "scene_id", "trajectory_id", "frame_index", "png_bytes"]).to_pandas())
     if not pieces:
         raise UserError(source.root, "scenes", "none", "a dataset with frames")
@@ -95,8 +95,8 @@ def _first_frames(
     return pa.array(table["frame_id"], pa.string())
 
 
-def _holds(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
-    """Return where all conditions hold (N,), for rows of a scene's frames or labels."""
+def _all_hold(conditions: Sequence[Condition], tables: SceneTables, rows: pa.Table) -> np.ndarray:
+    """Return whether all conditions hold (N,) for each row of a scene's frames or labels."""
     mask = np.ones(len(rows), bool)
     if not conditions or not len(rows):
         return mask
@@ -116,15 +116,15 @@ def _column(tables: SceneTables, rows: pa.Table, table: str, name: str) -> pa.Ch
     if table == "labels":
         return rows[name]
     if table == "craters":
-        return values.take(_places(rows["crater_id"], tables["craters"]["crater_id"]))
+        return values.take(_row_numbers(rows["crater_id"], tables["craters"]["crater_id"]))
     frames = tables["frames"]
-    of_frame = _places(rows["frame_id"], frames["frame_id"]) if on_labels else np.arange(len(rows))
+    of_frame = _row_numbers(rows["frame_id"], frames["frame_id"]) if on_labels else np.arange(len(rows))
     if table == "frames":
         return (values if on_labels else rows[name]).take(of_frame)
-    of_trajectory = _places(frames["trajectory_id"], tables["trajectories"]["trajectory_id"])
+    of_trajectory = _row_numbers(frames["trajectory_id"], tables["trajectories"]["trajectory_id"])
     return values.take(of_trajectory[of_frame])
 
 
-def _places(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
+def _row_numbers(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
     index = pd.Index(within.to_pandas())
     return index.get_indexer(values.to_pandas())

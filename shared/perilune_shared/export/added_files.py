@@ -13,15 +13,16 @@ from perilune_shared.validation.expected_files import EXTRA_NAMES
 
 
 def check_sums(dataset: Dataset, paths: Iterable[Path], progress: Progress = NO_PROGRESS) -> dict[str, str] | None:
-    """Return the hashes of the dataset's other files if writing `paths` requires a new SHA256SUMS, otherwise None.
+    """Check that `paths` may be written; return the hashes for a new SHA256SUMS, or None if it stays the same.
 
-    A new SHA256SUMS is required if one of `paths` is directly in the folder of a complete dataset; that of an
-    incomplete dataset is written on completion. Raises UserError if the hash of another file is wrong, since new sums
-    would hide it, or if a name is not allowed in a dataset (perilune_shared.validation.expected_files).
+    The hashes are those of all other files of the dataset. SHA256SUMS changes if one of `paths` is directly in the
+    folder of a complete dataset; an incomplete dataset has none yet. Raises UserError if the hash of another file is
+    wrong, since new sums would hide it, or if a name is not allowed in a dataset
+    (perilune_shared.validation.expected_files).
     """
     for path in paths:
         if any(path.resolve().is_relative_to((dataset.root / folder).resolve()) for folder in ("manifest", "images")):
-            raise UserError(path, "--out", "a file in a folder of tables or images", "another place")
+            raise UserError(path, "--out", "a file in manifest/ or images/", "a path outside these folders")
     own = {path.name for path in paths if path.resolve().parent == dataset.root.resolve()}
     for name in sorted(own - EXTRA_NAMES):
         raise UserError(dataset.root / name, "--out", name, f"{', '.join(sorted(EXTRA_NAMES))}, or another folder")

@@ -1,7 +1,7 @@
-"""Write the dataset card, for readers and for dataset repositories: README.md and card.png.
+"""Write the dataset card: README.md and card.png, for readers and for dataset repositories.
 
 The page is Markdown with a YAML head in Hugging Face's format (https://huggingface.co/docs/hub/datasets-cards).
-Datasets are untrusted: each text from a dataset is put in a code span, reduced to letters, digits and harmless marks.
+Datasets are untrusted: each text from a dataset is put in a code span, with only letters, digits and safe punctuation.
 """
 
 import shlex
@@ -27,19 +27,21 @@ from perilune_shared.progress import Progress
 
 CARD_NAME = "README.md"
 _PICTURE_NAME = "card.png"
-_MARK = "<!-- written by `perilune-manifest card`, which writes it anew; changes by hand are lost -->"
-_HARMLESS = frozenset(string.ascii_letters + string.digits + " ._+,:()/%=?-")
+_MARK_START = "<!-- written by `perilune-manifest card`"
+"""Start of the comment that identifies a card; the rest of the comment may differ between versions."""
+_MARK = f"{_MARK_START}, which overwrites this file; manual changes are lost -->"
+_SAFE = frozenset(string.ascii_letters + string.digits + " ._+,:()/%=?-")
 _PURPOSE = {"detect": "Crater detection", "nav": "Navigation"}
 _IMAGES = {
     "files": "8- or 16-bit grey PNGs under frames/",
     "packed": "grey PNGs packed in images/*.parquet",
-    "absent": "not here: the manifest alone",
+    "absent": "not included (only the manifest)",
     "planned": "not rendered yet",
 }
 
 
 def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[Path, Path]:
-    """Write the page and the picture beside it, and update the dataset's checksums; return the two paths.
+    """Write the page and the picture beside it, and update the dataset's checksums; return both paths.
 
     `out` is by default README.md in the dataset. Raises UserError if a file that is not a card would be overwritten,
     the dataset has no frames or its checksums are wrong.
@@ -48,9 +50,9 @@ def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[
     if out.suffix != ".md":
         raise UserError(out, "--out", out.name, "a name that ends in .md")
     picture = out.with_name(_PICTURE_NAME) if out.name == CARD_NAME else out.with_suffix(".png")
-    ours = out.is_file() and _MARK in out.read_text(encoding="utf-8", errors="replace")
+    is_card = out.is_file() and _MARK_START in out.read_text(encoding="utf-8", errors="replace")
     for path in (out, picture):
-        if path.exists() and not ours:
+        if path.exists() and not is_card:
             raise UserError(path, "--out", "a file that is not a card", "another path, or move that file away")
     known = check_sums(dataset, (out, picture), progress)
     gathered = gather(dataset, progress)
@@ -62,30 +64,31 @@ def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[
 
 def code(value: object) -> str:
     """Format untrusted text as a code span that is safe in Markdown, in its tables and in HTML."""
-    text = "".join(c if c in _HARMLESS else "?" for c in shortened(one_line(value), 200))
+    text = "".join(c if c in _SAFE else "?" for c in shortened(one_line(value), 200))
     return f"`{text.strip() or 'none'}`"
 
 
 def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
     """Return the page as Markdown."""
     info = dataset.info
-    state = "" if info.complete else "\n\n**Not complete**: the renderer is still at work, or was stopped."
+    state = "" if info.complete else "\n\n**Not complete**: rendering is in progress or was interrupted."
     parts = [
         head_of(dataset, table_configs(dataset)),
         f"{_MARK}\n\n# {code(info.name)}",
-        f"Rendered lunar descents with exact crater ellipses and camera poses. {_purpose(info)}{state}",
+        "Rendered images of lunar landing trajectories with exact crater ellipses and camera poses. "
+        f"{_purpose(info)}{state}",
         f"![Frames with labels, and histograms]({quote(picture_name)})",
-        "*Labels: green where the selection `visible` takes them, orange for craters that a frame hardly shows.*",
-        "## What it holds\n\n" + _counts(dataset),
-        _table(["", "lowest", "5 %", "median", "95 %", "highest"], _quantiles(gathered)),
+        "*Labels: green if in the selection `visible`, otherwise orange (craters that are hard to see in the frame).*",
+        "## Contents\n\n" + _counts(dataset),
+        _table(["", "minimum", "5 %", "median", "95 %", "maximum"], _quantiles(gathered)),
         *_real_ground(gathered),
         "## Scenes\n\n" + _scenes(dataset),
         "## Splits\n\n" + _splits(dataset),
         "## Files\n\n" + _files(dataset),
-        "## Making it again\n\n" + "\n\n".join(_remake(key, recipe) for key, recipe in info.recipes.items()),
-        "## History\n\n" + ("\n".join(f"- {code(line)}" for line in info.history) or "As rendered."),
+        "## Reproduction\n\n" + "\n\n".join(_remake(key, recipe) for key, recipe in info.recipes.items()),
+        "## History\n\n" + ("\n".join(f"- {code(line)}" for line in info.history) or "Not edited since rendering."),
         f"## Licence\n\n{code(info.licence)}",
-        f"## Citation\n\nThe hash names this dataset and no other.\n\n```bibtex\n{citation_of(dataset)}\n```",
+        f"## Citation\n\nThe hash identifies this dataset.\n\n```bibtex\n{citation_of(dataset)}\n```",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -118,7 +121,7 @@ def _real_ground(gathered: Gathered) -> Iterable[str]:
     if by_split is not None:
         values = np.concatenate(list(by_split.values()))
         low, mean, high = (f"{100 * value:.0f}" for value in (np.nanmin(values), np.nanmean(values), np.nanmax(values)))
-        yield f"Real ground: {mean} % of a frame's ground in the mean, from {low} to {high} %. The rest is procedural."
+        yield f"Real ground: on average {mean} % of a frame's ground ({low} to {high} %). The rest is procedural."
 
 
 def _scenes(dataset: Dataset) -> str:
@@ -128,10 +131,10 @@ def _scenes(dataset: Dataset) -> str:
         "longitude, deg": "longitude_deg",
         "Sun's azimuth, deg": "sun_azimuth_deg",
         "Sun's elevation, deg": "sun_elevation_deg",
-        "side, m": "extent_m",
+        "side of the terrain, m": "extent_m",
     }
     rows = [[title, f"{scenes[name].min():.6g} to {scenes[name].max():.6g}"] for title, name in numbers.items()]
-    for title, name in {"photometry": "photometry", "ground from": "dem_source"}.items():
+    for title, name in {"photometry": "photometry", "source of the terrain": "dem_source"}.items():
         counted = scenes[name].value_counts()
         shown = ", ".join(f"{code(value)} ({number})" for value, number in counted.head(8).items())
         rows.append([title, shown + (f" and {len(counted) - 8} more" if len(counted) > 8 else "")])
@@ -144,9 +147,11 @@ def _splits(dataset: Dataset) -> str:
     terrain = {row["scene_id"]: terrain_of(row["dem_source"], row["content_sha256"]) for row in scenes}
     splits = frames.groupby(frames["scene_id"].map(terrain).to_numpy())["split"].nunique()
     shared = int((splits > 1).sum())
-    by = f"Split by {dataset.info.split_by}: that is what no two splits share. "
+    by = f"Split by {dataset.info.split_by}: no {dataset.info.split_by} is in two splits. "
     if shared:
-        return by + f"**{shared} of {len(splits)} terrains are in more than one split**, so that test figures flatter."
+        return (
+            by + f"**{shared} of {len(splits)} terrains are in more than one split**, so test metrics are optimistic."
+        )
     return by + "No terrain is in two splits."
 
 
@@ -158,8 +163,8 @@ def _files(dataset: Dataset) -> str:
             f"- Images: {_IMAGES[info.images]}.",
             f"- Camera: {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px, principal point "
             f"({camera.cx_px:.6g}, {camera.cy_px:.6g}) px from the outer corner of the top-left pixel, {lens}.",
-            "- Tables: manifest/*/*.parquet; unit and meaning of each column stand in the files.",
-            f"- {INFO_NAME}: everything that it was made by. SHA256SUMS: `sha256sum -c SHA256SUMS`.",
+            "- Tables: manifest/*/*.parquet; the metadata of the files has the unit and meaning of each column.",
+            f"- {INFO_NAME}: settings, random seeds and versions. SHA256SUMS: check it with `sha256sum -c SHA256SUMS`.",
             f"- Schema version {code(info.schema_version)}.",
         ]
     )
@@ -178,8 +183,8 @@ def _remake(key: str, recipe: Recipe) -> str:
         source = f" FIRST is {code(origin.name)}, whose {INFO_NAME} has the SHA-256 {code(origin.sha256)}."
     versions = ", ".join(code(f"{name} {version}") for name, version in recipe.versions.items())
     return (
-        f"Recipe {code(key)}: preset {code(recipe.preset)}, seed {recipe.seed}, with {versions}.{source} What the "
-        f"history tells was done after. Single frames come again by `perilune-render regenerate`.\n\n"
+        f"Recipe {code(key)}: preset {code(recipe.preset)}, seed {recipe.seed}, with {versions}.{source} The "
+        f"edits in the history were made afterwards. `perilune-render regenerate` renders single frames again.\n\n"
         f"```sh\n{unpack}\n{make} --config recipe.yaml --out again\n```"
     )
 

@@ -30,7 +30,7 @@ _COLUMNS = 4
 _COLOURS = {"train": "#4477aa", "val": "#ee9933", "test": "#228855"}
 _LOGARITHMIC = ("radius_px", "visible_fraction", "sunlit_fraction")
 """Measures with a logarithmic count axis, since most values are in few bins."""
-_CHOSEN, _OTHER = "#50dc50", "#ff8c3c"
+_SELECTED_COLOUR, _OTHER_COLOUR = "#50dc50", "#ff8c3c"
 TITLES = {
     "radius_px": "label radius sqrt(a b), px",
     "labels_per_frame": "labels per frame",
@@ -48,12 +48,12 @@ TITLES = {
 
 @dataclass(frozen=True, slots=True)
 class Gathered:
-    """Data of a dataset that the card shows."""
+    """Data that the card shows."""
 
     measures: dict[str, dict[str, NDArray[np.float32]]]
     """Values by measure and split; see `TITLES` for names and units."""
     samples: list[tuple[dict, pd.DataFrame]] = field(default_factory=list)
-    """Rows of the frames to show, each with its labels; their column `visible` is the selection of that name."""
+    """Rows of the frames to show, each with its labels; their column `visible`: in the selection `visible`."""
 
 
 def gather(dataset: Dataset, progress: Progress) -> Gathered:
@@ -61,7 +61,7 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
     ids = dataset.scene_ids()
     if not ids:
         raise UserError(dataset.root, "scenes", "none", "a dataset with frames")
-    task = progress.add_task("card", total=len(ids), unit="scenes")
+    task = progress.add_task("reading", total=len(ids), unit="scenes")
     collected: dict[str, dict[str, list[np.ndarray]]] = {}
     samples: list[tuple[dict, pd.DataFrame]] = []
     # Spread the frames over the scenes and over the length of trajectories.
@@ -162,25 +162,25 @@ def _draw_frame(axis: "Axes", row: dict, labels: pd.DataFrame, png: bytes) -> No
         offsets=labels[["ellipse_cx_px", "ellipse_cy_px"]].to_numpy(),
         offset_transform=axis.transData,
         facecolors="none",
-        edgecolors=np.where(chosen, _CHOSEN, _OTHER).tolist(),
+        edgecolors=np.where(chosen, _SELECTED_COLOUR, _OTHER_COLOUR).tolist(),
         linewidths=1.1,
     )
     axis.add_collection(ellipses)
     axis.set_xlim(0, width)
     axis.set_ylim(height, 0)
     altitude_m = float(np.asarray(row["position_m"])[2])
-    axis.set_title(f"{row['split']}, {altitude_m:.0f} m up, {len(labels)} labels", fontsize=8)
+    axis.set_title(f"{row['split']}, altitude {altitude_m:.0f} m, {len(labels)} labels", fontsize=8)
 
 
 def _draw_histogram(axis: "Axes", name: str, by_split: Mapping[str, np.ndarray]) -> None:
     axis.set_axis_on()
     finite = {split: by_split[split][np.isfinite(by_split[split])] for split in SPLITS if split in by_split}
-    every = np.concatenate(list(finite.values()))
-    if not len(every):
+    all_values = np.concatenate(list(finite.values()))
+    if not len(all_values):
         axis.text(0.5, 0.5, "no values", ha="center", va="center", transform=axis.transAxes, fontsize=8)
     else:
-        low, high = float(every.min()), float(every.max())
-        # If all values are equal, the bins still need a width.
+        low, high = float(all_values.min()), float(all_values.max())
+        # Equal values would give bins without a width.
         edges = (
             np.linspace(low, high, 31) if high - low > 1e-6 * max(1.0, abs(high)) else np.linspace(low - 1, low + 1, 4)
         )

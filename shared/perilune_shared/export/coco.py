@@ -1,7 +1,7 @@
 """Export to COCO: boxes, and ellipses as polygons, one file per split.
 
 Format: https://cocodataset.org/#format-data. COCO's coordinates have their origin at the outer corner of the top-left
-pixel, as ours do. Boxes and polygons are clipped to the image, as usual in COCO; the whole ellipse is included too.
+pixel, as in perilune. Boxes and polygons are clipped to the image, as usual in COCO; ellipses are not clipped.
 Labels that are not selected are marked `iscrowd`: evaluators ignore detections that match them.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
-from perilune_shared.export.rows import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, scenes_of, sizes
+from perilune_shared.export.rows import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, frame_sizes, scenes_of
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
@@ -24,9 +24,9 @@ _N_CORNERS = 32
 _DECIMALS = 3
 """Decimals of pixel coordinates in the file, finer than the accuracy of any label."""
 _ANGLES = 2 * np.pi * np.arange(_N_CORNERS) / _N_CORNERS
-_CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+_POLYGON = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 # A polygon with corners on the ellipse has a smaller area; scaling it by 0.3 % makes the areas equal.
-_CIRCLE *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
+_POLYGON *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
 
 
 def export_coco(
@@ -59,14 +59,14 @@ def export_coco(
 def polygons_of(labels: pd.DataFrame) -> NDArray[np.float64]:
     """Return polygons (N, 32, 2), pixels, with the area of the labels' ellipses, not clipped to the image."""
     cos, sin = np.cos(labels["ellipse_theta_rad"].to_numpy()), np.sin(labels["ellipse_theta_rad"].to_numpy())
-    along = labels["ellipse_a_px"].to_numpy()[:, None] * _CIRCLE[:, 0]
-    across = labels["ellipse_b_px"].to_numpy()[:, None] * _CIRCLE[:, 1]
+    along = labels["ellipse_a_px"].to_numpy()[:, None] * _POLYGON[:, 0]
+    across = labels["ellipse_b_px"].to_numpy()[:, None] * _POLYGON[:, 1]
     x = labels["ellipse_cx_px"].to_numpy()[:, None] + along * cos[:, None] - across * sin[:, None]
     y = labels["ellipse_cy_px"].to_numpy()[:, None] + along * sin[:, None] + across * cos[:, None]
     return np.stack([x, y], axis=-1)
 
 
-def cut_at_edges(polygon: NDArray[np.float64], width_px: float, height_px: float) -> NDArray[np.float64]:
+def clip_to_image(polygon: NDArray[np.float64], width_px: float, height_px: float) -> NDArray[np.float64]:
     """Clip a convex polygon (M, 2) to the image; the result is empty if they do not overlap.
 
     Clips at one edge after the other (Sutherland & Hodgman 1974, doi 10.1145/360767.360802).
@@ -98,9 +98,9 @@ def area_of(polygon: NDArray[np.float64]) -> float:
 def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
     """Return a scene's annotations by image_id. Labels wholly outside their image are omitted."""
     labels = scene.labels
-    boxes, size, polygons = clipped_boxes(labels, scene.frames), sizes(labels, scene.frames), polygons_of(labels)
+    boxes, size, polygons = clipped_boxes(labels, scene.frames), frame_sizes(labels, scene.frames), polygons_of(labels)
     boxes[:, 2:] -= boxes[:, :2]
-    whole = ((polygons >= 0) & (polygons <= size[:, None])).all(axis=(1, 2))
+    is_inside = ((polygons >= 0) & (polygons <= size[:, None])).all(axis=(1, 2))
     columns = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
     ellipses = labels[columns].to_numpy(np.float64)
     image_ids = scene.frames.set_index("frame_id")["image_id"].loc[labels["frame_id"]].to_list()
@@ -108,7 +108,7 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
     measures = {name: labels[name].to_numpy(np.float64) for name in LABEL_MEASURES if name in labels}
     found: dict[int, list[dict[str, Any]]] = {}
     for k, (image_id, label_id, crater_id, chosen) in enumerate(names):
-        polygon = polygons[k] if whole[k] else cut_at_edges(polygons[k], *size[k])
+        polygon = polygons[k] if is_inside[k] else clip_to_image(polygons[k], *size[k])
         area = area_of(polygon) if len(polygon) > 2 else 0.0
         if area <= 0 or boxes[k, 2:].min() <= 0:
             continue
@@ -130,7 +130,7 @@ def _annotations(scene: SceneRows) -> dict[int, list[dict[str, Any]]]:
 
 
 class _SplitFile:
-    """Write one JSON file: annotations as they are added, and images, which are few, at the end."""
+    """Writer of one JSON file: writes annotations when they are added, and the images on closing."""
 
     def __init__(self, path: Path, dataset: Dataset):
         info = dataset.info
@@ -141,7 +141,7 @@ class _SplitFile:
             "info": {
                 "description": info.name,
                 "version": info.schema_version,
-                "ellipse": "cx_px, cy_px, a_px, b_px, theta_rad; whole, while bbox and segmentation end at the edges",
+                "ellipse": "cx_px, cy_px, a_px, b_px, theta_rad; not clipped, unlike bbox and segmentation",
             },
             "licenses": [{"id": 1, "name": info.licence, "url": ""}],
             "categories": [CATEGORY],

@@ -81,9 +81,14 @@ def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progre
     """
     out = out or dataset.root / CROISSANT_NAME
     if out.resolve().parent != dataset.root.resolve() or out.suffix != ".json":
-        raise UserError(out, "--out", "another folder", f"a .json file in {dataset.root}, since its paths are relative")
+        raise UserError(
+            out,
+            "--out",
+            "a file in another folder or of another type",
+            f"a .json file in {dataset.root}, since its paths are relative",
+        )
     if out.name == INFO_NAME:
-        raise UserError(out, "--out", INFO_NAME, "a name that is not taken")
+        raise UserError(out, "--out", INFO_NAME, "another name")
     if not dataset.info.complete:
         raise UserError(dataset.root, "complete", "false", "a finished dataset")
     known = check_sums(dataset, [out], progress)
@@ -104,7 +109,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
             "@type": "cr:FileObject",
             "@id": INFO_NAME,
             "name": INFO_NAME,
-            "description": "what the dataset is, what it was made by, what was done to it",
+            "description": "metadata of the dataset: camera, splits, recipes, edits since rendering",
             "contentUrl": INFO_NAME,
             "encodingFormat": "application/json",
             "sha256": files.sha256_of(dataset.root / INFO_NAME),
@@ -139,7 +144,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
         "name": info.name,
         "description": _description(dataset),
         "license": _licence(info.licence),
-        # Datasets have no version number: count the edits since rendering.
+        # Datasets have no version number: use the number of edits since rendering.
         "version": f"1.0.{len(info.history)}",
         "citeAs": citation_of(dataset),
         "keywords": ["Moon", "craters", "lunar landing", "synthetic images", info.kind],
@@ -152,16 +157,16 @@ def citation_of(dataset: Dataset) -> str:
     """Return a BibTeX entry that identifies this dataset by a hash."""
     sha256 = files.sha256_of(dataset.root / INFO_NAME)
     key = "".join(c if c.isascii() and c.isalnum() else "-" for c in dataset.info.name).strip("-")
-    note = f"Rendered lunar descents. SHA-256 of {INFO_NAME}: {sha256}"
+    note = f"Rendered images of lunar landing trajectories. SHA-256 of {INFO_NAME}: {sha256}"
     return f"@misc{{{key}, title = {{{dataset.info.name}}}, howpublished = {{perilune dataset}}, note = {{{note}}}}}"
 
 
 def _description(dataset: Dataset) -> str:
     counts = dataset.info.counts
     return (
-        f"Rendered lunar descents with exact crater ellipses and camera poses: {counts.scenes} scenes, "
-        f"{counts.trajectories} descents, {counts.frames} frames, {counts.labels} labels, made by perilune. "
-        f"Splits share no {dataset.info.split_by}."
+        "Rendered images of lunar landing trajectories with exact crater ellipses and camera poses: "
+        f"{counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames, {counts.labels} labels, "
+        f"made by perilune. Splits share no {dataset.info.split_by}."
     )
 
 
@@ -186,7 +191,7 @@ def _distribution(dataset: Dataset, table: str, known: Mapping[str, str]) -> dic
         "@type": "cr:FileSet",
         "@id": f"{table}-parquet",
         **common,
-        "description": "parts, each with the rows of a scene or a descent; their hashes stand in SHA256SUMS",
+        "description": "parts, each with the rows of one scene or trajectory; SHA256SUMS has their hashes",
         "includes": f"manifest/{table}/*.parquet",
     }
 
@@ -218,7 +223,7 @@ def _images(*, packed: bool) -> dict[str, Any]:
         "@type": "cr:FileSet",
         "@id": "image-files",
         "name": "image-files",
-        "description": "packed frames" if packed else "frames; their hashes stand in the table frames",
+        "description": "packed frames" if packed else "frames; the table frames has their hashes",
         "encodingFormat": _PARQUET if packed else "image/png",
         "includes": "images/*.parquet" if packed else "frames/*.png",
     }

@@ -1,8 +1,8 @@
 """Export to Hugging Face: one row per frame with its image, pose and labels, in Parquet files for each split.
 
-A dataset's own tables mix frames of all splits and keep labels separate from frames; `datasets` would read all of it as
-training data. From this export, `datasets.load_dataset(folder)` loads all splits and `load_dataset(folder,
-split="test")` loads one. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
+A dataset's own tables mix frames of all splits and keep labels separate from frames; the library `datasets` would read
+all of them as training data. With this export, `datasets.load_dataset(folder)` loads all splits and
+`load_dataset(folder, split="test")` loads one. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
 """
 
 import json
@@ -23,7 +23,7 @@ from perilune_shared.export.rows import Choice, SceneRows, scenes_of
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
-_LEFT_OUT = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
+_OMITTED = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
 _LABEL = pa.struct(
     [
         *(pa.field(field.name, field.type) for field in TABLES["labels"] if field.name != "frame_id"),
@@ -70,8 +70,8 @@ def export_hugging_face(
 
 _PAGE = """
 
-Rendered lunar descents: one row a frame, with its image, camera pose and labels (crater ellipses). Units stand in the
-names of the columns; their meaning stands in the metadata of the Parquet files.
+Rendered images of lunar landing trajectories. Each row is a frame with its image, camera pose and labels (crater
+ellipses). The column names contain the units. The metadata of the Parquet files has the meaning of each column.
 
 ```python
 from datasets import load_dataset
@@ -84,7 +84,7 @@ test = load_dataset("FOLDER", split="test")
 def schema_of() -> pa.Schema:
     """Return the schema of the files: columns of frames, the image, and the labels as a list of structs."""
     columns = [IMAGES.field("frame_id"), IMAGES.field("image")]
-    columns += [field for field in TABLES["frames"] if field.name not in ("frame_id", *_LEFT_OUT)]
+    columns += [field for field in TABLES["frames"] if field.name not in ("frame_id", *_OMITTED)]
     columns.append(pa.field("labels", pa.list_(_LABEL), metadata={"unit": "", "meaning": "craters in the frame"}))
     features = {field.name: {"_type": "Image"} if field.name == "image" else _feature(field.type) for field in columns}
     return pa.schema(columns, metadata={"huggingface": json.dumps({"info": {"features": features}})})
@@ -104,16 +104,16 @@ def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]
     schema = schema_of()
     for split, frames in scene.frames.groupby("split"):
         for start in range(0, len(frames), _FRAMES_PER_GROUP):
-            some = frames.iloc[start : start + _FRAMES_PER_GROUP]
-            pngs = dict(dataset.pngs(pa.Table.from_pandas(some[["frame_id", "png_path"]], preserve_index=False)))
-            images = [{"bytes": pngs[name], "path": f"{name}.png"} for name in some["frame_id"]]
+            batch = frames.iloc[start : start + _FRAMES_PER_GROUP]
+            pngs = dict(dataset.pngs(pa.Table.from_pandas(batch[["frame_id", "png_path"]], preserve_index=False)))
+            images = [{"bytes": pngs[name], "path": f"{name}.png"} for name in batch["frame_id"]]
             columns = {
                 "image": pa.array(images, schema.field("image").type),
-                "labels": _labels(scene.labels, some["frame_id"]),
+                "labels": _labels(scene.labels, batch["frame_id"]),
             }
             for field in schema:
                 if field.name not in columns:
-                    columns[field.name] = pa.array(some[field.name].tolist(), field.type, from_pandas=True)
+                    columns[field.name] = pa.array(batch[field.name].tolist(), field.type, from_pandas=True)
             yield str(split), pa.table([columns[name] for name in schema.names], schema=schema)
 
 
@@ -127,7 +127,7 @@ def _labels(labels: pd.DataFrame, frame_ids: pd.Series) -> pa.ListArray:
 
 
 class _Shards:
-    """Parquet files of one split, each of about `shard_bytes`."""
+    """Writer of the Parquet files of one split, each of about `shard_bytes`."""
 
     def __init__(self, folder: Path, shard_bytes: int):
         self._folder, self._shard_bytes = folder, shard_bytes

@@ -1,4 +1,4 @@
-"""Read a dataset's rows scene by scene, for all exports.
+"""Read the rows of a dataset scene by scene; used by all exports.
 
 Use::
 
@@ -24,11 +24,11 @@ from perilune_shared.labels.thresholds import Selection
 Choice = Callable[[Dataset, str, pa.Table], NDArray[np.bool_]]
 """Select labels: takes the dataset, a scene_id and its labels (N rows, all columns); returns bool (N,)."""
 LABEL_MEASURES = ("visible_fraction", "sunlit_fraction", "contrast")
-"""Columns of labels on which users select; exports include those that the dataset has."""
+"""Columns of labels by which users select; exports include those that the dataset has."""
 
 
 def by_selection(selection: Selection) -> Choice:
-    """Return the choice of the labels that match a selection."""
+    """Return a function that selects labels by the thresholds of a selection."""
 
     def choose(dataset: Dataset, scene_id: str, labels: pa.Table) -> NDArray[np.bool_]:
         craters = dataset.table("craters", ["crater_id", "depth_m", "diameter_m"], scene_id=scene_id).to_pandas()
@@ -56,16 +56,17 @@ def scenes_of(
     """Yield the scenes in order, with one scene in memory at a time.
 
     `image_id` and `label_id` number the frames and labels of the whole dataset from 1, in order, so they do not depend
-    on the requested split and choice. Raises UserError if no frame belongs to the split, or one has an unknown split.
+    on the requested split and choice. Raises UserError if no frame belongs to the split, or a frame has an unknown
+    split.
     """
-    n_frames = n_labels = n_given = 0
+    n_frames = n_labels = n_yielded = 0
     for scene_id in dataset.scene_ids():
         frames = dataset.table("frames", scene_id=scene_id).to_pandas()
         frames = frames.sort_values("frame_id", kind="stable", ignore_index=True)
-        odd = sorted(set(frames["split"]) - set(SPLITS))
-        if odd:
+        unknown = sorted(set(frames["split"]) - set(SPLITS))
+        if unknown:
             # Split names become file names, and datasets are untrusted.
-            raise UserError(dataset.root, "split", odd[0], "one of " + ", ".join(SPLITS))
+            raise UserError(dataset.root, "split", unknown[0], "one of " + ", ".join(SPLITS))
         frames["image_id"] = np.arange(len(frames)) + n_frames + 1
         n_frames += len(frames)
         rows = dataset.table("labels", scene_id=scene_id) if with_labels else TABLES["labels"].empty_table()
@@ -77,21 +78,23 @@ def scenes_of(
         if split is not None:
             frames = frames[frames["split"] == split].reset_index(drop=True)
         labels = labels[labels["frame_id"].isin(frames["frame_id"])].reset_index(drop=True)
-        n_given += len(frames)
+        n_yielded += len(frames)
         if len(frames):
             yield SceneRows(scene_id, frames, labels)
-    if not n_given:
-        raise UserError(dataset.root, "frames", "none" if split is None else f"none of split {split}", "some frames")
+    if not n_yielded:
+        raise UserError(
+            dataset.root, "frames", "none" if split is None else f"none of split {split}", "at least one frame"
+        )
 
 
 def clipped_boxes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
     """Return the boxes (N, 4) of labels as x0, y0, x1, y1, pixels, clipped to their frames."""
-    size = sizes(labels, frames)
+    size = frame_sizes(labels, frames)
     boxes = labels[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
     return np.clip(boxes, 0.0, np.hstack([size, size]))
 
 
-def sizes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
+def frame_sizes(labels: pd.DataFrame, frames: pd.DataFrame) -> NDArray[np.float64]:
     """Return width and height (N, 2) of the frame of each label, pixels."""
     by_id = frames.set_index("frame_id")[["width_px", "height_px"]]
     return by_id.loc[labels["frame_id"]].to_numpy(np.float64).reshape(-1, 2)

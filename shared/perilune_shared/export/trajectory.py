@@ -1,4 +1,4 @@
-"""Export trajectories to TUM and KITTI, one file per trajectory, for evo and the benchmarks' own tools.
+"""Export trajectories to TUM and KITTI, one file per trajectory; read by evo and by the tools of both benchmarks.
 
 Poses are camera poses: the position of the centre of projection, and the rotation from O_C (x right, y down, z along
 the viewing direction) to the reference frame, e.g. rotation_site_from_camera for O_L.
@@ -21,8 +21,8 @@ from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
 _TUM_HEADER = (
-    "# camera poses of one descent: centre of projection in O_L (X west, Y south, Z up), metres;\n"
-    "# rotation_site_from_camera (camera: x right, y down, z along the view); seconds since the first frame\n"
+    "# camera poses of one trajectory: centre of projection in O_L (X west, Y south, Z up), metres;\n"
+    "# rotation_site_from_camera (camera: x right, y down, z forward); seconds since the first frame\n"
     "# timestamp tx ty tz qx qy qz qw\n"
 )
 

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import SPLITS
-from perilune_shared.export.rows import Choice, clipped_boxes, scenes_of, sizes
+from perilune_shared.export.rows import Choice, clipped_boxes, frame_sizes, scenes_of
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
@@ -41,20 +41,22 @@ def export_yolo(
     with files.new_folder(out) as folder:
         for scene in scenes_of(dataset, split, choose):
             labels = scene.labels[scene.labels["chosen"]]
-            boxes = clipped_boxes(labels, scene.frames) / np.tile(sizes(labels, scene.frames), 2)
+            boxes = clipped_boxes(labels, scene.frames) / np.tile(frame_sizes(labels, scene.frames), 2)
             # The 8 decimals below resolve 0.001 px in the widest image (100,000 px).
             size, centre = boxes[:, 2:] - boxes[:, :2], (boxes[:, 2:] + boxes[:, :2]) / 2
-            seen = (size > 0).all(axis=1)
+            not_empty = (size > 0).all(axis=1)
             lines: dict[str, list[str]] = defaultdict(list)
-            for frame_id, (x, y), (w, h) in zip(labels["frame_id"][seen], centre[seen], size[seen], strict=True):
+            for frame_id, (x, y), (w, h) in zip(
+                labels["frame_id"][not_empty], centre[not_empty], size[not_empty], strict=True
+            ):
                 lines[frame_id].append(f"{CRATER_CLASS} {x:.8f} {y:.8f} {w:.8f} {h:.8f}\n")
-            n_boxes += int(seen.sum())
+            n_boxes += int(not_empty.sum())
             for frame_id, own_split in zip(scene.frames["frame_id"], scene.frames["split"], strict=True):
                 files.write_text(
                     files.inside(folder, f"labels/{frame_id}.txt"), "".join(lines[frame_id]), durable=False
                 )
                 lists[own_split].append(f"./images/{frame_id}.png\n")
-            _bring_images(dataset, scene.frames, folder, link=link)
+            _write_images(dataset, scene.frames, folder, link=link)
             progress.advance(task)
         for name, entries in lists.items():
             files.write_text(folder / f"{name}.txt", "".join(entries))
@@ -64,7 +66,7 @@ def export_yolo(
     return n_boxes
 
 
-def _bring_images(dataset: Dataset, frames: pd.DataFrame, folder: Path, *, link: bool) -> None:
+def _write_images(dataset: Dataset, frames: pd.DataFrame, folder: Path, *, link: bool) -> None:
     """Write the PNGs of frames as images/<frame_id>.png."""
     rows = frames[["frame_id", "png_path"]]
     if dataset.info.images == "files":

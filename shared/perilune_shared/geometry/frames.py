@@ -77,7 +77,7 @@ def sun_direction(azimuth_deg: float, elevation_deg: float) -> Array:
 def earth_direction(latitude_deg: float, longitude_deg: float) -> Array:
     """Return the unit vector (3,) in O_L towards the Earth's mean position, above latitude 0, longitude 0.
 
-    Deviation: ignores libration (up to about 8 degrees) and the parallax of the site (up to 0.3 degrees).
+    Approximation: ignores libration (up to about 8 degrees) and the parallax of the site (up to 0.3 degrees).
     """
     latitude, longitude = np.radians([latitude_deg, longitude_deg])
     west, south = np.sin(longitude), np.sin(latitude) * np.cos(longitude)

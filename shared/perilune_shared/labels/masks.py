@@ -25,7 +25,7 @@ from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 SLACK_RADII, SLACK_PX = 0.1, 2.0
-"""Tolerance of the depth test: in crater radii and in pixel widths at the crater; the larger one counts."""
+"""Tolerance of the depth test: in crater radii and in pixel widths at the crater; the larger of both applies."""
 _CRATER = ["crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m"]
 
 
@@ -86,7 +86,7 @@ def frame_masks(
             expected = f"{exr_camera.width_px} x {exr_camera.height_px} pixels, the size of the EXRs"
             raise UserError(frame_id, "depth_m", f"{depth_m.shape[::-1]}", expected)
         if image == "png" and camera != exr_camera:
-            depth_m = _looked_up(depth_m, camera, exr_camera)
+            depth_m = _resampled(depth_m, camera, exr_camera)
     rotation = matrix_from_quaternion(pose["rotation_wxyz"])
     centres = camera_from_site(rows[["x_m", "y_m", "z_m"]].to_numpy(np.float64), pose["position_m"], rotation)
     normals = rows[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float64) @ rotation.T
@@ -132,7 +132,7 @@ def crater_masks(
     return masks
 
 
-def _looked_up(depth_m: NDArray[np.floating], camera: Camera, source: Camera) -> NDArray[np.floating]:
+def _resampled(depth_m: NDArray[np.floating], camera: Camera, source: Camera) -> NDArray[np.floating]:
     """Sample the depth image of `source` at the pixel nearest to each pixel centre of `camera`; both share one pose."""
     place = np.floor(source.project(camera.rays(camera.pixel_centres())))
     column = np.clip(place[..., 0], 0, source.width_px - 1).astype(int)

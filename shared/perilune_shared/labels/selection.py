@@ -42,7 +42,7 @@ def selected(labels: pd.DataFrame, selection: Selection) -> NDArray[np.bool_]:
 
 
 def label_bound_px(info: DatasetInfo) -> float:
-    """Maximum radius of a label in a dataset, pixels, from its recipes; the default if they do not state it."""
+    """Return the maximum radius of a label in a dataset, pixels, from its recipes, or the default if they have none."""
     stated = [recipe.config.get("labels") for recipe in info.recipes.values()]
     bounds = [labels.get("max_radius_px") for labels in stated if isinstance(labels, dict)]
     numbers = [float(bound) for bound in bounds if isinstance(bound, int | float) and bound > 0]

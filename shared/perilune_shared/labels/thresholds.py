@@ -15,7 +15,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Selection(Section):
-    """Thresholds; a selected label fulfils all of them. null sets no threshold."""
+    """Thresholds of a selection; a selected label fulfils all of them. null sets no threshold."""
 
     radius_px: tuple[Positive, Positive | None] | None = None
     """Minimum and maximum radius sqrt(a b), pixels; null as the maximum sets no upper limit."""
@@ -45,5 +45,5 @@ SELECTIONS: dict[str, Selection] = {
 
 
 def default_label_bound_px(width_px: int) -> float:
-    """Default maximum radius of a label, pixels: 50, and proportional to the width in images wider than 256 px."""
+    """Return the default maximum radius of a label, pixels: 50 up to 256 px width, proportional to the width above."""
     return max(50.0, width_px * 50 / 256)

@@ -76,7 +76,7 @@ def faults_of(root: Path, progress: Progress = NO_PROGRESS) -> Iterator[tuple[st
 
 @contextlib.contextmanager
 def _hashing(root: Path, names: list[str], progress: Progress) -> Iterator[Callable[[int], object]]:
-    """Give a function that advances the progress bar by a number of bytes read."""
+    """Yield a function that advances the progress bar by a number of bytes read."""
     total = sum((root / name).stat().st_size for name in names if (root / name).is_file())
     task = progress.add_task("hashing", total=total / 1e6, unit="MB")
     yield lambda n_bytes: progress.advance(task, n_bytes / 1e6)

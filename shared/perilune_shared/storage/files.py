@@ -19,7 +19,7 @@ _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _LONGEST_PATH = 500
 _CHUNK_BYTES = 2**20
 _FICLONE = 0x40049409
-"""Value from linux/fs.h; PowerPC, MIPS and SPARC have another, so there the call fails and files are copied."""
+"""FICLONE from linux/fs.h. PowerPC, MIPS and SPARC use another number; there the call fails and files are copied."""
 
 
 def temporary_name(path: Path) -> Path:
@@ -30,7 +30,7 @@ def temporary_name(path: Path) -> Path:
 
 @contextlib.contextmanager
 def written_aside(path: Path, *, durable: bool = True) -> Iterator[Path]:
-    """Give a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
+    """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any failure.
 
     The temporary name keeps the suffix of `path`, since image writers choose their format by it. With `durable` the
     file is synchronised to disk before the rename, so that a power failure leaves no empty file. Callers that write
@@ -108,10 +108,10 @@ def inside(root: Path, relative: str) -> Path:
         raise UserError(root, "path", repr(relative), "a relative POSIX path of plain names inside the dataset")
     path = root.joinpath(*PurePosixPath(relative).parts)
     try:
-        own = path.resolve().is_relative_to(root.resolve())
+        is_inside = path.resolve().is_relative_to(root.resolve())
     except (OSError, RuntimeError):  # cyclic links
-        own = False
-    if not own:
+        is_inside = False
+    if not is_inside:
         raise UserError(root, "path", repr(relative), "a path without links that leave the dataset")
     return path
 
@@ -130,7 +130,7 @@ def check_plain_file(path: Path) -> int:
 
 @contextlib.contextmanager
 def new_folder(out: Path) -> Iterator[Path]:
-    """Give a hidden folder beside `out`; rename it to `out` on success, remove it on any failure.
+    """Yield a hidden folder beside `out`; rename it to `out` on success, remove it on any failure.
 
     Files are synchronised to disk before the rename. Folders left by killed writers of the same `out` are removed.
     Raises UserError if `out` is not empty or another process is writing it.
@@ -139,9 +139,9 @@ def new_folder(out: Path) -> Iterator[Path]:
     out = out.absolute()  # "." has no name from which to form a temporary name
     out.parent.mkdir(parents=True, exist_ok=True)
     with lock(out.with_name(f".{out.name}.lock"), out):
-        left = re.compile(rf"\.{re.escape(out.name)}\.[0-9a-f]+\.part")
+        leftover = re.compile(rf"\.{re.escape(out.name)}\.[0-9a-f]+\.part")
         for path in out.parent.iterdir():
-            if left.fullmatch(path.name):
+            if leftover.fullmatch(path.name):
                 shutil.rmtree(path, ignore_errors=True)
         aside = out.with_name(f".{out.name}.{secrets.token_hex(8)}.part")
         try:

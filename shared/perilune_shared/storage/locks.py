@@ -23,8 +23,8 @@ from perilune_shared.errors import UserError
 
 LOCK_NAME = ".perilune.lock"
 """Lock file in a folder that is written in place."""
-_RENEWED_S = 30.0
-_EXPIRED_S = 600.0
+_RENEWAL_INTERVAL_S = 30.0
+_EXPIRY_S = 600.0
 _LARGEST_RECORD_BYTES = 10_000
 TEMPORARY_FILE = re.compile(r"\..+\.[0-9a-f]+\.part(\.[A-Za-z0-9]+)?")
 
@@ -53,48 +53,48 @@ def locked(folder: Path) -> Iterator[None]:
 @contextlib.contextmanager
 def lock(path: Path, folder: Path) -> Iterator[None]:
     """Hold the lock file `path`, which protects `folder`. Raises UserError if another process holds it."""
-    held, record, elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
+    held, record, held_elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
     try:
         try:
             held.acquire(timeout=0)
         except Timeout:
-            raise _refusal(folder, _read(record), "a free folder: wait until that process ends") from None
-        left_s = _left_s(record)
-        elsewhere = left_s > 0
-        if elsewhere:
-            expected = f"a free folder: if that process was killed, remove {record} or wait {left_s:.0f} s"
-            raise _refusal(folder, _read(record), expected)
+            raise _locked_error(folder, _read(record), "a free folder: wait until that process ends") from None
+        seconds_left = _seconds_left(record)
+        held_elsewhere = seconds_left > 0
+        if held_elsewhere:
+            expected = f"a free folder: if that process was killed, remove {record} or wait {seconds_left:.0f} s"
+            raise _locked_error(folder, _read(record), expected)
         with _recorded(record):
             yield
     finally:
         if held.is_locked:
             # Remove the file before the release: afterwards it may be another process's lock.
-            if not elsewhere:
+            if not held_elsewhere:
                 with contextlib.suppress(OSError):
                     path.unlink(missing_ok=True)
             held.release()
 
 
-def _left_s(record: Path) -> float:
+def _seconds_left(record: Path) -> float:
     """Return the seconds until the record of a process on another machine expires; 0 if there is none.
 
-    A record from this machine does not count: since the lock was free, that process has ended.
+    A record from this machine is ignored: since the lock was free, that process has ended.
     """
     holder = _read(record)
     if holder is None or holder.get("boot_id") == _boot_id():
         return 0.0
-    return max(_EXPIRED_S - (time.time() - record.stat().st_mtime), 0.0)
+    return max(_EXPIRY_S - (time.time() - record.stat().st_mtime), 0.0)
 
 
 @contextlib.contextmanager
 def _recorded(record: Path) -> Iterator[None]:
-    """Write the record of this process as the holder and keep renewing it within the block."""
+    """Write a record with this process as the holder, and renew it regularly within the block."""
     since = datetime.now(UTC).isoformat(timespec="seconds")
     holder = {"pid": os.getpid(), "host": platform.node(), "since": since, "boot_id": _boot_id()}
     ended = threading.Event()
 
     def renew() -> None:
-        while not ended.wait(_RENEWED_S):
+        while not ended.wait(_RENEWAL_INTERVAL_S):
             with contextlib.suppress(OSError):
                 os.utime(record)
 
@@ -118,11 +118,11 @@ def _read(record: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def _refusal(folder: Path, holder: dict[str, Any] | None, expected: str) -> UserError:
+def _locked_error(folder: Path, holder: dict[str, Any] | None, expected: str) -> UserError:
     known = holder or {}
     words = {"pid": "PID", "host": "on host", "since": "since"}
     text = " ".join(f"{word} {known[name]}" for name, word in words.items() if name in known)
-    return UserError(folder, "folder", f"one locked by {text or 'another process'}", expected)
+    return UserError(folder, "folder", f"locked by {text or 'another process'}", expected)
 
 
 def _boot_id() -> str:

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 _HEADER_BYTES = 16_384
-_DEEPEST = 4
+_MAX_DEPTH = 4
 _DICTIONARY = 2
 _BOOLS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _STRUCT = (1, 2), 3, (4, 5, 6), 7, 8, 12
-_TYPE, _UNPACKED, _PACKED, _DATA, _DATA_V2 = 1, 2, 3, 5, 8
+_TYPE, _UNCOMPRESSED, _COMPRESSED, _DATA, _DATA_V2 = 1, 2, 3, 5, 8
 
 
 @dataclass(frozen=True, slots=True)
 class Pages:
     """Totals over the pages of one column in one row group."""
 
-    unpacked_bytes: int
-    """Maximum size after decompression, bytes."""
+    uncompressed_bytes: int
+    """Size after decompression that the page headers state, bytes."""
     n_values: int
     """Number of values."""
     has_dictionary: bool
@@ -35,21 +35,21 @@ def pages_of(stream: BinaryIO, column: Any) -> Pages:
     if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
         start = column.dictionary_page_offset
     end = start + column.total_compressed_size
-    unpacked, n_values, has_dictionary = 0, 0, False
+    uncompressed, n_values, has_dictionary = 0, 0, False
     while start < end and n_values < column.num_values:
         header, length = _header(stream, start)
-        sizes = header.get(_UNPACKED), header.get(_PACKED)
+        sizes = header.get(_UNCOMPRESSED), header.get(_COMPRESSED)
         if not all(isinstance(size, int) and size >= 0 for size in sizes):
             raise ValueError(f"a page at byte {start} without sizes")
-        unpacked += header[_UNPACKED]
+        uncompressed += header[_UNCOMPRESSED]
         has_dictionary |= header.get(_TYPE) == _DICTIONARY
         for kind in (_DATA, _DATA_V2):
-            held = header.get(kind, {}).get(1, 0)
-            if held < 0:
-                raise ValueError(f"a page at byte {start} with {held} values")
-            n_values += held
-        start += length + header[_PACKED]
-    return Pages(unpacked, n_values, has_dictionary)
+            n_page_values = header.get(kind, {}).get(1, 0)
+            if n_page_values < 0:
+                raise ValueError(f"a page at byte {start} with {n_page_values} values")
+            n_values += n_page_values
+        start += length + header[_COMPRESSED]
+    return Pages(uncompressed, n_values, has_dictionary)
 
 
 def _header(stream: BinaryIO, start: int) -> tuple[dict, int]:
@@ -75,7 +75,7 @@ def _varint(buffer: bytes, at: int) -> tuple[int, int]:
 
 def _struct(buffer: bytes, at: int, depth: int) -> tuple[dict, int]:
     """Parse integers and structs of a struct, by field id; return them and the end. IndexError past the buffer."""
-    if depth > _DEEPEST:
+    if depth > _MAX_DEPTH:
         raise IndexError
     fields: dict[int, Any] = {}
     number = 0

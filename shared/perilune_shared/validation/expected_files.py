@@ -28,7 +28,7 @@ EXTRA_NAMES = frozenset(
 )
 """Files that tools or users may add directly in the dataset's folder; like dataset.json they are in SHA256SUMS."""
 _LOCKS = (LOCK_NAME, f"{LOCK_NAME}.json")
-_MOST = 1000
+_MAX_REPORTED = 1000
 
 
 def unexpected(dataset: Dataset) -> Iterator[str]:
@@ -46,7 +46,7 @@ def unexpected(dataset: Dataset) -> Iterator[str]:
     if dataset.info.images == "files":
         frames = dataset.table("frames", ["png_path", "exr_path"])
         for kind in ("png", "exr"):
-            # A row of `frames` must not legitimise files of other types.
+            # Files of other types stay unexpected, even if a row of `frames` lists them.
             paths = [path for path in frames[f"{kind}_path"].to_pylist() if path and path.endswith(f".{kind}")]
             own_files |= {path for path in paths if path.split("/")[0] not in ("manifest", "images")}
         own_folders |= {str(parent) for path in own_files for parent in Path(path).parents if str(parent) != "."}
@@ -55,20 +55,20 @@ def unexpected(dataset: Dataset) -> Iterator[str]:
         place = Path(root).relative_to(dataset.root)
         inner = [(place / name).as_posix() for name in folders]
         folders[:] = [name for name, path in zip(folders, inner, strict=True) if path in own_folders]
-        odd = [path for path in inner if path not in own_folders and _holds_files(dataset.root / path)]
-        odd += [path for path in inner if path in own_folders and (dataset.root / path).is_symlink()]
+        found = [path for path in inner if path not in own_folders and _contains_files(dataset.root / path)]
+        found += [path for path in inner if path in own_folders and (dataset.root / path).is_symlink()]
         for name in names:
             path = (place / name).as_posix()
             if path not in own_files and (dataset.info.complete or not TEMPORARY_FILE.fullmatch(name)):
-                odd.append(path)
-        for path in sorted(odd):
+                found.append(path)
+        for path in sorted(found):
             n_found += 1
             yield path
-            if n_found == _MOST:
+            if n_found == _MAX_REPORTED:
                 return
 
 
-def _holds_files(folder: Path) -> bool:
+def _contains_files(folder: Path) -> bool:
     """Whether a folder is a link, or contains a file or link at any depth."""
     return folder.is_symlink() or any(
         names or any(Path(root, name).is_symlink() for name in folders) for root, folders, names in os.walk(folder)

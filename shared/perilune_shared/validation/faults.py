@@ -1,4 +1,4 @@
-"""The class Fault, and the checks of a single part: name, schema, values."""
+"""The class Fault, and the checks of one part: name, schema, values."""
 
 import re
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ _PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
 _PLAIN = r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$"
 _COLUMN = r"^[A-Za-z][A-Za-z0-9_]{0,63}$"
 _SHA256 = r"^[0-9a-f]{64}$"
-_TEXTS = {
+_PATTERNS = {
     "scene_id": ID_PATTERN,
     "trajectory_id": ID_PATTERN,
     "frame_id": FRAME_ID_PATTERN,
@@ -59,7 +59,7 @@ _RANGES = {
     "ellipse_theta_rad": (0, np.pi),
 }
 _UNIT_VECTORS = ("rotation_wxyz", "sun_direction")
-_MOST = 1e12
+_MAX_PLAUSIBLE = 1e12
 """Largest plausible value of any length, time or size, far above that of any trajectory."""
 
 
@@ -123,15 +123,15 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
         first_row = 0
         for group in range(part.n_groups):
             rows = part.read(groups=[group], any_ids=True)
-            yield from _of_the_name(where, first_row, path.stem, rows)
+            yield from _name_faults(where, first_row, path.stem, rows)
             for field in rows.schema:
-                yield from _of_values(where, first_row, field, rows[field.name].combine_chunks())
+                yield from _value_faults(where, first_row, field, rows[field.name].combine_chunks())
             first_row += len(rows)
     except UserError as error:
         yield Fault.from_error(where, None, error)
 
 
-def _of_the_name(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
+def _name_faults(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:
     """Yield a fault if a part has rows that its name excludes: readers select parts by name."""
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem):
@@ -145,10 +145,10 @@ def _of_the_name(where: str, first_row: int, stem: str, rows: pa.Table) -> Itera
     others = np.flatnonzero(~np.asarray(own, bool))
     if len(others):
         row = first_row + int(others[0])
-        yield Fault.of(where, row, "part", "a row of another scene or descent", f"rows of {stem} alone")
+        yield Fault.of(where, row, "part", "a row of another scene or trajectory", f"only rows of {stem}")
 
 
-def _of_values(where: str, first_row: int, field: pa.Field, column: pa.Array) -> Iterator[Fault]:
+def _value_faults(where: str, first_row: int, field: pa.Field, column: pa.Array) -> Iterator[Fault]:
     """Check one column for nulls, non-finite values, ranges, lengths and patterns."""
     present = ~np.asarray(column.is_null(), bool)
     if not field.nullable and not present.all():
@@ -156,7 +156,7 @@ def _of_values(where: str, first_row: int, field: pa.Field, column: pa.Array) ->
         return
     checks: list[tuple[np.ndarray, str]] = []
     if pa.types.is_string(field.type):
-        pattern = _TEXTS.get(field.name, _PLAIN)
+        pattern = _PATTERNS.get(field.name, _PLAIN)
         fits = np.asarray(pc.fill_null(pc.match_substring_regex(column, pattern), False), bool)
         line_breaks = np.asarray(pc.fill_null(pc.match_substring(column, "\n"), False), bool)
         checks.append((~fits | line_breaks, f"text like {pattern}"))
@@ -166,7 +166,7 @@ def _of_values(where: str, first_row: int, field: pa.Field, column: pa.Array) ->
     else:
         values = column.fill_null(1).to_numpy(zero_copy_only=False).astype(np.float64)[:, None]
     if values is not None:
-        checks.append((~(np.abs(values) < _MOST).all(axis=1) & (field.name != "seed"), "a finite number"))
+        checks.append((~(np.abs(values) < _MAX_PLAUSIBLE).all(axis=1) & (field.name != "seed"), "a finite number"))
         if field.name in _POSITIVE:
             checks.append((values[:, 0] <= 0, "above 0"))
         if field.name in _NOT_NEGATIVE:

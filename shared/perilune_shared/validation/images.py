@@ -28,28 +28,28 @@ def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     for part in dataset.parts("frames"):
         where = part.relative_to(dataset.root).as_posix()
         first_row = 0
-        for rows in _groups(dataset, part, columns):
+        for rows in _readable_groups(dataset, part, columns):
             places = {frame_id: first_row + row for row, frame_id in enumerate(rows["frame_id"].to_pylist())}
             records = rows.to_pylist()
             for row, frame in enumerate(records, first_row):
                 for kind in IMAGE_KINDS if info.images == "files" else ():
                     if frame[f"{kind}_path"] is not None:
-                        yield from _file(dataset, frame, kind, row, where)
+                        yield from _file_faults(dataset, frame, kind, row, where)
                 progress.advance(task)
             if info.images == "packed":
                 try:
                     for frame_id, png in dataset.pngs(rows):
                         row = places[frame_id]
                         sha256 = hashlib.sha256(png).hexdigest()
-                        yield from _png(dataset, png, len(png), sha256, records[row - first_row], row)
+                        yield from _png_faults(dataset, png, len(png), sha256, records[row - first_row], row)
                 except UserError as error:
                     yield Fault.from_error("images", None, error)
             first_row += len(rows)
     if info.images == "packed":
-        yield from _shards(dataset)
+        yield from _shard_faults(dataset)
 
 
-def _groups(dataset: Dataset, part: Path, columns: list[str]) -> Iterator[pa.Table]:
+def _readable_groups(dataset: Dataset, part: Path, columns: list[str]) -> Iterator[pa.Table]:
     """Yield the readable row groups of a part of `frames`; `part_faults` reports the unreadable ones."""
     with contextlib.suppress(UserError):
         opened = dataset.open_part(part, "frames")
@@ -57,7 +57,7 @@ def _groups(dataset: Dataset, part: Path, columns: list[str]) -> Iterator[pa.Tab
             yield opened.read(columns, [group])
 
 
-def _shards(dataset: Dataset) -> Iterator[Fault]:
+def _shard_faults(dataset: Dataset) -> Iterator[Fault]:
     known = set(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())
     found: set[str] = set()
     for shard in dataset.shards():
@@ -69,11 +69,13 @@ def _shards(dataset: Dataset) -> Iterator[Fault]:
             continue
         odd = [key for key in keys if key not in known or key in found]
         if odd or len(set(keys)) != len(keys):
-            yield Fault.of(where, None, "frame_id", (odd or ["twice the same"])[0], "frames of the manifest, each once")
+            yield Fault.of(
+                where, None, "frame_id", (odd or ["a frame_id twice"])[0], "frames of the manifest, each once"
+            )
         found |= set(keys)
 
 
-def _file(dataset: Dataset, frame: dict, kind: str, row: int, where: str) -> Iterator[Fault]:
+def _file_faults(dataset: Dataset, frame: dict, kind: str, row: int, where: str) -> Iterator[Fault]:
     relative = frame[f"{kind}_path"]
     try:
         path = dataset.file(relative)
@@ -90,20 +92,20 @@ def _file(dataset: Dataset, frame: dict, kind: str, row: int, where: str) -> Ite
         yield Fault.of(relative, row, f"{kind}_bytes", n_bytes, frame[f"{kind}_bytes"])
     elif kind == "exr":
         if files.sha256_of(path) != frame["exr_sha256"]:
-            yield Fault.of(relative, row, "exr_sha256", "another content", frame["exr_sha256"])
+            yield Fault.of(relative, row, "exr_sha256", "a different SHA-256", frame["exr_sha256"])
     else:
         with path.open("rb") as stream:
             head = stream.read(64)
-        yield from _png(dataset, head, n_bytes, files.sha256_of(path), frame, row)
+        yield from _png_faults(dataset, head, n_bytes, files.sha256_of(path), frame, row)
 
 
-def _png(dataset: Dataset, head: bytes, n_bytes: int, sha256: str, frame: dict, row: int) -> Iterator[Fault]:
+def _png_faults(dataset: Dataset, head: bytes, n_bytes: int, sha256: str, frame: dict, row: int) -> Iterator[Fault]:
     """Check a PNG's size, hash and header, given its first bytes."""
     where, camera = frame["png_path"], dataset.info.camera
     if n_bytes != frame["png_bytes"]:
         yield Fault.of(where, row, "png_bytes", n_bytes, frame["png_bytes"])
     if sha256 != frame["png_sha256"]:
-        yield Fault.of(where, row, "png_sha256", "another content", frame["png_sha256"])
+        yield Fault.of(where, row, "png_sha256", "a different SHA-256", frame["png_sha256"])
     try:
         header = png_header(head)
     except ValueError as error:

@@ -86,8 +86,8 @@ def _labels(
 ) -> Iterator[Fault]:
     """Check the references of labels, and their ellipses against ellipses projected from crater and pose."""
     where = places["labels"]
-    frame_of = _places(labels["frame_id"], frames["frame_id"])
-    crater_of = _places(labels["crater_id"], craters["crater_id"])
+    frame_of = _row_numbers(labels["frame_id"], frames["frame_id"])
+    crater_of = _row_numbers(labels["crater_id"], craters["crater_id"])
     for name, found_at in (("frame_id", frame_of), ("crater_id", crater_of)):
         unknown = np.flatnonzero(found_at < 0)
         if len(unknown):
@@ -96,33 +96,33 @@ def _labels(
     known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
     if not len(known):
         return
-    again = _projected(info, craters, frames, crater_of[known], frame_of[known])
-    size = 1 + again["ellipse_a_px"]
+    projected = _projected(info, craters, frames, crater_of[known], frame_of[known])
+    size = 1 + projected["ellipse_a_px"]
     misfit = np.zeros(len(known), bool)
-    for name, values in again.items():
-        apart = np.abs(labels[name].to_numpy()[known] - values)
+    for name, values in projected.items():
+        error = np.abs(labels[name].to_numpy()[known] - values)
         tolerance = _LABEL_TOLERANCE_PX * size
         if name == "ellipse_theta_rad":
             # The direction has period pi and is undefined for a circle.
-            apart = np.minimum(apart, np.pi - apart) * np.minimum(1, size - 1 - again["ellipse_b_px"])
-        wrong = np.flatnonzero(~(apart < tolerance))
+            error = np.minimum(error, np.pi - error) * np.minimum(1, size - 1 - projected["ellipse_b_px"])
+        wrong = np.flatnonzero(~(error < tolerance))
         misfit[wrong] = True
         if len(wrong):
             row = int(known[wrong[0]])
             expected = f"{values[wrong[0]]}, projected from crater and pose"
             yield Fault.of(where, row, name, labels[name][row].as_py(), expected)
     # If all labels of a frame with several labels are wrong, the pose is probably wrong: report it too.
-    labelled = np.bincount(frame_of[known], minlength=len(frames))
-    lost = np.bincount(frame_of[known[misfit]], minlength=len(frames))
-    odd = np.flatnonzero((labelled > 1) & (lost == labelled))
+    n_labels = np.bincount(frame_of[known], minlength=len(frames))
+    n_misfits = np.bincount(frame_of[known[misfit]], minlength=len(frames))
+    odd = np.flatnonzero((n_labels > 1) & (n_misfits == n_labels))
     if len(odd):
-        found = f"a pose that matches none of {labelled[odd[0]]} labels"
+        found = f"a pose that matches none of {n_labels[odd[0]]} labels"
         yield Fault.of(
             places["frames"],
             int(odd[0]),
             "position_m+rotation_wxyz",
             found,
-            "the pose of its labels",
+            "a pose that matches its labels",
         )
 
 
@@ -135,15 +135,15 @@ def _projected(
     normal = np.stack([craters[f"normal_{axis}"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
     offset = centre - _vectors(frames["position_m"])[frame_of]
     in_camera = np.einsum("nij,nj->ni", rotation, offset)
-    turned = np.einsum("nij,nj->ni", rotation, normal)
+    normal_in_camera = np.einsum("nij,nj->ni", rotation, normal)
     radius = craters["diameter_m"].to_numpy()[crater_of] / 2
-    sound = (np.abs(in_camera) < _FARTHEST_M).all(axis=1) & (np.abs(turned) <= 2).all(axis=1)
-    sound &= (radius > 0) & (radius < _FARTHEST_M)
+    valid = (np.abs(in_camera) < _FARTHEST_M).all(axis=1) & (np.abs(normal_in_camera) <= 2).all(axis=1)
+    valid &= (radius > 0) & (radius < _FARTHEST_M)
     # Replace invalid input by a circle behind the camera: its projection is NaN, so the label does not match.
-    in_camera[~sound], turned[~sound], radius[~sound] = (0, 0, -10), (0, 0, 1), 1
+    in_camera[~valid], normal_in_camera[~valid], radius[~valid] = (0, 0, -10), (0, 0, 1), 1
     with np.errstate(all="ignore"):
         try:
-            ellipses = project_circles(info.camera.intrinsics(), in_camera, turned, radius)
+            ellipses = project_circles(info.camera.intrinsics(), in_camera, normal_in_camera, radius)
         except np.linalg.LinAlgError:
             ellipses = Ellipses(*np.full((5, len(radius)), np.nan))
     names = ("cx_px", "cy_px", "a_px", "b_px", "theta_rad")
@@ -152,7 +152,7 @@ def _projected(
     return columns | boxes | {"radius_px": ellipses.radius_px()}
 
 
-def _places(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
+def _row_numbers(values: pa.ChunkedArray, within: pa.ChunkedArray) -> np.ndarray:
     """Return the row number of each value in the column `within` (M,); -1 if it is missing."""
     found = pc.index_in(values, within.combine_chunks())
     return pc.fill_null(found, -1).to_numpy().astype(np.int64)

@@ -1,4 +1,4 @@
-"""Check a whole dataset; each fault has file, row, column, value found and value expected.
+"""Check a whole dataset and return its faults: file, row, column, value found and value expected.
 
 Tables are read by part, then by trajectory, so memory does not grow with the dataset.
 """
@@ -24,14 +24,15 @@ from perilune_shared.validation.faults import Fault, part_faults
 from perilune_shared.validation.images import image_faults
 from perilune_shared.validation.trajectory import trajectory_faults
 
-_DEGREES = 1e-9
-_NOT_PLANNED = ("craters", "boulders", "labels")
+_TOLERANCE_DEG = 1e-9
+_EMPTY_IN_PLANS = ("craters", "boulders", "labels")
 
 
 def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
     """Return all faults of a dataset; an empty list means that all checks passed.
 
-    Faults of the same file and column are reported once, at their first row. All labels are projected again.
+    Faults of the same file and column are reported once, at their first row. All labels are compared with ellipses
+    projected from crater and pose.
     """
     # Values that overflow are reported as faults; NumPy's warnings would clutter the output.
     with np.errstate(all="ignore"), dataset.parts_kept_open():
@@ -57,7 +58,7 @@ def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
         for part in dataset.parts(name):
             faults += part_faults(dataset, part, name)
     try:
-        faults += _tables(dataset, progress)
+        faults += _table_faults(dataset, progress)
     except UserError as error:
         if not faults:
             faults.append(Fault.from_error("manifest", None, error))
@@ -69,17 +70,19 @@ def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
     return list({(fault.file, fault.column, fault.row is None): fault for fault in reversed(faults)}.values())[::-1]
 
 
-def _tables(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
+def _table_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     """Check rows of several tables against each other."""
     counts = count_rows(dataset).model_dump()
     for name, present in counts.items():
         counted = getattr(dataset.info.counts, name)
         if counted != present:
             yield Fault.of("dataset.json", None, f"counts.{name}", counted, f"{present}, the number of rows")
-        if dataset.info.images == "planned" and name in _NOT_PLANNED and present:
-            yield Fault.of(f"manifest/{name}", None, "images", "rows", "none: dataset.json says images: planned")
+        if dataset.info.images == "planned" and name in _EMPTY_IN_PLANS and present:
+            yield Fault.of(
+                f"manifest/{name}", None, "images", "rows", "no rows, since images is planned in dataset.json"
+            )
     scene_ids = dataset.table("scenes", ["scene_id"])["scene_id"].to_pylist()
-    yield from _unique(dataset, "scenes", dataset.table("scenes", KEYS["scenes"]), "manifest/scenes")
+    yield from _repeated_keys(dataset, "scenes", dataset.table("scenes", KEYS["scenes"]), "manifest/scenes")
     used: set[str] = set()
     reported: set[tuple[str, str]] = set()
     seen = dict.fromkeys(TABLES, 0)
@@ -90,7 +93,9 @@ def _tables(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
         scene = dataset.table("scenes", scene_id=scene_id)
         if not len(scene):
             expected = "part names and row group statistics that match the scene's rows"
-            yield Fault.of("manifest/scenes", None, "part", f"{scene_id} elsewhere", expected)
+            yield Fault.of(
+                "manifest/scenes", None, "part", f"rows of {scene_id} in another part or row group", expected
+            )
             continue
         used.add(scene["recipe"][0].as_py())
         frame_splits = dataset.table("frames", ["trajectory_id", "split"], scene_id=scene_id)
@@ -102,7 +107,7 @@ def _tables(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
         for trajectory_id, split in {tuple(each.values()) for each in frame_splits.to_pylist()}:
             splits_of_trajectory[terrain, seed_of.get(trajectory_id, trajectory_id)].add(split)
         seen["scenes"] += len(scene)
-        yield from _scene(dataset, scene_id, scene, seen, reported)
+        yield from _scene_faults(dataset, scene_id, scene, seen, reported)
         progress.advance(task)
     for name, present in counts.items():
         if seen[name] != present:
@@ -124,21 +129,21 @@ def _tables(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
                 None,
                 "split",
                 found,
-                "one split for each trajectory, also for copies with another name",
+                "one split for each trajectory, also for copies under another name",
             )
 
 
-def _scene(
+def _scene_faults(
     dataset: Dataset, scene_id: str, scene: pa.Table, seen: dict[str, int], reported: set[tuple[str, str]]
 ) -> Iterator[Fault]:
     """Check one scene's row, craters and boulders, then each of its trajectories; count the rows seen."""
-    where = {name: _place(dataset, name, scene_id) for name in TABLES}
+    where = {name: _file_of(dataset, name, scene_id) for name in TABLES}
     craters = dataset.table("craters", scene_id=scene_id)
     boulders = dataset.table("boulders", scene_id=scene_id)
     trajectories = dataset.table("trajectories", scene_id=scene_id)
     for name, rows in (("craters", craters), ("boulders", boulders), ("trajectories", trajectories)):
         seen[name] += len(rows)
-        yield from _unique(dataset, name, rows.select(KEYS[name]), where[name])
+        yield from _repeated_keys(dataset, name, rows.select(KEYS[name]), where[name])
     row = scene.to_pylist()[0]
     if dataset.info.images != "planned":
         content = content_sha256(craters, boulders)
@@ -151,16 +156,16 @@ def _scene(
                 f"{content}, the hash of craters and boulders",
             )
     if len(craters):
-        yield from _in_file(dataset, _crater_places(craters, row, where["craters"]), scene_id, reported)
+        yield from _in_file(dataset, _crater_faults(craters, row, where["craters"]), scene_id, reported)
     for trajectory in trajectories.to_pylist():
         trajectory_id = trajectory["trajectory_id"]
         frames = dataset.table("frames", scene_id=scene_id, trajectory_id=trajectory_id)
         labels = dataset.table("labels", scene_id=scene_id, trajectory_id=trajectory_id)
         seen["frames"] += len(frames)
         seen["labels"] += len(labels)
-        places = {name: _place(dataset, name, scene_id, trajectory_id) for name in ("frames", "labels")}
+        places = {name: _file_of(dataset, name, scene_id, trajectory_id) for name in ("frames", "labels")}
         for name, rows in (("frames", frames), ("labels", labels)):
-            yield from _unique(dataset, name, rows.select(KEYS[name]), places[name])
+            yield from _repeated_keys(dataset, name, rows.select(KEYS[name]), places[name])
         faults = trajectory_faults(dataset.info, row, craters, trajectory, frames, labels, places)
         yield from _in_file(dataset, faults, f"{scene_id}/{trajectory_id}/", reported)
 
@@ -184,7 +189,7 @@ def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, reported: set[
         yield fault
 
 
-def _crater_places(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault]:
+def _crater_faults(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault]:
     """Check that latitude and longitude match x and y, and that normals have length 1."""
     normals = np.stack([craters[f"normal_{axis}"].to_numpy() for axis in "xyz"], axis=1)
     wrong = np.flatnonzero(np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-6)
@@ -192,23 +197,23 @@ def _crater_places(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault
         yield Fault.of(where, int(wrong[0]), "normal_x", normals[wrong[0]].tolist(), "a normal of length 1")
     x, y = craters["x_m"].to_numpy(), craters["y_m"].to_numpy()
     latitude, longitude = selenographic_from_site(x, y, scene["latitude_deg"], scene["longitude_deg"])
-    for name, again in (("latitude_deg", latitude), ("longitude_deg", longitude)):
-        apart = np.abs(craters[name].to_numpy() - again)
-        apart = np.minimum(apart, np.abs(apart - 360))
-        wrong = np.flatnonzero(apart > _DEGREES)
+    for name, computed in (("latitude_deg", latitude), ("longitude_deg", longitude)):
+        error_deg = np.abs(craters[name].to_numpy() - computed)
+        error_deg = np.minimum(error_deg, np.abs(error_deg - 360))
+        wrong = np.flatnonzero(error_deg > _TOLERANCE_DEG)
         if len(wrong):
             found = craters[name][int(wrong[0])].as_py()
-            yield Fault.of(where, int(wrong[0]), name, found, f"{again[wrong[0]]}, from x_m and y_m")
+            yield Fault.of(where, int(wrong[0]), name, found, f"{computed[wrong[0]]}, from x_m and y_m")
 
 
-def _place(dataset: Dataset, table: str, scene_id: str, trajectory_id: str | None = None) -> str:
+def _file_of(dataset: Dataset, table: str, scene_id: str, trajectory_id: str | None = None) -> str:
     parts = dataset.parts(table, scene_id, trajectory_id)
     return parts[0].relative_to(dataset.root).as_posix() if len(parts) == 1 else f"manifest/{table}"
 
 
-def _unique(dataset: Dataset, table: str, keys: pa.Table, where: str) -> Iterator[Fault]:
+def _repeated_keys(dataset: Dataset, table: str, keys: pa.Table, where: str) -> Iterator[Fault]:
     counted = keys.group_by(keys.column_names).aggregate([([], "count_all")])
-    doubled = counted.filter(pc.greater(counted["count_all"], 1))
-    if len(doubled):
-        found = list(doubled.to_pylist()[0].values())[:-1]
+    repeated = counted.filter(pc.greater(counted["count_all"], 1))
+    if len(repeated):
+        found = list(repeated.to_pylist()[0].values())[:-1]
         yield Fault.of(where, None, "+".join(KEYS[table]), found, "unique")

@@ -66,7 +66,7 @@ def test_a_frame_dealt_differently_keeps_the_first_split(drawn, tmp_path):
 def test_two_descents_over_one_terrain(tmp_path):
     build_dataset(tmp_path / "a", "nav", splits={"train": 2}, scenes=1, n_frames=3, craters=40)
     build_dataset(tmp_path / "b", "nav", splits={"train": 2}, scenes=1, n_frames=3, craters=40, jitter_m=9)
-    with pytest.raises(UserError, match="another position_m"):
+    with pytest.raises(UserError, match="a different position_m"):
         merged(tmp_path / "m", tmp_path / "a", tmp_path / "b")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
 

@@ -48,15 +48,15 @@ def test_large_tables_become_several_parts_that_the_reader_accepts(little, tmp_p
     source = open_dataset(little)
     assert source.info.counts.craters == 600
     pack(source, tmp_path / "p", most_rows=100, most_images=2)
-    original = parts._MOST_ROWS
-    monkeypatch.setattr(parts, "_MOST_ROWS", 100)
+    original = parts._MAX_ROWS
+    monkeypatch.setattr(parts, "_MAX_ROWS", 100)
     with pytest.raises(UserError, match="rows"):
         source.table("craters")
     made = open_dataset(tmp_path / "p")
     assert validate(made) == []
     assert len(made.parts("craters")) == 6 and len(made.parts("labels")) == 1 and len(made.shards()) == 3
     assert [part.stem for part in made.parts("craters")][:2] == ["all", "all.0001"]
-    monkeypatch.setattr(parts, "_MOST_ROWS", original)
+    monkeypatch.setattr(parts, "_MAX_ROWS", original)
     assert made.table("craters").equals(source.table("craters"))
     for scene_id in source.scene_ids():
         assert made.table("craters", scene_id=scene_id).equals(source.table("craters", scene_id=scene_id))

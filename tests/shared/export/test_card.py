@@ -160,7 +160,7 @@ def test_packed_and_absent_frames(crowded_packed, crowded, card, tmp_path):
     dataset.info = dataset.info.model_copy(update={"images": "absent"})
     with Progress(disable=True) as progress:
         page, picture = write_card(dataset, tmp_path / "absent.md", progress)
-    assert Image.open(picture).height < 500 and "the manifest alone" in page.read_text()
+    assert Image.open(picture).height < 500 and "not included (only the manifest)" in page.read_text()
 
 
 def test_files_of_others_stay(crowded, tmp_path):

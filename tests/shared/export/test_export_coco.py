@@ -21,7 +21,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
-from perilune_shared.export.coco import area_of, cut_at_edges, export_coco
+from perilune_shared.export.coco import area_of, clip_to_image, export_coco
 from perilune_shared.labels.selection import read_labels, selected
 from perilune_shared.labels.thresholds import SELECTIONS
 
@@ -160,9 +160,9 @@ def test_packed_frames_give_the_same(crowded_packed, whole, tmp_path):
 
 def test_a_polygon_is_cut_at_the_edges():
     square = np.array([[-1.0, -1.0], [3.0, -1.0], [3.0, 3.0], [-1.0, 3.0]])
-    cut = cut_at_edges(square, 10, 2)
+    cut = clip_to_image(square, 10, 2)
     assert area_of(cut) == pytest.approx(3 * 2) and cut.min() == 0 and cut.max(axis=0).tolist() == [3, 2]
-    assert len(cut_at_edges(square + 20, 10, 10)) == 0
+    assert len(clip_to_image(square + 20, 10, 10)) == 0
 
 
 def test_nothing_half_written(crowded, tmp_path):
