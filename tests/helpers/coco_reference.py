@@ -12,16 +12,18 @@ IGNORED_AREA = 1e12
 
 
 def coco_evaluation(found, labels, copies=1):
-    """COCOeval with maxDets raised and one range of areas; ignored labels lie outside that range, and
-    each is there `copies` times; with None once for each detection that may match it. AP at each of COCO's IoUs, by
-    101 points and by all points."""
+    """Return the AP at each IoU of COCO, by 101 points and by all points.
+
+    COCOeval uses a higher maxDets and one range of areas. Ignored labels are outside that range, and each is repeated
+    `copies` times; with None, once for each detection that may match it.
+    """
     images, annotations, results, averages = [], [], [], []
     for frame, (ours, truth) in enumerate(zip(found, labels, strict=True), start=1):
         images.append({"id": frame})
         repeats = _matchable(ours.boxes, truth.boxes) if copies is None else np.full(len(truth.boxes), copies)
-        for (x0, y0, x1, y1), wanted, repeat in zip(truth.boxes.tolist(), truth.selected, repeats, strict=True):
-            for _ in range(1 if wanted else repeat):
-                box, area = [x0, y0, x1 - x0, y1 - y0], (x1 - x0) * (y1 - y0) if wanted else IGNORED_AREA
+        for (x0, y0, x1, y1), is_selected, repeat in zip(truth.boxes.tolist(), truth.selected, repeats, strict=True):
+            for _ in range(1 if is_selected else repeat):
+                box, area = [x0, y0, x1 - x0, y1 - y0], (x1 - x0) * (y1 - y0) if is_selected else IGNORED_AREA
                 number = len(annotations) + 1
                 annotations.append(
                     {"id": number, "image_id": frame, "category_id": 1, "bbox": box, "area": area, "iscrowd": 0}
@@ -35,11 +37,11 @@ def coco_evaluation(found, labels, copies=1):
         evaluation = COCOeval(truth_set, truth_set.loadRes(results), "bbox")
         evaluation.params.maxDets = [100_000]
         evaluation.params.areaRng, evaluation.params.areaRngLbl = [[0, 1e10]], ["all"]
-        wanted = sum(int(part.selected.sum()) for part in labels)
+        n_selected = sum(int(part.selected.sum()) for part in labels)
         # Matching does not depend on the recalls.
         evaluation.evaluate()
-        # At the 101 recalls; and at every recall that can be reached, over which the mean is the area under all points.
-        for recalls in (np.linspace(0, 1, 101), np.arange(1, wanted + 1) / wanted):
+        # 101 recalls, then every reachable recall; the mean over these is the area under all points.
+        for recalls in (np.linspace(0, 1, 101), np.arange(1, n_selected + 1) / n_selected):
             evaluation.params.recThrs = recalls
             evaluation.accumulate()
             averages.append(evaluation.eval["precision"][:, :, 0, 0, 0].mean(axis=1))
@@ -47,7 +49,7 @@ def coco_evaluation(found, labels, copies=1):
 
 
 def _matchable(found, labels):
-    """How many of the boxes `found` (N, 4) overlap each label (M, 4) by COCO's least IoU of 0.5; at least 1."""
+    """Count the boxes `found` (N, 4) that overlap each label (M, 4) with an IoU of at least 0.5; at least 1."""
     if not len(found) or not len(labels):
         return np.ones(len(labels), int)
     sized = [np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1) for boxes in (found, labels)]

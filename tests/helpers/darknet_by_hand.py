@@ -1,4 +1,4 @@
-"""yolov3.cfg line by line, and a reading of weight files that shares nothing with the code under test."""
+"""yolov3.cfg layer by layer, and a reader of weight files that is independent of the code under test."""
 
 import struct
 
@@ -30,7 +30,7 @@ def cfg(filters: int = 255, backbone_only: bool = False) -> list[tuple]:
 
 
 def shapes(layers: list[tuple], width: float, filters: int = 255) -> list[tuple[int, int, int, bool]]:
-    """(out, in, size, norm) of every convolution in the order of the file."""
+    """List (out, in, size, norm) of every convolution in the order of the file."""
     out: list[int] = []
     found = []
     for index, (kind, *rest) in enumerate(layers):
@@ -47,7 +47,7 @@ def shapes(layers: list[tuple], width: float, filters: int = 255) -> list[tuple[
 
 
 def random_values(layers: list[tuple], width: float, seed: int) -> np.ndarray:
-    """Floats of a whole file, such that features neither die out nor explode."""
+    """Return random values of a whole file, scaled so that features neither vanish nor explode."""
     rng = np.random.default_rng(seed)
     parts = []
     for out, inputs, size, norm in shapes(layers, width):
@@ -60,7 +60,7 @@ def random_values(layers: list[tuple], width: float, seed: int) -> np.ndarray:
 
 
 def run(layers: list[tuple], raw: bytes, image: torch.Tensor, width: float) -> list[torch.Tensor]:
-    """Outputs of all layers; fails where floats are missing or left over."""
+    """Compute the outputs of all layers; fails if values are missing or left over."""
     major, minor = struct.unpack("<2i", raw[:8])
     values = np.frombuffer(raw, "<f4", offset=20 if major * 10 + minor >= 2 else 16)
     place = 0

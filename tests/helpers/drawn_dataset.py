@@ -1,7 +1,7 @@
-"""Small real datasets: cratered ground, shaded from one Sun, seen from the poses that the manifest gives.
+"""Small datasets without a renderer: shaded cratered terrain, seen from the poses in the manifest.
 
-The ground is a plane with the shading of a height field painted onto it, so a pixel's place in O_L is exact and
-images, poses, labels and time agree.
+The terrain is a plane, textured with the shading of a height field. So the position of each pixel in O_L is exact, and
+images, poses, labels and times are consistent.
 """
 
 import hashlib
@@ -31,7 +31,7 @@ _PARABOLA = {"start_altitude_m": 1400.0, "end_altitude_m": 400.0, "downrange_m":
 
 
 class _Ground:
-    """Craters on a plane, and its brightness texture; every fourth crater is worn away."""
+    """Craters on a plane and its brightness texture; every fourth crater is eroded."""
 
     def __init__(self, rng: np.random.Generator, count: int):
         self.diameter_m = np.sort(np.clip(25.0 * (1 - rng.random(count)) ** -0.6, 25.0, 400.0))[::-1]
@@ -82,7 +82,10 @@ def build_dataset(
     jitter_m: float = 4.0,
     jitter_deg: float = 0.3,
 ) -> Path:
-    """Write a dataset. `splits` counts descents for each split; each descent has its own terrain, unless `scenes`."""
+    """Write a dataset with a number of trajectories for each split in `splits`.
+
+    Each trajectory has its own terrain, unless `scenes` gives the number of terrains.
+    """
     splits = splits or {"train": 3, "val": 1, "test": 1}
     camera = Camera.from_field_of_view(side_px, side_px, 40.0)
     names = [split for split, count in splits.items() for _ in range(count)]
@@ -91,10 +94,10 @@ def build_dataset(
     )
     grounds: dict[str, _Ground] = {}
     rows: dict[str, list[dict]] = {name: [] for name in TABLES}
-    for descent, split in enumerate(names):
-        scene = f"s{descent if scenes is None else descent % scenes:03d}"
-        trajectory = f"t{descent:03d}"
-        rng = np.random.default_rng([seed, descent])
+    for number, split in enumerate(names):
+        scene = f"s{number if scenes is None else number % scenes:03d}"
+        trajectory = f"t{number:03d}"
+        rng = np.random.default_rng([seed, number])
         if scene not in grounds:
             grounds[scene] = _Ground(np.random.default_rng([seed, 1000, int(scene[1:])]), craters)
             _add_scene(rows, scene, grounds[scene], recipe.key)
@@ -103,7 +106,7 @@ def build_dataset(
             {
                 "scene_id": scene,
                 "trajectory_id": trajectory,
-                "seed": descent,
+                "seed": number,
                 "n_frames": n_frames,
                 "split": split,
                 "nominal_position_m": nominal.position_m,

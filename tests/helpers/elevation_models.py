@@ -1,10 +1,10 @@
-"""Elevation models that tests write."""
+"""Elevation models for tests, written as GeoTIFF."""
 
 import numpy as np
 import rasterio
 
 POLAR = "+proj=stere +lat_0=-90 +lon_0=0 +R=1737400 +units=m"
-"""A projection of the Moon's south pole."""
+"""Projection about the Moon's south pole."""
 PLACED = rasterio.Affine(5, 0, 1e5, 0, -5, 0)
 
 
@@ -26,7 +26,7 @@ def write(path, height, crs, transform):
 
 
 def rough(seed=1, n=150):
-    """Smooth random ground, some metres high."""
+    """Return smooth random heights (n, n), a few metres high."""
     rng = np.random.default_rng(seed)
     i, j = np.mgrid[:n, :n]
     waves = [(rng.uniform(0, 6.3), rng.uniform(0, 6.3), 2.0**k) for k in range(5, 9)]

@@ -1,4 +1,4 @@
-"""A second rendering engine, in NumPy: flat ground under the Sun, by a reflectance law, without shadows."""
+"""A second rendering engine in NumPy: flat terrain with a reflectance law, without shadows."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ class FlatEngine:
         self.law, self.camera, self.sun = law, camera, sun
 
     def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int) -> Radiance:
-        """One ray through each pixel's centre; the seed has no effect, since nothing is sampled."""
+        """Render with one ray through each pixel centre; the seed has no effect, since nothing is sampled."""
         rays = self.camera.rays(self.camera.pixel_centres()) @ rotation_camera_from_site
         depth_m = (-position_m[2] / rays[..., 2]).astype(np.float32)
         view = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)

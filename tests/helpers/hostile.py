@@ -1,4 +1,4 @@
-"""Datasets of ill will: how to damage one, and what must come of it."""
+"""Hostile datasets: functions that damage a dataset, and the checks that it is refused."""
 
 import hashlib
 import json
@@ -20,19 +20,19 @@ from perilune_shared.errors import UserError, run_command_line
 from perilune_shared.storage import checksums
 from perilune_shared.validation.validate import validate
 
-Told = list[tuple[str, str]]
-"""File and column of each fault; of a refusal by one line, the line twice."""
+FaultPlaces = list[tuple[str, str]]
+"""File and column of each fault; for an error message, the message twice."""
 _GIB = 2**30
 
 
 def part_of(root: Path, table: str) -> Path:
-    """The only part of a table."""
+    """Return the only part of a table."""
     (path,) = (root / "manifest" / table).glob("*.parquet")
     return path
 
 
 def rewrite(root: Path, table: str, change: Callable[[list[dict]], object]) -> None:
-    """Apply `change` to a table's rows."""
+    """Apply `change` to the rows of a table."""
     path = part_of(root, table)
     rows = pq.read_table(path).to_pylist()
     change(rows)
@@ -40,12 +40,12 @@ def rewrite(root: Path, table: str, change: Callable[[list[dict]], object]) -> N
 
 
 def put(table: str, column: str, value: object, row: int = 0) -> Callable[[Path], None]:
-    """One value replaced."""
+    """Replace one value."""
     return lambda root: rewrite(root, table, lambda rows: rows[row].__setitem__(column, value))
 
 
 def edit(change: Callable[[dict], object]) -> Callable[[Path], None]:
-    """dataset.json changed as plain data."""
+    """Change dataset.json as plain data."""
 
     def damage(root: Path) -> None:
         path = root / "dataset.json"
@@ -57,7 +57,7 @@ def edit(change: Callable[[dict], object]) -> Callable[[Path], None]:
 
 
 def pack(root: Path, change: Callable[[list[dict]], object] = lambda rows: None, schema=IMAGES, **options) -> None:
-    """The frames in one shard instead of files, with `change` applied to its rows."""
+    """Pack the frames in one shard, with `change` applied to its rows."""
     frames = pq.read_table(part_of(root, "frames")).to_pylist()
     rows = [
         {
@@ -73,11 +73,11 @@ def pack(root: Path, change: Callable[[list[dict]], object] = lambda rows: None,
     edit(lambda content: content.update(images="packed"))(root)
 
 
-def snapshot(folder: Path, but: Path) -> dict[str, tuple]:
-    """All that lies in a folder beside a dataset, with its content and times."""
+def snapshot(folder: Path, excluded: Path) -> dict[str, tuple]:
+    """Return content and times of all files in a folder, except the dataset `excluded`."""
     found = {}
     for path in [folder, *sorted(folder.rglob("*"))]:
-        if path == folder or (path != but and but not in path.parents):
+        if path == folder or (path != excluded and excluded not in path.parents):
             state = path.lstat()
             content = path.read_bytes() if path.is_file() and not path.is_symlink() else None
             found[str(path)] = state.st_mode, state.st_mtime_ns if path != folder else 0, content
@@ -85,7 +85,7 @@ def snapshot(folder: Path, but: Path) -> dict[str, tuple]:
 
 
 def read_all(dataset: Dataset) -> None:
-    """Whatever a reader reads."""
+    """Read everything that a reader can read."""
     for table in TABLES:
         dataset.table(table)
     for scene_id in dataset.scene_ids():
@@ -95,7 +95,7 @@ def read_all(dataset: Dataset) -> None:
 
 
 def command(root: Path, name: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Run `perilune-manifest`; what it printed, once it is known that it ended as a user's fault should."""
+    """Run a command of `perilune-manifest` and return its output; fails unless errors are single lines."""
     monkeypatch.setattr(sys, "argv", ["perilune-manifest", name, str(root)])
     monkeypatch.setenv("COLUMNS", "1500")
     capsys.readouterr()
@@ -106,27 +106,27 @@ def command(root: Path, name: str, capsys: pytest.CaptureFixture, monkeypatch: p
         code = stop.code
     out, err = capsys.readouterr()
     assert code in (0, 2), (code, out, err)
-    told = out + err
-    assert "Traceback" not in told and "Warning" not in told
-    # The progress bar comes before it.
+    output = out + err
+    assert "Traceback" not in output and "Warning" not in output
+    # The progress bar is printed before the error.
     lines = [line for line in err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == (code == 2 and " fault" not in out), told
+    assert len(lines) == (code == 2 and " fault" not in out), output
     assert not lines or err.rstrip().endswith(lines[0]), err
-    assert name != "validate" or code == 2, told
-    assert all(c.isprintable() or c == "\n" for c in told), repr(told)
-    return told
+    assert name != "validate" or code == 2, output
+    assert all(c.isprintable() or c == "\n" for c in output), repr(output)
+    return output
 
 
-def told_by(printed: str) -> Told:
-    """File and column of each fault in the table that `validate` printed, or the line with which it refused."""
+def faults_in_output(printed: str) -> FaultPlaces:
+    """Parse the output of `validate`: file and column of each fault, or the error message."""
     rows = [[cell.strip() for cell in line.split("│")] for line in printed.splitlines() if line.startswith("│")]
     assert all(len(row) == 7 and row[4] and row[5] for row in rows), printed
     refused = [line for line in printed.splitlines() if line.startswith("error: ")]
     return [(row[1], row[3]) for row in rows] + [(line, line) for line in refused]
 
 
-def told_of(root: Path) -> Told:
-    """What opening and validating tells of a dataset. Fails where it raises anything but a user's fault."""
+def faults_or_error(root: Path) -> FaultPlaces:
+    """Open and validate a dataset; return its faults, or the message of the UserError. Other errors propagate."""
     try:
         faults = validate(open_dataset(root))
     except UserError as error:
@@ -137,10 +137,10 @@ def told_of(root: Path) -> Told:
 
 
 def assert_refused(root: Path, file: str, column: str, capsys, monkeypatch) -> None:
-    """A damaged dataset is refused, naming file and column, by library and command line; nothing beside it changes."""
+    """Check that library and command line refuse a dataset and name file and column, and change nothing beside it."""
     before = snapshot(root.parent, root)
-    told = told_by(command(root, "validate", capsys, monkeypatch))
-    assert any(file in found and column in name for found, name in told), told
+    faults = faults_in_output(command(root, "validate", capsys, monkeypatch))
+    assert any(file in found and column in name for found, name in faults), faults
     try:
         read_all(open_dataset(root))
     except UserError as error:
@@ -152,16 +152,16 @@ def assert_refused(root: Path, file: str, column: str, capsys, monkeypatch) -> N
 _CHILD = """
 import resource, sys, time
 from pathlib import Path
-from tests.helpers.hostile import told_of
+from tests.helpers.hostile import faults_or_error
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-told = told_of(Path(sys.argv[1]))
+faults = faults_or_error(Path(sys.argv[1]))
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-print((after - before) // 1024, told)
+print((after - before) // 1024, faults)
 """
 
 
-def told_within(root: Path, most_mib: int, most_s: int = 30) -> str:
-    """What a process of its own tells of a dataset, which has that much memory beyond its libraries, and that time."""
+def faults_within_limits(root: Path, most_mib: int, most_s: int = 30) -> str:
+    """Run `faults_or_error` in a new process with limits on time and on memory beyond its libraries."""
 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_AS, (6 * _GIB, 6 * _GIB))
@@ -177,18 +177,18 @@ def told_within(root: Path, most_mib: int, most_s: int = 30) -> str:
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
     assert run.returncode == 0, run.stderr
-    mib, _, told = run.stdout.partition(" ")
+    mib, _, faults = run.stdout.partition(" ")
     assert int(mib) <= most_mib, run.stdout
-    return told
+    return faults
 
 
 def digest(content: bytes) -> str:
-    """SHA-256 in hexadecimal."""
+    """Return the SHA-256, hexadecimal."""
     return hashlib.sha256(content).hexdigest()
 
 
 def sealed(damage: Callable[[Path], object]) -> Callable[[Path], None]:
-    """A damage whose doer also made the checksums anew."""
+    """Apply a damage, then write valid checksums."""
 
     def both(root: Path) -> None:
         damage(root)

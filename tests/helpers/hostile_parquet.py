@@ -1,4 +1,4 @@
-"""Parquet files that no writer would make: their footers (Thrift, compact protocol) taken apart and put together."""
+"""Forge Parquet files that no writer makes: parse and write their footers (Thrift, compact protocol)."""
 
 import struct
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from pathlib import Path
 
 _BOOLS, _BYTE, _INTEGERS, _DOUBLE, _TEXT, _LISTS, _STRUCT = (1, 2), 3, (4, 5, 6), 7, 8, (9, 10), 12
 Fields = dict[int, tuple[int, object]]
-"""Type and value of a struct's fields by their numbers in parquet.thrift."""
+"""Type and value of the fields of a struct, by field number of parquet.thrift."""
 
 
 def _varint(buffer: bytes, at: int) -> tuple[int, int]:
@@ -98,22 +98,22 @@ def forge(path: Path, change: Callable[[Fields], None]) -> None:
 
 
 def put(fields: Fields, number: int, value: object) -> None:
-    """Give a field another value of its type."""
+    """Replace the value of a field and keep its type."""
     fields[number] = fields[number][0], value
 
 
 def groups(footer: Fields) -> list[Fields]:
-    """The row groups: 1 columns, 2 total_byte_size, 3 num_rows."""
+    """Return the row groups: 1 columns, 2 total_byte_size, 3 num_rows."""
     return footer[4][1][1]
 
 
 def columns(group: Fields) -> list[Fields]:
-    """Metadata of a row group's columns: 5 num_values, 6 and 7 decompressed and compressed bytes, 9 to 11 offsets."""
+    """Return the metadata of the columns: 5 num_values, 6 and 7 decompressed and compressed bytes, 9 to 11 offsets."""
     return [chunk[3][1] for chunk in group[1][1][1]]
 
 
 def nested(depth: int) -> bytes:
-    """A file without rows whose schema is nested to a depth."""
+    """Return a file without rows whose schema is nested to a depth."""
     group = {3: (5, 0), 4: (8, b"a"), 5: (5, 1)}
     leaf = {1: (5, 1), 3: (5, 0), 4: (8, b"z")}
     footer = {1: (5, 2), 2: (9, (12, [group] * depth + [leaf])), 3: (6, 0), 4: (9, (12, []))}

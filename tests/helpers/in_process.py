@@ -1,4 +1,4 @@
-"""A command line run within the test's own process, which saves the seconds of starting Python and its imports."""
+"""Run a command line in the process of the test, which saves the time to start Python and import modules."""
 
 import contextlib
 import io
@@ -9,7 +9,7 @@ from unittest import mock
 
 
 def call(main: Callable[[], None], *arguments: object) -> subprocess.CompletedProcess:
-    """Exit code, standard output and standard error of `main` with these arguments."""
+    """Run `main` with these arguments; return exit code, standard output and standard error."""
     given = [str(argument) for argument in arguments]
     out, err, code = io.StringIO(), io.StringIO(), 0
     with (

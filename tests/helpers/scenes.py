@@ -1,4 +1,4 @@
-"""Small scenes and configurations of the renderer that tests build."""
+"""Small scenes and configurations of the renderer for tests."""
 
 import numpy as np
 
@@ -13,13 +13,13 @@ NO_BOULDERS = Boulders(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int
 
 
 def config_with(**changes) -> DatasetConfig:
-    """The defaults with some sections replaced."""
+    """Return the default configuration with some sections replaced."""
     kind = KindConfig(n_scenes=1, trajectories_per_scene=1, n_frames=4, split_by="scene")
     return DatasetConfig(**{"detect": kind, "nav": kind, **changes})
 
 
 def round_craters(rows, wear=1e-3) -> Craters:
-    """Craters in order, from rows of x, y, diameter, depth / diameter and, unless `wear` serves for all, wear K/R^2."""
+    """Make craters, in order, from rows of x, y, diameter, depth / diameter and optionally wear K/R^2."""
     columns = np.atleast_2d(np.asarray(rows, float)).T
     x, y, diameter, ratio = columns[:4]
     ratio_k = columns[4] if len(columns) > 4 else np.full_like(x, wear)
@@ -27,7 +27,7 @@ def round_craters(rows, wear=1e-3) -> Craters:
 
 
 def flat_scene(extent_m: float, n: int, craters: Craters | None = None, height_m: np.ndarray | None = None) -> Scene:
-    """A scene on an even grid of n x n vertices (n odd), flat unless heights (n, n; rows are y) are given."""
+    """Make a scene on a uniform grid of n x n vertices (n odd), flat unless heights (n, n; rows are y) are given."""
     grid = Grid.even(extent_m / 2, (n - 1) // 2)
     height = np.zeros(n * n) if height_m is None else np.ravel(height_m)
     none = craters if craters is not None else round_craters(np.empty((0, 4)))

@@ -1,4 +1,4 @@
-"""The folder of a detect run, without the training: random weights, a configuration, a threshold."""
+"""Detect runs without training: random weights, a configuration and a threshold."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ THRESHOLD = 0.005
 
 
 def store_run(root: Path, *more: str) -> Path:
-    """A run below `root`, with `more` settings; its network finds a little everywhere, at scores around 0.01."""
+    """Store a run below `root`, with `more` settings; its network has detections everywhere, with scores near 0.01."""
     settings = ("width=0.125", "precision=float32", "device=cpu", "evaluation.min_score=0.001", *more)
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, tuple(f"detect.{s}" for s in settings))
     run = runs.RunFolder(root / "detect" / "stored")
@@ -29,5 +29,5 @@ def store_run(root: Path, *more: str) -> Path:
 
 
 def settings_of(run: Path, *settings: str) -> DetectConfig:
-    """The stored settings, some of them changed."""
+    """Return the stored settings of a run, with some of them changed."""
     return config_of_run(run, settings)

@@ -11,12 +11,12 @@ from perilune_train.training import runs
 
 
 def uses_of(dataset: Path, split: str, use: Use = "trained", name: str = "elsewhere") -> frozenset[TerrainUse]:
-    """The ground of a split as if a network had met it in another dataset."""
+    """Return the terrain uses of a split, as if a network had used it in another dataset."""
     scenes = split_terrain(open_dataset(dataset), split, use)
     return frozenset(TerrainUse(name, s.scene_id, use, s.sha256, name) for s in scenes)
 
 
 def store_record(checkpoint: Path, uses: Iterable[TerrainUse]) -> None:
-    """Write these uses as the terrain record of a checkpoint, in place of an older one."""
+    """Write these uses as the terrain record of a checkpoint; replaces an existing one."""
     content = runs.load_weights(checkpoint)
     torch.save({**content, "terrain": Provenance(frozenset(uses)).plain()}, checkpoint)

@@ -1,4 +1,4 @@
-"""Small datasets that tests of the manifest share."""
+"""Small datasets for the tests of this folder."""
 
 import shutil
 from pathlib import Path
@@ -14,26 +14,26 @@ from perilune_shared.dataset.writer import new_dataset
 
 @pytest.fixture(scope="session")
 def drawn(tmp_path_factory) -> Path:
-    """Five terrains, one descent of 8 frames over each: 3 train, 1 val, 1 test. Read only."""
+    """Dataset of five terrains with one trajectory of 8 frames each: 3 train, 1 val, 1 test. Do not change it."""
     return build_dataset(tmp_path_factory.mktemp("drawn") / "a", "detect")
 
 
 @pytest.fixture(scope="session")
 def other(tmp_path_factory) -> Path:
-    """As `drawn`, on other terrains with the same names. Read only."""
+    """Like `drawn`, with different terrains of the same names. Do not change it."""
     return build_dataset(tmp_path_factory.mktemp("drawn") / "b", "detect", seed=8)
 
 
 @pytest.fixture(scope="session")
 def crowded(tmp_path_factory) -> Path:
-    """A dataset with its frames as files: 4 descents of 5 frames, each over its own terrain."""
+    """Dataset of 4 trajectories of 5 frames, each over its own terrain; frames are files."""
     root = tmp_path_factory.mktemp("crowded") / "set"
     return build_dataset(root, "detect", splits={"train": 2, "val": 1, "test": 1}, n_frames=5, side_px=128, craters=600)
 
 
 @pytest.fixture(scope="session")
 def crowded_packed(crowded, tmp_path_factory) -> Path:
-    """The same with whole tables and its frames in Parquet."""
+    """The dataset `crowded`, packed: each table in one part, frames in Parquet."""
     source, out = open_dataset(crowded), tmp_path_factory.mktemp("packed") / "set"
     info = read_info(crowded).model_copy(update={"images": "packed"})
     with new_dataset(out, info, whole_tables=True) as writer:
@@ -47,14 +47,14 @@ def crowded_packed(crowded, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def little(tmp_path_factory) -> Path:
-    """Two terrains with one descent of three frames of 32 px each. Read only: copy before a change."""
+    """Dataset of two terrains with one trajectory of three frames each, 32 px wide. Do not change it."""
     root = tmp_path_factory.mktemp("little") / "dataset"
     return build_dataset(root, "detect", side_px=32, splits={"train": 1, "val": 1}, n_frames=3, craters=300)
 
 
 @pytest.fixture
 def victim(little, tmp_path) -> Path:
-    """A copy of it that a test may damage, and beside it a folder that nobody may touch."""
+    """A copy of `little` that a test may damage; the folder beside it must stay unchanged."""
     beside = tmp_path / "canary"
     beside.mkdir()
     (beside / "secret.txt").write_text("secret")

@@ -26,7 +26,7 @@ def fault(**kwargs) -> str:
     return text
 
 
-def test_later_sources_win(tmp_path):
+def test_later_sources_override(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text("dataset: {seed: 5, terrain: {relief: {rms_slope_deg: 1}}}")
     config = dataset(config_file=file, settings=("dataset.seed=7", "dataset.camera.width_px=64"))
@@ -34,7 +34,7 @@ def test_later_sources_win(tmp_path):
     assert config.camera.width_px == 64 and config.camera.height_px == 128
 
 
-def test_an_unknown_key_is_named_with_the_nearest(tmp_path):
+def test_an_unknown_key_suggests_the_nearest(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text("dataset: {terrain: {craters: {max_diametre_m: 3}}}")
     text = fault(config_file=file)
@@ -64,7 +64,7 @@ def test_an_unknown_key_is_named_with_the_nearest(tmp_path):
         ("dataset.camera.weight_on_moon=1", ["got an unknown key, expected one of width_px, height_px, "]),
     ],
 )
-def test_a_wrong_setting_is_told_in_one_line(setting, parts):
+def test_an_invalid_setting_gives_one_line(setting, parts):
     text = fault(settings=(setting,))
     for part in parts:
         assert part in text
@@ -78,7 +78,7 @@ def test_an_unknown_preset():
 @pytest.mark.parametrize(
     "content", ["dataset: [1, 2]", "- a", "dataset: {a: 1", "a: &x [1]\nb: *x", "!!python/object:os.system {}"]
 )
-def test_files_that_are_no_configuration(tmp_path, content):
+def test_files_that_are_not_configurations(tmp_path, content):
     file = tmp_path / "a.yaml"
     file.write_text(content)
     assert "a.yaml" in fault(config_file=file)
@@ -88,7 +88,7 @@ def test_a_missing_file(tmp_path):
     assert "no such file" in fault(config_file=tmp_path / "none.yaml")
 
 
-def test_other_sections_may_stand_in_the_same_file(tmp_path):
+def test_other_sections_are_allowed_in_the_same_file(tmp_path):
     file = tmp_path / "a.yaml"
     file.write_text("detect: {anything: 1}\ndataset: {seed: 9}")
     assert dataset(config_file=file).seed == 9
@@ -101,8 +101,8 @@ WRONG = ["'text'", -1e9, 1e9, 1.5, 0, 1, True, None, [], [1] * 99, ["a"], [[1]],
     ("section", "model"),
     [("dataset", DatasetConfig), ("detect", DetectConfig), ("navigate", NavigateConfig), ("explain", ExplainConfig)],
 )
-def test_every_wrong_value_of_every_setting_is_told_as_got_and_expected(section, model):
-    """No message has the wording of the validation library."""
+def test_errors_of_all_settings_have_got_and_expected(section, model):
+    """No message contains text of the validation library."""
     package = "perilune_render" if section == "dataset" else "perilune_train"
     preset = resolve(model, section, package, "tiny").model_dump(mode="json")
     messages = []
@@ -131,7 +131,7 @@ def test_a_setting_is_a_path_and_a_value():
     assert parse_setting("detect.strides=[4, 8, 16]") == (["detect", "strides"], [4, 8, 16])
 
 
-def test_a_resolved_section_reads_back(tmp_path):
+def test_a_written_section_reads_back(tmp_path):
     config = dataset(settings=("dataset.seed=11",))
     file = tmp_path / "a.yaml"
     file.write_text(to_yaml("dataset", config))

@@ -1,4 +1,4 @@
-"""The record of a run names the commit of this repository, and no other."""
+"""Run records: the commit is that of this repository, never of another one."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ def git(root: Path, *arguments: str) -> str:
 
 
 def commit_by(path: Path) -> str:
-    """The commit that the package in a folder records."""
+    """Return the commit that the package in a folder records."""
     own = {**os.environ, "PYTHONPATH": str(path)}
     done = subprocess.run([sys.executable, "-c", ASK], env=own, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -28,7 +28,7 @@ def commit_by(path: Path) -> str:
 
 @pytest.fixture
 def checkout(tmp_path) -> Path:
-    """A repository with shared/perilune_shared in it, as this one has it."""
+    """A repository with shared/perilune_shared, like this one."""
     target = tmp_path / "checkout/shared/perilune_shared"
     target.mkdir(parents=True)
     (target / "run_record.py").write_bytes(Path(module.__file__).read_bytes())
@@ -40,7 +40,7 @@ def checkout(tmp_path) -> Path:
     return root
 
 
-def test_the_commit_is_the_checkouts_and_says_if_files_differ(checkout):
+def test_the_commit_of_the_checkout_is_marked_if_files_are_modified(checkout):
     head = git(checkout, "rev-parse", "HEAD")
     (checkout / "untracked").touch()
     assert commit_by(checkout / "shared") == head
@@ -48,7 +48,7 @@ def test_the_commit_is_the_checkouts_and_says_if_files_differ(checkout):
     assert commit_by(checkout / "shared") == f"{head} modified"
 
 
-def test_an_installed_package_does_not_take_the_commit_of_the_repository_around_it(checkout):
+def test_an_installed_package_ignores_the_repository_around_it(checkout):
     installed = checkout / "env/lib/site-packages"
     shutil.copytree(checkout / "shared/perilune_shared", installed / "perilune_shared")
     assert commit_by(installed) == "unknown"
@@ -61,7 +61,7 @@ def test_the_record_has_hardware_and_command():
     assert len(record.date) == 10
 
 
-def test_a_benchmark_is_recorded_as_it_was_called(tmp_path):
+def test_the_command_of_a_benchmark(tmp_path):
     bench = tmp_path / "bench"
     bench.mkdir()
     (bench / "speed.py").write_text("from perilune_shared.run_record import run_record; print(run_record().command)")
@@ -71,7 +71,7 @@ def test_a_benchmark_is_recorded_as_it_was_called(tmp_path):
     assert done.stdout.strip() == "python -m bench.speed --fast"
 
 
-def test_the_command_is_the_one_to_type(tmp_path):
+def test_the_command_of_a_console_script(tmp_path):
     (tmp_path / "measure.py").write_text(
         "from perilune_shared.run_record import run_record; print(run_record().command)"
     )

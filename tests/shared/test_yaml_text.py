@@ -1,4 +1,4 @@
-"""YAML 1.2 as configuration files and --set have it: the core schema's scalars, and no YAML 1.1 forms."""
+"""YAML 1.2 of configuration files and --set: scalars of the core schema, no forms of YAML 1.1."""
 
 import math
 import time
@@ -12,7 +12,7 @@ from perilune_shared.config import parse_setting
 from perilune_shared.errors import UserError
 from perilune_shared.yaml_text import parse_yaml, to_yaml_text
 
-# Specification 1.2.2, section 10.3.2, and what version 1.1 read otherwise.
+# Specification 1.2.2, section 10.3.2, and values that version 1.1 reads differently.
 SCALARS = [
     ("1:30", "1:30"),
     ("012", 12),
@@ -43,7 +43,7 @@ SCALARS = [
 
 
 @pytest.mark.parametrize(("text", "value"), SCALARS)
-def test_scalars_are_those_of_the_core_schema(text, value):
+def test_scalars_of_the_core_schema(text, value):
     for found in (
         parse_yaml(f"a: {text}", "")["a"],
         parse_yaml(f"{{b: {text}, c: 1}}", "")["b"],
@@ -52,12 +52,12 @@ def test_scalars_are_those_of_the_core_schema(text, value):
         assert found == value and type(found) is type(value)
 
 
-def test_not_a_number_is_one_of_the_core_schemas_numbers():
+def test_nan_is_a_number_of_the_core_schema():
     assert math.isnan(parse_yaml(".nan", ""))
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         ("a: 1\nb: 2\na: 3", "got the key 'a' twice at line 3, expected each key once"),
         ("{a: {b: 1, b: 1}}", "the key 'b' twice"),
@@ -88,18 +88,18 @@ def test_not_a_number_is_one_of_the_core_schemas_numbers():
         ("a" * 100_001, "100001 characters"),
     ],
 )
-def test_what_is_refused_is_told_in_one_line(text, told):
+def test_refused_yaml_gives_one_line(text, expected):
     start = time.process_time()
     with pytest.raises(UserError) as caught:
         parse_yaml(text, "c.yaml")
     message = str(caught.value)
-    assert message.startswith("c.yaml: ") and told in message and "\n" not in message and len(message) < 400
+    assert message.startswith("c.yaml: ") and expected in message and "\n" not in message and len(message) < 400
     assert time.process_time() - start < 10
 
 
 @settings(max_examples=50)
 @given(st.text(alphabet="ab:{}[],-&*!|>'\"%@`#?~. 01\n\t\\", max_size=60) | st.text(max_size=30))
-def test_any_text_is_plain_data_or_one_error(text):
+def test_any_text_gives_plain_data_or_a_user_error(text):
     try:
         data = parse_yaml(text, "")
     except UserError as error:
@@ -119,7 +119,7 @@ PLAIN = st.recursive(
 
 @settings(max_examples=50)
 @given(st.dictionaries(st.from_regex(r"[a-z_]{1,9}", fullmatch=True), PLAIN, max_size=3))
-def test_what_is_written_reads_back(data):
+def test_written_yaml_reads_back(data):
     assert parse_yaml(to_yaml_text(data), "") == data or data == {}
 
 

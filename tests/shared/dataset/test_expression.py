@@ -1,4 +1,4 @@
-"""Conditions: types are checked, nothing is executed, row groups are left out."""
+"""Conditions: types are checked, no code is executed, row groups are skipped."""
 
 import math
 
@@ -23,7 +23,7 @@ ROWS = pa.table(
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
+    ("text", "expected"),
     [
         ("radius_px > 4", [0, 1, 1, 0]),
         ("4 < radius_px <= 9", [0, 1, 1, 0]),
@@ -45,12 +45,12 @@ ROWS = pa.table(
         ("contrast != 9", [1, 0, 0, 1]),
     ],
 )
-def test_conditions(text, wanted):
-    assert Condition(text).holds(ROWS).astype(int).tolist() == wanted
+def test_conditions(text, expected):
+    assert Condition(text).holds(ROWS).astype(int).tolist() == expected
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("radius > 4", "radius_px"),
         ("boulders.diameter_m > 1", "table.column"),
@@ -100,8 +100,8 @@ def test_conditions(text, wanted):
         ("", "a condition such as"),
     ],
 )
-def test_what_is_no_condition(text, told):
-    with pytest.raises(UserError, match=told) as raised:
+def test_invalid_conditions_are_refused(text, message):
+    with pytest.raises(UserError, match=message) as raised:
         Condition(text)
     assert str(raised.value).startswith("--where: condition: got ") and "\n" not in str(raised.value)
 
@@ -109,7 +109,7 @@ def test_what_is_no_condition(text, told):
 @pytest.mark.parametrize(
     "text", ["frame_index * 9223372036854775807 > 1", "frame_index % (frame_index - frame_index) == 1"]
 )
-def test_arithmetic_beyond_its_range_is_an_error(text):
+def test_arithmetic_overflow_is_an_error(text):
     with pytest.raises(UserError, match="range"):
         Condition(text).holds(ROWS)
 
@@ -124,18 +124,18 @@ def test_arithmetic_beyond_its_range_is_an_error(text):
         ("photometry not in ('a', 'b')", [False, False, True]),
     ],
 )
-def test_a_null_is_neither_in_a_list_nor_outside_it(text, held):
+def test_null_is_neither_in_nor_not_in_a_list(text, held):
     rows = pa.table({"labels.contrast": [1.0, None, 3.0], "scenes.photometry": ["a", None, "c"]})
     assert Condition(text).holds(rows).tolist() == held
 
 
-def test_conditions_leave_out_row_groups(crowded_packed):
-    """Those whose statistics exclude it are not read; the rows are those of a filter after reading."""
+def test_conditions_skip_row_groups(crowded_packed):
+    """Row groups whose statistics exclude the condition are not read; the result equals filtering all rows."""
     dataset = open_dataset(crowded_packed)
     condition = Condition("split == 'val' or frame_id < 's000/t000/000002'")
     frames = dataset.table("frames").to_pandas()
-    wanted = frames[(frames["split"] == "val") | (frames["frame_id"] < "s000/t000/000002")]["frame_id"].tolist()
-    assert dataset.table("frames", ["frame_id"], where=condition)["frame_id"].to_pylist() == wanted
+    expected = frames[(frames["split"] == "val") | (frames["frame_id"] < "s000/t000/000002")]["frame_id"].tolist()
+    assert dataset.table("frames", ["frame_id"], where=condition)["frame_id"].to_pylist() == expected
     (path,) = dataset.parts("craters")
     part = Part(path, "craters")
     assert part.n_groups > 1

@@ -1,4 +1,4 @@
-"""Broken keys stop every command with one line."""
+"""Every command refuses a dataset with broken keys, with a message of one line."""
 
 import pytest
 from tests.helpers.hostile import rewrite
@@ -32,8 +32,8 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_broken_keys_stop_every_command(name, victim, tmp_path):
-    table, change, told = BROKEN[name]
+def test_every_command_refuses_broken_keys(name, victim, tmp_path):
+    table, change, message = BROKEN[name]
     rewrite(victim, table, change)
     seal(victim)
     dataset = open_dataset(victim)
@@ -45,21 +45,21 @@ def test_broken_keys_stop_every_command(name, victim, tmp_path):
         lambda: read_labels(dataset),
         lambda: summary(dataset),
     ):
-        with pytest.raises(UserError, match=f"{told}.*perilune-manifest validate"):
+        with pytest.raises(UserError, match=f"{message}.*perilune-manifest validate"):
             work()
     assert not (tmp_path / "o").exists()
     for command in (["stats"], ["export", "--format", "coco", "--out", str(tmp_path / "o")], ["card"]):
-        with pytest.raises(UserError, match=told):
+        with pytest.raises(UserError, match=message):
             CliRunner().invoke(app, [command[0], str(victim), *command[1:]], catch_exceptions=False)
 
 
-def test_sound_keys_are_let_through(drawn, crowded_packed):
+def test_valid_keys_are_accepted(drawn, crowded_packed):
     for root in (drawn, crowded_packed):
         check_keys(open_dataset(root))
 
 
 @pytest.mark.parametrize("work", [summary, read_labels])
-def test_labels_are_checked_as_they_are_read(work, drawn, monkeypatch):
+def test_labels_are_checked_while_they_are_read(work, drawn, monkeypatch):
     opened, plain = [], Part.__init__
 
     def counted(part, path, *rest):

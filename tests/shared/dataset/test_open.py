@@ -1,4 +1,4 @@
-"""A dataset in Python: tables as pandas, frames by number or name."""
+"""Reading a dataset in Python: tables as pandas, frames by row number or frame_id."""
 
 import cv2
 import numpy as np
@@ -25,7 +25,7 @@ def test_tables_and_frames(name, request):
         assert dataset[frame.frame_id].png == frame.png
 
 
-def test_frames_that_are_not_there(crowded):
+def test_missing_frames_raise_an_error(crowded):
     dataset = ps.open_dataset(crowded)
     for place in (len(dataset), -len(dataset) - 1):
         with pytest.raises(IndexError):
@@ -37,12 +37,12 @@ def test_frames_that_are_not_there(crowded):
 
 
 def huge(png):
-    """The same PNG with a header of 65,536 x 65,536 pixels."""
+    """Return the PNG with a header of 65,536 x 65,536 pixels."""
     return png[:16] + (65536).to_bytes(4, "big") * 2 + png[24:]
 
 
 @pytest.mark.parametrize("damage", [lambda _: b"no picture", lambda png: png[: len(png) // 2], huge])
-def test_a_frame_that_is_no_picture_is_named(victim, damage):
+def test_an_invalid_image_error_names_the_frame(victim, damage):
     dataset = ps.open_dataset(victim)
     path = victim / dataset.frames["png_path"][0]
     path.write_bytes(damage(path.read_bytes()))
@@ -50,7 +50,7 @@ def test_a_frame_that_is_no_picture_is_named(victim, damage):
         _ = dataset[0].image
 
 
-def test_deep_frames_have_all_their_bits(victim):
+def test_16_bit_frames_keep_all_bits(victim):
     dataset = ps.open_dataset(victim)
     path = victim / dataset.frames["png_path"][0]
     deep = np.arange(32 * 32, dtype=np.uint16).reshape(32, 32) * 60

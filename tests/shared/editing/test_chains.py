@@ -1,4 +1,4 @@
-"""Random chains of merge, subset, split, migrate, pack: no result contradicts itself."""
+"""Random sequences of merge, subset, split, migrate and pack: every result is consistent."""
 
 import itertools
 import os
@@ -22,7 +22,7 @@ from perilune_shared.validation.validate import validate
 
 OLD = Path(__file__).parents[1] / "old"
 CHAINS = int(os.environ.get("PERILUNE_CHAINS", "60"))
-"""A thousand take minutes."""
+"""Number of random chains; 1000 take minutes."""
 CONDITIONS = (
     "frame_index % 2 == 0",
     "split == 'train'",
@@ -41,14 +41,14 @@ STEPS = st.one_of(
 
 
 class Pool:
-    """Datasets by the steps that made them, each made and checked once."""
+    """Cache of datasets by the steps that made them; each is made and checked once."""
 
     def __init__(self, root: Path):
         self.root, self.numbers = root, itertools.count()
         self.made: dict[tuple, Path | None] = {}
         for seed in (1, 2):
             splits = {"train": 1, "val": 1, "test": 1}
-            # More descents than terrains, so that not every split is one by scene.
+            # More trajectories than terrains, so that not every split is by scene.
             self.made["drawn", seed] = build_dataset(
                 root / f"drawn{seed}",
                 "detect",
@@ -61,7 +61,7 @@ class Pool:
             )
 
     def of(self, key: tuple, make) -> Path | None:
-        """The dataset of a key; None where making it was refused in one line, and then nothing is left behind."""
+        """Return the dataset of a key, or None if it was refused with one line; then no file is left."""
         if key not in self.made:
             out = self.root / str(next(self.numbers))
             try:
@@ -87,15 +87,15 @@ def check(root: Path) -> None:
         "scene": terrain.groupby("content_sha256")["split"].nunique().max() > 1,
         "trajectory": frames.groupby(["scene_id", "trajectory_id"])["split"].nunique().max() > 1,
     }
-    wanted = "frame" if shared["trajectory"] else "trajectory" if shared["scene"] else "scene"
-    assert dataset.info.split_by == wanted
-    descents = dataset.table("trajectories").to_pandas().set_index(["scene_id", "trajectory_id"])["n_frames"]
+    expected = "frame" if shared["trajectory"] else "trajectory" if shared["scene"] else "scene"
+    assert dataset.info.split_by == expected
+    trajectories = dataset.table("trajectories").to_pandas().set_index(["scene_id", "trajectory_id"])["n_frames"]
     counted = frames.groupby(["scene_id", "trajectory_id"]).size()
-    pd.testing.assert_series_equal(descents.sort_index(), counted.sort_index(), check_names=False)
+    pd.testing.assert_series_equal(trajectories.sort_index(), counted.sort_index(), check_names=False)
 
 
 def step(pool: Pool, key: tuple, folder: Path, earlier: list[tuple[tuple, Path]], what: tuple) -> tuple:
-    """The key and folder of the next dataset of a chain; the same where the step is refused."""
+    """Return key and folder of the next dataset of a chain; the given ones if the step is refused."""
     name, *detail = what
     new = (*key, what)
     if name == "merge":
@@ -122,7 +122,7 @@ def pool(tmp_path_factory):
     return Pool(tmp_path_factory.mktemp("chains"))
 
 
-def test_chains(pool):
+def test_every_result_of_a_chain_is_consistent(pool):
     chains = []
 
     @settings(max_examples=CHAINS, derandomize=True, database=None, suppress_health_check=list(HealthCheck))

@@ -1,4 +1,4 @@
-"""Merged datasets hold every frame once and contradict nothing."""
+"""Merged datasets contain every frame once and are consistent."""
 
 import shutil
 
@@ -27,21 +27,21 @@ def merged(out, *sources, **options):
     return made
 
 
-def test_other_terrains_of_the_same_name_are_renamed(drawn, other, tmp_path):
+def test_different_terrains_with_the_same_name_are_renamed(drawn, other, tmp_path):
     made = merged(tmp_path / "m", drawn, other)
     assert made.info.counts.frames == 80 and made.info.counts.scenes == 10 and made.info.split_by == "scene"
     assert "s000-2" in made.scene_ids()
     first, second = open_dataset(drawn), open_dataset(other)
     new = made.table("labels", ["radius_px"], scene_id="s000-2")
     assert new.equals(second.table("labels", ["radius_px"], scene_id="s000"))
-    # Statistics are those of all rows, not sums or means of two.
+    # Statistics are computed from all rows, not from those of the sources.
     rows = summary(made).set_index("split")
     assert rows.loc["train", "labels"] == sum(d.table("labels", split="train").num_rows for d in (first, second))
     path = made.table("frames", ["png_path"], scene_id="s000-2")["png_path"][3].as_py()
     assert made.file(path).read_bytes() == (other / "frames/s000/t000/000003.png").read_bytes()
 
 
-def test_halves_of_a_dataset_become_the_whole_again(drawn, tmp_path):
+def test_merging_both_halves_restores_the_dataset(drawn, tmp_path):
     whole = open_dataset(drawn)
     subset(whole, tmp_path / "even", ["frame_index % 2 == 0"])
     subset(whole, tmp_path / "odd", ["frame_index % 2 == 1"])
@@ -50,12 +50,12 @@ def test_halves_of_a_dataset_become_the_whole_again(drawn, tmp_path):
     assert [each.column for each in found] == ["history"]
 
 
-def test_a_dataset_with_itself_is_itself(drawn, tmp_path):
+def test_merging_a_dataset_with_itself_changes_nothing(drawn, tmp_path):
     made = merged(tmp_path / "m", drawn, drawn)
     assert made.info.counts == open_dataset(drawn).info.counts
 
 
-def test_a_frame_dealt_differently_keeps_the_first_split(drawn, tmp_path):
+def test_a_frame_with_two_splits_keeps_the_first(drawn, tmp_path):
     split_dataset(open_dataset(drawn), tmp_path / "f", by="frame", seed=3)
     made = merged(tmp_path / "m", tmp_path / "f", drawn)
     assert made.info.split_by == "frame"
@@ -63,7 +63,7 @@ def test_a_frame_dealt_differently_keeps_the_first_split(drawn, tmp_path):
     assert made.table("frames", ["frame_id", "split"]).sort_by("frame_id").equals(theirs)
 
 
-def test_two_descents_over_one_terrain(tmp_path):
+def test_two_trajectories_over_one_terrain(tmp_path):
     build_dataset(tmp_path / "a", "nav", splits={"train": 2}, scenes=1, n_frames=3, craters=40)
     build_dataset(tmp_path / "b", "nav", splits={"train": 2}, scenes=1, n_frames=3, craters=40, jitter_m=9)
     with pytest.raises(UserError, match="a different position_m"):
@@ -71,7 +71,7 @@ def test_two_descents_over_one_terrain(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
 
 
-def test_frames_are_left_out_on_wish(drawn, other, tmp_path):
+def test_frames_can_be_left_out(drawn, other, tmp_path):
     made = merged(tmp_path / "m", drawn, other, images="none")
     assert made.info.images == "absent" and not (tmp_path / "m/frames").exists()
     with pytest.raises(UserError, match="absent"):
@@ -88,11 +88,11 @@ def test_copies_and_links(drawn, other, tmp_path):
     assert not (tmp_path / "c" / relative).samefile(drawn / relative)
 
 
-def test_what_cannot_be_merged(drawn, tmp_path):
+def test_incompatible_datasets_are_refused(drawn, tmp_path):
     nav = build_dataset(tmp_path / "nav", "nav", splits={"train": 1}, n_frames=2, craters=40)
     small = build_dataset(tmp_path / "small", "detect", splits={"train": 1}, n_frames=2, craters=40, side_px=64)
-    for source, told in ((nav, "kind"), (small, "camera")):
-        with pytest.raises(UserError, match=told):
+    for source, field in ((nav, "kind"), (small, "camera")):
+        with pytest.raises(UserError, match=field):
             merged(tmp_path / "m", drawn, source)
     with pytest.raises(UserError, match="at least two"):
         merged(tmp_path / "m", drawn)
@@ -105,7 +105,7 @@ def test_what_cannot_be_merged(drawn, tmp_path):
     assert not (tmp_path / "m").exists() and not list(tmp_path.glob(".*"))
 
 
-def test_a_missing_frame_stops_everything(drawn, other, tmp_path):
+def test_a_missing_frame_leaves_no_result(drawn, other, tmp_path):
     broken = shutil.copytree(drawn, tmp_path / "broken")
     (broken / "frames/s001/t001/000002.png").unlink()
     with pytest.raises(UserError, match=r"000002\.png"):
@@ -122,7 +122,7 @@ def test_recipes_and_licences_are_kept(drawn, other, tmp_path):
 
 
 def with_info(source, folder, **changes):
-    """A copy of a dataset with fields of dataset.json replaced."""
+    """Copy a dataset and replace fields of its dataset.json."""
     root = shutil.copytree(source, folder)
     edit(lambda content: content.update(changes))(root)
     seal(root)
@@ -167,12 +167,12 @@ def equal_licences(one, two):
 
 
 @pytest.mark.parametrize("licence", ["Free-For-All", "MIT AND (", "MIT OR", ""])
-def test_a_licence_that_is_none_is_refused(licence):
+def test_an_invalid_licence_is_refused(licence):
     with pytest.raises(UserError, match=r"data: licence: got .*, expected an SPDX licence expression"):
         joined_licence([("data", licence), ("b", "MIT")])
 
 
-def test_a_choice_of_licences_can_be_merged(little, tmp_path):
+def test_alternative_licences_can_be_merged(little, tmp_path):
     root = with_info(little, tmp_path / "either", licence="MIT OR Apache-2.0")
     merge([open_dataset(root), open_dataset(little)], tmp_path / "m", images="none")
     assert open_dataset(tmp_path / "m").info.licence == "(MIT OR Apache-2.0) AND CC0-1.0"

@@ -1,4 +1,4 @@
-"""Packed datasets, unpacked, old ones migrated, and what differs."""
+"""Packing, unpacking, migration, diff and attach."""
 
 import json
 import shutil
@@ -32,7 +32,7 @@ def packed(drawn, tmp_path_factory):
     return out
 
 
-def test_packed_and_unpacked_it_is_the_same(drawn, packed, tmp_path):
+def test_unpacking_restores_the_dataset(drawn, packed, tmp_path):
     source, made = open_dataset(drawn), open_dataset(packed)
     assert validate(made) == [] and made.info.images == "packed" and len(made.shards()) > 1
     assert not (packed / "frames").exists() and len(list(packed.rglob("*.parquet"))) == 6 + len(made.shards())
@@ -44,7 +44,7 @@ def test_packed_and_unpacked_it_is_the_same(drawn, packed, tmp_path):
         assert again.file(path).read_bytes() == source.file(path).read_bytes()
 
 
-def test_large_tables_become_several_parts_that_the_reader_accepts(little, tmp_path, monkeypatch):
+def test_large_tables_become_several_readable_parts(little, tmp_path, monkeypatch):
     source = open_dataset(little)
     assert source.info.counts.craters == 600
     pack(source, tmp_path / "p", most_rows=100, most_images=2)
@@ -64,7 +64,7 @@ def test_large_tables_become_several_parts_that_the_reader_accepts(little, tmp_p
 
 
 def test_files_without_optional_columns_read_as_null(little, tmp_path, monkeypatch):
-    """A column that came later is null in older files, and is written by every tool; see the list in schema.py."""
+    """A column that was added later is null in older files, and every tool writes it (OPTIONAL in schema.py)."""
     later = pa.field("later_share", pa.float64(), metadata={"unit": "", "meaning": "a later column"})
     schema = TABLES["frames"].append(later)
     monkeypatch.setitem(TABLES, "frames", schema)
@@ -83,14 +83,14 @@ def test_files_without_optional_columns_read_as_null(little, tmp_path, monkeypat
     assert metadata_of(source)["recordSet"][4]["field"][-1]["name"] != "later_share"
 
 
-def test_packed_frames_are_found_by_their_ids(drawn, packed):
+def test_packed_frames_are_read_by_frame_id(drawn, packed):
     source, made = open_dataset(drawn), open_dataset(packed)
     frames = made.table("frames", split="test")
     found = dict(made.pngs(frames))
     assert found == dict(source.pngs(source.table("frames", split="test"))) and len(found) == 8
 
 
-def test_one_descent_of_a_packed_table(drawn, packed):
+def test_one_trajectory_of_a_packed_table(drawn, packed):
     source, made = open_dataset(drawn), open_dataset(packed)
     for name in ("frames", "labels", "trajectories"):
         theirs = source.table(name, scene_id="s003", trajectory_id="t003")
@@ -98,13 +98,13 @@ def test_one_descent_of_a_packed_table(drawn, packed):
     assert made.table("craters", ["x_m"], scene_id="s002").equals(source.table("craters", ["x_m"], scene_id="s002"))
 
 
-def test_a_packed_dataset_can_be_cut(packed, tmp_path):
+def test_a_subset_of_a_packed_dataset(packed, tmp_path):
     subset(open_dataset(packed), tmp_path / "s", ["split == 'val'"])
     made = open_dataset(tmp_path / "s")
     assert validate(made) == [] and made.info.images == "files" and made.info.counts.frames == 8
 
 
-def test_a_shard_is_an_image_dataset_by_its_own_metadata(packed):
+def test_the_metadata_of_a_shard_declares_an_image_column(packed):
     schema = pq.read_schema(open_dataset(packed).shards()[0])
     features = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
     assert features["image"] == {"_type": "Image"} and schema.names == ["frame_id", "image"]
@@ -112,7 +112,7 @@ def test_a_shard_is_an_image_dataset_by_its_own_metadata(packed):
 
 @pytest.mark.parametrize("version", ["1", "2"])
 def test_old_datasets_are_migrated(version, tmp_path):
-    """Each was rendered by the release that wrote its version, then cut to the craters with labels."""
+    """Each dataset was rendered by a release of its schema version, then reduced to the craters with labels."""
     with pytest.raises(UserError, match="migrate"):
         open_dataset(OLD / version)
     migrate(OLD / version, tmp_path / "new")
@@ -133,17 +133,17 @@ def test_damaged_old_datasets_are_refused(tmp_path):
     old = shutil.copytree(OLD / "2", tmp_path / "old")
     info = json.loads((old / "dataset.json").read_text())
 
-    def told(match, **changes):
+    def assert_refused(match, **changes):
         (old / "dataset.json").write_text(json.dumps({**info, **changes}))
         with pytest.raises(UserError, match=match):
             migrate(old, tmp_path / "new")
         assert not (tmp_path / "new").exists()
 
-    told("schema_version", schema_version="0")
-    told("schema_version", schema_version=["2"])
-    told("complete", complete=False)
-    told("config", config=3)
-    told("camera", camera={})
+    assert_refused("schema_version", schema_version="0")
+    assert_refused("schema_version", schema_version=["2"])
+    assert_refused("complete", complete=False)
+    assert_refused("config", config=3)
+    assert_refused("camera", camera={})
     (old / "dataset.json").write_text(json.dumps({k: v for k, v in info.items() if k != "seed"}))
     with pytest.raises(UserError, match="seed"):
         migrate(old, tmp_path / "new")
@@ -154,7 +154,7 @@ def test_damaged_old_datasets_are_refused(tmp_path):
         migrate(old, tmp_path / "new")
 
 
-def test_differences_are_named(drawn, tmp_path):
+def test_diff_names_the_differences(drawn, tmp_path):
     source = open_dataset(drawn)
     assert differences(source, source) == []
     subset(source, tmp_path / "s", ["split != 'val'", "radius_px > 4"])
@@ -168,8 +168,8 @@ def test_differences_are_named(drawn, tmp_path):
     assert ("frames", "position_m") not in found and ("craters", "") not in found
 
 
-def test_rows_twice_are_a_difference(little, tmp_path):
-    """Once with the same content, once with another."""
+def test_repeated_rows_are_a_difference(little, tmp_path):
+    """Rows with equal keys: once with equal content, once with different content."""
     twice = shutil.copytree(little, tmp_path / "twice")
     rewrite(twice, "labels", lambda rows: rows.append(dict(rows[2])))
     found = differences(open_dataset(little), open_dataset(twice))
@@ -181,7 +181,7 @@ def test_rows_twice_are_a_difference(little, tmp_path):
     assert differences(open_dataset(other), open_dataset(other)) == []
 
 
-def test_a_manifest_and_its_frames_become_a_dataset(drawn, tmp_path):
+def test_attach_combines_manifest_and_frames(drawn, tmp_path):
     source = open_dataset(drawn)
     subset(source, tmp_path / "m", ["split == 'val'"], images="none")
     manifest = open_dataset(tmp_path / "m")

@@ -1,4 +1,4 @@
-"""Splits by content: terrain, flight and pose, whatever their names."""
+"""Splits by content: terrain, flight and pose, independent of names."""
 
 import shutil
 
@@ -30,7 +30,7 @@ def test_split(drawn, tmp_path, by):
     assert not open_dataset(tmp_path / "t").table("frames", ["split"]).equals(made.table("frames", ["split"]))
 
 
-def test_too_few_to_split(drawn, tmp_path):
+def test_too_few_units_are_refused(drawn, tmp_path):
     with pytest.raises(UserError, match="5 terrains"):
         split_dataset(open_dataset(drawn), tmp_path / "s", val_share=0.5, test_share=0.4)
     with pytest.raises(UserError, match="shares"):
@@ -39,7 +39,7 @@ def test_too_few_to_split(drawn, tmp_path):
 
 @pytest.mark.parametrize("by", ["trajectory", "frame"])
 def test_a_flight_under_two_names_stays_in_one_split(tmp_path, by):
-    """A flight that was developed again has another name, and may have another seed in a plan made by hand."""
+    """A flight that was developed again has another name, and may have another seed in a manual plan."""
     root = build_dataset(tmp_path / "d", "nav", splits={"train": 6}, scenes=2, n_frames=4, craters=40, side_px=32)
     for table in ("trajectories", "frames"):
         rewrite(root, table, lambda rows: rows.extend([renamed(row) for row in rows]))
@@ -59,7 +59,7 @@ def test_a_flight_under_two_names_stays_in_one_split(tmp_path, by):
 def renamed(row):
     row = {**row, "trajectory_id": row["trajectory_id"] + "b"}
     if "seed" in row:
-        # Half of the flights keep their seed, half are known by their poses alone.
+        # Half of the flights keep their seed; the others are recognised only by their poses.
         row["seed"] += 100 * (row["seed"] % 2)
     if "frame_id" in row:
         row["frame_id"] = f"{row['scene_id']}/{row['trajectory_id']}/{row['frame_index']:06d}"
@@ -67,7 +67,7 @@ def renamed(row):
     return row
 
 
-def test_the_same_ground_under_two_names_stays_in_one_split(drawn, tmp_path):
+def test_one_terrain_under_two_names_stays_in_one_split(drawn, tmp_path):
     sources = []
     for k in range(2):
         root = shutil.copytree(drawn, tmp_path / f"{k}")

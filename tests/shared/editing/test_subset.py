@@ -11,15 +11,15 @@ from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
 
 
-def taken(source, out, *conditions, **options):
+def subset_of(source, out, *conditions, **options):
     subset(open_dataset(source), out, conditions, **options)
     made = open_dataset(out)
     assert validate(made) == []
     return made
 
 
-def test_frames_by_their_descent_scene_and_pose(drawn, tmp_path):
-    made = taken(drawn, tmp_path / "s", "position_m[2] > 900 and trajectories.seed != 1", "sun_elevation_deg > 5")
+def test_frames_selected_by_trajectory_scene_and_pose(drawn, tmp_path):
+    made = subset_of(drawn, tmp_path / "s", "position_m[2] > 900 and trajectories.seed != 1", "sun_elevation_deg > 5")
     frames = made.table("frames").to_pandas()
     every = open_dataset(drawn).table("frames").to_pandas()
     high = every["position_m"].str[2] > 900
@@ -27,8 +27,8 @@ def test_frames_by_their_descent_scene_and_pose(drawn, tmp_path):
     assert made.info.counts.scenes == 4 and set(made.table("labels")["frame_id"].to_pylist()) <= set(frames["frame_id"])
 
 
-def test_labels_by_their_crater(drawn, tmp_path):
-    made = taken(drawn, tmp_path / "s", "depth_m / craters.diameter_m >= 0.04", "frame_index < 4 and radius_px > 3")
+def test_labels_selected_by_crater(drawn, tmp_path):
+    made = subset_of(drawn, tmp_path / "s", "depth_m / craters.diameter_m >= 0.04", "frame_index < 4 and radius_px > 3")
     whole = open_dataset(drawn)
     assert made.info.counts.frames == 40
     labels = whole.table("labels").to_pandas()
@@ -39,42 +39,42 @@ def test_labels_by_their_crater(drawn, tmp_path):
     assert made.info.counts.labels == kept.sum() > 0
 
 
-def test_so_many_frames(drawn, tmp_path):
-    made = taken(drawn, tmp_path / "s", n_frames=19)
+def test_subset_by_number_of_frames(drawn, tmp_path):
+    made = subset_of(drawn, tmp_path / "s", n_frames=19)
     rows = made.table("trajectories").to_pydict()
     assert rows["scene_id"] == ["s000", "s001", "s002"] and rows["n_frames"] == [8, 8, 3]
     assert made.info.counts.frames == 19
 
 
-def test_so_many_megabytes(drawn, tmp_path):
-    made = taken(drawn, tmp_path / "s", "frame_index > 0", megabytes=0.1)
+def test_subset_by_size(drawn, tmp_path):
+    made = subset_of(drawn, tmp_path / "s", "frame_index > 0", megabytes=0.1)
     n_bytes = sum(made.table("frames", ["png_bytes"])["png_bytes"].to_pylist())
     assert 0.09e6 < n_bytes <= 0.1e6
     assert min(made.table("frames", ["frame_index"])["frame_index"].to_pylist()) == 1
 
 
-def test_a_plan_keeps_hashes_and_leaves_what_follows(drawn, tmp_path):
-    made = taken(drawn, tmp_path / "s", images="plan")
+def test_a_plan_keeps_hashes_without_derived_rows(drawn, tmp_path):
+    made = subset_of(drawn, tmp_path / "s", images="plan")
     assert made.info.images == "planned" and made.info.counts.craters == made.info.counts.labels == 0
     assert made.table("frames", ["png_sha256"]).num_rows == 40 and made.table("frames")["png_sha256"].null_count == 0
 
 
 @pytest.mark.parametrize("options", [{"n_frames": 0}, {"megabytes": -1.0}, {"megabytes": 1e-5}])
-def test_nothing_left_is_refused(drawn, tmp_path, options):
+def test_an_empty_subset_is_refused(drawn, tmp_path, options):
     with pytest.raises(UserError):
-        taken(drawn, tmp_path / "s", **options)
+        subset_of(drawn, tmp_path / "s", **options)
     with pytest.raises(UserError, match="none left"):
-        taken(drawn, tmp_path / "s", "frame_index > 99")
+        subset_of(drawn, tmp_path / "s", "frame_index > 99")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_edited_frame_of_a_subset_leaves_its_source_alone(little, tmp_path):
-    """Frames are copied; they are linked only with `link`."""
+def test_editing_a_frame_of_a_subset_leaves_its_source_unchanged(little, tmp_path):
+    """Frames are copied; only `link` makes hard links."""
     relative = "frames/s000/t000/000001.png"
     before = (little / relative).read_bytes()
     for k, made in enumerate(
         [
-            taken(little, tmp_path / "s"),
+            subset_of(little, tmp_path / "s"),
             split_of(little, tmp_path / "t"),
             merged(little, tmp_path / "m"),
             unpacked(little, tmp_path / "u"),
@@ -83,7 +83,7 @@ def test_an_edited_frame_of_a_subset_leaves_its_source_alone(little, tmp_path):
         assert (made.root / relative).read_bytes() == before and not (made.root / relative).samefile(little / relative)
         (made.root / relative).write_bytes(b"edited %d" % k)
     assert (little / relative).read_bytes() == before
-    linked = taken(little, tmp_path / "l", images="link")
+    linked = subset_of(little, tmp_path / "l", images="link")
     assert (linked.root / relative).samefile(little / relative)
 
 

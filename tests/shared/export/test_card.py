@@ -1,4 +1,4 @@
-"""The card tells what the dataset holds, can be followed, and is harmless whatever the dataset says of itself."""
+"""Dataset cards: content, reproduction commands, and escaping of untrusted text."""
 
 import io
 import json
@@ -34,13 +34,13 @@ from perilune_shared.validation.validate import validate
 EVIL = '`</code><script>alert(1)</script> ![x](http://evil) [y](javascript:z) | $(rm) &lt; "\n# owned\n<img src=x>'
 
 
-def carded(root, out=None):
+def card_files(root, out=None):
     with Progress(disable=True) as progress:
         return write_card(open_dataset(root), out, progress)
 
 
-def rendered(page: Path) -> str:
-    """The page as HTML, with raw HTML let through as careless sites do."""
+def html_of(page: Path) -> str:
+    """Render the page as HTML without removing raw HTML, as some sites do."""
     _, _, body = page.read_text().split("---\n", 2)
     return MarkdownIt("commonmark", {"html": True}).enable("table").render(body)
 
@@ -48,7 +48,7 @@ def rendered(page: Path) -> str:
 @pytest.fixture(scope="module")
 def card(crowded, tmp_path_factory):
     root = Path(shutil.copytree(crowded, tmp_path_factory.mktemp("card") / "set"))
-    page, picture = carded(root)
+    page, picture = card_files(root)
     assert (page.name, picture.name) == ("README.md", "card.png")
     return root
 
@@ -64,14 +64,14 @@ def test_huggingface_hub_reads_the_head(card):
     }
 
 
-def test_the_head_is_of_the_hubs_form(card):
+def test_the_head_has_the_format_of_the_hub(card):
     head = yaml.safe_load((card / "README.md").read_text().split("---\n")[1])
     assert head["license"] == "cc0-1.0" and head["task_categories"] == ["object-detection"]
     assert head["pretty_name"] == "test" and head["size_categories"] == ["n<1K"]
 
 
-def test_the_page_tells_what_is_there(card):
-    html, dataset = rendered(card / "README.md"), open_dataset(card)
+def test_the_page_has_counts_quantiles_and_splits(card):
+    html, dataset = html_of(card / "README.md"), open_dataset(card)
     counts = dataset.info.counts
     assert f"{counts.frames} frames, {counts.labels:,} labels" in html
     assert html.count("<table>") == 3 and '<img src="card.png"' in html
@@ -93,21 +93,21 @@ def test_the_picture_shows_frames_with_labels(card):
     assert blue[: len(blue) // 2].sum() == 0
 
 
-def test_the_dataset_stays_valid_and_the_card_the_same(card):
+def test_writing_the_card_again_changes_nothing(card):
     assert validate(open_dataset(card)) == []
     before = {path.name: path.read_bytes() for path in card.iterdir() if path.is_file()}
-    carded(card)
+    card_files(card)
     assert {path.name: path.read_bytes() for path in card.iterdir() if path.is_file()} == before
 
 
-def test_terrain_in_two_splits_is_told(tmp_path):
+def test_the_page_warns_of_terrain_in_two_splits(tmp_path):
     splits = {"train": 1, "test": 1}
     root = build_dataset(tmp_path / "nav", "nav", splits=splits, scenes=1, n_frames=2, side_px=32)
-    html = rendered(carded(root)[0])
+    html = html_of(card_files(root)[0])
     assert "1 of 1 terrains are in more than one split" in html and "Split by trajectory" in html
 
 
-def test_what_a_dataset_says_is_harmless(crowded, card, tmp_path):
+def test_text_from_a_dataset_is_escaped(crowded, card, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     part = root / "manifest/scenes/all.parquet"
     rows = read_part(part, "scenes").to_pylist()
@@ -117,10 +117,10 @@ def test_what_a_dataset_says_is_harmless(crowded, card, tmp_path):
     info = dataset.info.changed("merged " + EVIL).changed("[y](javascript:z) ![x](http://evil) | **b**")
     write_info(root, info)
     checksums.seal(root)
-    clean, hostile = rendered(card / "README.md"), rendered(carded(root)[0])
+    clean, hostile = html_of(card / "README.md"), html_of(card_files(root)[0])
     tags = [re.findall(r"<(\w+)", html) for html in (clean, hostile)]
     history = ["ul", "li", "code", "li", "code"]
-    # Scenes of one dem_source are one terrain, here in three splits: that is told in bold.
+    # Scenes with one dem_source are one terrain, here in three splits; the warning about it is bold.
     assert sorted([*tags[0], *history, "strong"]) == sorted([*tags[1], "p"])
     assert "owned" in hostile and "<script" not in hostile and "href" not in hostile
 
@@ -131,8 +131,8 @@ def test_code_is_a_code_span(text):
     assert re.fullmatch(r"<p><code>[A-Za-z0-9 ._+,:()/%=?-]+</code></p>\n", html)
 
 
-def test_the_recipe_can_be_followed(card, tmp_path):
-    """The card's first command, pasted into a shell, gives the configuration that the second reads."""
+def test_the_commands_reproduce_the_configuration(card, tmp_path):
+    """The first command of the card, run in a shell, writes the configuration that the second reads."""
     page = (card / "README.md").read_text()
     unpack, make = re.search(r"```sh\n(.*?)\n```", page, re.DOTALL)[1].splitlines()
     shutil.copy(card / "dataset.json", tmp_path)
@@ -152,7 +152,7 @@ def test_the_recipe_can_be_followed(card, tmp_path):
 
 
 def test_packed_and_absent_frames(crowded_packed, crowded, card, tmp_path):
-    from_packed = carded(crowded_packed, tmp_path / "packed.md")[1].read_bytes()
+    from_packed = card_files(crowded_packed, tmp_path / "packed.md")[1].read_bytes()
     assert np.array_equal(
         *(np.asarray(Image.open(io.BytesIO(b))) for b in (from_packed, (card / "card.png").read_bytes()))
     )
@@ -163,16 +163,16 @@ def test_packed_and_absent_frames(crowded_packed, crowded, card, tmp_path):
     assert Image.open(picture).height < 500 and "not included (only the manifest)" in page.read_text()
 
 
-def test_files_of_others_stay(crowded, tmp_path):
+def test_other_files_are_not_overwritten(crowded, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     (root / "README.md").write_text("mine")
     with pytest.raises(UserError, match="not a card"):
-        carded(root)
+        card_files(root)
     (root / "README.md").unlink()
     info = json.loads((root / "dataset.json").read_text())
     (root / "dataset.json").write_text(json.dumps(info))
     with pytest.raises(UserError, match="different SHA-256"):
-        carded(root)
+        card_files(root)
     assert not (root / "README.md").exists() and not (root / "card.png").exists()
 
 
@@ -181,19 +181,19 @@ def test_a_frame_of_another_size_is_refused(crowded, tmp_path):
     for path in root.rglob("*.png"):
         Image.new("L", (4000, 4000)).save(path)
     with pytest.raises(UserError, match="4000 x 4000 px"):
-        carded(root)
+        card_files(root)
 
 
 def test_frames_of_16_bits_and_no_labels(crowded, card, tmp_path):
-    """The upper eight bits are the picture; a dataset without labels has a card too."""
+    """The picture shows the upper eight bits; a dataset without labels has a card too."""
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     for path in root.rglob("*.png"):
         grey = np.asarray(Image.open(path)).astype(np.uint16)
         Image.fromarray(grey * 257).save(path)
-    pages = [carded(root, tmp_path / "deep.md")]
+    pages = [card_files(root, tmp_path / "deep.md")]
     part = root / "manifest/labels/all.parquet"
     pq.write_table(TABLES["labels"].empty_table(), part)
-    pages.append(carded(root, tmp_path / "bare.md"))
+    pages.append(card_files(root, tmp_path / "bare.md"))
     plain, deep, bare = (np.asarray(Image.open(p)) for p in (card / "card.png", *(picture for _, picture in pages)))
     assert np.array_equal(plain, deep)
     assert bare.shape == plain.shape and not np.array_equal(bare, plain)
@@ -211,7 +211,7 @@ def test_command_line(crowded, tmp_path):
     assert not (tmp_path / "b.md").exists()
 
 
-def test_one_terrain_is_called_one(tmp_path):
+def test_singular_for_one_terrain(tmp_path):
     root = build_dataset(tmp_path / "d", "detect", splits={"train": 1}, n_frames=1, side_px=32, craters=40)
-    page = carded(root)[0].read_text()
+    page = card_files(root)[0].read_text()
     assert "Crater detection: one trajectory over one terrain." in page and "many" not in page

@@ -1,4 +1,4 @@
-"""COCO files are read by pycocotools, whose evaluator gives the truth full marks."""
+"""COCO files, read by pycocotools; its evaluator gives perfect predictions an average precision of 1."""
 
 import contextlib
 import io
@@ -44,18 +44,18 @@ def quietly(function, *arguments):
 
 
 @pytest.fixture(scope="module")
-def whole(crowded, tmp_path_factory):
+def all_labels(crowded, tmp_path_factory):
     return exported(crowded, tmp_path_factory.mktemp("coco") / "all")
 
 
 @pytest.fixture(scope="module")
-def chosen(crowded, tmp_path_factory):
+def with_choice(crowded, tmp_path_factory):
     return exported(crowded, tmp_path_factory.mktemp("coco") / "large", choose=only_large)
 
 
-def average_precision(truth: COCO, results: list[dict], kind: str) -> float:
-    """Mean over the IoU thresholds 0.5 to 0.95 of all predictions of an image, not of COCO's first 100."""
-    evaluation = COCOeval(truth, quietly(truth.loadRes, results), kind)
+def average_precision(ground_truth: COCO, results: list[dict], kind: str) -> float:
+    """Return the mean over IoU thresholds 0.5 to 0.95, with all predictions of an image, not only the first 100."""
+    evaluation = COCOeval(ground_truth, quietly(ground_truth.loadRes, results), kind)
     evaluation.params.maxDets = [1, 10, 10_000]
     quietly(evaluation.evaluate)
     quietly(evaluation.accumulate)
@@ -64,7 +64,7 @@ def average_precision(truth: COCO, results: list[dict], kind: str) -> float:
     return float(precision.mean())
 
 
-def perfect(truth: COCO, *, crowd=False) -> list[dict]:
+def perfect_predictions(ground_truth: COCO, *, crowd=False) -> list[dict]:
     return [
         {
             "image_id": a["image_id"],
@@ -73,56 +73,58 @@ def perfect(truth: COCO, *, crowd=False) -> list[dict]:
             "segmentation": a["segmentation"],
             "score": 1.0,
         }
-        for a in truth.anns.values()
+        for a in ground_truth.anns.values()
         if crowd or not a["iscrowd"]
     ]
 
 
 @pytest.mark.parametrize("split", ["train", "val", "test"])
 @pytest.mark.parametrize("kind", ["bbox", "segm"])
-def test_perfect_predictions_have_an_ap_of_one(whole, split, kind):
-    truth = quietly(COCO, whole / f"instances_{split}.json")
-    results = perfect(truth)
+def test_perfect_predictions_have_an_ap_of_one(all_labels, split, kind):
+    ground_truth = quietly(COCO, all_labels / f"instances_{split}.json")
+    results = perfect_predictions(ground_truth)
     assert len(results) > 100
-    assert average_precision(truth, results, kind) == pytest.approx(1, abs=1e-12)
+    assert average_precision(ground_truth, results, kind) == pytest.approx(1, abs=1e-12)
 
 
-def test_moved_predictions_do_not(whole):
-    truth = quietly(COCO, whole / "instances_test.json")
-    moved = [{**result, "bbox": [result["bbox"][0] + 1, *result["bbox"][1:]]} for result in perfect(truth)]
-    assert 0.1 < average_precision(truth, moved, "bbox") < 0.9
+def test_shifted_predictions_have_a_lower_ap(all_labels):
+    ground_truth = quietly(COCO, all_labels / "instances_test.json")
+    moved = [
+        {**result, "bbox": [result["bbox"][0] + 1, *result["bbox"][1:]]} for result in perfect_predictions(ground_truth)
+    ]
+    assert 0.1 < average_precision(ground_truth, moved, "bbox") < 0.9
 
 
-def test_every_label_is_there(crowded, whole):
+def test_every_label_is_exported(crowded, all_labels):
     dataset = open_dataset(crowded)
     frames = {row["png_path"]: row for row in dataset.table("frames").to_pylist()}
     labels = {(row["frame_id"], row["crater_id"]): row for row in dataset.table("labels").to_pylist()}
     for split in ("train", "val", "test"):
-        truth = quietly(COCO, whole / f"instances_{split}.json")
-        assert {i["file_name"] for i in truth.imgs.values()} == {
+        ground_truth = quietly(COCO, all_labels / f"instances_{split}.json")
+        assert {i["file_name"] for i in ground_truth.imgs.values()} == {
             p for p, row in frames.items() if row["split"] == split
         }
-        for annotation in truth.anns.values():
-            image = truth.imgs[annotation["image_id"]]
+        for annotation in ground_truth.anns.values():
+            image = ground_truth.imgs[annotation["image_id"]]
             row = labels.pop((frames[image["file_name"]]["frame_id"], annotation["crater_id"]))
             x, y, w, h = annotation["bbox"]
             corners = [x, y, x + w, y + h]
-            wanted = [row[f"bbox_{name}_px"] for name in ("x0", "y0", "x1", "y1")]
-            assert np.allclose(corners, np.clip(wanted, 0, image["width"]), atol=2e-3)
+            expected = [row[f"bbox_{name}_px"] for name in ("x0", "y0", "x1", "y1")]
+            assert np.allclose(corners, np.clip(expected, 0, image["width"]), atol=2e-3)
             assert annotation["ellipse"][0] == pytest.approx(row["ellipse_cx_px"], abs=1e-6)
             assert annotation["visible_fraction"] == 1.0
     assert not labels
 
 
-def test_masks_cover_the_ellipses(whole):
-    """Rasterised by pycocotools, a whole ellipse has its area and its middle, in our pixels."""
-    truth = quietly(COCO, whole / "instances_train.json")
+def test_masks_cover_the_ellipses(all_labels):
+    """The mask from pycocotools has the area and the centre of the ellipse, in the pixels of perilune."""
+    ground_truth = quietly(COCO, all_labels / "instances_train.json")
     checked, outline = 0, []
-    for annotation in truth.anns.values():
+    for annotation in ground_truth.anns.values():
         cx, cy, a, b, _ = annotation["ellipse"]
         if a < 8 or min(cx, cy, 128 - cx, 128 - cy) < a + 1:
             continue
-        rows, columns = np.nonzero(truth.annToMask(annotation))
+        rows, columns = np.nonzero(ground_truth.annToMask(annotation))
         assert len(rows) == pytest.approx(np.pi * a * b, rel=0.05)
         assert annotation["area"] == pytest.approx(np.pi * a * b, rel=1e-3)
         outline.append([columns.mean() + 0.5 - cx, rows.mean() + 0.5 - cy])
@@ -131,41 +133,43 @@ def test_masks_cover_the_ellipses(whole):
     assert np.abs(np.mean(outline, axis=0)).max() < 0.1
 
 
-def test_craters_that_are_not_chosen_are_ignored(chosen):
-    truth = quietly(COCO, chosen / "instances_test.json")
-    crowd = [a for a in truth.anns.values() if a["iscrowd"]]
-    assert 0 < len(crowd) < len(truth.anns)
+def test_unselected_craters_are_ignored(with_choice):
+    ground_truth = quietly(COCO, with_choice / "instances_test.json")
+    crowd = [a for a in ground_truth.anns.values() if a["iscrowd"]]
+    assert 0 < len(crowd) < len(ground_truth.anns)
     assert max(np.sqrt(a["ellipse"][2] * a["ellipse"][3]) for a in crowd) <= SMALLEST_PX
-    assert average_precision(truth, perfect(truth), "bbox") == pytest.approx(1, abs=1e-12)
-    # Whoever finds them too is neither worse nor better.
-    assert average_precision(truth, perfect(truth, crowd=True), "bbox") == pytest.approx(1, abs=1e-12)
+    assert average_precision(ground_truth, perfect_predictions(ground_truth), "bbox") == pytest.approx(1, abs=1e-12)
+    # Detecting them too does not change the result.
+    assert average_precision(ground_truth, perfect_predictions(ground_truth, crowd=True), "bbox") == pytest.approx(
+        1, abs=1e-12
+    )
 
 
-def test_numbers_do_not_depend_on_split_and_choice(crowded, whole, chosen, tmp_path):
+def test_numbers_do_not_depend_on_split_and_choice(crowded, all_labels, with_choice, tmp_path):
     one = exported(crowded, tmp_path / "one", split="test")
     assert [path.name for path in one.iterdir()] == ["instances_test.json"]
-    assert (one / "instances_test.json").read_bytes() == (whole / "instances_test.json").read_bytes()
+    assert (one / "instances_test.json").read_bytes() == (all_labels / "instances_test.json").read_bytes()
     ids = [{a["id"]: a["bbox"] for a in json.loads((f / "instances_val.json").read_text())["annotations"]}
-           for f in (whole, chosen)]  # fmt: skip
+           for f in (all_labels, with_choice)]  # fmt: skip
     assert ids[0] == ids[1]
-    every = [a["id"] for f in whole.iterdir() for a in json.loads(f.read_text())["annotations"]]
+    every = [a["id"] for f in all_labels.iterdir() for a in json.loads(f.read_text())["annotations"]]
     assert sorted(every) == list(range(1, len(every) + 1))
 
 
-def test_packed_frames_give_the_same(crowded_packed, whole, tmp_path):
+def test_packed_frames_give_the_same_file(crowded_packed, all_labels, tmp_path):
     again = exported(crowded_packed, tmp_path / "packed")
-    for path in whole.iterdir():
+    for path in all_labels.iterdir():
         assert (again / path.name).read_bytes() == path.read_bytes()
 
 
-def test_a_polygon_is_cut_at_the_edges():
+def test_a_polygon_is_clipped_to_the_image():
     square = np.array([[-1.0, -1.0], [3.0, -1.0], [3.0, 3.0], [-1.0, 3.0]])
     cut = clip_to_image(square, 10, 2)
     assert area_of(cut) == pytest.approx(3 * 2) and cut.min() == 0 and cut.max(axis=0).tolist() == [3, 2]
     assert len(clip_to_image(square + 20, 10, 10)) == 0
 
 
-def test_nothing_half_written(crowded, tmp_path):
+def test_a_failed_export_leaves_no_files(crowded, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
@@ -176,7 +180,7 @@ def test_nothing_half_written(crowded, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
 
 
-def test_a_path_out_of_the_dataset_is_refused(crowded, tmp_path):
+def test_a_path_outside_the_dataset_is_refused(crowded, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     part = root / "manifest/frames/all.parquet"
     rows = read_part(part, "frames").to_pylist()
@@ -187,13 +191,13 @@ def test_a_path_out_of_the_dataset_is_refused(crowded, tmp_path):
     assert not (tmp_path / "coco").exists()
 
 
-def test_a_selection_by_its_name(crowded, tmp_path):
+def test_a_named_selection(crowded, tmp_path):
     command = ["export", str(crowded), "--format", "coco", "--selection", "visible", "--out", str(tmp_path / "coco")]
     done = CliRunner().invoke(app, command)
     assert done.exit_code == 0, done.output
     labels = read_labels(open_dataset(crowded), split="train")
-    wanted = selected(labels, SELECTIONS["visible"])
+    expected = selected(labels, SELECTIONS["visible"])
     annotations = json.loads((tmp_path / "coco/instances_train.json").read_text())["annotations"]
-    assert 0 < sum(not each["iscrowd"] for each in annotations) == wanted.sum() < len(labels) == len(annotations)
+    assert 0 < sum(not each["iscrowd"] for each in annotations) == expected.sum() < len(labels) == len(annotations)
     with pytest.raises(UserError, match="visible"):
         CliRunner().invoke(app, [*command[:-3], "visibel", *command[-2:]], catch_exceptions=False)

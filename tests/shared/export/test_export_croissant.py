@@ -1,4 +1,4 @@
-"""Croissant metadata is read by mlcroissant, which reads the records of the local files by it."""
+"""Croissant metadata, read by mlcroissant, which then reads the records of the local files."""
 
 import io
 import json
@@ -24,7 +24,7 @@ from perilune_shared.validation.validate import validate
 
 @pytest.fixture(scope="module", params=["crowded", "crowded_packed", "parts"])
 def described(request, tmp_path_factory):
-    """Datasets of each layout: one part a table, packed frames, a part a scene or descent."""
+    """Datasets of each layout: one part per table, packed frames, one part per scene or trajectory."""
     copy = tmp_path_factory.mktemp(request.param) / "set"
     if request.param == "parts":
         source = open_dataset(request.getfixturevalue("crowded"))
@@ -70,11 +70,11 @@ def test_images_are_the_frames(described):
     names = dict(zip(frames["frame_id"].to_pylist(), frames[column].to_pylist(), strict=True))
     assert len(found) == len(pngs) == 20
     for frame_id in list(pngs)[::7]:
-        wanted = np.asarray(Image.open(io.BytesIO(pngs[frame_id])).convert("L"))
-        assert np.array_equal(np.asarray(found[names[frame_id]].convert("L")), wanted)
+        expected = np.asarray(Image.open(io.BytesIO(pngs[frame_id])).convert("L"))
+        assert np.array_equal(np.asarray(found[names[frame_id]].convert("L")), expected)
 
 
-def test_units_and_meanings_are_told(described):
+def test_fields_have_units_and_meanings(described):
     dataset, _ = described
     content = json.loads((dataset.root / "croissant.json").read_text())
     fields = {field["@id"]: field for records in content["recordSet"] for field in records["field"]}
@@ -87,7 +87,7 @@ def test_the_dataset_stays_valid(described):
     assert validate(described[0]) == []
 
 
-def test_a_wrong_sum_is_not_sealed_over(crowded, tmp_path):
+def test_a_wrong_checksum_is_not_overwritten(crowded, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     sums = (root / "SHA256SUMS").read_text()
     (root / "SHA256SUMS").write_text(sums.replace(sums[:8], "00000000"))

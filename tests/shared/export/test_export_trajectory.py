@@ -1,4 +1,4 @@
-"""Trajectories are read by evo, whose error of the truth against the truth is nothing."""
+"""Exported trajectories, read by evo, have no error against the manifest."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.export.trajectory import export_kitti, export_tum
 from perilune_shared.geometry.camera import Camera
 
-DESCENTS = ["s000/t000", "s001/t001", "s002/t002", "s003/t003"]
+TRAJECTORIES = ["s000/t000", "s001/t001", "s002/t002", "s003/t003"]
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +23,9 @@ def files(crowded, tmp_path_factory):
     return folder
 
 
-def truth(root, descent) -> PoseTrajectory3D:
-    """The manifest's poses, camera to O_L, built by evo from quaternions (w, x, y, z)."""
-    scene, trajectory = descent.split("/")
+def ground_truth(root, trajectory) -> PoseTrajectory3D:
+    """Return the poses of the manifest, O_C to O_L, built by evo from quaternions (w, x, y, z)."""
+    scene, trajectory = trajectory.split("/")
     frames = open_dataset(root).table("frames", scene_id=scene, trajectory_id=trajectory).to_pandas()
     w, x, y, z = np.stack(frames["rotation_wxyz"]).T
     return PoseTrajectory3D(
@@ -44,35 +44,35 @@ def largest_error(reference, estimate, relation) -> float:
 RELATIONS = [metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg]
 
 
-@pytest.mark.parametrize("descent", DESCENTS)
+@pytest.mark.parametrize("trajectory", TRAJECTORIES)
 @pytest.mark.parametrize("relation", RELATIONS)
-def test_tum_has_no_error(crowded, files, descent, relation):
-    found = file_interface.read_tum_trajectory_file(files / f"tum/{descent}.txt")
+def test_tum_has_no_error(crowded, files, trajectory, relation):
+    found = file_interface.read_tum_trajectory_file(files / f"tum/{trajectory}.txt")
     assert found.check()[0] and found.num_poses == 5
-    wanted = truth(crowded, descent)
-    assert np.array_equal(found.timestamps, wanted.timestamps)
-    assert largest_error(wanted, found, relation) < 1e-6
-    other = truth(crowded, next(name for name in DESCENTS if name != descent))
+    expected = ground_truth(crowded, trajectory)
+    assert np.array_equal(found.timestamps, expected.timestamps)
+    assert largest_error(expected, found, relation) < 1e-6
+    other = ground_truth(crowded, next(name for name in TRAJECTORIES if name != trajectory))
     assert largest_error(other, found, relation) > 0.1
 
 
-@pytest.mark.parametrize("descent", DESCENTS)
+@pytest.mark.parametrize("trajectory", TRAJECTORIES)
 @pytest.mark.parametrize("relation", RELATIONS)
-def test_kitti_has_no_error(crowded, files, descent, relation):
-    found = file_interface.read_kitti_poses_file(files / f"kitti/{descent}.txt")
+def test_kitti_has_no_error(crowded, files, trajectory, relation):
+    found = file_interface.read_kitti_poses_file(files / f"kitti/{trajectory}.txt")
     assert found.check()[0] and found.num_poses == 5
-    wanted = truth(crowded, descent)
-    times = np.loadtxt(files / f"kitti/{descent}.times.txt")
-    assert np.array_equal(times, wanted.timestamps)
+    expected = ground_truth(crowded, trajectory)
+    times = np.loadtxt(files / f"kitti/{trajectory}.times.txt")
+    assert np.array_equal(times, expected.timestamps)
     # The reference is the first camera.
-    first = np.linalg.inv(wanted.poses_se3[0])
-    relative = PosePath3D(poses_se3=[first @ pose for pose in wanted.poses_se3])
+    first = np.linalg.inv(expected.poses_se3[0])
+    relative = PosePath3D(poses_se3=[first @ pose for pose in expected.poses_se3])
     assert np.allclose(found.poses_se3[0], np.eye(4), atol=1e-12)
     assert largest_error(relative, found, relation) < 1e-6
 
 
-def test_a_pose_takes_the_camera_to_the_site(crowded, files):
-    """A label's crater, taken to the camera by the inverse of the file's pose, comes to its place in the image."""
+def test_poses_transform_from_camera_to_site(crowded, files):
+    """The inverse of a pose of the file projects a crater to the centre of its label."""
     dataset = open_dataset(crowded)
     pose = file_interface.read_tum_trajectory_file(files / "tum/s000/t000.txt").poses_se3[0]
     craters = dataset.table("craters", scene_id="s000").to_pandas().set_index("crater_id")

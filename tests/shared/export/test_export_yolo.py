@@ -1,4 +1,4 @@
-"""YOLO folders: parsed as the format's description says, they give the manifest's boxes."""
+"""YOLO folders, parsed according to the format, give the boxes of the manifest."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def exported(root, out, **choice):
 
 
 def parsed(folder) -> dict:
-    """Split to image path to boxes (N, 5), the way of trainers: data.yaml, list, image, its label."""
+    """Return boxes (N, 5) by split and image path, read as trainers do: data.yaml, list, image, label file."""
     data = yaml.safe_load((folder / "data.yaml").read_text())
     assert data["names"] == {0: "crater"} and "path" not in data
     found = {}
@@ -38,7 +38,7 @@ def parsed(folder) -> dict:
 
 
 @pytest.mark.parametrize("kind", ["crowded", "crowded_packed"])
-def test_boxes_and_images_are_those_of_the_manifest(kind, request, tmp_path):
+def test_boxes_and_images_equal_the_manifest(kind, request, tmp_path):
     dataset = open_dataset(request.getfixturevalue(kind))
     found = parsed(exported(dataset.root, tmp_path / "yolo"))
     frames = dataset.table("frames").to_pandas()
@@ -52,10 +52,10 @@ def test_boxes_and_images_are_those_of_the_manifest(kind, request, tmp_path):
         own = labels[labels["frame_id"] == frame.frame_id]
         assert len(boxes) == len(own) and (boxes[:, 0] == 0).all() and (boxes >= 0).all() and (boxes <= 1).all()
         whole = own[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy()
-        wanted = np.clip(whole, 0, 128)
-        n_cut += int((whole != wanted).any(axis=1).sum())
+        expected = np.clip(whole, 0, 128)
+        n_cut += int((whole != expected).any(axis=1).sum())
         corners = np.hstack([boxes[:, 1:3] - boxes[:, 3:] / 2, boxes[:, 1:3] + boxes[:, 3:] / 2]) * 128
-        assert np.allclose(corners, wanted, atol=1e-5)
+        assert np.allclose(corners, expected, atol=1e-5)
     assert n_cut > 0
 
 

@@ -1,4 +1,4 @@
-"""Hugging Face `datasets` loads exports by split, and never takes another frame for training data."""
+"""Hugging Face `datasets` loads the splits of an export and does not mix them."""
 
 import io
 import shutil
@@ -18,7 +18,7 @@ from perilune_shared.labels.thresholds import SELECTIONS
 
 @pytest.fixture
 def offline(monkeypatch, tmp_path):
-    """The library without its hub, its caches in a folder that goes away."""
+    """Use the library without network and with its caches in a temporary folder."""
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
     return pytest.importorskip("datasets")
@@ -36,14 +36,14 @@ def test_shards_are_images(crowded_packed, offline, tmp_path):
 
 @pytest.fixture(params=["files", "packed", "split by frame"])
 def source(request, crowded, crowded_packed, tmp_path):
-    """Datasets with their frames as files, packed, and with splits that parts mix."""
+    """Datasets with frames as files, with packed frames, and with several splits in one part."""
     if request.param == "split by frame":
         split_dataset(open_dataset(crowded), tmp_path / "mixed", "frame", 0.2, 0.2)
         return open_dataset(tmp_path / "mixed")
     return open_dataset(crowded if request.param == "files" else crowded_packed)
 
 
-def test_an_export_has_the_splits_with_images_poses_and_labels(source, offline, tmp_path):
+def test_an_export_has_splits_with_images_poses_and_labels(source, offline, tmp_path):
     out = tmp_path / "hub"
     with Progress(disable=True) as progress:
         choose = by_selection(SELECTIONS["visible"])
@@ -69,7 +69,7 @@ def test_an_export_has_the_splits_with_images_poses_and_labels(source, offline, 
     assert test["frame_id"] == loaded["test"]["frame_id"]
 
 
-def test_a_dataset_with_its_card_has_no_split_that_is_called_train(source, offline, tmp_path):
+def test_the_card_of_a_dataset_declares_no_split_train(source, offline, tmp_path):
     root = shutil.copytree(source.root, tmp_path / "set")
     with Progress(disable=True) as progress:
         write_card(open_dataset(root), None, progress)

@@ -11,7 +11,7 @@ from perilune_shared.geometry.camera import Camera, camera_from_site
 CAMERA = Camera(width_px=256, height_px=200, fx_px=300.0, fy_px=310.0, cx_px=128.0, cy_px=90.0)
 
 
-def test_the_axis_hits_the_principal_point():
+def test_the_optical_axis_projects_to_the_principal_point():
     assert np.allclose(CAMERA.project([0, 0, 7.0]), [128, 90])
 
 
@@ -19,19 +19,19 @@ def test_x_is_right_and_y_is_down():
     assert np.allclose(CAMERA.project([1.0, 2.0, 10.0]), [128 + 30, 90 + 62])
 
 
-def test_the_calibration_matrix_projects_alike():
+def test_the_calibration_matrix_gives_the_same_projection():
     point = np.array([0.4, -0.7, 3.0])
     homogeneous = CAMERA.matrix @ point
     assert np.allclose(CAMERA.project(point), homogeneous[:2] / homogeneous[2])
 
 
-def test_the_first_pixels_centre_lies_at_a_half():
+def test_the_first_pixel_centre_is_at_one_half():
     centres = CAMERA.pixel_centres()
     assert centres.shape == (200, 256, 2)
     assert centres[0, 0].tolist() == [0.5, 0.5] and centres[3, 5].tolist() == [5.5, 3.5]
 
 
-def test_behind_the_camera_there_is_no_pixel():
+def test_points_behind_the_camera_give_nan():
     assert np.isnan(CAMERA.project([0, 0, -1.0])).all()
     assert not CAMERA.inside(CAMERA.project([0, 0, -1.0]))
 
@@ -42,12 +42,12 @@ def test_field_of_view_spans_the_width():
 
 
 @given(st.floats(0, 256), st.floats(0, 200), st.floats(0.1, 1e4))
-def test_rays_undo_projection(u, v, depth):
+def test_rays_invert_projection(u, v, depth):
     assert np.allclose(CAMERA.project(CAMERA.rays([u, v]) * depth), [u, v], atol=1e-9)
 
 
-def test_points_are_seen_from_the_camera():
-    # Looking down from 10 m: the ground point below and 2 m along X lies right of the axis, at depth 10.
+def test_transform_from_site_to_camera():
+    # Looking down from 10 m, the ground point 2 m along X is right of the axis, at depth 10 m.
     down = np.diag([1.0, -1.0, -1.0])
     assert np.allclose(camera_from_site([2.0, 1.0, 0.0], [0, 0, 10.0], down), [2, -1, 10])
 
@@ -61,7 +61,7 @@ LENSES = [
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_distortion_is_opencvs(lens):
+def test_distortion_equals_opencv(lens):
     camera = replace(CAMERA, distortion=lens)
     rng = np.random.default_rng(1)
     points = np.append(rng.uniform(-0.4, 0.4, (500, 2)), np.ones((500, 1)), axis=1) * rng.uniform(1, 900, (500, 1))
@@ -75,7 +75,7 @@ def test_distortion_is_opencvs(lens):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_rays_undo_distortion_in_every_pixel(lens):
+def test_rays_invert_distortion_in_every_pixel(lens):
     camera = replace(CAMERA, distortion=lens)
     pixels = camera.pixel_centres()
     assert np.abs(camera.project(camera.rays(pixels) * 70.0) - pixels).max() < 1e-7
@@ -86,13 +86,13 @@ def test_without_distortion_the_covering_pinhole_is_the_camera():
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_the_covering_pinhole_sees_every_ray_and_little_more(lens):
+def test_the_covering_pinhole_is_as_small_as_possible(lens):
     camera = replace(CAMERA, distortion=lens)
     pinhole = camera.covering_pinhole()
     assert not any(pinhole.distortion) and (pinhole.fx_px, pinhole.fy_px) == (camera.fx_px, camera.fy_px)
     seen = pinhole.project(camera.rays(camera.outline()))
     assert pinhole.covers(camera) and (seen >= 0).all() and (seen <= [pinhole.width_px, pinhole.height_px]).all()
-    # Whole pixels on each side, and not one too many where the image grew.
+    # The image grows by whole pixels, and on each side by no more than needed.
     left, top = pinhole.cx_px - camera.cx_px, pinhole.cy_px - camera.cy_px
     right, bottom = pinhole.width_px - camera.width_px - left, pinhole.height_px - camera.height_px - top
     spare = [*seen.min(axis=0), *(np.array([pinhole.width_px, pinhole.height_px]) - seen.max(axis=0))]
@@ -100,13 +100,13 @@ def test_the_covering_pinhole_sees_every_ray_and_little_more(lens):
         assert grown == int(grown) >= 0 and (grown == 0 or left_over < 1)
 
 
-def test_a_camera_covers_its_own_view_and_no_wider_one():
+def test_covers():
     assert CAMERA.covers(CAMERA) and CAMERA.covers(replace(CAMERA, width_px=200))
     assert not CAMERA.covers(replace(CAMERA, width_px=257)) and not CAMERA.covers(replace(CAMERA, fx_px=290.0))
 
 
-def test_beyond_the_fold_there_is_no_pixel():
-    # r (1 - 0.3 r^2) turns back at r = 1 / sqrt(0.9).
+def test_points_beyond_the_fold_give_nan():
+    # r (1 - 0.3 r^2) has its maximum at r = 1 / sqrt(0.9).
     camera = replace(CAMERA, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))
     fold = 1 / np.sqrt(0.9)
     pixels = camera.project([[0.999 * fold, 0, 1], [1.001 * fold, 0, 1], [3.0, 0, 1]])

@@ -18,7 +18,7 @@ def one(centre, normal, radius):
     )
 
 
-def test_a_circle_seen_straight_on():
+def test_a_circle_facing_the_camera():
     camera = Camera(256, 256, 250.0, 250.0, 128.0, 128.0)
     ellipse = project_circles(camera, np.array([[1.0, -2.0, 10.0]]), np.array([[0, 0, -1.0]]), np.array([0.4]))
     assert np.allclose([ellipse.cx_px, ellipse.cy_px], [[128 + 25], [128 - 50]])
@@ -34,7 +34,7 @@ def test_a_circle_seen_straight_on():
     st.floats(1.0, 80.0),
 )
 def test_projected_rim_points_lie_on_the_ellipse(centre, normal, radius):
-    # Seen edge on, a circle has no ellipse.
+    # A circle seen edge on has no ellipse.
     assume(abs(np.dot(centre, normal)) > 0.02 * np.linalg.norm(centre) * np.linalg.norm(normal))
     ellipse = one(centre, normal, radius)
     unit = np.array([normal]) / np.linalg.norm(normal)
@@ -49,7 +49,7 @@ def test_projected_rim_points_lie_on_the_ellipse(centre, normal, radius):
     assert np.allclose(box, seen, atol=2e-4 * radius * 280 / 200 + 1e-6)
 
 
-def test_the_image_of_the_centre_is_not_the_ellipses_centre():
+def test_the_projected_centre_differs_from_the_ellipse_centre():
     ellipse = one((0, 0, 10), (0, 1, -1), 4)
     assert abs(ellipse.cy_px[0] - CAMERA.project([0, 0, 10.0])[1]) > 5
 
@@ -62,7 +62,7 @@ def test_a_circle_with_no_elliptical_image_gives_nan(centre, normal):
     assert np.isnan(ellipse.a_px).all() and np.isnan(ellipse.bounding_boxes()).all()
 
 
-def test_no_circle_gives_no_ellipse():
+def test_empty_input_gives_no_ellipses():
     empty = project_circles(CAMERA, np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     assert empty.bounding_boxes().shape == (0, 4)
 
@@ -76,7 +76,7 @@ def craters_in_view(n=400):
 
 
 def distance_px(ellipses: Ellipses, pixels: np.ndarray) -> np.ndarray:
-    """Of points (N, M, 2) from N ellipses, to first order."""
+    """Return the distance of points (N, M, 2) from N ellipses, pixels, to first order (N, M)."""
     dx, dy = pixels[..., 0] - ellipses.cx_px[:, None], pixels[..., 1] - ellipses.cy_px[:, None]
     cos, sin = np.cos(ellipses.theta_rad)[:, None], np.sin(ellipses.theta_rad)[:, None]
     u, v = dx * cos + dy * sin, dy * cos - dx * sin
@@ -84,25 +84,25 @@ def distance_px(ellipses: Ellipses, pixels: np.ndarray) -> np.ndarray:
     return np.abs((u / a) ** 2 + (v / b) ** 2 - 1) / (2 * np.hypot(u / a**2, v / b**2))
 
 
-def test_a_distorted_rim_lies_along_its_ellipse():
+def test_a_distorted_rim_is_close_to_its_ellipse():
     camera = replace(CAMERA, distortion=(-0.1, 0.02, 0.001, -0.001, 0.0))
     circles = craters_in_view()
     ellipses = project_circles(camera, *circles)
     apart = distance_px(ellipses, camera.project(rim_points(*circles, 90)))
     assert np.isfinite(apart).all() and apart.max() < 0.05
-    # Small ones are closer, as their distortion is nearly even.
+    # The fit of small ellipses is better, since their distortion is nearly uniform.
     assert apart[ellipses.radius_px() < 10].max() < 0.005
     plain = project_circles(CAMERA, *circles)
     assert np.abs(plain.cx_px - ellipses.cx_px).max() > 2
     assert distance_px(plain, camera.project(rim_points(*circles, 90))).max() > 2
 
 
-def test_fitted_without_distortion_it_is_the_conic():
+def test_the_fit_without_distortion_equals_the_conic():
     circles = craters_in_view()
     exact, fitted = project_circles(CAMERA, *circles), fit_ellipses(CAMERA.project(rim_points(*circles, 64)))
     for name in ("cx_px", "cy_px", "a_px", "b_px"):
         assert np.abs(getattr(exact, name) - getattr(fitted, name)).max() < 1e-6
-    # A vanishing distortion takes the fit and lands at the same place.
+    # A tiny distortion uses the fit and gives the same ellipse.
     hardly = project_circles(replace(CAMERA, distortion=(1e-12, 0.0, 0.0, 0.0, 0.0)), *circles)
     assert np.abs(hardly.bounding_boxes() - exact.bounding_boxes()).max() < 1e-6
 
@@ -120,7 +120,7 @@ def test_a_slender_ellipse_is_fitted():
     ("centre", "normal"),
     [((0, 0, 1), (0, 1, -0.01)), ((0, 0, -5), (0, 0, 1)), ((0, 0, 10), (1, 0, 0)), ((9, 0, 8), (0, 0, -1))],
 )
-def test_with_distortion_too_a_circle_without_image_gives_nan(centre, normal):
+def test_an_invisible_circle_gives_nan_with_distortion(centre, normal):
     camera = replace(CAMERA, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))
     seen = np.array([[1.0, 0.5, 20.0], centre], float)
     normals = np.array([[0, 0, -1.0], normal]) / np.linalg.norm([[0, 0, -1.0], normal], axis=1, keepdims=True)

@@ -25,7 +25,7 @@ def test_quaternion_and_matrix_are_inverse(a, b, c):
     assert np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-12) and np.isclose(np.linalg.det(matrix), 1)
 
 
-def test_rotation_vector_turns_by_its_length():
+def test_rotation_vector_rotates_by_its_length():
     turned = frames.matrix_from_rotation_vector([0, 0, np.radians(30)]) @ [1, 0, 0]
     assert np.allclose(turned, [np.cos(np.radians(30)), np.sin(np.radians(30)), 0])
 
@@ -33,17 +33,17 @@ def test_rotation_vector_turns_by_its_length():
 @pytest.mark.parametrize(
     ("azimuth", "expected"), [(0, [0, -1, 0]), (90, [-1, 0, 0]), (180, [0, 1, 0]), (270, [1, 0, 0])]
 )
-def test_sun_stands_where_the_compass_says(azimuth, expected):
-    # Y is south and X is west: a Sun in the north is at -Y, one in the east at -X.
+def test_sun_azimuth_is_clockwise_from_north(azimuth, expected):
+    # Y is south and X is west, so north is -Y and east is -X.
     assert np.allclose(frames.sun_direction(azimuth, 0), expected, atol=1e-12)
 
 
-def test_sun_in_the_zenith():
+def test_sun_at_the_zenith():
     assert np.allclose(frames.sun_direction(123, 90), [0, 0, 1], atol=1e-12)
 
 
 @pytest.mark.parametrize(("latitude", "longitude"), [(0, 30), (40, 0), (-45.5, 177.6), (60, -100), (-20, -70)])
-def test_the_earth_stands_over_the_middle_of_the_near_side(latitude, longitude):
+def test_the_earth_is_above_the_centre_of_the_near_side(latitude, longitude):
     x, y = frames.site_from_selenographic(0.0, 0.0, latitude, longitude)
     angle = np.hypot(x, y) / frames.MOON_RADIUS_M
     expected = np.array([*(np.array([x, y]) / np.hypot(x, y) * np.sin(angle)), np.cos(angle)])
@@ -69,7 +69,7 @@ def test_site_and_selenographic_are_inverse(x, y, latitude, longitude):
     assert np.allclose(back, [x, y], atol=1e-4)
 
 
-def test_rotations_equal_those_of_scipy_to_rounding():
+def test_rotations_equal_scipy_up_to_rounding():
     rng = np.random.default_rng(3)
     quaternions = rng.normal(size=(200, 4))
     expected = Rotation.from_quat(quaternions, scalar_first=True)

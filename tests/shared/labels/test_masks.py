@@ -1,4 +1,4 @@
-"""Masks against discs sampled densely, a ridge that hides by formula, and a rendered dataset."""
+"""Crater masks, compared with densely sampled discs, an analytical ridge and a rendered dataset."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def whole(mask, camera, which="amodal"):
 
 
 @pytest.mark.parametrize("camera", [CAMERA, BARREL])
-def test_an_amodal_mask_is_the_discs_image(camera):
+def test_an_amodal_mask_is_the_image_of_the_disc(camera):
     masks = crater_masks(camera, [7, 8, 9, 10], CENTRES, NORMALS, RADII)
     assert [mask.crater_id for mask in masks] == [7, 8, 9, 10]
     p, q = plane_basis(NORMALS)
@@ -41,7 +41,7 @@ def test_an_amodal_mask_is_the_discs_image(camera):
         pixels = pixels[camera.inside(pixels)].astype(int)
         touched = np.zeros_like(image)
         touched[pixels[:, 1], pixels[:, 0]] = True
-        # Every pixel of the mask holds a part of the disc, and those it only cuts are its edge.
+        # Every pixel of the mask contains a part of the disc; only pixels at its edge are partly covered.
         assert image.sum() > 100 and not (image & ~touched).any()
         inner = touched.copy()
         for axis in (0, 1):
@@ -50,14 +50,14 @@ def test_an_amodal_mask_is_the_discs_image(camera):
         edge = ~np.ones_like(inner)
         edge[[0, -1]], edge[:, [0, -1]] = True, True
         assert not (inner & ~image & ~edge).any()
-    # Behind the camera there is nothing; without depth nobody knows what is hidden.
+    # A crater behind the camera has no pixels; without depth there is no visible mask.
     assert masks[3].amodal.size == 0 and masks[0].visible is None
-    # The second crater leaves the image.
+    # The second crater is partly outside the image.
     assert whole(masks[1], camera)[:, 0].any()
 
 
-def test_a_ridge_hides_what_lies_behind_it():
-    """A wall across the view 60 m away and as high as the image's rows from 50 on; ground at the disc elsewhere."""
+def test_a_ridge_hides_craters_behind_it():
+    """A wall at 60 m covers the image rows from 50 on; elsewhere the terrain is at the depth of the disc."""
     rays = CAMERA.rays(CAMERA.pixel_centres())
     ground = (CENTRES[0] @ NORMALS[0]) / (rays @ NORMALS[0])
     floor = ground + 3.0
@@ -66,11 +66,11 @@ def test_a_ridge_hides_what_lies_behind_it():
     amodal, visible = whole(mask, CAMERA), whole(mask, CAMERA, "visible")
     np.testing.assert_array_equal(visible, amodal & ~wall)
     assert visible.any() and (amodal & wall).any()
-    # Ground that stands above the disc by less than the slack, here 2 x 100 / 130 m, is the crater's own.
+    # Terrain nearer than the disc by less than the tolerance, here 2 x 100 / 130 m, does not hide it.
     for nearer, seen in ((1.4, True), (1.7, False)):
         (mask,) = crater_masks(CAMERA, [1], CENTRES[:1], NORMALS[:1], RADII[:1], ground - nearer)
         assert mask.visible.any() == seen and (not seen or (mask.visible == mask.amodal).all())
-    # Nothing hit is nothing in the way.
+    # Infinite depth hides nothing.
     (mask,) = crater_masks(CAMERA, [1], CENTRES[:1], NORMALS[:1], RADII[:1], np.full((90, 120), np.inf))
     np.testing.assert_array_equal(mask.visible, mask.amodal)
 
@@ -93,10 +93,10 @@ def test_masks_of_a_rendered_frame(tiny):
     large = inside.to_numpy() & (labels["radius_px"] > 4).to_numpy()
     assert large.sum() > 5
     np.testing.assert_allclose(area[large], ellipse[large], rtol=0.08)
-    # Seen from above nearly everything is visible, and so say the labels.
+    # From above, nearly everything is visible, as in the labels.
     share = np.array([mask.visible.sum() for mask in masks]) / area
     assert np.median(share) == 1 and share.min() < 1.01
-    # The ground that the EXR has in a visible pixel lies under the rim's disc or little above it.
+    # The terrain of the EXR in a visible pixel is below the disc or slightly above it.
     craters = dataset.table("craters", scene_id=frame.scene_id).to_pandas().set_index("crater_id")
     rotation = matrix_from_quaternion(frame.rotation_wxyz)
     points = camera.rays(camera.pixel_centres()) * exr["Z"][..., None] @ rotation + frame.position_m
@@ -104,7 +104,7 @@ def test_masks_of_a_rendered_frame(tiny):
         crater = craters.loc[mask.crater_id]
         off = points[mask.window][mask.visible] - crater[["x_m", "y_m", "z_m"]].to_numpy(float)
         assert (np.hypot(off[:, 0], off[:, 1]) < 0.8 * crater.diameter_m).all()
-    # The instance image holds the smallest crater of those seen.
+    # The instance image has the smallest visible crater of each pixel.
     owner = np.full(exr["Z"].shape, -1.0)
     every = craters.index[np.argsort(-craters["diameter_m"].to_numpy(), kind="stable")]
     z = camera_from_site(craters.loc[every, ["x_m", "y_m", "z_m"]].to_numpy(), frame.position_m, rotation)[:, 2]
@@ -114,8 +114,8 @@ def test_masks_of_a_rendered_frame(tiny):
     assert (owner == exr["crater"]).mean() > 0.9999 and (owner >= 0).any()
 
 
-def test_masks_under_distortion_are_in_the_camera_that_is_asked_for(tiny_detect):
-    """A pinhole dataset read as that of a distorted camera within it: the same ground, other pixels."""
+def test_masks_with_distortion_use_the_requested_camera(tiny_detect):
+    """Read a pinhole dataset as one of a distorted camera with a smaller view: same terrain, other pixels."""
     from perilune_render.imaging.exr import read_exr
 
     dataset = open_dataset(tiny_detect)
@@ -125,7 +125,7 @@ def test_masks_under_distortion_are_in_the_camera_that_is_asked_for(tiny_detect)
     dataset.info = dataset.info.model_copy(update={"camera": bent, "exr_camera": pinhole})
     frame = dataset.table("frames").to_pandas().iloc[5]
     depth_m = read_exr(dataset.file(frame.exr_path))["Z"]
-    # Something near hides the right half of what the pinhole sees.
+    # A near obstacle hides the right half of the pinhole image.
     depth_m[:, 64:] = 1.0
     camera, exr_camera = bent.intrinsics(), pinhole.intrinsics()
     labels = dataset.table("labels").to_pandas()
@@ -140,16 +140,16 @@ def test_masks_under_distortion_are_in_the_camera_that_is_asked_for(tiny_detect)
             expected = whole(exr, exr_camera, which)[place[..., 1], place[..., 0]]
             found = whole(png, camera, which)
             compared += found.sum()
-            # Alike but for the edge, which the nearest pixel roughens.
+            # Equal except at the edge, because depth is sampled at the nearest pixel.
             assert (found != expected).sum() <= 4 + 0.5 * np.sqrt(found.sum()) * np.pi
         amodal, visible = whole(png, camera), whole(png, camera, "visible")
         assert not visible[:, 32:].any()
         beside += amodal[:, 31].sum(), visible[:, 31].sum()
-    # Hidden is the right half to the pixel.
+    # Exactly the right half is hidden.
     assert compared > 1000 and 0.9 * beside[0] < beside[1] > 0
 
 
-def test_what_is_not_there_is_refused(tiny):
+def test_unknown_frames_and_craters_are_refused(tiny):
     dataset = open_dataset(tiny / "detect")
     frame_id = dataset.table("frames", ["frame_id"])["frame_id"][0].as_py()
     with pytest.raises(UserError, match="frame_id: got nowhere"):

@@ -1,4 +1,4 @@
-"""Named selections, and the labels with what they ask for."""
+"""Named selections, and labels read with the columns that they need."""
 
 import numpy as np
 import pandas as pd
@@ -42,7 +42,7 @@ def test_the_named_selections():
     ("width_px", "stated", "bound"),
     [(128, None, 50.0), (256, None, 50.0), (1024, None, 200.0), (1024, 50.0, 50.0), (1024, "much", 200.0)],
 )
-def test_the_largest_label_follows_the_recipe_and_the_image(tiny, width_px, stated, bound):
+def test_the_label_bound_comes_from_the_recipe_or_the_image_width(tiny, width_px, stated, bound):
     info = open_dataset(tiny / "detect").info
     recipe = info.recipe().model_copy(update={"config": {"labels": {"max_radius_px": stated}}})
     camera = info.camera.model_copy(update={"width_px": width_px})
@@ -59,7 +59,7 @@ def test_the_largest_label_follows_the_recipe_and_the_image(tiny, width_px, stat
         ("min_contrast", 20.0, {"contrast": -30.0}),
     ],
 )
-def test_each_threshold_is_inclusive_and_tells_on_its_own(threshold, value, row):
+def test_each_threshold_is_inclusive_and_independent(threshold, value, row):
     chosen = selected(labels({}, row), Selection(**{threshold: value}))
     assert chosen.dtype == np.bool_ and chosen.tolist() == [True, False]
 
@@ -75,10 +75,10 @@ def test_labels_are_read_with_their_craters(tiny):
     assert row.depth_m == craters.loc[(row.scene_id, row.crater_id)].depth_m
     parts = [read_labels(dataset, split=split) for split in ("train", "val", "test")]
     assert sum(map(len, parts)) == len(rows) and all(len(part) for part in parts)
-    # What is wanted of a real dataset is neither everything nor nothing.
+    # A selection of a real dataset contains some labels, not all.
     seen = selected(rows, SELECTIONS["visible"])
     assert 0.2 < seen.mean() < 0.95 and selected(rows, SELECTIONS["paper"]).all()
     assert np.isfinite(rows["contrast"]).all() and (rows["contrast"] > 4).mean() < 0.98
-    # Deep craters show more than worn ones.
+    # Deep craters have more contrast than eroded ones.
     ratio = rows["depth_m"] / rows["diameter_m"]
     assert rows["contrast"][ratio > 0.1].median() > 1.5 * rows["contrast"][ratio < 0.04].median()

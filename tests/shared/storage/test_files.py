@@ -7,7 +7,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 
 
-def test_a_file_is_there_whole_or_not_at_all(tmp_path):
+def test_a_file_is_written_completely_or_not_at_all(tmp_path):
     target = tmp_path / "folder" / "a.txt"
     with pytest.raises(RuntimeError), files.written_aside(target) as aside:
         aside.write_text("half")
@@ -25,7 +25,7 @@ def test_paths_that_could_leave_the_folder_are_refused(tmp_path, path):
         files.inside(tmp_path, path)
 
 
-def test_a_link_out_of_the_folder_is_refused(tmp_path):
+def test_a_link_that_leaves_the_folder_is_refused(tmp_path):
     root = tmp_path / "dataset"
     root.mkdir()
     (root / "out").symlink_to(tmp_path)
@@ -33,7 +33,7 @@ def test_a_link_out_of_the_folder_is_refused(tmp_path):
         files.inside(root, "out/secret.png")
 
 
-def test_a_plain_path_is_given_back(tmp_path):
+def test_a_plain_path_is_returned(tmp_path):
     assert files.inside(tmp_path, "frames/scene-0000/000001.png") == tmp_path / "frames/scene-0000/000001.png"
 
 
@@ -42,8 +42,8 @@ def test_sha256_of_abc(tmp_path):
     assert files.sha256_of(tmp_path / "a") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
-    """A power cut after the rename would otherwise leave an empty file that counts as finished."""
+def test_a_file_is_synchronised_before_the_rename(tmp_path, monkeypatch):
+    """Otherwise a power failure after the rename could leave an empty file that looks complete."""
     synchronised = []
 
     def fsync(descriptor):

@@ -1,4 +1,4 @@
-"""One writer at a time on a folder: other processes, killed ones, other machines."""
+"""Locks of folders against other processes, killed processes and other machines."""
 
 import json
 import os
@@ -25,7 +25,7 @@ with {"locked": locked, "new_folder": new_folder}[sys.argv[1]](pathlib.Path(sys.
 
 
 def holder(way, folder):
-    """Another process that holds the lock of a folder until it reads a line."""
+    """Start another process that holds the lock of a folder until it reads a line."""
     command = [sys.executable, "-c", HOLD, way, str(folder)]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "held\n"
@@ -41,11 +41,11 @@ def test_a_second_process_is_refused_until_the_first_ends(tmp_path):
     before = names(tmp_path)
     try:
         with (
-            pytest.raises(UserError, match=rf"locked by PID {process.pid} on host \S+ since 20\S+, ") as told,
+            pytest.raises(UserError, match=rf"locked by PID {process.pid} on host \S+ since 20\S+, ") as raised,
             locked(tmp_path),
         ):
             pytest.fail("locked twice")
-        assert len(str(told.value).splitlines()) == 1 and names(tmp_path) == before
+        assert len(str(raised.value).splitlines()) == 1 and names(tmp_path) == before
     finally:
         process.communicate("\n")
     with locked(tmp_path):
@@ -105,7 +105,7 @@ def test_a_refused_folder_is_not_left_behind(tmp_path):
     assert names(tmp_path) == []
 
 
-def test_a_second_new_folder_leaves_the_first_alone(tmp_path):
+def test_a_refused_new_folder_does_not_disturb_the_first(tmp_path):
     out = tmp_path / "out"
     process = holder("new_folder", out)
     with pytest.raises(UserError, match=f"locked by PID {process.pid} "), new_folder(out):
@@ -116,7 +116,7 @@ def test_a_second_new_folder_leaves_the_first_alone(tmp_path):
     assert names(tmp_path) == ["out"] and (out / "first").read_text() == "first"
 
 
-def test_a_folder_filled_meanwhile_is_not_replaced(tmp_path):
+def test_a_folder_that_is_no_longer_empty_is_not_replaced(tmp_path):
     out = tmp_path / "out"
     with pytest.raises(UserError, match="a path that is not empty"), new_folder(out) as folder:
         (folder / "mine").write_text("mine")
@@ -125,7 +125,7 @@ def test_a_folder_filled_meanwhile_is_not_replaced(tmp_path):
     assert names(tmp_path) == ["out"] and names(out) == ["theirs"]
 
 
-def test_killed_writers_of_new_folders_leave_nothing_in_the_end(tmp_path):
+def test_temporary_folders_of_killed_writers_are_removed(tmp_path):
     for name in (".out.1.part", ".out.0123456789abcdef.part", ".out.2.1.part", ".other.1.part"):
         (tmp_path / name).mkdir()
     with new_folder(tmp_path / "out") as folder:

@@ -1,4 +1,4 @@
-"""Whatever is changed in a dataset is found: any byte, any end, any file, and what does not fit under new checksums."""
+"""Validation finds any changed byte, truncated or missing file, and inconsistent rows under valid checksums."""
 
 import shutil
 from pathlib import Path
@@ -22,8 +22,8 @@ def names_in(root):
     return sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
 
 
-def named(root, name):
-    """Whether a fault, or the refusal, names a file; for SHA256SUMS by a file that differs from it."""
+def is_named(root, name):
+    """Whether a fault or an error names a file; for SHA256SUMS, whether it names a file with another hash."""
     try:
         faults = validate(open_dataset(root))
     except UserError as error:
@@ -36,7 +36,7 @@ def named(root, name):
 
 @pytest.fixture(scope="module", params=["files", "packed"])
 def whole(request, little, tmp_path_factory):
-    """A dataset that each example damages and mends."""
+    """A dataset that each example damages and restores."""
     root = Path(shutil.copytree(little, tmp_path_factory.mktemp("bytes") / "dataset"))
     if request.param == "packed":
         sealed(pack)(root)
@@ -48,14 +48,14 @@ def whole(request, little, tmp_path_factory):
 @seed(1)
 @settings(max_examples=150, database=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(which=st.integers(0, _HUGE), at=st.integers(0, _HUGE), bits=st.integers(1, 255))
-def test_any_flipped_byte_is_found(whole, which, at, bits):
+def test_any_flipped_bit_is_found(whole, which, at, bits):
     names = names_in(whole)
     name = names[which % len(names)]
     content = bytearray((whole / name).read_bytes())
     content[at % len(content)] ^= bits
     before = (whole / name).read_bytes()
     (whole / name).write_bytes(content)
-    found = named(whole, name)
+    found = is_named(whole, name)
     (whole / name).write_bytes(before)
     assert found
 
@@ -68,14 +68,14 @@ def test_any_truncated_file_is_found(whole, which, at):
     name = names[which % len(names)]
     content = (whole / name).read_bytes()
     (whole / name).write_bytes(content[: at % len(content)])
-    found = named(whole, name)
+    found = is_named(whole, name)
     (whole / name).write_bytes(content)
     assert found
 
 
 @pytest.mark.parametrize("name", ["dataset.json", checksums.SUMS_NAME])
-def test_every_byte_of_the_small_files_counts(name, victim):
-    """By opening and comparing checksums alone, which is a part of validation."""
+def test_every_byte_of_small_files_is_checked(name, victim):
+    """Opening the dataset and comparing checksums, a part of validation, is enough."""
     content = (victim / name).read_bytes()
     for at in range(len(content)):
         (victim / name).write_bytes(content[:at] + bytes([content[at] ^ 0x01]) + content[at + 1 :])
@@ -85,7 +85,7 @@ def test_every_byte_of_the_small_files_counts(name, victim):
         except UserError as error:
             assert name in str(error)
             continue
-        assert any(name in file or name in wanted for file, _, wanted in faults), at
+        assert any(name in file or name in expected for file, _, expected in faults), at
 
 
 def test_any_missing_file_is_found(whole):
@@ -101,12 +101,12 @@ def test_any_missing_file_is_found(whole):
 
 
 def each(table, change):
-    """Every row of a table changed."""
+    """Change every row of a table."""
     return lambda root: rewrite(root, table, lambda rows: [change(row) for row in rows])
 
 
 def swap(*names):
-    """Values of two columns in each other's place."""
+    """Swap the values of two columns."""
 
     def change(row):
         row[names[0]], row[names[1]] = row[names[1]], row[names[0]]
@@ -114,8 +114,8 @@ def swap(*names):
     return change
 
 
-def turn(name, *order):
-    """A vector's components in another order."""
+def reorder(name, *order):
+    """Reorder the components of a vector."""
 
     def change(row):
         row[name] = [row[name][k] for k in order]
@@ -130,8 +130,8 @@ def scale(name, factor):
     return change
 
 
-def doubled(table, row=0):
-    """A row twice, with the counts that fit."""
+def repeated(table, row=0):
+    """Repeat a row and adapt the counts."""
 
     def damage(root):
         rewrite(root, table, lambda rows: rows.insert(row, dict(rows[row])))
@@ -140,13 +140,13 @@ def doubled(table, row=0):
     return damage
 
 
-def less(table):
-    """A row less."""
+def without_row(table):
+    """Remove a row."""
     return lambda root: rewrite(root, table, lambda rows: rows.pop())
 
 
 def without_part(table):
-    """A table gone, with the counts that fit."""
+    """Remove a table and adapt the counts."""
 
     def damage(root):
         (root / f"manifest/{table}/all.parquet").unlink()
@@ -181,13 +181,13 @@ SWAPS = {
     ),
     "latitude and longitude of sites": (each("scenes", swap("latitude_deg", "longitude_deg")), "craters", "latitude"),
     "the Sun's azimuth and elevation": (each("scenes", swap("sun_azimuth_deg", "sun_elevation_deg")), "", "sun_"),
-    "x and y of positions": (each("frames", turn("position_m", 1, 0, 2)), "frames", POSE),
-    "y and z of positions": (each("frames", turn("position_m", 0, 2, 1)), "frames", POSE),
+    "x and y of positions": (each("frames", reorder("position_m", 1, 0, 2)), "frames", POSE),
+    "y and z of positions": (each("frames", reorder("position_m", 0, 2, 1)), "frames", POSE),
     "z upside down": (each("frames", scale("position_m", [1, 1, -1])), "frames", POSE),
-    "w behind x, y and z": (each("frames", turn("rotation_wxyz", 1, 2, 3, 0)), "frames", POSE),
+    "w behind x, y and z": (each("frames", reorder("rotation_wxyz", 1, 2, 3, 0)), "frames", POSE),
     "the rotation's inverse": (each("frames", scale("rotation_wxyz", [1, -1, -1, -1])), "frames", POSE),
-    "x and y of the Sun": (each("frames", turn("sun_direction", 1, 0, 2)), "frames", "sun_direction"),
-    "y and z of the Sun": (each("frames", turn("sun_direction", 0, 2, 1)), "frames", "sun_direction"),
+    "x and y of the Sun": (each("frames", reorder("sun_direction", 1, 0, 2)), "frames", "sun_direction"),
+    "y and z of the Sun": (each("frames", reorder("sun_direction", 0, 2, 1)), "frames", "sun_direction"),
     "the Sun from below": (each("frames", scale("sun_direction", -1.0)), "frames", "sun_direction"),
     "x and y of ellipses": (each("labels", swap("ellipse_cx_px", "ellipse_cy_px")), "labels", ELLIPSE),
     "axes of ellipses": (each("labels", swap("ellipse_a_px", "ellipse_b_px")), "labels", "ellipse_a_px"),
@@ -225,7 +225,7 @@ SWAPS = {
         "split",
     ),
     **{
-        f"a row of {table} twice": (doubled(table), table, key)
+        f"a row of {table} twice": (repeated(table), table, key)
         for table, key in (
             ("scenes", "scene_id"),
             ("craters", "crater_id"),
@@ -234,16 +234,19 @@ SWAPS = {
             ("labels", "crater_id"),
         )
     },
-    **{f"a row less in {table}": (less(table), "dataset.json", f"counts.{table}") for table in ("craters", "labels")},
+    **{
+        f"a row less in {table}": (without_row(table), "dataset.json", f"counts.{table}")
+        for table in ("craters", "labels")
+    },
     "no frames": (without_part("frames"), "trajectories", "n_frames"),
     "no craters": (without_part("craters"), "scenes", "content_sha256"),
-    "no descents": (without_part("trajectories"), "frames", "frame_id"),
+    "no trajectories": (without_part("trajectories"), "frames", "frame_id"),
     "no scenes": (without_part("scenes"), "craters", "scene_id"),
 }
 
 
-def oblong(root):
-    """Frames of 32 x 24 pixels, cut at the lower edge: the same camera, fewer rows."""
+def crop_frames(root):
+    """Crop the frames to 32 x 24 pixels at the lower edge: the same camera, fewer rows."""
 
     def cut(row):
         path = root / row["png_path"]
@@ -257,15 +260,15 @@ def oblong(root):
 
 @pytest.fixture(scope="module")
 def flat(little, tmp_path_factory):
-    """A dataset of oblong frames. Read only."""
+    """A dataset of oblong frames. Do not change it."""
     root = Path(shutil.copytree(little, tmp_path_factory.mktemp("oblong") / "dataset"))
-    sealed(oblong)(root)
+    sealed(crop_frames)(root)
     assert validate(open_dataset(root)) == []
     return root
 
 
 @pytest.mark.parametrize("name", SWAPS)
-def test_what_does_not_fit_is_found_whatever_the_checksums_say(name, flat, tmp_path):
+def test_inconsistent_rows_are_found_under_valid_checksums(name, flat, tmp_path):
     damage, file, column = SWAPS[name]
     root = Path(shutil.copytree(flat, tmp_path / "dataset"))
     sealed(damage)(root)
@@ -279,8 +282,8 @@ def test_what_does_not_fit_is_found_whatever_the_checksums_say(name, flat, tmp_p
 
 
 @pytest.mark.parametrize("table", ["craters", "frames", "labels"])
-def test_the_row_is_that_of_the_file(table, flat, tmp_path):
-    """Also where the rows of several descents lie in one file."""
+def test_faults_have_the_row_number_in_the_file(table, flat, tmp_path):
+    """Also if one file has the rows of several trajectories."""
     column, value = {
         "craters": ("latitude_deg", -79.0),
         "frames": ("cx_px", 17.0),

@@ -37,24 +37,24 @@ UNEXPECTED = {
 
 
 @pytest.mark.parametrize("name", UNEXPECTED)
-def test_unexpected_files_are_faults_though_sealed(name, victim):
-    path, told = UNEXPECTED[name]
+def test_unexpected_files_are_faults_even_with_checksums(name, victim):
+    path, reported = UNEXPECTED[name]
     (victim / path).parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(part_of(victim, "labels"), victim / path)
     seal(victim)
-    listed(victim, path)
-    assert (told or path, "file") in [(fault.file, fault.column) for fault in validate(open_dataset(victim))]
+    add_checksum(victim, path)
+    assert (reported or path, "file") in [(fault.file, fault.column) for fault in validate(open_dataset(victim))]
 
 
-def listed(root, path):
-    """The checksums with a further file."""
+def add_checksum(root, path):
+    """Add a file to the checksums."""
     sums = root / SUMS_NAME
     lines = set(sums.read_text().splitlines()) | {f"{digest((root / path).read_bytes())}  {path}"}
     sums.write_text("".join(f"{line}\n" for line in sorted(lines, key=lambda line: line[66:])))
 
 
 def test_a_frame_row_does_not_make_a_table_expected(victim):
-    """Its path leads to another table's folder."""
+    """The path of the frame is in the folder of another table."""
     path = "manifest/labels/other.parquet.png"
     part = part_of(victim, "frames")
     rows = pq.read_table(part)
@@ -66,8 +66,8 @@ def test_a_frame_row_does_not_make_a_table_expected(victim):
     assert (path, "file") in [(fault.file, fault.column) for fault in validate(open_dataset(victim))]
 
 
-def test_a_link_that_leads_nowhere_is_a_fault(victim):
-    """Also with a progress bar, which needs the sizes of files."""
+def test_a_broken_link_is_a_fault(victim):
+    """Also with a progress bar, which needs file sizes."""
     link = victim / "manifest/labels/other.parquet"
     link.write_bytes(b"")
     seal(victim)
@@ -80,7 +80,7 @@ def test_a_link_that_leads_nowhere_is_a_fault(victim):
     }
 
 
-def test_known_files_and_a_writers_lock_are_expected(victim):
+def test_known_files_and_the_lock_of_a_writer_are_expected(victim):
     for name in ("LICENSE", "CITATION.cff"):
         (victim / name).write_text("text")
     assert [fault.file for fault in validate(open_dataset(victim))] == ["CITATION.cff", "LICENSE"]  # not in SHA256SUMS
@@ -93,7 +93,7 @@ def test_known_files_and_a_writers_lock_are_expected(victim):
     assert [fault.column for fault in validate(open_dataset(victim))] == ["complete"]
 
 
-def test_cards_and_metadata_have_their_own_names_in_a_dataset(crowded, tmp_path):
+def test_cards_and_metadata_have_fixed_names_in_a_dataset(crowded, tmp_path):
     root = shutil.copytree(crowded, tmp_path / "set")
     dataset = open_dataset(root)
     with Progress(disable=True) as progress:
@@ -109,7 +109,7 @@ def test_cards_and_metadata_have_their_own_names_in_a_dataset(crowded, tmp_path)
     assert validate(open_dataset(root)) == []
 
 
-def test_each_file_is_hashed_once_in_a_run(crowded_packed, tmp_path, monkeypatch):
+def test_each_file_is_hashed_once(crowded_packed, tmp_path, monkeypatch):
     root = shutil.copytree(crowded_packed, tmp_path / "set")
     read, whole = [], files.sha256_of
 

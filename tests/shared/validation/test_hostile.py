@@ -17,12 +17,12 @@ from perilune_shared.storage.checksums import SUMS_NAME
 
 
 def raw(content):
-    """dataset.json of other bytes."""
+    """Replace the bytes of dataset.json."""
     return lambda root: (root / "dataset.json").write_bytes(content)
 
 
 def spliced(old, new):
-    """dataset.json with a piece of its text replaced."""
+    """Replace a piece of the text of dataset.json."""
 
     def damage(root):
         path = root / "dataset.json"
@@ -34,12 +34,12 @@ def spliced(old, new):
 
 
 def of_recipe(change):
-    """The first recipe changed, under its old key."""
+    """Change the first recipe and keep its key."""
     return edit(lambda content: change(next(iter(content["recipes"].values()))))
 
 
 def rekeyed(change):
-    """The first recipe changed, under the key that fits it."""
+    """Change the first recipe and its key."""
 
     def damage(root):
         info = open_dataset(root).info
@@ -113,13 +113,13 @@ INFO = {
 
 
 @pytest.mark.parametrize("name", INFO)
-def test_a_dataset_json_of_ill_will(name, victim, capsys, monkeypatch):
-    damage, told = INFO[name]
+def test_hostile_dataset_json_is_refused(name, victim, capsys, monkeypatch):
+    damage, column = INFO[name]
     damage(victim)
-    assert_refused(victim, "", told, capsys, monkeypatch)
+    assert_refused(victim, "", column, capsys, monkeypatch)
 
 
-def test_settings_that_nobody_could_read_again_are_not_written(victim):
+def test_unreadable_settings_are_not_written(victim):
     info = open_dataset(victim).info
     odd = info.recipe().model_copy(update={"config": {"dem": "a\x1b.tif"}})
     before = (victim / "dataset.json").read_bytes()
@@ -129,12 +129,12 @@ def test_settings_that_nobody_could_read_again_are_not_written(victim):
 
 
 def sums(change):
-    """SHA256SUMS as another text."""
+    """Change the text of SHA256SUMS."""
     return lambda root: (root / SUMS_NAME).write_bytes(change((root / SUMS_NAME).read_bytes()))
 
 
 def linked(name, target):
-    """A file or folder of the dataset replaced by a link to `target`, relative to the dataset's own folder's parent."""
+    """Replace a file or folder of the dataset by a link to `target`, relative to the parent of the dataset."""
 
     def damage(root):
         path = root / name
@@ -148,7 +148,7 @@ def linked(name, target):
 
 
 def moved(name):
-    """A folder moved beside the dataset, with a link in its place."""
+    """Move a folder out of the dataset and replace it by a link."""
 
     def damage(root):
         (root / name).rename(root.parent / "elsewhere")
@@ -226,7 +226,7 @@ FILES = {
     "a part named with a blank": (sealed(added("manifest/frames/a b.parquet")), "a b.parquet", "part"),
     "a part named with a line break": (sealed(added("manifest/frames/a\nb.parquet")), "a b.parquet", "part"),
     "a part of three names": (sealed(added("manifest/frames/a.b.c.parquet")), "a.b.c.parquet", "part"),
-    "a part that nobody sealed": (added("manifest/frames/z.parquet"), "z.parquet", "SHA-256"),
+    "a part without a checksum": (added("manifest/frames/z.parquet"), "z.parquet", "SHA-256"),
     "a script in the manifest": (added("manifest/setup.py"), "manifest/setup.py", "SHA-256"),
     "frames by a link": (moved("frames"), _FRAMES, "png_path"),
     "a frame by a link": (linked(_PNG, "canary/frame.png"), _FRAMES, "png_path"),
@@ -240,14 +240,14 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_files_of_ill_will(name, victim, capsys, monkeypatch):
+def test_hostile_files_are_refused(name, victim, capsys, monkeypatch):
     damage, file, column = FILES[name]
     damage(victim)
     assert_refused(victim, file, column, capsys, monkeypatch)
 
 
-def test_a_folder_that_would_be_markup(victim, capsys, monkeypatch):
-    """The user's own folder may be named by anybody too."""
+def test_a_folder_name_with_markup(victim, capsys, monkeypatch):
+    """The name of the dataset's folder may be hostile too."""
     odd = victim.parent / "[" / "red]"
     odd.parent.mkdir()
     victim.rename(odd)
@@ -256,14 +256,14 @@ def test_a_folder_that_would_be_markup(victim, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["../../canary/x", "/tmp/x", "a b", "", "a/b", "a.b.c", "a\n", "-rf", ".x", "a" * 300])
-def test_parts_are_written_under_plain_names_alone(name, victim):
+def test_parts_are_written_only_under_plain_names(name, victim):
     rows = open_dataset(victim).table("scenes")
     with pytest.raises(UserError, match="part"):
         write_part(victim, "scenes", name, rows)
 
 
 @pytest.mark.parametrize("path", ["loop/a.png", "a" * 201, "/".join(["a"] * 300), "frames\\a.png", "frames/\u00e4.png"])
-def test_paths_that_no_file_has_are_refused(path, victim):
+def test_impossible_paths_are_refused(path, victim):
     (victim / "loop").symlink_to(victim / "loop")
     with pytest.raises(UserError, match="path"):
         files.inside(victim, path)

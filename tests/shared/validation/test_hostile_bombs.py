@@ -1,11 +1,11 @@
-"""A dataset is untrusted: small files that would unpack into much memory, or take for ever."""
+"""A dataset is untrusted: small files that would decompress to much memory, or take very long to read."""
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from tests.helpers import hostile_parquet as forged
-from tests.helpers.hostile import edit, part_of, sealed, told_within
+from tests.helpers.hostile import edit, faults_within_limits, part_of, sealed
 
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import IMAGES, TABLES
@@ -13,7 +13,7 @@ from perilune_shared.errors import UserError
 
 
 def constant(n, **cells):
-    """Rows of `scenes` that hardly take room."""
+    """Return rows of `scenes` that compress to few bytes."""
     values = {"string": "a", "int64": 1, "double": 1.0}
     columns = [pa.array([values[str(field.type)]] * n, field.type) for field in TABLES["scenes"]]
     rows = pa.table(columns, schema=TABLES["scenes"])
@@ -23,7 +23,7 @@ def constant(n, **cells):
 
 
 def scenes(rows, change=None, **options):
-    """The part of `scenes` from other rows, and then with its footer changed."""
+    """Write the part of `scenes` from other rows, then change its footer."""
 
     def damage(root):
         path = part_of(root, "scenes")
@@ -35,13 +35,13 @@ def scenes(rows, change=None, **options):
 
 
 def thousandfold(found):
-    """Each group a thousand times, with the sums that go with it."""
+    """Repeat each row group a thousand times and adapt the sums."""
     forged.groups(found)[:] = forged.groups(found) * 1000
     forged.put(found, 3, found[3][1] * 1000)
 
 
 def small(found):
-    """A footer that says that all columns are small, and without dictionaries."""
+    """Change a footer so that it states small columns without dictionaries."""
     for group in forged.groups(found):
         forged.put(group, 2, 1000)
         for each in forged.columns(group):
@@ -58,7 +58,7 @@ def repeated_text():
 
 
 def long_list(root):
-    """10^8 numbers in one row of a vector."""
+    """Put 10^8 numbers in one row of a vector."""
     path = part_of(root, "trajectories")
     rows = pq.read_table(path)
     place = rows.schema.get_field_index("nominal_position_m")
@@ -98,15 +98,15 @@ BOMBS = {
 
 
 @pytest.mark.parametrize("name", BOMBS)
-def test_bombs_do_not_go_off(name, victim):
-    damage, told = BOMBS[name]
+def test_bombs_are_refused_within_memory_and_time_limits(name, victim):
+    damage, column = BOMBS[name]
     sealed(damage)(victim)
     assert sum(path.stat().st_size for path in victim.rglob("*") if path.is_file()) < 3_000_000
-    assert told in told_within(victim, 80)
+    assert column in faults_within_limits(victim, 80)
 
 
-def test_a_part_as_large_as_they_come_is_read(tmp_path):
-    """The limits leave room for what the renderer writes: rows of numbers that hardly shrink."""
+def test_the_largest_real_part_is_read(tmp_path):
+    """The limits accept what the renderer writes: numbers that hardly compress."""
     rng = np.random.default_rng(1)
     columns = [
         pa.array([f"s000/t000/{i % 1000:06d}" for i in range(300_000)])

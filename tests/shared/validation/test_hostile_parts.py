@@ -1,4 +1,4 @@
-"""A dataset is untrusted: Parquet files whose columns, footers or pages are not what they should be."""
+"""A dataset is untrusted: Parquet files with invalid columns, footers or pages."""
 
 import os
 import pickle
@@ -17,7 +17,7 @@ from perilune_shared.validation.validate import validate
 
 
 class Pickled:
-    """Whoever unpickles this makes a folder."""
+    """Unpickling this makes a folder."""
 
     def __init__(self, path):
         self.path = str(path)
@@ -27,7 +27,7 @@ class Pickled:
 
 
 def column(table, name, kind, values, nullable=False):
-    """A column of another type, under the metadata of the right one."""
+    """Replace a column by one of another type, with the metadata of the original."""
 
     def damage(root):
         path = part_of(root, table)
@@ -41,7 +41,7 @@ def column(table, name, kind, values, nullable=False):
 
 
 def table(name, change, **options):
-    """A whole table changed as Arrow."""
+    """Change a whole table as Arrow."""
 
     def damage(root):
         path = part_of(root, name)
@@ -51,12 +51,12 @@ def table(name, change, **options):
 
 
 def footer(name, change):
-    """A part's footer changed."""
+    """Change the footer of a part."""
     return sealed(lambda root: forged.forge(part_of(root, name), change))
 
 
 def content(name, change):
-    """A part's bytes changed."""
+    """Change the bytes of a part."""
 
     def damage(root):
         path = part_of(root, name)
@@ -88,7 +88,7 @@ def renamed(old, new):
 
 
 def swapped(a, b):
-    """Two columns in each other's place."""
+    """Swap two columns."""
 
     def change(rows):
         names = rows.column_names
@@ -104,7 +104,7 @@ def extended(name):
 
 
 def nulled(name):
-    """The first value of a column missing."""
+    """Set the first value of a column to null."""
 
     def change(rows):
         place = rows.schema.get_field_index(name)
@@ -201,14 +201,14 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_parts_of_ill_will(name, victim, capsys, monkeypatch):
-    damage, told = CASES[name]
+def test_hostile_parts_are_refused(name, victim, capsys, monkeypatch):
+    damage, name_of_column = CASES[name]
     damage(victim)
-    assert_refused(victim, "", told, capsys, monkeypatch)
+    assert_refused(victim, "", name_of_column, capsys, monkeypatch)
 
 
 def test_unknown_columns_are_ignored_and_never_read(victim):
-    """Whatever they hold: lists of any length, text without end, pickles."""
+    """Whatever they contain: long lists, long texts, pickles."""
     part = part_of(victim, "frames")
     rows = pq.read_table(part)
     n = len(rows)
@@ -226,7 +226,7 @@ def test_unknown_columns_are_ignored_and_never_read(victim):
 
 
 def test_a_known_column_between_unknown_ones_keeps_its_checks(victim):
-    """A known column of another type stays an error, and so does a name that differs in case alone."""
+    """A known column of another type is an error, and so is a name that differs only in case."""
     part = part_of(victim, "craters")
     rows = pq.read_table(part)
     wrong = rows.set_column(2, "x_m", rows["x_m"].cast(pa.float32())).append_column("later", pa.nulls(len(rows)))
@@ -238,8 +238,8 @@ def test_a_known_column_between_unknown_ones_keeps_its_checks(victim):
         open_dataset(victim).table("craters", ["x_m"])
 
 
-def test_what_is_pickled_stays_so(victim, capsys, monkeypatch):
-    """In the file's metadata, a column's, that of pandas and that of a type of Python's own."""
+def test_pickles_are_never_loaded(victim, capsys, monkeypatch):
+    """Pickles in the metadata of the file, of a column, of pandas and of a Python extension type."""
     bait = victim.parent / "canary" / "made"
     pickled = pickle.dumps(Pickled(bait))
     path = part_of(victim, "scenes")
@@ -253,5 +253,5 @@ def test_what_is_pickled_stays_so(victim, capsys, monkeypatch):
     sealed(lambda root: None)(victim)
     assert_refused(victim, "manifest/scenes/all.parquet", "scene_id", capsys, monkeypatch)
     assert not bait.exists()
-    pickle.loads(pickled)  # noqa: S301 - the bait works
+    pickle.loads(pickled)  # noqa: S301 - shows that unpickling would run code
     assert bait.is_dir()

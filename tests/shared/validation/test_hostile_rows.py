@@ -1,4 +1,4 @@
-"""A dataset is untrusted: names, paths, poses, labels and frames that its rows hold, under checksums that fit."""
+"""A dataset is untrusted: hostile names, paths, poses, labels and frames under valid checksums."""
 
 import struct
 import zlib
@@ -43,7 +43,7 @@ NAMES = {
 
 
 def renamed(root, scene_id):
-    """The first scene's name replaced wherever it stands."""
+    """Replace the id of the first scene in all tables."""
 
     def change(row):
         if row.get("scene_id") == "s000":
@@ -56,7 +56,7 @@ def renamed(root, scene_id):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_scenes_of_odd_names(name, victim, capsys, monkeypatch):
+def test_hostile_scene_ids_are_refused(name, victim, capsys, monkeypatch):
     sealed(lambda root: renamed(root, NAMES[name]))(victim)
     assert_refused(victim, "manifest/scenes/all.parquet", "scene_id", capsys, monkeypatch)
     with pytest.raises(UserError, match="_id"):
@@ -64,7 +64,7 @@ def test_scenes_of_odd_names(name, victim, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["climbs", "a command", "of 10 kB", "with NUL"])
-def test_descents_and_frames_of_odd_names(name, victim, capsys, monkeypatch):
+def test_hostile_trajectory_and_frame_ids_are_refused(name, victim, capsys, monkeypatch):
     sealed(put("trajectories", "trajectory_id", NAMES[name]))(victim)
     sealed(put("frames", "frame_id", f"s000/{NAMES[name]}/000000"))(victim)
     assert_refused(victim, "manifest/trajectories/all.parquet", "trajectory_id", capsys, monkeypatch)
@@ -73,7 +73,7 @@ def test_descents_and_frames_of_odd_names(name, victim, capsys, monkeypatch):
 
 @pytest.mark.parametrize("column", ["photometry", "dem_source", "recipe", "content_sha256"])
 @pytest.mark.parametrize("name", ["HTML", "a formula", "that steers a terminal"])
-def test_texts_of_ill_will(column, name, victim, capsys, monkeypatch):
+def test_hostile_texts_are_refused(column, name, victim, capsys, monkeypatch):
     sealed(put("scenes", column, NAMES[name]))(victim)
     assert_refused(victim, "manifest/scenes/all.parquet", column, capsys, monkeypatch)
 
@@ -104,13 +104,13 @@ PATHS = {
 
 
 @pytest.mark.parametrize("name", PATHS)
-def test_paths_of_ill_will(name, victim, capsys, monkeypatch):
+def test_hostile_paths_are_refused(name, victim, capsys, monkeypatch):
     sealed(put("frames", "png_path", PATHS[name]))(victim)
     assert_refused(victim, "", "png_path", capsys, monkeypatch)
 
 
 @pytest.mark.parametrize("path", ["../canary/frame.exr", "/dev/zero", "dataset.json"])
-def test_exr_paths_of_ill_will(path, victim, capsys, monkeypatch):
+def test_hostile_exr_paths_are_refused(path, victim, capsys, monkeypatch):
     for column, value in (("exr_path", path), ("exr_sha256", "0" * 64), ("exr_bytes", 12)):
         sealed(put("frames", column, value))(victim)
     assert_refused(victim, "", "exr_", capsys, monkeypatch)
@@ -158,15 +158,15 @@ NUMBERS = [
     ("table", "column", "value", "distorted"),
     [(*case, False) for case in NUMBERS] + [(*case, True) for case in NUMBERS[:8]],
 )
-def test_numbers_of_ill_will(table, column, value, distorted, victim, capsys, monkeypatch):
-    # With distortion ellipses are fitted, without they are reckoned.
+def test_hostile_numbers_are_refused(table, column, value, distorted, victim, capsys, monkeypatch):
+    # With distortion, ellipses are fitted; without, they are computed.
     if distorted:
         edit(lambda content: content["camera"].update(distortion=[-0.1, 0.01, 0.0, 0.0, 0.0]))(victim)
     sealed(put(table, column, value))(victim)
-    told = column if column != "normal_z" else "normal_"
-    # So low above the ground that no rim lies before the camera.
-    told = "ellipse_" if value == [0.0, 0.0, 1e-300] else told
-    assert_refused(victim, "", told, capsys, monkeypatch)
+    expected_column = column if column != "normal_z" else "normal_"
+    # The camera is so low that no rim is in front of it.
+    expected_column = "ellipse_" if value == [0.0, 0.0, 1e-300] else expected_column
+    assert_refused(victim, "", expected_column, capsys, monkeypatch)
 
 
 def chunk(name, content):
@@ -178,7 +178,7 @@ def png(width, height, bits=8, colour=0, rows=b""):
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-IMAGES_OF_ILL_WILL = {
+HOSTILE_IMAGES = {
     "60 000 x 60 000": (png(60_000, 60_000), "width_px"),
     "2^32 - 1 wide": (png(2**32 - 1, 1), "width_px"),
     "no size": (png(0, 0), "width_px"),
@@ -188,24 +188,24 @@ IMAGES_OF_ILL_WILL = {
     "one bit": (png(32, 32, bits=1), "png_path"),
     "a JPEG": (b"\xff\xd8\xff\xe0" + bytes(100), "png_path"),
     "an SVG": (b'<svg onload="alert(1)"/>' + bytes(100), "png_path"),
-    "a signature alone": (b"\x89PNG\r\n\x1a\n", "png_path"),
+    "only a signature": (b"\x89PNG\r\n\x1a\n", "png_path"),
     "nothing": (b"", "png_bytes"),
 }
 
 
 @pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("name", IMAGES_OF_ILL_WILL)
-def test_frames_of_ill_will(name, packed, victim, capsys, monkeypatch):
-    content, told = IMAGES_OF_ILL_WILL[name]
+@pytest.mark.parametrize("name", HOSTILE_IMAGES)
+def test_hostile_frames_are_refused(name, packed, victim, capsys, monkeypatch):
+    content, expected_column = HOSTILE_IMAGES[name]
     (victim / "frames/s000/t000/000000.png").write_bytes(content)
     put("frames", "png_bytes", len(content))(victim)
     put("frames", "png_sha256", digest(content))(victim)
     sealed(pack if packed else lambda root: None)(victim)
-    assert_refused(victim, "", told, capsys, monkeypatch)
+    assert_refused(victim, "", expected_column, capsys, monkeypatch)
 
 
-def test_what_follows_an_image_is_let_be(victim):
-    """Its size and hash stand in the manifest."""
+def test_bytes_after_an_image_are_allowed(victim):
+    """The manifest has the size and hash of the whole file."""
     path = victim / "frames/s000/t000/000000.png"
     content = path.read_bytes() + b"#!/bin/sh\n"
     path.write_bytes(content)
@@ -250,19 +250,19 @@ SHARDS = {
 
 
 @pytest.mark.parametrize("name", SHARDS)
-def test_shards_of_ill_will(name, victim, capsys, monkeypatch):
-    damage, told = SHARDS[name]
+def test_hostile_shards_are_refused(name, victim, capsys, monkeypatch):
+    damage, expected_column = SHARDS[name]
     sealed(damage)(victim)
-    assert_refused(victim, "", told, capsys, monkeypatch)
+    assert_refused(victim, "", expected_column, capsys, monkeypatch)
 
 
-def scene_elsewhere(root):
-    """A part named by one scene that holds another's rows."""
+def rows_of_another_scene(root):
+    """Make a part named after one scene that contains rows of another."""
     part_of(root, "scenes").rename(root / "manifest/scenes/s001.parquet")
 
 
 def false_statistics(root):
-    """Row groups that say that they hold other scenes."""
+    """Change the statistics of row groups so that they state other scenes."""
     path = part_of(root, "scenes")
 
     def change(footer):
@@ -274,14 +274,14 @@ def false_statistics(root):
     forged.forge(path, change)
 
 
-@pytest.mark.parametrize("damage", [scene_elsewhere, false_statistics])
-def test_rows_that_are_not_where_they_are_looked_for(damage, victim, capsys, monkeypatch):
+@pytest.mark.parametrize("damage", [rows_of_another_scene, false_statistics])
+def test_rows_in_the_wrong_part_are_found(damage, victim, capsys, monkeypatch):
     sealed(damage)(victim)
     assert_refused(victim, "manifest/scenes", "part", capsys, monkeypatch)
 
 
 @pytest.mark.parametrize("new", ["../../../canary/x", "..", "a\0"])
-def test_frames_are_brought_under_plain_names_alone(new, victim):
+def test_frames_are_copied_only_under_plain_names(new, victim):
     dataset = open_dataset(victim)
     frames = dataset.table("frames", scene_id="s000")
     names = dict.fromkeys(frames["frame_id"].to_pylist(), new)

@@ -1,4 +1,4 @@
-"""Datasets that are right but unusual, and such as are damaged in their rows: a right result, or one line."""
+"""Unusual but valid datasets give a correct result; datasets with damaged rows give one line."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ from perilune_shared.validation.validate import validate
 
 
 def replaced(root, table, rows):
-    """A table of a drawn dataset written anew, with right checksums."""
+    """Write a table of a drawn dataset again, with valid checksums."""
     root.joinpath("manifest", table, "all.parquet").unlink()
     write_part(root, table, "all", rows)
     seal(root)
@@ -47,7 +47,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_frames_kept_elsewhere_in_a_dataset_come_along(victim, tmp_path, change):
+def test_frames_under_other_paths_are_copied(victim, tmp_path, change):
     frames = rows_of(victim, "frames")
     moved = [f"pictures/{frame_id.replace('/', '_')}.png" for frame_id in frames["frame_id"].to_pylist()]
     (victim / "pictures").mkdir()
@@ -60,7 +60,7 @@ def test_frames_kept_elsewhere_in_a_dataset_come_along(victim, tmp_path, change)
     assert validate(open_dataset(tmp_path / "out")) == []
 
 
-def test_a_frame_that_is_a_link_within_the_dataset_comes_as_a_file(victim, tmp_path):
+def test_a_linked_frame_is_copied_as_a_file(victim, tmp_path):
     path = victim / rows_of(victim, "frames")["png_path"][1].as_py()
     path.rename(path.with_name("real.png"))
     path.symlink_to("real.png")
@@ -68,7 +68,7 @@ def test_a_frame_that_is_a_link_within_the_dataset_comes_as_a_file(victim, tmp_p
     assert validate(open_dataset(tmp_path / "out")) == []
 
 
-def test_a_plan_and_what_was_rendered_from_it_are_the_same_scenes(little, tmp_path):
+def test_a_plan_and_its_rendered_dataset_have_the_same_scenes(little, tmp_path):
     subset(open_dataset(little), tmp_path / "plan", images="plan")
     merge([open_dataset(little), open_dataset(tmp_path / "plan")], tmp_path / "both", images="plan")
     both = open_dataset(tmp_path / "both")
@@ -85,14 +85,14 @@ def test_a_plan_and_what_was_rendered_from_it_are_the_same_scenes(little, tmp_pa
         ("trajectories", lambda rows: rows.slice(0, 0)),
     ],
 )
-def test_no_row_is_lost_of_tables_that_do_not_agree(victim, tmp_path, change, table, damage):
+def test_inconsistent_tables_lose_no_rows(victim, tmp_path, change, table, damage):
     replaced(victim, table, damage(rows_of(victim, table)))
     with pytest.raises(UserError, match=f"{table}.*validate"):
         CHANGES[change](open_dataset(victim), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_dataset_without_a_row_is_refused_in_one_line(victim, tmp_path):
+def test_a_dataset_without_rows_is_refused_in_one_line(victim, tmp_path):
     for table in ("scenes", "trajectories", "frames", "labels", "craters", "boulders"):
         replaced(victim, table, rows_of(victim, table).slice(0, 0))
     with pytest.raises(UserError, match="none"):
@@ -101,13 +101,13 @@ def test_a_dataset_without_a_row_is_refused_in_one_line(victim, tmp_path):
         write_card(open_dataset(victim), tmp_path / "page.md", Progress())
 
 
-def test_a_plan_makes_no_coco_file_without_labels(little, tmp_path):
+def test_a_plan_is_not_exported_to_coco(little, tmp_path):
     subset(open_dataset(little), tmp_path / "plan", images="plan")
     with pytest.raises(UserError, match="planned"):
         export_coco(open_dataset(tmp_path / "plan"), tmp_path / "coco", Progress())
 
 
-def test_what_is_no_picture_is_not_attached(little, tmp_path):
+def test_attach_refuses_invalid_images(little, tmp_path):
     subset(open_dataset(little), tmp_path / "absent", images="none")
     shutil.copytree(little / "frames", tmp_path / "made" / "frames")
     (tmp_path / "made" / "frames/s000/t000/000001.png").write_bytes(b"no picture")
@@ -116,12 +116,12 @@ def test_what_is_no_picture_is_not_attached(little, tmp_path):
 
 
 @pytest.mark.parametrize("size", [float("inf"), float("nan"), 0, 9000])
-def test_shards_are_of_a_size_that_can_be_read(little, tmp_path, size):
+def test_shards_have_a_readable_size(little, tmp_path, size):
     with pytest.raises(UserError, match="at most"):
         pack(open_dataset(little), tmp_path / "out", shard_mb=size)
 
 
-def test_the_working_folder_can_be_the_new_one(tmp_path, monkeypatch):
+def test_the_working_folder_can_be_the_output(tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     with new_folder(type(tmp_path)()) as folder:
@@ -141,13 +141,13 @@ def test_the_working_folder_can_be_the_new_one(tmp_path, monkeypatch):
         "'%099999999999d' % 3 == split",
     ],
 )
-def test_conditions_without_end_or_value_are_refused(little, tmp_path, where):
+def test_endless_or_empty_conditions_are_refused(little, tmp_path, where):
     with pytest.raises(UserError, match="condition"):
         subset(open_dataset(little), tmp_path / "out", [where])
 
 
 def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
-    """Added craters differ with the seed; the ground that the model shows does not."""
+    """The added craters depend on the seed; the terrain of the elevation model does not."""
     scenes = rows_of(victim, "scenes")
     replaced(victim, "scenes", with_column(scenes, "dem_source", ["a.tif sha256:" + "1" * 64] * len(scenes)))
     (fault,) = validate(open_dataset(victim))
@@ -158,8 +158,8 @@ def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
         split_dataset(open_dataset(victim), tmp_path / "split", by="scene", val_share=0.5, test_share=0)
 
 
-def test_a_damaged_table_is_not_handed_on(drawn, tmp_path):
-    """New checksums would make a fault look right for good."""
+def test_a_damaged_table_is_not_copied(drawn, tmp_path):
+    """New checksums would hide the damage."""
     broken = shutil.copytree(drawn, tmp_path / "broken")
     part = broken / "manifest/labels/all.parquet"
     rows = pq.read_table(part).to_pandas()
@@ -177,8 +177,8 @@ def test_a_damaged_table_is_not_handed_on(drawn, tmp_path):
     assert not out.exists()
 
 
-def test_a_descent_developed_twice_is_one_descent(drawn, tmp_path):
-    """Under two recipes, as a dataset and what was developed of it: its frames may not be split apart unseen."""
+def test_a_trajectory_developed_twice_is_one_trajectory(drawn, tmp_path):
+    """It has two recipes: the dataset and the one developed from it. Its frames must not be in different splits."""
     other = shutil.copytree(drawn, tmp_path / "other")
     info = json.loads((other / "dataset.json").read_text())
     (recipe,) = info["recipes"].values()
@@ -189,12 +189,12 @@ def test_a_descent_developed_twice_is_one_descent(drawn, tmp_path):
     rows = pq.read_table(part).to_pandas().assign(recipe=key)
     pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["scenes"], preserve_index=False), part)
     seal(other)
-    split_dataset(open_dataset(other), tmp_path / "dealt", val_share=0.2, test_share=0.2, seed=1)
-    merge([open_dataset(drawn), open_dataset(tmp_path / "dealt")], tmp_path / "m")
+    split_dataset(open_dataset(other), tmp_path / "split", val_share=0.2, test_share=0.2, seed=1)
+    merge([open_dataset(drawn), open_dataset(tmp_path / "split")], tmp_path / "m")
     made = open_dataset(tmp_path / "m")
     assert made.info.counts.scenes == 10 and made.info.split_by == "frame" and validate(made) == []
-    boast = made.info.model_copy(update={"split_by": "trajectory"})
-    write_info(made.root, boast)
+    wrong_info = made.info.model_copy(update={"split_by": "trajectory"})
+    write_info(made.root, wrong_info)
     seal(made.root)
     assert "one split for each trajectory" in validate(open_dataset(made.root))[0].expected
 

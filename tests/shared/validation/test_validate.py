@@ -1,4 +1,4 @@
-"""Every damage to a dataset is found, and named by file and column."""
+"""Validation finds damage to a dataset and names file and column."""
 
 import json
 import subprocess
@@ -129,13 +129,13 @@ def test_parts_are_never_rewritten(tiny_detect):
     assert count_rows(open_dataset(tiny_detect)).scenes == 4
 
 
-def test_units_stand_in_the_file(tiny):
+def test_files_contain_units(tiny):
     part = sorted((tiny / "detect/manifest/craters").glob("*.parquet"))[0]
     schema = pq.read_schema(part)
     assert schema.field("diameter_m").metadata[b"unit"] == b"m" and schema.metadata[b"perilune.table"] == b"craters"
 
 
-def test_chosen_rows_and_columns(tiny):
+def test_selected_rows_and_columns(tiny):
     dataset = open_dataset(tiny / "detect")
     one = dataset.table("craters", columns=["diameter_m"], scene_id="scene-0001")
     assert one.column_names == ["diameter_m"] and 0 < one.num_rows < dataset.table("craters").num_rows
@@ -143,7 +143,7 @@ def test_chosen_rows_and_columns(tiny):
     assert splits == {"train": 8, "val": 8, "test": 8}
 
 
-def test_summary_counts_what_is_there(tiny):
+def test_summary_counts_rows(tiny):
     dataset = open_dataset(tiny / "nav")
     frame = summary(dataset).set_index("split")
     assert frame["frames"].sum() == 45 and frame.loc["train", "trajectories"] == 3
@@ -162,7 +162,7 @@ def test_every_part_is_opened_once(little, monkeypatch):
     dataset = open_dataset(little)
     assert validate(dataset) == []
     assert sorted(opened) == sorted(part for name in TABLES for part in dataset.parts(name))
-    # Only as long as it is validated: a part is read as it is now.
+    # Parts are kept open only during validation; later reads open them again.
     dataset.table("frames")
     assert len(opened) == len(set(opened)) + 1
 
