@@ -33,7 +33,7 @@ class RunRecord:
 
 @functools.cache
 def run_record() -> RunRecord:
-    """Return the record of this process. It is made in the first call: call it when the program starts."""
+    """Return the record of this process. The first call makes it, so call it when the program starts."""
     return RunRecord(_commit(), _hardware(), round(_load(), 1), _command(), f"{datetime.now(UTC):%Y-%m-%d}")
 
 

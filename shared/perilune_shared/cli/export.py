@@ -102,7 +102,7 @@ def card(
         Path | None, typer.Option(help="Markdown file beside its picture, by default README.md in the dataset.")
     ] = None,
 ) -> None:
-    """Write a dataset card: counts, histograms, labelled frames, licence and the command that reproduces it."""
+    """Write a dataset card: counts, histograms, labelled frames, licence and the command to reproduce the data."""
     from perilune_shared.export.card import write_card
 
     with progress_bar() as progress:

@@ -191,25 +191,20 @@ class Condition:
         if not isinstance(right, ast.Tuple | ast.List) or not right.elts:
             raise self._fault(ast.unparse(right), "a list after `in`, such as split in ('val', 'test')")
         try:
-            values_in_list = [ast.literal_eval(value_in_list) for value_in_list in right.elts]
+            items = [ast.literal_eval(item) for item in right.elts]
         except ValueError:
             raise self._fault(ast.unparse(right), "a list of numbers or of text") from None
-        texts = all(isinstance(value_in_list, str) for value_in_list in values_in_list)
-        numbers = all(
-            isinstance(value_in_list, int | float) and not isinstance(value_in_list, bool)
-            for value_in_list in values_in_list
-        )
+        texts = all(isinstance(item, str) for item in items)
+        numbers = all(isinstance(item, int | float) and not isinstance(item, bool) for item in items)
         if not ((texts and value.kind == "text") or (numbers and value.is_number)):
             expected = "comparisons of numbers with numbers and text with text"
             raise self._fault(f"{ast.unparse(left)} ({value.kind}) in {ast.unparse(right)}", expected)
         if texts:
-            found = value.expression.isin(pa.array(values_in_list, pa.string()))
-        elif value.kind == "integer" and all(isinstance(value_in_list, int) for value_in_list in values_in_list):
-            found = value.expression.isin(pa.array(values_in_list, pa.int64()))
+            found = value.expression.isin(pa.array(items, pa.string()))
+        elif value.kind == "integer" and all(isinstance(item, int) for item in items):
+            found = value.expression.isin(pa.array(items, pa.int64()))
         else:
-            found = value.expression.cast(pa.float64()).isin(
-                pa.array([float(value_in_list) for value_in_list in values_in_list])
-            )
+            found = value.expression.cast(pa.float64()).isin(pa.array([float(item) for item in items]))
         # pyarrow evaluates `null in list` as false, so `null not in list` would be true; return null.
         return pc.if_else(value.expression.is_valid(), found, pa.scalar(None, pa.bool_()))
 
@@ -234,8 +229,10 @@ class Condition:
             if node.id in TABLES[table].names:
                 return table, node.id
         known = sorted({name for table in _SEARCHED for name in TABLES[table].names})
-        near = difflib.get_close_matches(node.id, known, n=1)
-        raise self._fault(node.id, f"{near[0]} (nearest known)" if near else "a column of " + ", ".join(_SEARCHED))
+        similar = difflib.get_close_matches(node.id, known, n=1)
+        raise self._fault(
+            node.id, f"{similar[0]} (nearest known)" if similar else "a column of " + ", ".join(_SEARCHED)
+        )
 
     @staticmethod
     def _fault(found: str, expected: str) -> UserError:

@@ -151,7 +151,7 @@ class Dataset:
         if trajectory_id is not None and scene_id is None:
             raise UserError("table", "scene_id", "None", "the scene_id too: trajectory_ids repeat in each scene")
         if where is not None and where.columns_of_only(table) is None:
-            raise UserError(table, "where", where.text, f"a condition on columns of {table} alone")
+            raise UserError(table, "where", where.text, f"a condition only on columns of {table}")
         names = list(columns) if columns is not None else TABLES[table].names
         schema = pa.schema([TABLES[table].field(name) for name in names])
         of_split = split if table != "labels" else None

@@ -15,7 +15,7 @@ LARGEST_IMAGE_PX = 2**27
 """Largest image that is decompressed, pixels."""
 _FAR = 1e9
 _ROTATION_TOLERANCE = 1e-6
-# Names appear in tables, pages and shell commands: only letters, digits and characters without a meaning there.
+# Names appear in tables, pages and quoted shell commands: only letters, digits and punctuation that is safe there.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$")]
 _Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _Row = tuple[float, float, float]

@@ -60,7 +60,7 @@ def write_packed(
 
 
 class _ShardWriter:
-    """Write one shard; the file is created with the first row group."""
+    """Writer of one shard; the file is created with the first row group."""
 
     def __init__(self, folder: Path, number: int):
         self.number, self.n_images, self.n_bytes = number, 0, 0

@@ -30,7 +30,7 @@ _PER_TRAJECTORY = ("frames", "labels")
 
 
 class DatasetWriter:
-    """Write a dataset into a folder; create it with `new_dataset`."""
+    """Writer of a dataset; created by `new_dataset`."""
 
     def __init__(
         self, root: Path, info: DatasetInfo, *, whole_tables: bool = False, most_rows: int = MOST_ROWS_WRITTEN
@@ -49,8 +49,8 @@ class DatasetWriter:
         """Append one scene that has frames.
 
         Recomputes the number of frames and the split of each trajectory, and sets the paths at which `add_images`
-        stores the frames. Raises UserError if the table scenes has not exactly one row, or if a frame's trajectory is
-        missing.
+        stores the frames. Raises UserError unless the table scenes has exactly one row and each frame has its
+        trajectory.
         """
         check_scene("new dataset", tables)
         frames = _with_new_paths(tables["frames"])
@@ -154,7 +154,7 @@ def new_dataset(
 
 
 def check_scene(where: object, tables: SceneTables) -> None:
-    """Raise UserError about `where` if the table scenes has not exactly one row, or a frame's trajectory is missing."""
+    """Raise UserError about `where` unless the table scenes has exactly one row and each frame has its trajectory."""
     scenes, frames = tables["scenes"]["scene_id"], tables["frames"]
     if len(scenes) != 1:
         found = f"{len(scenes)} rows of {min(scenes.to_pylist(), default='a scene')}"

@@ -13,7 +13,7 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
 
     Terrain is the key from `terrain_of`; pose numbers each position and rotation over a terrain. Trajectories over one
     terrain are the same flight if they have the same random seed or a common pose. So a flight that was developed again
-    or rendered with another Sun is the same flight. Splits must not share the unit by which a dataset is split.
+    or rendered with another Sun is the same flight. A split by one of these units puts each unit in one split.
     """
     columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
     rows = dataset.table("frames", columns).sort_by("frame_id")
@@ -37,7 +37,10 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
 
 
 def _connected_groups(unit: NDArray[np.int64], keys: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Number groups of rows (N,). Rows with the same unit, or the same value of a key, are in the same group."""
+    """Return the group of each row (N,). Rows with the same unit, or an equal value of any key, are in one group.
+
+    Also rows that are connected through other rows. `unit` (N,) has numbers from 0; `keys` are arrays (N,).
+    """
     root = np.arange(unit.max(initial=-1) + 1)
 
     def find(one: int) -> int:

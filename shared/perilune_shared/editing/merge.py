@@ -88,7 +88,7 @@ def _has_exrs(source: Dataset) -> bool:
 
 
 def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list[tuple[int, str]]]:
-    """Return by scene_id of the result: the index of each source that contains the scene, and its scene_id there.
+    """Group equal scenes: by scene_id of the result, the index of each source that has it and the scene_id there.
 
     Crater ids are not compared for plans, which have no labels.
     """

@@ -68,7 +68,7 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
     if states == {"planned"} or images == "plan":
         return "planned"
     if "planned" in states:
-        raise UserError(sources[0].root, "images", ", ".join(sorted(states)), "either only planned datasets or none")
+        raise UserError(sources[0].root, "images", ", ".join(sorted(states)), "all datasets planned, or none of them")
     if images == "none" or states == {"absent"}:
         return "absent"
     if "absent" in states:

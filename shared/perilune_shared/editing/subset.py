@@ -30,8 +30,8 @@ def subset(
 
     A condition on columns of frames, trajectories and scenes selects frames. One that uses labels or craters selects
     labels and keeps all frames. Scenes keep all their craters and boulders, since these identify the terrain. With
-    `n_frames` or `megabytes` (10^6 bytes), each scene in turn gives one trajectory until the limit is reached, so that
-    the subset has many terrains; the last trajectory is truncated. Raises UserError if no frame is left.
+    `n_frames` or `megabytes` (10^6 bytes), trajectories are taken from each scene in turn until the limit is reached,
+    so that the subset has many terrains; the last trajectory is truncated. Raises UserError if no frame is left.
     """
     conditions = [Condition(text) for text in where]
     on_frames = [condition for condition in conditions if not condition.on_labels]

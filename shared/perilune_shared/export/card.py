@@ -56,7 +56,7 @@ def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[
             raise UserError(path, "--out", "a file that is not a card", "another path, or move that file away")
     known = check_sums(dataset, (out, picture), progress)
     gathered = gather(dataset, progress)
-    # Build the page first: it checks the keys and is much faster than the picture.
+    # Build the page first: this checks the keys and is much faster than drawing.
     page = card_of(dataset, gathered, picture.name).encode()
     add_files(dataset, {picture: draw(dataset, gathered), out: page}, known)
     return out, picture
@@ -164,7 +164,7 @@ def _files(dataset: Dataset) -> str:
             f"- Camera: {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px, principal point "
             f"({camera.cx_px:.6g}, {camera.cy_px:.6g}) px from the outer corner of the top-left pixel, {lens}.",
             "- Tables: manifest/*/*.parquet; the metadata of the files has the unit and meaning of each column.",
-            f"- {INFO_NAME}: settings, random seeds and versions. SHA256SUMS: check it with `sha256sum -c SHA256SUMS`.",
+            f"- {INFO_NAME}: settings, random seeds and versions. `sha256sum -c SHA256SUMS` checks it and the tables.",
             f"- Schema version {code(info.schema_version)}.",
         ]
     )

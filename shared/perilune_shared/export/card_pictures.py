@@ -36,8 +36,8 @@ TITLES = {
     "labels_per_frame": "labels per frame",
     "altitude_m": "altitude above the site, m",
     "sun_elevation_deg": "Sun's elevation, deg",
-    "visible_fraction": "visible share of the rim",
-    "sunlit_fraction": "sunlit share of the crater",
+    "visible_fraction": "visible fraction of the rim",
+    "sunlit_fraction": "sunlit fraction of the crater",
     "depth_ratio": "depth / diameter of labelled craters",
     "contrast": "contrast",
     "speed_mps": "speed, m/s",
@@ -53,7 +53,7 @@ class Gathered:
     measures: dict[str, dict[str, NDArray[np.float32]]]
     """Values by measure and split; see `TITLES` for names and units."""
     samples: list[tuple[dict, pd.DataFrame]] = field(default_factory=list)
-    """Rows of the frames to show, each with its labels; their column `visible`: in the selection `visible`."""
+    """Rows of the frames to show, each with its labels; column `visible`: in the selection of that name or not."""
 
 
 def gather(dataset: Dataset, progress: Progress) -> Gathered:

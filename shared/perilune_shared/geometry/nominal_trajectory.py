@@ -1,6 +1,6 @@
 """The nominal trajectory: the planned path, known to the guidance before the flight.
 
-The paper uses "a parabola" from 1500 m to 200 m and does not specify it. Here the vertical speed is constant and the
+The paper uses "a parabola" from 1500 m to 200 m without details. Here the vertical speed is constant and the
 horizontal speed decreases linearly to zero at the end point. The path is a parabola with a vertical axis that ends
 vertically: p(t) = p0 + v0 t + a t^2 / 2.
 """

@@ -42,7 +42,7 @@ class CraterMask:
     amodal: NDArray[np.bool_]
     """Whether each pixel's centre is inside the rim, hidden or not (h, w)."""
     visible: NDArray[np.bool_] | None
-    """Pixels of `amodal` in which no nearer terrain hides the crater (h, w); None if no depth was given."""
+    """Whether each pixel is in `amodal` and no nearer terrain hides it (h, w); None if no depth was given."""
 
     @property
     def window(self) -> tuple[slice, slice]:

@@ -74,7 +74,10 @@ def _varint(buffer: bytes, at: int) -> tuple[int, int]:
 
 
 def _struct(buffer: bytes, at: int, depth: int) -> tuple[dict, int]:
-    """Parse integers and structs of a struct, by field id; return them and the end. IndexError past the buffer."""
+    """Parse the integers and structs in a struct; return them by field id, and the offset after the struct.
+
+    Raises IndexError past the end of the buffer.
+    """
     if depth > _MAX_DEPTH:
         raise IndexError
     fields: dict[int, Any] = {}

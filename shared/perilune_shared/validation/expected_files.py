@@ -34,8 +34,8 @@ _MAX_REPORTED = 1000
 def unexpected(dataset: Dataset) -> Iterator[str]:
     """Yield relative paths of files and folders that do not belong to the dataset, at most 1000.
 
-    An unexpected folder is reported without its content; an empty one is no fault. The lock of a writer is accepted,
-    and so are temporary files of the writer while the dataset is not complete.
+    An unexpected folder is reported without its content, and only if it is not empty. The lock of a writer is accepted;
+    its temporary files are accepted while the dataset is not complete.
     """
     own_folders = {"manifest", *(f"manifest/{table}" for table in TABLES)}
     own_files = {INFO_NAME, SUMS_NAME, *EXTRA_NAMES, *_LOCKS}

@@ -92,7 +92,7 @@ def _table_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     for scene_id in dict.fromkeys(scene_ids):
         scene = dataset.table("scenes", scene_id=scene_id)
         if not len(scene):
-            expected = "part names and row group statistics that match the scene's rows"
+            expected = "part names and statistics that match the rows of the scene"
             yield Fault.of(
                 "manifest/scenes", None, "part", f"rows of {scene_id} in another part or row group", expected
             )

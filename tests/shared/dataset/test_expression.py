@@ -145,5 +145,5 @@ def test_conditions_skip_row_groups(crowded_packed):
     assert dataset.table("craters", where=Condition("craters.scene_id == 's002'")).equals(
         dataset.table("craters", scene_id="s002")
     )
-    with pytest.raises(UserError, match="of craters alone"):
+    with pytest.raises(UserError, match="only on columns of craters"):
         dataset.table("craters", where=Condition("radius_px > 1"))

@@ -176,6 +176,13 @@ def test_other_files_are_not_overwritten(crowded, tmp_path):
     assert not (root / "README.md").exists() and not (root / "card.png").exists()
 
 
+def test_a_card_of_an_older_version_is_overwritten(card, tmp_path):
+    page = tmp_path / "about.md"
+    page.write_text("<!-- written by `perilune-manifest card`, in other words -->\n")
+    card_files(card, page)
+    assert "## Contents" in page.read_text()
+
+
 def test_a_frame_of_another_size_is_refused(crowded, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
     for path in root.rglob("*.png"):
