@@ -2,8 +2,8 @@
 
 `python -m benchmarks.train.contrast DATASET RUN` takes a dataset and a detect run on it. Evaluates on the test split,
 for the craters of the selection `visible` without its contrast threshold: the area under the ROC curve (AUC) of
-contrast, depth ratio and radius, overall and by radius; the share found by contrast; and the run's own detections,
-evaluated with each selection. A crater is found if a detection with at least the run's threshold overlaps it by IoU
+contrast, depth ratio and radius, overall and by radius; the fraction found by contrast; and the metrics of the run's
+detections with each selection. A crater is found if a detection with at least the run's threshold overlaps it by IoU
 0.5, highest scores first. Writes runs/bench/contrast.json, and with --picture FRAME_ID contrast.jpg, an enlarged frame,
 plain and coloured by contrast.
 """
@@ -42,9 +42,10 @@ _SCALE = 4
 
 
 def auc(values: Array, found: NDArray[np.bool_]) -> float | None:
-    """Share of pairs of a found and a missed crater in which the found one has the larger value; a tie counts half.
+    """Area under the ROC curve of values (N,) for `found` (N,).
 
-    None if there are no such pairs.
+    It is the fraction of pairs of a found and a missed crater in which the found one has the larger value. A tie counts
+    half. None if there are no such pairs.
     """
     rank = pd.Series(values).rank().to_numpy()
     n, m = int(found.sum()), int((~found).sum())
@@ -69,7 +70,7 @@ def found_by(labels: pd.DataFrame, detections: dict[str, Detections], threshold:
 
 
 def measure(dataset: Dataset, detections: dict[str, Detections], threshold: float) -> dict:
-    """The figures of contrast.json."""
+    """AUC and fraction found, for contrast.json."""
     labels = read_labels(dataset, _BOX, "test")
     labels = labels[selected(labels, SELECTIONS["visible"].model_copy(update={"min_contrast": None}))]
     labels = labels.reset_index(drop=True)
@@ -132,7 +133,7 @@ def main(
     picture: Annotated[str, typer.Option(help="frame_id to draw.")] = "",
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Compare the labels' contrast with what a detector found."""
+    """Compare the labels' contrast with the craters that a detector found."""
     opened = open_dataset(dataset)
     table = pq.read_table(run / "detections.parquet").to_pandas().sort_values("score", ascending=False, kind="stable")
     detections = {

@@ -1,8 +1,8 @@
 """Inference time per image of 256 x 256 pixels for every engine, on two cores.
 
-Two cores stand for a flight computer of that size. Measures networks of full and half width, without and with
-attention, of both strides, with random weights (which do not affect the speed), or the network of a run. Every engine
-is warmed up, then all are called in turn, so that other load on the machine affects all equally. Writes
+Two cores represent a flight computer. Measures networks of full and half width, without and with attention, with both
+sets of strides, with random weights (which do not affect the speed), or the network of a run. Every engine is warmed
+up, then all are called in turn, so that other load on the machine affects all equally. Writes
 runs/bench/infer.json.
 """
 

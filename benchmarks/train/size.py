@@ -40,14 +40,14 @@ def point(root: Path) -> dict[str, Any]:
 
 
 def draw(points: list[dict[str, Any]], path: Path) -> None:
-    """Plot AP (the paper's sum) against multiply-adds; distilled runs have their own line."""
+    """Plot AP (the paper's sum) against multiply-adds; distilled runs have their own markers."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    for distilled, marker, words in ((False, "o", "from labels alone"), (True, "s", "with a teacher")):
+    for distilled, marker, words in ((False, "o", "labels only"), (True, "s", "with a teacher")):
         some = sorted((p for p in points if p["distilled"] == distilled), key=lambda p: p["multiply_adds"])
         if not some:
             continue

@@ -37,14 +37,14 @@ from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
 from perilune_train.training.fit import fit
 
-_UNCOUNTED = 3
+_WARM_UP_STEPS = 3
 
 
 class Clock(Callback):
     """Measures the time of the counted steps in seconds."""
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        if batch_idx == _UNCOUNTED - 1:
+        if batch_idx == _WARM_UP_STEPS - 1:
             self.start = time.perf_counter()
         self.seconds = time.perf_counter() - getattr(self, "start", 0.0)
 
@@ -61,17 +61,19 @@ class Timed(DetectTask):
     def train_dataloader(self):
         if self.batches is None:
             return super().train_dataloader()
-        # A DataLoader returns the batches unchanged. Lightning would treat a bare list as several loaders.
+        # A DataLoader returns the batches unchanged. Lightning would treat a plain list as several loaders.
         return DataLoader(self.batches, batch_size=None, collate_fn=lambda batch: batch)  # type: ignore[arg-type]
 
 
-def few(split: DetectSplit, count: int) -> DetectSplit:
+def first_frames(split: DetectSplit, count: int) -> DetectSplit:
     """The first `count` frames of a split."""
     frames = replace(split.frames, table=split.frames.table.iloc[:count], images=split.frames.images[:count])
     return replace(split, frames=frames, labels=split.labels[:count])
 
 
-def trained(network: YOLOv3, config: DetectConfig, train: DetectSplit, val: DetectSplit, batches: list | None) -> float:
+def seconds_of_fit(
+    network: YOLOv3, config: DetectConfig, train: DetectSplit, val: DetectSplit, batches: list | None
+) -> float:
     """Time in seconds of the counted steps of an epoch of `fit`."""
     task = Timed(copy.deepcopy(network), config, train, val, 0)
     task.batches = batches
@@ -81,13 +83,13 @@ def trained(network: YOLOv3, config: DetectConfig, train: DetectSplit, val: Dete
     return task.clock.seconds
 
 
-def bare(network: YOLOv3, config: DetectConfig, batches: list, device: str, bf16: bool) -> float:
+def seconds_of_bare_loop(network: YOLOv3, config: DetectConfig, batches: list, device: str, bf16: bool) -> float:
     """Time in seconds of the counted steps of the bare loop."""
     network = copy.deepcopy(network).to(device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, fused=True)
     start = 0.0
     for step, (images, targets) in enumerate(batches):
-        if step == _UNCOUNTED:
+        if step == _WARM_UP_STEPS:
             start = time.perf_counter()
         with torch.autocast(device, torch.bfloat16, enabled=bf16):
             outputs = network(images.to(device))
@@ -120,28 +122,28 @@ def main(
     device = runs.choose_device(config.device)
     bf16 = runs.choose_bf16(config.precision, device)
     whole = load_split(open_dataset(dataset), "val", config.labels)
-    train, val = few(whole, steps * config.batch_size), few(whole, config.batch_size)
+    train, val = first_frames(whole, steps * config.batch_size), first_frames(whole, config.batch_size)
     steps = len(train) // config.batch_size
-    train = few(train, steps * config.batch_size)
+    train = first_frames(train, steps * config.batch_size)
     network = build_network(config, label_sizes(train), dataset)
     batches = list(loader(TrainingFrames(train, config.augment, config.seed, 0), config))
     seconds: dict[str, list[float]] = {"ours": [], "memory": [], "bare": []}
     for _ in range(turns):
-        seconds["ours"].append(trained(network, config, train, val, None))
-        seconds["memory"].append(trained(network, config, train, val, batches))
-        seconds["bare"].append(bare(network, config, batches, device, bf16))
+        seconds["ours"].append(seconds_of_fit(network, config, train, val, None))
+        seconds["memory"].append(seconds_of_fit(network, config, train, val, batches))
+        seconds["bare"].append(seconds_of_bare_loop(network, config, batches, device, bf16))
     # Ratios of neighbouring turns, since the machine's speed changes over time.
     ratios = {
         name: [other / own for own, other in zip(seconds["ours"], seconds[name], strict=True)]
         for name in ("memory", "bare")
     }
     result = {
-        "images_per_s": (steps - _UNCOUNTED) * config.batch_size / statistics.median(seconds["ours"]),
+        "images_per_s": (steps - _WARM_UP_STEPS) * config.batch_size / statistics.median(seconds["ours"]),
         "ratio_to_memory": statistics.median(ratios["memory"]),
         "ratio_to_bare": statistics.median(ratios["bare"]),
         "seconds": seconds,
         "preset": preset,
-        "steps": steps - _UNCOUNTED,
+        "steps": steps - _WARM_UP_STEPS,
         "batch_size": config.batch_size,
         "threads": torch.get_num_threads(),
         "device": device,

@@ -1,4 +1,4 @@
-"""Compare four ways to start from a pretrained, frozen backbone, on features and loss.
+"""Compare features and loss of four ways to start from a pretrained, frozen backbone.
 
 A plain detector (no attention) is trained from scratch. Its backbone then initialises networks with attention. The
 backbone weights stay frozen while gates, neck and heads are trained. Neck and heads start at random, as from
@@ -45,7 +45,7 @@ _LAST = 20
 
 
 def batches(split: DetectSplit, config: DetectConfig) -> Iterator[Batch]:
-    """Training batches in an endless sequence."""
+    """Training batches of one epoch after another, without end."""
     epoch = 0
     while True:
         yield from loader(TrainingFrames(split, config.augment, config.seed, epoch), config)
@@ -62,7 +62,7 @@ def loss_of(network: YOLOv3, batch: Batch, config: DetectConfig) -> Tensor:
 
 
 def train(network: YOLOv3, split: DetectSplit, config: DetectConfig, steps: int) -> list[float]:
-    """The loss of each step; the network's parameters and modules keep their modes."""
+    """Train for a number of steps; returns the losses. What is frozen or in evaluation mode stays so."""
     learnt = [p for p in network.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(learnt, lr=config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: learning_rate_factor(s, 20, steps))
@@ -93,7 +93,7 @@ def recalibrate(network: YOLOv3, split: DetectSplit, config: DetectConfig) -> No
 
 
 @torch.no_grad()
-def likeness(network: YOLOv3, plain: YOLOv3, images: Tensor) -> dict[str, list[float]]:
+def similarity(network: YOLOv3, plain: YOLOv3, images: Tensor) -> dict[str, list[float]]:
     """Cosine of the features to those of the plain backbone and ratio of their RMS, for each stage."""
     expected = plain.backbone(images)
     kept = {key: value.clone() for key, value in network.state_dict().items()}
@@ -107,7 +107,7 @@ def likeness(network: YOLOv3, plain: YOLOv3, images: Tensor) -> dict[str, list[f
 
 
 def compare(train_split: DetectSplit, val_split: DetectSplit, config: DetectConfig, steps: int, before: int) -> dict:
-    """Figures of every choice, all starting from the same plain detector."""
+    """Features and losses of every choice; all start from the same plain detector."""
     sizes = label_sizes(train_split)
     plain = build_network(config.model_copy(update={"attention": "none"}), sizes, Path())
     train(plain.train(), train_split, config, before)
@@ -125,7 +125,7 @@ def compare(train_split: DetectSplit, val_split: DetectSplit, config: DetectConf
         for part in parts:
             part.requires_grad_(False)
             part.train(choice == "adapt")
-        similar = likeness(network, plain, val[0][0])
+        similar = similarity(network, plain, val[0][0])
         losses = train(network, train_split, config, steps)
         network.eval()
         with torch.no_grad():
@@ -139,7 +139,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dataset", type=Path, required=True)
     parser.add_argument("--width", type=float, default=0.25)
-    parser.add_argument("--steps", type=int, default=200, help="with the frozen backbone")
+    parser.add_argument("--steps", type=int, default=200, help="steps with the frozen backbone")
     parser.add_argument("--before", type=int, default=400, help="steps of the plain detector")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("runs/bench/transfer.json"))

@@ -1,3 +1,3 @@
-"""Crater detection, landing navigation and their explanation, learned from perilune manifests alone."""
+"""Training and evaluation of networks for crater detection and landing navigation on perilune datasets."""
 
 __version__ = "0.1.0"

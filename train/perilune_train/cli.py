@@ -1,4 +1,4 @@
-"""`perilune-train`: train the detector and the navigators, and explain them."""
+"""`perilune-train`: train and evaluate the detector and the navigators, and compute their attention masks."""
 
 from typing import Annotated
 
@@ -17,7 +17,7 @@ from perilune_train.navigate.config import NavigateConfig
 
 SECTIONS: dict[str, type[Section]] = {"detect": DetectConfig, "navigate": NavigateConfig, "explain": ExplainConfig}
 app = typer.Typer(
-    help="Crater detection, landing navigation and their explanation, from perilune datasets (see `perilune-render`).",
+    help="Train networks for crater detection and landing navigation on perilune datasets; draw attention masks.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
@@ -33,10 +33,10 @@ def config(
     config: ConfigFile = None,
     settings: Settings = None,
     show: Annotated[
-        bool, typer.Option("--show/--plain", help="With meaning, unit and default; or values alone.")
+        bool, typer.Option("--show/--plain", help="Each setting with meaning, unit and default; or the values only.")
     ] = True,
 ) -> None:
-    """Print every setting of detection, navigation and explanation as a configuration file to start from."""
+    """Print all settings of detection, navigation and explanation as a configuration file to edit."""
     for section, model in SECTIONS.items():
         resolved = resolve(model, section, "perilune_train", preset, config, tuple(settings or ()))
         typer.echo(annotated_yaml(section, resolved) if show else to_yaml(section, resolved), nl=False)

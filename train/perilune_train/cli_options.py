@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-Preset = Annotated[str, typer.Option(help="tiny, small, paper or large: the settings to start from.")]
+Preset = Annotated[str, typer.Option(help="Preset with the values of all settings: tiny, small, paper or large.")]
 ConfigFile = Annotated[
     Path | None, typer.Option(help="YAML file whose section (detect, navigate or explain) overrides the preset.")
 ]
@@ -24,6 +24,6 @@ AllowOverlap = Annotated[
     bool,
     typer.Option(
         "--allow-overlap",
-        help="Allow test terrain that the network was trained on; marks every figure and picture.",
+        help="Allow test terrain that the network was trained on; all output is then marked.",
     ),
 ]

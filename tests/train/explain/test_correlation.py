@@ -39,7 +39,7 @@ def test_pcc2_leaves_out_the_image_itself_and_the_undefined():
     a = np.array([[0.0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [2, 2, 2, 2]])
     between = correlation.pearson_between(a)
     np.testing.assert_allclose(between[:3, :3], [[1, -1, 1], [-1, 1, -1], [1, -1, 1]], atol=1e-12)
-    value, undefined = correlation.mean_of_others(between)
+    value, undefined = correlation.mean_between(between)
     assert value == pytest.approx(-1 / 3)  # (-1, 1, -1, -1, 1, -1) / 6
     assert undefined == 6
     value, undefined = correlation.mean_defined([np.nan, np.nan])

@@ -94,7 +94,7 @@ def test_a_run_correlates_every_block(checkpoints, dataset_detect, dataset_nav, 
     # The same again leaves it alone; other settings or another checkpoint are refused.
     before = {path: path.stat().st_mtime_ns for path in run.root.rglob("*")}
     _explain(checkpoints, dataset_detect, dataset_nav, tmp_path)
-    with pytest.raises(UserError, match=r"explain.n_drawn: got 1, expected 2, with which the run began; --overwrite"):
+    with pytest.raises(UserError, match=r"explain.n_drawn: got 1, expected 2, as in the existing run; --overwrite"):
         _explain(checkpoints, dataset_detect, dataset_nav, tmp_path, n_drawn=1)
     with pytest.raises(UserError, match=r"inputs.json: detector: got SHA-256 .*--overwrite"):
         _explain((checkpoints[1], checkpoints[1]), dataset_detect, dataset_nav, tmp_path)

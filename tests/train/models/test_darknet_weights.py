@@ -98,10 +98,10 @@ def test_headers_are_kept_byte_for_byte(tmp_path, backbone, values, name):
 @pytest.mark.parametrize(
     ("size", "found"),
     [
-        (0, "0 bytes: no whole header"),
-        (11, "11 bytes: no whole header"),
-        (15, "15 bytes: no whole header"),
-        (19, "19 bytes: no whole header"),
+        (0, "0 bytes: an incomplete header"),
+        (11, "11 bytes: an incomplete header"),
+        (15, "15 bytes: an incomplete header"),
+        (19, "19 bytes: an incomplete header"),
         (20, "20 bytes: a header and 0 floats"),
         (-1, "floats and 3 bytes"),
         (-4, "floats"),

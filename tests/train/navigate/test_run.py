@@ -126,7 +126,7 @@ def test_finished_runs_are_left_as_they_are(runs, dataset_nav, dataset_detect, d
     assert " ".join(capsys.readouterr().err.split()).count("finished, left unchanged") == 2
     with pytest.raises(UserError, match=r"tiny-stack.*inputs.json: dataset: got SHA-256 .*--overwrite"):
         navigate_run(_settings(), dataset_detect, runs.parent, "tiny", detector)
-    with pytest.raises(UserError, match=r"navigate.kappa: got 2.0, expected 1.0, with which the run began"):
+    with pytest.raises(UserError, match=r"navigate.kappa: got 2.0, expected 1.0, as in the existing run"):
         navigate_run(_settings(kappa=2.0), dataset_nav, runs.parent, "tiny", detector)
     assert files() == before
 

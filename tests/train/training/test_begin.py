@@ -55,11 +55,11 @@ def test_the_same_command_resumes_and_needs_the_same_settings_and_dataset(tmp_pa
     (run.root / "checkpoints").mkdir()
     run.last.write_text("state")
     assert begin(tmp_path, Settings())[1] == "resume" and run.last.exists()
-    with pytest.raises(UserError, match=r"config.yaml: detect.rate: got 0.2, expected 0.1, with which the run began"):
+    with pytest.raises(UserError, match=r"config.yaml: detect.rate: got 0.2, expected 0.1, as in the existing run"):
         begin(tmp_path, Settings(rate=0.2))
-    with pytest.raises(UserError, match=r"inputs.json: dataset: got SHA-256 2, expected 1, with which the run began"):
+    with pytest.raises(UserError, match=r"inputs.json: dataset: got SHA-256 2, expected 1, as in the existing run"):
         begin(tmp_path, Settings(), dataset="2")
-    with pytest.raises(UserError, match=r"inputs.json: dataset: got nothing, expected 1, with which the run began"):
+    with pytest.raises(UserError, match=r"inputs.json: dataset: got nothing, expected 1, as in the existing run"):
         begin(tmp_path, Settings(), dataset=None)
     run.inputs.write_text('{"dataset": null}')
     with pytest.raises(UserError, match=r"inputs.json: dataset: got SHA-256 1, expected nothing, with which the run"):

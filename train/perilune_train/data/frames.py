@@ -16,8 +16,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.png import png_header
 from perilune_shared.terminal import progress_bar
 
-_AT_ONCE = 256
-"""Number of compressed frames that may wait for a free thread."""
+_PORTION = 256
+"""Number of compressed frames in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,10 @@ class FrameStore:
 
 
 def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int | None = None) -> NDArray[np.uint8]:
-    """Decode a PNG's bytes to a frame (height, width), 8-bit grey; of a 16-bit PNG the upper eight bits.
+    """Decode a PNG to a frame (height, width), 8-bit grey; a 16-bit PNG gives its upper eight bits.
 
-    Raises UserError if it is not `size_bytes` long as in the manifest, is no grey PNG, or has another size in pixels
-    (checked before it is unpacked).
+    Raises UserError if the PNG does not have `size_bytes` bytes as in the manifest, is not grey, has another size in
+    pixels (checked before decoding), or cannot be decoded.
     """
     # A decoder may fill the missing rows of a truncated file silently, so check the length.
     if size_bytes is not None and len(png) != size_bytes:
@@ -50,12 +50,15 @@ def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int
         raise UserError(name, "size", f"{header.width_px} x {header.height_px}", f"{width_px} x {height_px} pixels")
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if image is None:
-        raise UserError(name, "frame", "a file that does not decode", "a grey PNG")
+        raise UserError(name, "frame", "a file that cannot be decoded", "a grey PNG")
     return (image >> 8 if image.dtype == np.uint16 else image).astype(np.uint8, copy=False)
 
 
 def load_frames(dataset: Dataset, split: str) -> FrameStore:
-    """Load all frames of a split, 64 kB each at 256 x 256. Raises UserError on none, too many or a bad one."""
+    """Load all frames of a split, 64 kB each at 256 x 256 px.
+
+    Raises UserError if there are none, if they do not fit into memory, or if one is invalid.
+    """
     rows = dataset.table("frames", split=split)
     table = rows.to_pandas()
     if table.empty:
@@ -67,26 +70,26 @@ def load_frames(dataset: Dataset, split: str) -> FrameStore:
         found = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
         raise UserError(dataset.root, "frames", found, f"{split} frames that fit into this machine's memory")
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
-    place = {frame_id: i for i, frame_id in enumerate(table["frame_id"])}
+    row_of = {frame_id: i for i, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()
 
     def unpack(frame: tuple[str, bytes]) -> None:
-        i = place[frame[0]]
+        i = row_of[frame[0]]
         images[i] = decode(frame[1], f"{dataset.root}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
 
-    # OpenCV releases Python's lock while it decodes.
+    # OpenCV releases Python's global interpreter lock while it decodes.
     with progress_bar() as progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as threads:
         task = progress.add_task(f"load {split}", total=len(table), unit="frames", note="")
-        for some in _portions(dataset.pngs(rows), _AT_ONCE):
-            for _ in threads.map(unpack, some):
+        for portion in _portions(dataset.pngs(rows), _PORTION):
+            for _ in threads.map(unpack, portion):
                 progress.advance(task)
     return FrameStore(table, images)
 
 
 def _portions(frames: Iterable[tuple[str, bytes]], size: int) -> Iterator[list[tuple[str, bytes]]]:
     rest = iter(frames)
-    while some := list(islice(rest, size)):
-        yield some
+    while portion := list(islice(rest, size)):
+        yield portion
 
 
 def normalised(images: NDArray) -> NDArray[np.float32]:

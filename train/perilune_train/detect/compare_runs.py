@@ -84,7 +84,7 @@ def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, 
         return "real images", ""
     status, mark = metrics.get("terrain/status"), metrics.get("terrain/mark")
     if status == "overlap" and not allow_overlap:
-        expected = "an evaluation on other terrain; --allow-overlap allows it and marks all figures"
+        expected = "an evaluation on other terrain; --allow-overlap accepts it and marks all output"
         raise UserError(folder / METRICS_FILE, "terrain/mark", mark, expected)
     known = status in get_args(Status) and isinstance(mark, str)
     return (str(status), str(mark)) if known else ("unknown", TerrainCheck("unknown").mark)

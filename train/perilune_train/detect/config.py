@@ -16,7 +16,7 @@ COARSEST_STRIDE = 32
 class LabelSettings(Selection):
     """Selection of the craters to find. All other labels are ignored: neither ground truth nor false positives.
 
-    A selection's name sets all thresholds; thresholds given beside it override it. A run stores the resolved values.
+    The name of a selection sets all thresholds; thresholds that are also given override it. A run stores all values.
     """
 
     selection: str = "visible"
@@ -52,7 +52,7 @@ class AugmentSettings(Section):
     flips_and_turns: bool = True
     """Apply one of the eight flips and quarter turns of a square frame, each equally likely."""
     scale: tuple[Annotated[float, Field(ge=0.25, le=4)], Annotated[float, Field(ge=0.25, le=4)]] = (1.0, 1.0)
-    """Least and largest zoom factor of a frame; its logarithm is uniform."""
+    """Smallest and largest zoom factor of a frame; its logarithm is uniform."""
     gain: Fraction = 0.3
     """Largest change of brightness: the factor is between 1 / (1 + gain) and 1 + gain, uniform in logarithm."""
     gamma: Fraction = 0.3
@@ -97,14 +97,14 @@ class EvaluationSettings(Section):
     """Factors by which frames are resized before inference; detections at all scales are merged. 1 with 2 finds more of
     the smallest craters at five times the cost. Validation during training uses scale 1 only."""
     match_iou: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    """Least IoU of a detection with the label that it matches."""
+    """Minimum IoU of a detection and a label for a match."""
     nms_iou: Annotated[float, Field(gt=0, lt=1)] = 0.45
     """Of two detections with a larger IoU, non-maximum suppression removes the one with the lower score."""
     min_score: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Detections below this score are dropped first. The precision-recall curve ends at this score."""
     max_aspect: Annotated[float, Field(gt=1)] | None = None
-    """Largest ratio of a box's longer to its shorter side; others are dropped before suppression. A box around two
-    craters is longer than a crater seen from above. None keeps all."""
+    """Largest ratio of a box's longer to its shorter side; longer boxes are dropped before suppression. A box around
+    two craters is longer than a crater seen from above. None keeps all."""
     max_detections: Count = 2000
     """Largest number of detections in a frame; the usual 100 would truncate crowded frames."""
     min_precision: Annotated[float, Field(gt=0, lt=1)] | None = None
@@ -128,8 +128,8 @@ class DetectConfig(Section):
     epochs: Count = 20
     """Passes over the training frames."""
     frozen_epochs: Annotated[int, Field(ge=0)] = 0
-    """First epochs, in which the backbone is frozen except its attention gates. Used only with `init_from`: freezing
-    random weights does not help, so without it training starts unfrozen."""
+    """Number of first epochs in which the backbone is frozen except its attention gates. Used only with `init_from`:
+    freezing random weights does not help, so without it training starts unfrozen."""
     init_from: str | None = None
     """Weights to start from. best.ckpt of a detect run of equal width and in_channels: all weights if the strides are
     equal, else the backbone. Or a Darknet file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads

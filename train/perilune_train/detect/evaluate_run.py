@@ -44,7 +44,9 @@ def evaluate_again(
     folder = out or run / "evaluation"
     check_output(folder, run)
     chosen = chosen_threshold(run) if threshold is None else threshold
-    chosen_on = "of the run, chosen on its validation split" if threshold is None else "given on the command line"
+    threshold_source = (
+        "of the run, chosen on its validation split" if threshold is None else "given on the command line"
+    )
     known = read_metrics(run).get("dataset/name")
     dataset = open_dataset(dataset_root)
     best = runs.RunFolder(run).best
@@ -63,12 +65,12 @@ def evaluate_again(
         val = load_split(dataset, "val", config.labels)
         seen, _ = detect_split(detector, val, "val")
         points = curve(match_detections(val, seen, config))
-        chosen, chosen_as = points.operating_threshold(config.evaluation.min_precision)
-        chosen_on = f"{chosen_as} on the dataset's val"
+        chosen, rule = points.operating_threshold(config.evaluation.min_precision)
+        threshold_source = f"{rule} on the dataset's val"
     found, rate = detect_split(detector, frames, split)
     evaluation = evaluate_split(frames, found, config, chosen)
     write_detections(folder / "detections.parquet", frames, found)
-    about = report_head(dataset, split, config, protocol, run.resolve().name, chosen_on)
+    about = report_head(dataset, split, config, protocol, run.resolve().name, threshold_source)
     write_evaluation(folder, evaluation, list(frames.frames.images), about)
     metrics = (
         selection_entries(config, frames) | dataset_entries(dataset, split, config) | {"dataset/protocol": protocol}

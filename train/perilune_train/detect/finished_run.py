@@ -1,4 +1,4 @@
-"""What the folder of a finished detect run says: settings and threshold."""
+"""Settings and threshold of a finished detect run, read from its folder."""
 
 import math
 from pathlib import Path

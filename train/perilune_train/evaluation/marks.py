@@ -1,4 +1,4 @@
-"""Visible marks on the output of an evaluation on terrain that the network was fitted to."""
+"""Visible marks on the output of an evaluation on terrain that the network was trained, selected or calibrated on."""
 
 import textwrap
 from collections.abc import Iterable
@@ -44,7 +44,7 @@ def mark_picture(path: Path, mark: str) -> None:
     """Put `mark` in white on a red band above a PNG. Raises OSError if it cannot be read or written."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
-        raise OSError(f"{path}: not read")
+        raise OSError(f"{path}: cannot be read")
     width = image.shape[1]
     lines = textwrap.wrap(mark, max(width // _CHARACTER_PX - 1, 8))
     band = np.full((_LINE_PX * len(lines) + 8, width, 3), _RED, np.uint8)
@@ -54,7 +54,7 @@ def mark_picture(path: Path, mark: str) -> None:
 
 
 def marked_page(text: str, mark: str) -> str:
-    """Add the mark below a Markdown page's first heading, and its first words to every other heading."""
+    """Add the mark below the title of a Markdown page, and the mark's first words to the heading of each section."""
     short = mark.split(":")[0].split(",")[0]
     lines: list[str] = []
     for line in text.split("\n"):

@@ -15,7 +15,7 @@ Metrics = dict[str, float | int | str | None]
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None]) -> None:
-    """Write metrics.json; values that are not finite become null. Adds the record of the run (run/...)."""
+    """Write metrics.json; values that are not finite become null. Adds commit, versions and hardware (run/...)."""
     # Imported here, so that reading metrics does not need torch.
     import torch
 
@@ -28,7 +28,7 @@ def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None])
 
 
 def read_metrics(folder: Path) -> Metrics:
-    """Read metrics.json of a run or of an evaluation. Raises UserError if it is missing or no flat table."""
+    """Read metrics.json of a run or of an evaluation. Raises UserError if it is missing or not a flat JSON object."""
     path = folder / METRICS_FILE
     if not path.is_file():
         expected = "the metrics of a finished run; resume it with the command that started it"
@@ -39,5 +39,5 @@ def read_metrics(folder: Path) -> Metrics:
         raise UserError(path, "metrics", error, "JSON") from None
     plain = (float, int, str, type(None))
     if not isinstance(content, dict) or not all(isinstance(value, plain) for value in content.values()):
-        raise UserError(path, "metrics", "another structure", "flat keys with numbers and text")
+        raise UserError(path, "metrics", "another structure", "a flat JSON object of numbers and texts")
     return content

@@ -19,5 +19,5 @@ def save_image(path: Path, image: NDArray) -> None:
     """Write an image, grey (height, width) or blue, green, red (height, width, 3), in the format of the suffix."""
     encoded, content = cv2.imencode(path.suffix, image)
     if not encoded:
-        raise OSError(f"{path}: not written")
+        raise OSError(f"{path}: cannot be written")
     write_bytes(path, content.tobytes())

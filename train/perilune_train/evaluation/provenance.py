@@ -1,9 +1,9 @@
 """Which terrain a network was fitted to, and whether a test split shares it.
 
-Every checkpoint carries a record of the terrain that the network was trained, selected or calibrated on, by content
-hash (`perilune_shared.content`), and of the terrain of the networks it starts or learns from. A test result on such
-terrain measures memory, not generalisation. The trainer therefore refuses it, unless the dataset's own protocol shares
-terrain or the user allows it. If the user allows it, all output is marked.
+Every checkpoint has a record of the terrain that the network was trained, selected or calibrated on, by content hash
+(`perilune_shared.content`). The record includes the terrain of the network's parents: the network that gave the initial
+weights, and the teacher. A test on such terrain measures memorisation, not generalisation. It raises an error, unless
+the splits of the dataset share terrain by protocol or the user allows it. If the user allows it, all output is marked.
 """
 
 import re
@@ -24,10 +24,11 @@ RECORD = "terrain"
 Use = Literal["trained", "selected", "calibrated", "tested"]
 Status = Literal["disjoint", "by protocol", "overlap", "unknown"]
 _USE_OF_SPLIT: dict[str, Use] = {"train": "trained", "val": "selected", "test": "tested"}
-_MOST_USES = 1_000_000
-_MOST_NAMED = 4
+_MAX_USES = 1_000_000
+_MAX_NAMED = 4
 _SHA256 = re.compile(r"[0-9a-f]{64}")
-_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}")
+_NAME_EXPECTED = "at most 200 letters, digits, spaces and ._+,:()/-"
 _PROTOCOLS = {
     "scene": "held-out scenes",
     "trajectory": "held-out descents, shared terrain",
@@ -48,20 +49,20 @@ class TerrainUse:
     sha256: str
     """Content hash of the terrain, see `terrain_of`."""
     group: str
-    """Name shared by datasets that share terrain by their protocol; otherwise the dataset's name."""
+    """Name of the group of datasets that share terrain by protocol; otherwise the dataset's name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """All terrain that a network was fitted to."""
+    """All terrain that a network was fitted to: trained, selected or calibrated on."""
 
     uses: frozenset[TerrainUse] = frozenset()
     """Also the test scenes of its own dataset (`tested`), which later calibration must avoid."""
     known: bool = True
-    """False where a network that it starts or learns from has no record."""
+    """False if a parent has no record."""
 
     def joined(self, parents: Iterable["Provenance"]) -> "Provenance":
-        """This record joined with those of the networks that it starts or learns from, without their test terrain."""
+        """This record together with those of the parents, without the parents' test terrain."""
         parents = list(parents)
         inherited = {use for parent in parents for use in parent.uses if use.use != "tested"}
         return Provenance(self.uses | inherited, self.known and all(parent.known for parent in parents))
@@ -83,14 +84,14 @@ def read_provenance(content: Mapping[str, Any], path: Path) -> Provenance:
     if not isinstance(record, dict) or set(record) != {"known", "uses"} or not isinstance(record["known"], bool):
         raise UserError(path, RECORD, type(record).__name__, expected)
     rows = record["uses"]
-    if not isinstance(rows, list) or len(rows) > _MOST_USES:
+    if not isinstance(rows, list) or len(rows) > _MAX_USES:
         raise UserError(path, f"{RECORD}.uses", type(rows).__name__, expected)
     for number, row in enumerate(rows):
-        sound = isinstance(row, list) and len(row) == 5 and all(isinstance(cell, str) for cell in row)
-        if not sound or row[2] not in get_args(Use) or not _SHA256.fullmatch(row[3]):
+        valid = isinstance(row, list) and len(row) == 5 and all(isinstance(cell, str) for cell in row)
+        if not valid or row[2] not in get_args(Use) or not _SHA256.fullmatch(row[3]):
             raise UserError(path, f"{RECORD}.uses.{number}", "a malformed row", expected)
-        if not all(_PLAIN.fullmatch(row[k]) for k in (0, 1, 4)):
-            raise UserError(path, f"{RECORD}.uses.{number}", "special characters", "plain names of dataset and scene")
+        if not all(_NAME.fullmatch(row[k]) for k in (0, 1, 4)):
+            raise UserError(path, f"{RECORD}.uses.{number}", "an invalid name", _NAME_EXPECTED)
     return Provenance(frozenset(TerrainUse(*row) for row in rows), record["known"])
 
 
@@ -99,8 +100,8 @@ def split_terrain(dataset: Dataset, split: str, use: Use) -> frozenset[TerrainUs
     scene_ids = set(dataset.table("frames", ["scene_id"], split=split)["scene_id"].to_pylist())
     rows = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pylist()
     for row in rows:
-        if not _PLAIN.fullmatch(row["scene_id"]):
-            raise UserError(dataset.root, "scene_id", repr(row["scene_id"]), "letters, digits and plain marks")
+        if not _NAME.fullmatch(row["scene_id"]):
+            raise UserError(dataset.root, "scene_id", repr(row["scene_id"]), _NAME_EXPECTED)
     name, group = dataset.info.name, _group(dataset.info)
     return frozenset(
         TerrainUse(name, row["scene_id"], use, terrain_of(row["dem_source"], row["content_sha256"]), group)
@@ -117,7 +118,7 @@ def training_provenance(dataset: Dataset) -> Provenance:
 def _group(info: DatasetInfo) -> str:
     """Name of a dataset's group.
 
-    The datasets of a configuration with `shared_terrain` are one landing area, as in the paper.
+    All datasets rendered from one configuration with `shared_terrain` are one group, the landing area of the paper.
     """
     names = {
         str(recipe.config.get("name")) if recipe.config.get("shared_terrain") is True else ""
@@ -125,7 +126,7 @@ def _group(info: DatasetInfo) -> str:
     }
     (name,) = names if len(names) == 1 else ("",)
     # Recipes are untrusted input: ignore a name that a record cannot hold.
-    return f"landing area of {name}" if name and _PLAIN.fullmatch(f"landing area of {name}") else info.name
+    return f"landing area of {name}" if name and _NAME.fullmatch(f"landing area of {name}") else info.name
 
 
 def protocol_of(info: DatasetInfo) -> str:
@@ -160,11 +161,11 @@ def check_terrain(
 ) -> TerrainCheck:
     """Compare a record with the terrain of a split.
 
-    Terrain shared by splits of the same dataset is by design if its protocol splits by frame or trajectory. Raises
-    UserError naming the scenes of any other overlap with a test split, unless `allow_overlap`.
+    A dataset that is split by frame or trajectory shares terrain between its splits by design. Raises UserError naming
+    the scenes of any other overlap with a test split, unless `allow_overlap`.
     """
     fitted = frozenset(use for use in provenance.uses if use.use != "tested")
-    # Evaluating training or validation frames is no overlap: the report names the split.
+    # Training and validation frames are evaluated on purpose: the report names the split.
     by_design = dataset.info.split_by != "scene" or split != "test"
     tested = split_terrain(dataset, split, "tested")
     return _compared(fitted, tested, dataset, by_design, provenance.known, allow_overlap or split != "test")
@@ -190,7 +191,7 @@ def _compared(
     known: bool,
     allow_overlap: bool,
 ) -> TerrainCheck:
-    """Check two sets of terrain for overlap; `by_design`: scenes of one protocol may be in both."""
+    """Check two sets of terrain for overlap; `by_design`: scenes of one group may be in both."""
     used: dict[str, list[TerrainUse]] = {}
     for use in sorted(fitted):
         used.setdefault(use.sha256, []).append(use)
@@ -202,10 +203,10 @@ def _compared(
             else:
                 overlapping.append(f"{scene.dataset}/{scene.scene_id} = {use.dataset}/{use.scene_id} ({use.use})")
     if overlapping:
-        more = len(overlapping) - _MOST_NAMED
-        named = (*overlapping[:_MOST_NAMED], *([f"{more} more"] if more > 0 else []))
+        more = len(overlapping) - _MAX_NAMED
+        named = (*overlapping[:_MAX_NAMED], *([f"{more} more"] if more > 0 else []))
         if not allow_overlap:
-            expected = "test terrain that nothing was fitted to; --allow-overlap allows it and marks all figures"
+            expected = "terrain not used to train, select or calibrate; --allow-overlap accepts it and marks all output"
             raise UserError(dataset.root, "test terrain", ", ".join(named), expected)
         return _reported(TerrainCheck("overlap", named))
     if not known:

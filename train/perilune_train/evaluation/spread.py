@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 Interval = tuple[float, float]
-LEAST_UNITS = 5
+MIN_UNITS = 5
 RESAMPLES = 1000
 _PERCENTILES = (2.5, 97.5)
 
@@ -28,7 +28,7 @@ class Resamples:
     names: list[str]
     """Names of the units (U)."""
     of_row: Rows
-    """Unit of each row (N,); a row is a frame or a pair of frames."""
+    """Index of the unit of each row (N,); a row is a frame or a pair of frames."""
     weights: Array
     """Weight of each unit in each resample (resamples, U)."""
 
@@ -38,7 +38,7 @@ class Resamples:
         return len(self.names)
 
     def of_units(self, units: Rows) -> "Resamples":
-        """Resamples that hold one unit each, once."""
+        """One resample for each of these units, which contains the unit once."""
         return replace(self, weights=np.eye(self.count)[units])
 
     def totals(self, rows: Rows, values: Array | None = None) -> Array:
@@ -53,12 +53,12 @@ class Spread:
     unit: str
     """scene, trajectory or image."""
     interval: Interval | None
-    """95 % interval; None with fewer than LEAST_UNITS units."""
+    """95 % interval; None with fewer than MIN_UNITS units."""
     by_unit: dict[str, float] = field(default_factory=dict)
     """Value of each unit; only if there is no interval."""
 
     def text(self, value: float | None) -> str:
-        """The value with its spread, if known, three decimals; a dash if undefined."""
+        """The value, and its spread if known, with three decimals; a dash if the value is undefined."""
         if value is None or not np.isfinite(value):
             return "-"
         known = {name: one for name, one in self.by_unit.items() if np.isfinite(one)}
@@ -105,10 +105,10 @@ def draw_resamples(
 def spreads(statistics: Callable[[Resamples], dict[str, Array]], rows: Rows, resamples: Resamples) -> dict[str, Spread]:
     """The spread of each metric that `statistics` computes for every resample (R,).
 
-    `rows` are the rows that the metrics use; only units that hold one of them count.
+    `rows` are the rows that the metrics use; units without any of them are left out.
     """
     units = np.unique(resamples.of_row[rows])
-    if len(units) >= LEAST_UNITS:
+    if len(units) >= MIN_UNITS:
         drawn = statistics(resamples)
         return {name: Spread(resamples.unit, interval(values)) for name, values in drawn.items()}
     names = [resamples.names[unit] for unit in units]

@@ -24,7 +24,7 @@ NAVIGATE_TITLE = (
 
 
 def draw_bars(path: Path, table: pd.DataFrame, measures: dict[str, str], title: str) -> None:
-    """Draw bars of several measures for each block; a block without a bar was undefined in every image.
+    """Draw bars of several measures for each block; a missing bar means that the value was undefined in every image.
 
     Dots show the same measure over all pixels, for measures over part of the pixels.
     """

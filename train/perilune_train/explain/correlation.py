@@ -26,7 +26,7 @@ def pearson_between(images: NDArray[np.floating]) -> Array:
     return flat @ flat.T
 
 
-def mean_of_others(correlations: Array) -> tuple[float, int]:
+def mean_between(correlations: Array) -> tuple[float, int]:
     """PCC2: mean of the correlations (N, N) between different images, NaN left out, and the number of NaN.
 
     The paper pairs each image n with one unspecified m != n; here all m are used.
@@ -36,14 +36,14 @@ def mean_of_others(correlations: Array) -> tuple[float, int]:
 
 
 def mean_defined(values: ArrayLike) -> tuple[float, int]:
-    """Mean of the values that are not NaN (NaN if there are none), and their number."""
+    """Mean of the values that are not NaN (NaN if there are none), and the number of NaN."""
     array = np.asarray(values, np.float64)
     undefined = int(np.isnan(array).sum())
     return (float(np.nanmean(array)) if undefined < array.size else float("nan")), undefined
 
 
 def is_constant(values: ArrayLike) -> bool:
-    """Whether the root mean square deviation of the values is within rounding: 1e-6 of the largest."""
+    """Whether the standard deviation of the values is at most 1e-6 of the largest absolute value, a rounding error."""
     array = np.asarray(values, np.float64)
     return bool(np.std(array) <= 1e-6 * max(float(np.abs(array).max()), 1e-30))
 
@@ -54,8 +54,8 @@ def ground_truth_mask(
     """The paper's mask G (height, width): 0 in craters, 0.2, 0.4, 0.6, 0.8 in rings around them, 1 elsewhere.
 
     Takes centres (N, 2) and radii (N,) in pixels; the rings end at ring_factors times the radius (equation
-    "crater_width"). Where craters overlap the least value is used, which the paper leaves open. The paper's text calls
-    the craters white and the background black, which contradicts its numbers; the numbers are followed.
+    "crater_width"). Where craters overlap, the smallest value is used; the paper does not define this case. The paper's
+    text calls the craters white and the background black, which contradicts its numbers; this code uses the numbers.
     """
     mask = np.ones((height_px, width_px))
     levels = np.arange(len(ring_factors) + 1) / (len(ring_factors) + 1)
@@ -118,7 +118,7 @@ def warped_mask(mask: NDArray[np.floating], affine: Array) -> tuple[Array, NDArr
 
 
 def _standardised(values: Array) -> Array:
-    """Mean 0 and length 1, so that a product is a correlation; NaN where the values are constant."""
+    """Values (n,) shifted to mean 0 and scaled to length 1, so that a product is a correlation; NaN if constant."""
     if is_constant(values):
         return np.full_like(values, np.nan)
     centred = values - values.mean()

@@ -30,11 +30,14 @@ def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> 
     channels = next(backbone.parameters()).shape[1]
     device = next(backbone.parameters()).device
 
-    def seen(part: NDArray) -> torch.Tensor:
+    def network_input(part: NDArray) -> torch.Tensor:
         return torch.from_numpy(normalised(part))[:, None].expand(-1, channels, -1, -1).to(device)
 
     return _collected(
-        backbone, [seen(images[i : i + _BATCH]) for i in range(0, len(images), _BATCH)], images.shape[1:], where
+        backbone,
+        [network_input(images[i : i + _BATCH]) for i in range(0, len(images), _BATCH)],
+        images.shape[1:],
+        where,
     )
 
 
@@ -72,7 +75,7 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
 def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
     """Draw a PNG sheet: for each image (N, height, width) the frame, then every block's mask, then a colour bar.
 
-    All masks of the sheet share one scale, from the least to the greatest value. Below each mask is its own range, or
+    All masks of the sheet share one scale, from the smallest to the largest value. Below each mask is its own range, or
     "constant" if it does not vary.
     """
     low = min(float(found.min()) for found in masks.values())

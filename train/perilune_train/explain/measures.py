@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.geometry.frames import Array
-from perilune_train.explain.correlation import mean_defined, mean_of_others, pearson, pearson_between, warped_mask
+from perilune_train.explain.correlation import mean_between, mean_defined, pearson, pearson_between, warped_mask
 from perilune_train.explain.masks import Masks
 
 PCC1_SIGN = (
@@ -25,7 +25,7 @@ def detector_correlations(masks: Masks, truth: NDArray[np.floating]) -> list[dic
         for measure, target in (("pcc1_background", truth), ("pcc1_craterness", 1 - truth)):
             values = [pearson(mask, one) for mask, one in zip(found, target, strict=True)]
             rows.append(_row(block, measure, *mean_defined(values), len(found)))
-        rows.append(_row(block, "pcc2", *mean_of_others(pearson_between(found)), len(found) * (len(found) - 1)))
+        rows.append(_row(block, "pcc2", *mean_between(pearson_between(found)), len(found) * (len(found) - 1)))
     return rows
 
 

@@ -1,4 +1,4 @@
-"""One explanation run: masks of both networks, their correlations, bar charts."""
+"""One explain run: attention masks of both networks, their correlations, bar charts."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -48,12 +48,14 @@ def explain_run(
     overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> RunFolder:
-    """Explain two checkpoints on the test frames of two datasets into runs/explain/<name>.
+    """Compute and draw the attention masks of two networks on test frames; writes runs/explain/<name>.
 
     `detector` is checkpoints/best.ckpt in the folder of its run, whose config.yaml defines the selected craters. Leaves
-    a finished run of the same settings, datasets and checkpoints unchanged, unless `overwrite`. Raises UserError if
-    these were different, if a dataset, a checkpoint or that file is missing or of another kind, or if a network has no
-    attention or was fitted to terrain of its test frames (unless `allow_overlap`).
+    a finished run of the same settings, datasets and checkpoints unchanged; `overwrite` replaces any existing run.
+
+    Raises UserError if the existing run has other settings, datasets or checkpoints; if a dataset, a checkpoint or
+    config.yaml is missing or invalid; if a network has no attention; or if it was fitted to terrain of its test frames
+    (unless `allow_overlap`).
     """
     run = RunFolder(runs / "explain" / name)
     inputs = hashes_of(
@@ -71,10 +73,10 @@ def explain_run(
     own = config_of_run(detector.parent.parent, ())
     frames, truth, labels = detect_frames(settings, own, detect_data)
     test = [trajectory for trajectory in load_trajectories(open_dataset(nav_data)) if trajectory.split == "test"]
-    pairs = _spread([(trajectory, step) for trajectory in test for step in range(trajectory.n_pairs)], settings.n_pairs)
+    pairs = _evenly_spaced([(one, step) for one in test for step in range(one.n_pairs)], settings.n_pairs)
     start_run(run, "explain", settings, inputs, state)
     detected = detector_masks(network, frames, detector)
-    draw_masks(run.root / "masks_detect.png", *_some(frames, detected, settings.n_drawn))
+    draw_masks(run.root / "masks_detect.png", *_to_draw(frames, detected, settings.n_drawn))
     shrunk = {id(trajectory): trajectory.shrunk(architecture["size_px"]) for trajectory in test}
     sequences = [pair_sequence(shrunk[id(trajectory)], step, 1, warp=False) for trajectory, step in pairs]
     size = test[0].images.shape[1:]
@@ -85,8 +87,8 @@ def explain_run(
         (size[0], size[1]),
         navigator,
     )
-    both = np.stack([np.concatenate([d.images[step], d.images[step + 1]]) for d, step in pairs])
-    draw_masks(run.root / "masks_navigate.png", *_some(both, stacked, settings.n_drawn))
+    both = np.stack([np.concatenate([one.images[step], one.images[step + 1]]) for one, step in pairs])
+    draw_masks(run.root / "masks_navigate.png", *_to_draw(both, stacked, settings.n_drawn))
     rows = detector_correlations(detected, truth) + _navigator_rows(stacked, pairs)
     table = pd.DataFrame(rows)
     with written_aside(run.root / _TABLE) as aside:
@@ -94,10 +96,11 @@ def explain_run(
     draw_bars(run.root / "pcc_detect.png", table, DETECT_BARS, DETECT_TITLE)
     draw_bars(run.root / "pcc_navigate.png", table, NAVIGATE_BARS, NAVIGATE_TITLE)
     console.print(PCC1_SIGN, markup=False)
-    once = table[table["measure"] != "pcc1_craterness"]  # Undefined whenever pcc1_background is.
-    undefined = int(once["undefined"].sum())
+    # pcc1_craterness is undefined whenever pcc1_background is; count them once.
+    counted = table[table["measure"] != "pcc1_craterness"]
+    undefined = int(counted["undefined"].sum())
     if undefined:
-        console.print(f"{undefined} of {int(once['count'].sum())} correlations undefined: a mask was constant")
+        console.print(f"{undefined} of {int(counted['count'].sum())} correlations undefined: a mask was constant")
     metrics: Metrics = {f"{row['measure']}/{row['block']}": row["value"] for row in rows}
     metrics |= {
         f"{row['measure']}_all_pixels/{row['block']}": row["value_all_pixels"]
@@ -141,13 +144,13 @@ def detect_frames(
 ) -> tuple[np.ndarray, np.ndarray, Metrics]:
     """Test frames (N, height, width), the paper's masks G of them, float32 (N, height, width), and their selection.
 
-    G holds the craters that the detector's own run selects, so none that is hardly visible in a frame.
+    G contains only craters that the detector's own run selects, so no hardly visible ones.
     """
     dataset = open_dataset(root)
     if dataset.info.kind != "detect":
         raise UserError(root, "kind", dataset.info.kind, "detect, a dataset with labels")
     split = load_split(dataset, "test", detector.labels)
-    chosen = _spread(range(len(split)), settings.n_frames)
+    chosen = _evenly_spaced(range(len(split)), settings.n_frames)
     height, width = split.frames.images.shape[1:]
     masks = []
     for own in (split.labels[i] for i in chosen):
@@ -172,12 +175,13 @@ def _navigator_rows(masks: Masks, pairs: list[tuple[Trajectory, int]]) -> list[d
     return rows
 
 
-def _spread(items, count: int) -> list:
+def _evenly_spaced(items, count: int) -> list:
     """At most `count` items, evenly spaced."""
     items = list(items)
     return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).astype(int))]
 
 
-def _some(images: np.ndarray, masks: Masks, count: int) -> tuple[np.ndarray, Masks]:
-    chosen = _spread(range(len(images)), count)
+def _to_draw(images: np.ndarray, masks: Masks, count: int) -> tuple[np.ndarray, Masks]:
+    """At most `count` of the images (N, height, width), evenly spaced, and their masks."""
+    chosen = _evenly_spaced(range(len(images)), count)
     return images[chosen], {name: found[chosen] for name, found in masks.items()}

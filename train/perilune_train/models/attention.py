@@ -10,7 +10,7 @@ class MeanAndMax(torch.autograd.Function):
     """Mean and maximum of a tensor along one dimension, which is kept with length 1.
 
     Equal to x.mean and x.amax, but the backward pass writes the gradient once and in the layout of x, which saves an
-    eighth of a training step on a CPU. Of equal maxima the first gets the gradient.
+    eighth of a training step on a CPU. If several elements are the maximum, the first gets its gradient.
     """
 
     @staticmethod
@@ -25,7 +25,7 @@ class MeanAndMax(torch.autograd.Function):
     def backward(ctx: Any, mean_grad: Tensor, max_grad: Tensor) -> tuple[Tensor, None]:
         (where,) = ctx.saved_tensors
         share = mean_grad / ctx.shape[ctx.dim]
-        # In the memory order of x: scatter_ copies a tensor of any other order twice.
+        # Use the memory order of x, since scatter_ copies a tensor of another order twice.
         order = ctx.order
         grad = share.expand(ctx.shape).permute(order).contiguous()
         grad.scatter_(order.index(ctx.dim), where.permute(order), (share + max_grad).permute(order))
@@ -59,7 +59,7 @@ class CBAM(nn.Module):
     def channel_gate(self, x: Tensor) -> Tensor:
         """M_c (N, C, 1, 1) of features (N, C, H, W)."""
         pooled = torch.stack(MeanAndMax.apply(x.flatten(2), 2))[..., 0]
-        # W1 is linear: summing before it gives the equation's sum with one multiplication less.
+        # W1 is linear: summing before it gives the equation's sum with one matrix product less.
         logits = self.excite(torch.relu(self.squeeze(pooled)).sum(0))
         return (self.scale * torch.sigmoid(logits))[:, :, None, None]
 

@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-_LEAST_UNION = 1e-7
-"""Smaller unions, square pixels, count as this one, so that two empty boxes overlap by 0."""
+_MIN_UNION = 1e-7
+"""Lower limit of the union, square pixels, so that two empty boxes have an IoU of 0."""
 
 
 def iou(first: Tensor, second: Tensor) -> Tensor:
@@ -12,7 +12,7 @@ def iou(first: Tensor, second: Tensor) -> Tensor:
     areas = _area(first) + _area(second)
     sides = torch.minimum(first[..., 2:], second[..., 2:]) - torch.maximum(first[..., :2], second[..., :2])
     intersection = sides.clamp(min=0).prod(-1)
-    return intersection / (areas - intersection).clamp(min=_LEAST_UNION)
+    return intersection / (areas - intersection).clamp(min=_MIN_UNION)
 
 
 def _area(boxes: Tensor) -> Tensor:

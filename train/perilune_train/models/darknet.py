@@ -42,7 +42,7 @@ class ResidualUnit(nn.Module):
 
 
 class AttentionDarknet53(nn.Module):
-    """The backbone of all networks, up to `stages` of Darknet53's five.
+    """The backbone of all networks: the first `stages` of Darknet53's five stages.
 
     At width 1 with 3 input channels and 5 stages it has 52 convolutions and 40,620,640 floats in Darknet's count
     (weights, and scale, bias, mean and variance of each batch norm), without attention. Residual unit j of stage i is

@@ -1,8 +1,9 @@
 """Darknet's weight files: `darknet53.conv.74` (the backbone) and `yolov3.weights` (the whole network).
 
-A file is a header and then float32, little endian, convolution by convolution in the order of the network's cfg:
-with batch norm bias, scale, mean, variance, weights (out, in, k, k); without it bias, weights. The header is int32
-major, minor, revision, then the number of images seen: 8 bytes if major * 10 + minor >= 2 (and both < 1000), else 4.
+A file has a header and then float32 values, little endian, for each convolution in the order of the network's cfg. A
+convolution with batch norm has bias, scale, mean, variance, weights (out, in, k, k); one without has bias, weights. The
+header is int32 major, minor, revision, then the number of images seen: 8 bytes if major * 10 + minor >= 2 (and both <
+1000), else 4.
 Source: the files that Redmon & Farhadi 2018 (arXiv 1804.02767) published, as Darknet reads them.
 """
 
@@ -47,7 +48,7 @@ class Slot:
     """A place in the file, and the tensor of a network that belongs there."""
 
     name: str
-    """Number of the convolution, from 0, and which of its tensors; for messages."""
+    """Name for messages: number of the convolution, from 0, and kind of tensor."""
     tensor: Tensor
     """The network's own tensor."""
     floats: int
@@ -60,10 +61,11 @@ def backbone_slots(backbone: AttentionDarknet53) -> list[Slot]:
 
 
 def network_slots(network: YOLOv3, filters: int = _FILTERS) -> list[Slot]:
-    """All tensors of a network with strides 8, 16, 32 in the order of yolov3.cfg, its output layers `filters` wide.
+    """All tensors of a network with strides 8, 16, 32, in the order of yolov3.cfg.
 
-    The order is that of execution: the backbone, then for strides 32, 16 and 8 the branch, the head and, except for
-    the last, the lateral convolution to the next stride. Raises ValueError for other strides.
+    `filters` is the number of channels of the output layers. The order is that of execution: the backbone, then for
+    strides 32, 16 and 8 the branch, the head and, except for the last, the lateral convolution to the next stride.
+    Raises ValueError for other strides.
     """
     if network.strides != (8, 16, 32):
         raise ValueError(f"strides are {network.strides}, not (8, 16, 32)")
@@ -81,7 +83,7 @@ def count_floats(slots: Sequence[Slot]) -> int:
 
 
 def is_darknet(path: Path) -> bool:
-    """Whether to read a file as Darknet's: by its first bytes, and if these do not decide, by its name."""
+    """Whether a file is Darknet's: not a torch checkpoint, and named like one or with a plausible version."""
     start = b""
     if path.is_file():
         with path.open("rb") as stream:
@@ -107,7 +109,7 @@ def read_darknet(path: Path, expected: Sequence[int]) -> DarknetFile:
         header = version + stream.read(length - len(version))
         whole, rest = divmod(size - length, 4)
         if size < length or rest or whole not in expected:
-            content = "no whole header" if size < length else f"a header and {whole} floats and {rest} bytes"
+            content = "an incomplete header" if size < length else f"a header and {whole} floats and {rest} bytes"
             found = f"{size} bytes: {content.removesuffix(' and 0 bytes')}"
             raise UserError(path, "size", found, f"{' or '.join(map(str, expected))} floats")
         values = np.fromfile(stream, "<f4", whole).astype(np.float32, copy=False)
@@ -125,21 +127,21 @@ def write_darknet(path: Path, content: DarknetFile) -> None:
 
 @torch.no_grad()
 def fill_slots(slots: Sequence[Slot], content: DarknetFile, path: Path) -> None:
-    """Copy the first floats of a file into a network; output layers of another width than ours are not changed.
+    """Copy the first floats of a file into a network; output layers with another number of channels are not changed.
 
     Raises UserError (`path` is for its message) and copies nothing if a variance is negative.
     """
     parts = np.split(content.values[: count_floats(slots)], np.cumsum([slot.floats for slot in slots])[:-1])
     for slot, part in zip(slots, parts, strict=True):
         if slot.name.endswith("variance") and part.min() < 0:
-            raise UserError(path, slot.name, part.min(), "variances from 0")
+            raise UserError(path, slot.name, part.min(), "a variance of at least 0")
     for slot, part in zip(slots, parts, strict=True):
         if slot.floats == slot.tensor.numel():
             slot.tensor.copy_(torch.from_numpy(part).view(slot.tensor.shape))
 
 
 def content_of(slots: Sequence[Slot]) -> DarknetFile:
-    """File content of a network's tensors, of version 0.2.0 and no images seen."""
+    """File content for a network's tensors, with version 0.2.0 and 0 images seen."""
     values = [slot.tensor.detach().float().cpu().contiguous().flatten().numpy() for slot in slots]
     return DarknetFile(_NEW_HEADER, np.concatenate(values))
 

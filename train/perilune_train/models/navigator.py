@@ -12,7 +12,7 @@ OUTPUTS = 9
 
 
 class Recurrent(nn.Module):
-    """Two LSTM layers (as DeepVO, Wang et al. 2017, doi 10.1109/ICRA.2017.7989236), then a linear layer to 9.
+    """Two LSTM layers (as in DeepVO, Wang et al. 2017, doi 10.1109/ICRA.2017.7989236), then a linear layer to 9.
 
     The linear layer starts at zero, so that an untrained network outputs the reference motion.
 
@@ -27,8 +27,8 @@ class Recurrent(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        memory, _ = self.lstm(features)
-        return self.output(memory).float()
+        hidden, _ = self.lstm(features)
+        return self.output(hidden).float()
 
 
 class StackNavigator(nn.Module):
@@ -54,14 +54,13 @@ class StackNavigator(nn.Module):
 
 
 class WarpNavigator(nn.Module):
-    """Network for the later frame warped onto the earlier by the nominal motion, stacked in channels.
+    """Network for pairs stacked in channels, the later frame warped onto the earlier one by the nominal motion.
 
-    The channels are both frames and, from three blurs of them, the local shift between them after Lucas & Kanade
-    (`local_shift`). Without the shift, training needs hundreds of steps to learn the product of brightness change and
-    slope. The backbone is cut at stride 8, and the spatial layout is kept to the end. At every cell of that grid a
-    head, which also takes the mean local shifts, estimates the residual flow after the nominal motion and its weight.
-    The motion that best fits the flow over the ground plane (least squares with a prior) is corrected by the LSTM's
-    output.
+    The channels are both frames and, at three levels of blur, the local shift between them (`local_shift`, Lucas &
+    Kanade). Without the shift, training needs hundreds of steps to learn the product of brightness change and gradient.
+    The backbone ends at stride 8. A head estimates, for every cell of that grid, the residual flow after the nominal
+    motion and its weight, from the features and the mean local shifts. A least-squares fit with a prior gives the
+    motion that explains the flow over the ground plane. The LSTM's output is added as a correction.
 
     Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes (batch,
     pairs) in metres, to the motion (batch, pairs, 9) in the units of navigate/network.py and the flow (batch, pairs,
@@ -107,9 +106,9 @@ class WarpNavigator(nn.Module):
         features = self.mix(self.backbone(stacked)[-1])
         with torch.autocast(features.device.type, enabled=False):
             shifts = functional.avg_pool2d(stacked[:, 2:], self.STRIDE)
-            places = self.place(torch.cat([features.float(), shifts], dim=1)).permute(0, 2, 3, 1)
-            flow_px, trust = places[..., :2], torch.exp(places[..., 2].clamp(-8, 8))
-            fitted = self.fitted_motion(flow_px, trust, altitude_m.flatten(), first.shape[-1])
+            estimates = self.place(torch.cat([features.float(), shifts], dim=1)).permute(0, 2, 3, 1)
+            flow_px, weight = estimates[..., :2], torch.exp(estimates[..., 2].clamp(-8, 8))
+            fitted = self.fitted_motion(flow_px, weight, altitude_m.flatten(), first.shape[-1])
         summary = torch.cat([self.summary(features).float(), fitted], dim=-1)
         correction = self.recurrent(summary.unflatten(0, first.shape[:2]))
         turn = fitted[:, 3:]
@@ -119,10 +118,11 @@ class WarpNavigator(nn.Module):
         motion = torch.cat([fitted[:, :3], columns], dim=-1).unflatten(0, first.shape[:2])
         return motion + correction, flow_px.unflatten(0, first.shape[:2])
 
-    def fitted_motion(self, flow_px: Tensor, trust: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
-        """Fit translation and rotation vector (N, 6), over their spreads, to flows (N, h, w, 2) at altitudes (N,).
+    def fitted_motion(self, flow_px: Tensor, weight: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
+        """Fit translation and rotation vector (N, 6), in units of their spreads, to flows (N, h, w, 2).
 
-        Minimises the sum of trust |J m - flow|^2 + prior |m|^2; trust (N, h, w) is in 1 / px^2. The prior decides
+        `altitude_m` (N,) is in metres. Minimises the sum of
+        weight |J m - flow|^2 + prior |m|^2; weight (N, h, w) is in 1 / px^2. The prior decides
         between tilt and sideways shift, which look alike from above. J is the flow of a plane at right angles to the
         view (Longuet-Higgins & Prazdny 1980, doi 10.1098/rspb.1980.0057), to first order in the motion; it neglects the
         nominal step compared with the altitude.
@@ -131,12 +131,12 @@ class WarpNavigator(nn.Module):
         over_altitude = torch.stack([1 / altitude_m] * 3 + [torch.ones_like(altitude_m)] * 3, dim=-1)
         unit = focal_px * self.unit * over_altitude
         jacobian = self.plane_flow(flow_px.shape[1], flow_px.shape[2], width_px) * unit[:, None, None, None]
-        weighted = jacobian * trust[..., None, None]
+        weighted = jacobian * weight[..., None, None]
         normal = torch.einsum("nhwij,nhwik->njk", weighted, jacobian) + torch.diag(self.log_prior.exp())
         return torch.linalg.solve(normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px))
 
     def plane_flow(self, rows: int, columns: int, width_px: int) -> Tensor:
-        """Flow over focal length per unit of translation over altitude and of rotation vector (rows, columns, 2, 6)."""
+        """Derivatives (rows, columns, 2, 6) of flow / focal length by translation / altitude and by rotation vector."""
         focal = self.focal_over_width * width_px / self.STRIDE
         x = ((torch.arange(columns, device=self.unit.device) + 0.5 - columns / 2) / focal).expand(rows, columns)
         y = ((torch.arange(rows, device=self.unit.device) + 0.5 - rows / 2) / focal)[:, None].expand(rows, columns)
@@ -147,7 +147,7 @@ class WarpNavigator(nn.Module):
 
 
 def blurred(images: Tensor, size_px: int) -> Tensor:
-    """Means over squares `size_px` wide (odd) around each pixel of images (N, C, H, W), cropped at the edge."""
+    """Box blur: means over squares `size_px` wide (odd) of images (N, C, H, W), cropped at the edge."""
     half = size_px // 2
     rows = functional.avg_pool2d(images, (size_px, 1), stride=1, padding=(half, 0), count_include_pad=False)
     return functional.avg_pool2d(rows, (1, size_px), stride=1, padding=(0, half), count_include_pad=False)
@@ -156,15 +156,15 @@ def blurred(images: Tensor, size_px: int) -> Tensor:
 def local_shift(pair: Tensor, window_px: int = 25) -> Tensor:
     """Shift from the first to the second of two images (N, 2, H, W): (N, 2, H, W), pixels along x and y.
 
-    Computes, for a square window around each pixel, one least-squares step (Lucas & Kanade 1981) that explains the
-    change of brightness by the slope, damped where slopes are weak. Valid for shifts below the width of the images'
+    For a square window around each pixel, one least-squares step (Lucas & Kanade 1981) explains the change of
+    brightness by the gradient. It is damped where gradients are small. Valid for shifts below the width of the images'
     finest features.
     """
-    slope_y, slope_x = torch.gradient(pair.mean(1, keepdim=True), dim=(2, 3))
-    lost = pair[:, :1] - pair[:, 1:]
-    products = [slope_x * slope_x, slope_y * slope_y, slope_x * slope_y, slope_x * lost, slope_y * lost]
-    xx, yy, xy, x_lost, y_lost = blurred(torch.cat(products, dim=1), window_px).split(1, dim=1)
+    grad_y, grad_x = torch.gradient(pair.mean(1, keepdim=True), dim=(2, 3))
+    change = pair[:, :1] - pair[:, 1:]
+    products = [grad_x * grad_x, grad_y * grad_y, grad_x * grad_y, grad_x * change, grad_y * change]
+    xx, yy, xy, x_change, y_change = blurred(torch.cat(products, dim=1), window_px).split(1, dim=1)
     damping = 0.02 * (xx + yy) + 1e-4
     xx, yy = xx + damping, yy + damping
-    shift = torch.cat([yy * x_lost - xy * y_lost, xx * y_lost - xy * x_lost], dim=1) / (xx * yy - xy * xy)
+    shift = torch.cat([yy * x_change - xy * y_change, xx * y_change - xy * x_change], dim=1) / (xx * yy - xy * xy)
     return shift.clamp(-8, 8)

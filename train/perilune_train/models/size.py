@@ -14,7 +14,7 @@ def multiply_adds(network: nn.Module, shape: tuple[int, ...]) -> int:
     pooling, as usual.
     """
     # On torch's `meta` device shapes are propagated and nothing is computed.
-    ghost = copy.deepcopy(network).to("meta").eval()
+    on_meta = copy.deepcopy(network).to("meta").eval()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        ghost(torch.empty(shape, device="meta"))
+        on_meta(torch.empty(shape, device="meta"))
     return counter.get_total_flops() // 2

@@ -13,7 +13,7 @@ ANCHORS_PER_SCALE = 3
 OUTPUTS = 5
 """x, y, width, height, objectness."""
 _STRIDES = (2, 4, 8, 16, 32)
-_LARGEST_LOG_SCALE = 4.0
+_MAX_LOG_SCALE = 4.0
 _PRIOR = 0.01
 """Initial crater probability of every cell, so that the many empty cells do not dominate the first steps."""
 
@@ -38,7 +38,7 @@ class YOLOv3(nn.Module):
         attention: Attention = "none",
         strides: Sequence[int] = (8, 16, 32),
     ):
-        """Anchors are (3, 3, 2), width and height in pixels, finest stride first; None: from a checkpoint."""
+        """Anchors are (3, 3, 2), width and height in pixels, finest stride first; None if loaded later."""
         super().__init__()
         if tuple(strides) not in ((8, 16, 32), (4, 8, 16)):
             raise ValueError(f"strides are {tuple(strides)}, not (8, 16, 32) or (4, 8, 16)")
@@ -98,7 +98,7 @@ class YOLOv3(nn.Module):
 
 
 def _output(channels: int) -> nn.Conv2d:
-    """Last layer of a head, initialised with all boxes at their anchors and objectness at its prior."""
+    """Last layer of a head; its initial boxes are the anchors, its initial objectness is the prior."""
     layer = nn.Conv2d(channels, ANCHORS_PER_SCALE * OUTPUTS, 1)
     nn.init.normal_(layer.weight, std=0.01)
     bias = torch.zeros(ANCHORS_PER_SCALE, OUTPUTS)
@@ -111,11 +111,12 @@ def decode(raw: Tensor, cells: Tensor, anchors: Tensor, stride: int) -> Tensor:
     """Boxes (..., 4) as x0, y0, x1, y1 in pixels of raw outputs (..., 4 or more).
 
     `cells` (..., 2) are column and row of the predicting cell, `anchors` (..., 2) width and height in pixels. Centre:
-    (cell + 2 s(t) - 0.5) stride; size: anchor exp(t). Deviation from YOLOv3, which has s(t) alone: the centre can be up
-    to half a cell outside the cell, because neighbouring cells are trained on a crater too (detect/data/assign.py).
+    (cell + 2 s(t) - 0.5) stride with the sigmoid s; size: anchor exp(t). Deviation from YOLOv3, which has only s(t):
+    the centre can be up to half a cell outside the cell, because neighbouring cells are trained on a crater too
+    (detect/data/assign.py).
     """
     centre = (cells + 2 * raw[..., :2].sigmoid() - 0.5) * stride
-    half = anchors * raw[..., 2:4].clamp(-_LARGEST_LOG_SCALE, _LARGEST_LOG_SCALE).exp() / 2
+    half = anchors * raw[..., 2:4].clamp(-_MAX_LOG_SCALE, _MAX_LOG_SCALE).exp() / 2
     return torch.cat([centre - half, centre + half], dim=-1)
 
 

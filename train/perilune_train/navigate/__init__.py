@@ -1,1 +1,1 @@
-"""Relative motion of a lander from pairs of consecutive trajectory images."""
+"""Relative motion of a lander from pairs of consecutive frames."""

@@ -21,13 +21,13 @@ def navigate(
     allow_overlap: AllowOverlap = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Train the navigation networks and evaluate them beside the nominal motion, mean motions and KLT tracks.
+    """Train the navigation networks and evaluate them together with the nominal motion, mean motions and KLT tracks.
 
     Writes runs/navigate/<name>/ (fusion warp) and runs/navigate/<name>-stack/ (fusion stack, the paper's network), each
     with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, navigation.parquet (one row per method),
-    errors.parquet (one row per pair), descent.png, errors.png and TensorBoard events. The stack network starts from the
-    backbone of runs/detect/<name>, if that fits. The same command resumes an interrupted run and leaves finished ones
-    unchanged; --overwrite replaces them.
+    errors.parquet (one row per pair), descent.png, errors.png and TensorBoard events. The stack network is initialised
+    with the backbone of runs/detect/<name>, if that has the same architecture. The same command resumes an interrupted
+    run and leaves finished ones unchanged; --overwrite replaces them.
     """
     settings = resolve(NavigateConfig, "navigate", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.

@@ -31,8 +31,8 @@ class FusionConfig(Section):
     learning_rate: Positive
     """Peak learning rate; the paper uses 1e-4."""
     jitter: Annotated[float, Field(ge=0)] = 0.0
-    """Standard deviation of a random extra motion of each training pair, over the spread of the residuals in the
-    training set."""
+    """Standard deviation of a random extra motion of each training pair, as a fraction of the spread of the residuals
+    in the training set."""
 
 
 class NavigateConfig(Section):

@@ -87,7 +87,7 @@ def sixd_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def euler_from_rotation(rotation: Tensor) -> Tensor:
-    """Angles (..., 3) in radians about x, y, z of rotation = Rz Ry Rx (..., 3, 3); |y| below a quarter turn."""
+    """Angles (..., 3) in radians about x, y, z of rotation = Rz Ry Rx (..., 3, 3); |y| below 90 degrees."""
     cos_y = torch.hypot(rotation[..., 0, 0], rotation[..., 1, 0])
     return torch.stack(
         [
@@ -100,9 +100,9 @@ def euler_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def rotation_vectors(rotation: ArrayLike) -> Array:
-    """Rotation vectors (..., 3) in radians of rotation matrices (..., 3, 3) well below half a turn.
+    """Rotation vectors (..., 3) in radians of rotation matrices (..., 3, 3) with angles well below 180 degrees.
 
-    The angle is computed from sine and cosine; the arc cosine alone loses small angles to rounding.
+    The angle is computed from sine and cosine; the arc cosine alone is inexact for small angles.
     """
     r = np.asarray(rotation, np.float64)
     skew = r - np.swapaxes(r, -1, -2)

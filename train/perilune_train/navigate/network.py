@@ -1,4 +1,4 @@
-"""The navigation networks: building, loading, decoding of their nine outputs."""
+"""The navigation networks: build, load, and convert their nine outputs to motions."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,19 +70,19 @@ def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:
 
 def predict(network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory) -> Motion:
     """Motions of a whole trajectory, in one pass of the network in evaluation mode."""
-    seen = trajectory.shrunk(architecture["size_px"])
-    sequence = pair_sequence(seen, 0, seen.n_pairs, warp=architecture["fusion"] == "warp")
+    shrunk = trajectory.shrunk(architecture["size_px"])
+    sequence = pair_sequence(shrunk, 0, shrunk.n_pairs, warp=architecture["fusion"] == "warp")
     device = next(network.parameters()).device
     scales = Scales(**architecture["scales"])
     with torch.no_grad():
-        output, _ = estimated(network, [sequence], device)
+        output, _ = network_output(network, [sequence], device)
     output = output[0].cpu()
     reference, unit = translation_units([sequence], scales, architecture["fusion"])
     return (reference[0] + unit * output[:, :3]).double().numpy(), decoded_rotation(output, scales).double().numpy()
 
 
-def estimated(network: nn.Module, batch: list[Sequence], device: torch.device) -> tuple[Tensor, Tensor | None]:
-    """Outputs (batch, pairs, 9) and, for a warp network, its estimated flow."""
+def network_output(network: nn.Module, batch: list[Sequence], device: torch.device) -> tuple[Tensor, Tensor | None]:
+    """Outputs (batch, pairs, 9), and of a warp network the flow (batch, pairs, height / 8, width / 8, 2), pixels."""
     first = torch.from_numpy(np.stack([sequence.first for sequence in batch])).to(device)
     second = torch.from_numpy(np.stack([sequence.second for sequence in batch])).to(device)
     if isinstance(network, WarpNavigator):

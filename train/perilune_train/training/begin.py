@@ -21,10 +21,10 @@ State = Literal["new", "resume", "finished"]
 Hashes = Mapping[str, str | None]
 """SHA-256 of each input of a run; None if it is missing."""
 
-_NO_RESULT = {"detect.workers", "detect.checkpoint_minutes"}
+_NO_EFFECT_ON_RESULT = {"detect.workers", "detect.checkpoint_minutes"}
 """Settings that change how a run proceeds, but not its result."""
 _REPLACE = "; --overwrite replaces the run"
-_AGREEMENT = "perilune/run"
+_STATE_KEY = "perilune/run"
 
 
 def hashes_of(inputs: Mapping[str, Path | None]) -> dict[str, str | None]:
@@ -34,30 +34,30 @@ def hashes_of(inputs: Mapping[str, Path | None]) -> dict[str, str | None]:
 
 
 def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrite: bool = False) -> State:
-    """Decide what to do with a run's folder, the same in all processes.
+    """Decide what to do with a run's folder; all processes get the same decision.
 
     new: start from the beginning, since there is no state or `overwrite` is given. resume: continue from last.ckpt.
     finished: leave the run unchanged; a message says so.
 
-    Raises UserError if the run began with other settings or inputs, if the folder holds no run of this task, or if the
-    first process resumes but this one has no last.ckpt (several machines, no shared folder).
+    Raises UserError if the existing run has other settings or inputs, if the folder holds no run of this task, or if
+    the first process resumes but this one has no last.ckpt (several machines, no shared folder).
     """
     if is_first_process():
         state = _decide(run, task, config, inputs, overwrite)
         if torch.distributed.is_torchelastic_launched():
-            _store().set(_AGREEMENT, state)
+            _store().set(_STATE_KEY, state)
     elif torch.distributed.is_torchelastic_launched():
-        state = _store().get(_AGREEMENT).decode()
+        state = _store().get(_STATE_KEY).decode()
     else:
         # Lightning starts these processes on the first process's machine, after the first has prepared the folder.
         state = "resume" if run.last.is_file() else "new"
     if state == "resume" and not run.last.is_file():
-        expected = "that of the first process: share the runs folder between the machines, or copy it"
+        expected = "the file of the first process: share the runs folder between the machines, or copy it"
         raise UserError(run.last, "last state", "no such file", expected)
     if state == "finished":
         console.print(f"{run.root}: finished, left unchanged; --overwrite replaces it", soft_wrap=True)
     elif state == "resume":
-        console.print(f"{run.root}: resume", soft_wrap=True)
+        console.print(f"{run.root}: resuming", soft_wrap=True)
     return state
 
 
@@ -66,7 +66,7 @@ def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state:
 
     Of several processes only the first changes the folder. Raises UserError on a folder that is no run of this task.
     """
-    # Recorded before the training: the checkout may change while it runs.
+    # Record the commit before training: the checkout may change during it.
     run_record()
     if not is_first_process() or state != "new":
         return
@@ -79,7 +79,7 @@ def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state:
 
 @functools.cache
 def _store() -> Any:
-    """The key-value store of torchrun, to which every process connects; available before training connects them."""
+    """The key-value store of torchrun; unlike torch's process group it is available before training starts."""
     return next(torch.distributed.rendezvous("env://"))[0]
 
 
@@ -91,12 +91,12 @@ def _decide(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrit
     if overwrite or not (run.finished or run.last.is_file()):
         return "new"
     check_settings(run, task, config)
-    _check_inputs(run, inputs, missing_is_fine=run.finished)
+    _check_inputs(run, inputs, skip_missing=run.finished)
     return "finished" if run.finished else "resume"
 
 
 def _is_used(run: RunFolder) -> bool:
-    # A killed start may leave a temporary file, whose name begins with a dot.
+    # A process killed at its start may leave a temporary file, whose name begins with a dot.
     return run.root.is_dir() and any(not path.name.startswith(".") for path in run.root.iterdir())
 
 
@@ -116,19 +116,19 @@ def _check_own(run: RunFolder, task: str) -> None:
 def check_settings(run: RunFolder, task: str, config: Section) -> None:
     """Raise UserError naming the first setting in which an older run, if there is one, differs from `config`.
 
-    A setting that config.yaml lacks is newer than the run and has its default.
+    A setting that is missing in config.yaml was added after the run; the run used its default.
     """
     if not run.config.is_file():
         return
     for key, old, new in _differences(task, read_config_file(run.config).get(task, {}), config):
-        if key not in _NO_RESULT:
-            raise UserError(run.config, key, new, f"{old}, with which the run began{_REPLACE}")
+        if key not in _NO_EFFECT_ON_RESULT:
+            raise UserError(run.config, key, new, f"{old}, as in the existing run{_REPLACE}")
 
 
-def _check_inputs(run: RunFolder, inputs: Hashes, missing_is_fine: bool) -> None:
-    """Raise UserError naming the first input that is not the one the run began with.
+def _check_inputs(run: RunFolder, inputs: Hashes, skip_missing: bool) -> None:
+    """Raise UserError naming the first input whose hash differs from the one in inputs.json.
 
-    With `missing_is_fine` an input that is missing now, or was missing at the start of the run, is not compared.
+    With `skip_missing`, inputs that are missing now or were missing when the run started are not compared.
     """
     if not run.inputs.is_file():
         return
@@ -137,14 +137,14 @@ def _check_inputs(run: RunFolder, inputs: Hashes, missing_is_fine: bool) -> None
     except (ValueError, RecursionError):
         began = None
     if not isinstance(began, dict):
-        raise UserError(run.inputs, "content", "no JSON object of hashes", f"the file as written{_REPLACE}")
+        raise UserError(run.inputs, "content", "no JSON object", f"the hashes of the run's inputs{_REPLACE}")
     for name, hash_now in inputs.items():
         hash_then = began.get(name, hash_now)
-        if hash_now == hash_then or (missing_is_fine and None in (hash_now, hash_then)):
+        if hash_now == hash_then or (skip_missing and None in (hash_now, hash_then)):
             continue
         got = "nothing" if hash_now is None else f"SHA-256 {hash_now[:12]}"
         then = "nothing" if hash_then is None else str(hash_then)[:12]
-        raise UserError(run.inputs, name, got, f"{then}, with which the run began{_REPLACE}")
+        raise UserError(run.inputs, name, got, f"{then}, as in the existing run{_REPLACE}")
 
 
 def _differences(where: str, old: Mapping[str, Any], config: Section) -> Iterator[tuple[str, object, object]]:

@@ -25,14 +25,14 @@ from perilune_train.training.runs import (
     save_weights,
 )
 
-_STEPS_BETWEEN_LOOKS = 20
+_STEPS_BETWEEN_CHECKS = 20
 _PROCESSES = "processes"
-"""Key of the number of processes in last.ckpt; position in the epoch and schedule count steps of all processes."""
+"""Key of the number of processes in last.ckpt. It must not change on resume: it determines the batches of a step."""
 _STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
 
 
 class KeepBest(Callback):
-    """Save the weights whenever the validation metric `monitor` improves (NaN never does).
+    """Save the weights whenever the validation metric `monitor` improves; NaN is no improvement.
 
     The task has `architecture` (plain settings) and `evaluated` (the network to evaluate and save), and may have
     `terrain` (the record of its training terrain, as plain data).
@@ -62,23 +62,23 @@ class KeepBest(Callback):
 class KeepLast(Callback):
     """Save the whole state after every epoch and, with `minutes`, within an epoch at this interval.
 
-    If a run is resumed within an epoch, call the task's `on_train_epoch_start`, which Lightning does not.
+    If a run is resumed within an epoch, also calls the task's `on_train_epoch_start`, which Lightning then skips.
     """
 
     def __init__(self, run: RunFolder, minutes: float | None):
         self.run, self.minutes = run, minutes
-        self.earlier_s, self.began = 0.0, time.monotonic()
+        self.seconds_before_resume, self.began = 0.0, time.monotonic()
 
     @property
     def seconds(self) -> float:
-        """Training time until now in seconds, including the time before a resume."""
-        return self.earlier_s + time.monotonic() - self.began
+        """Training time so far in seconds, including the time before a resume."""
+        return self.seconds_before_resume + time.monotonic() - self.began
 
     def state_dict(self) -> dict[str, float]:
         return {"seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        self.earlier_s = state_dict["seconds"]
+        self.seconds_before_resume = state_dict["seconds"]
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         self.saved = time.monotonic()
@@ -86,11 +86,11 @@ class KeepLast(Callback):
             pl_module.on_train_epoch_start()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        # After the last batch validation follows, and then the checkpoint of the epoch.
+        # The last batch is followed by validation and the checkpoint of the epoch.
         if self.minutes is None or trainer.is_last_batch:
             return
-        # Several processes agree on the time by asking the first, which makes them wait.
-        if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_LOOKS == 0:
+        # Several processes use the clock of the first. Asking it makes them wait, so do it rarely.
+        if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_CHECKS == 0:
             due = time.monotonic() - self.saved >= 60 * self.minutes
             if trainer.strategy.broadcast(due):
                 self.save(trainer)
@@ -123,8 +123,8 @@ class Bar(Callback):
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
         self.progress.advance(self.task)
-        # Reading the loss makes the GPU wait.
-        if batch_idx % _STEPS_BETWEEN_LOOKS == 0:
+        # Reading the loss makes the GPU wait, so do it rarely.
+        if batch_idx % _STEPS_BETWEEN_CHECKS == 0:
             note = f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, loss {float(outputs['loss']):.3f}"
             self.progress.update(self.task, note=note)
 
@@ -166,8 +166,8 @@ def fit(
     Returns the training time in seconds, including the time before a resume.
 
     The task provides its own loaders, which are requested again before every epoch, so that order and augmentation can
-    depend on seed and epoch only. With several processes each loader provides its share. The task logs `monitor` in
-    validation, and has `architecture` and `evaluated` (see KeepBest).
+    depend on seed and epoch only. With several processes, each loader provides the batches of its own process. The task
+    logs `monitor` in validation, and has `architecture` and `evaluated` (see KeepBest).
 
     With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
     uninterrupted run. The state is saved after every epoch, and with `checkpoint_minutes` within epochs too; then the
@@ -182,7 +182,7 @@ def fit(
         check_tensors(resume_from, state["state_dict"], task)
         began = state.get(_PROCESSES, 1)
         if began != devices * num_nodes:
-            expected = f"{began}, with which the run began; --overwrite replaces the run"
+            expected = f"{began}, as in the existing run; --overwrite replaces the run"
             raise UserError(resume_from, "processes", devices * num_nodes, expected)
     keep_last = KeepLast(run, checkpoint_minutes)
     device = choose_device(device)
@@ -218,6 +218,6 @@ def fit(
         try:
             trainer.fit(task, ckpt_path=resume_from, weights_only=True)
         except SystemExit:
-            # Lightning answers Ctrl-C with a bare exit; the command line prints a message for KeyboardInterrupt.
+            # On Ctrl-C, Lightning raises SystemExit; the command line prints a message for KeyboardInterrupt.
             raise KeyboardInterrupt from None
     return keep_last.seconds

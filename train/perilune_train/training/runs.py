@@ -58,7 +58,7 @@ class RunFolder:
 def is_first_process() -> bool:
     """Whether this process writes files and messages: the only process, or the first of several that train together.
 
-    Known from the start: Lightning reads the rank from the environment that it or torchrun sets for each process.
+    Also valid before training: Lightning reads the rank from an environment variable that it or torchrun sets.
     """
     # Imported here, so that commands that do not train need not import Lightning.
     from lightning.pytorch.utilities import rank_zero_only
@@ -73,7 +73,7 @@ def save_weights(
 
     `terrain` is the plain record of the terrain that it was fitted to (provenance.py); None leaves it unknown.
     """
-    # Via memory: torch's own writer hides a full disk behind a RuntimeError.
+    # Save to memory first: torch reports a full disk as a RuntimeError, not as an OSError.
     content = io.BytesIO()
     record = {} if terrain is None else {RECORD: dict(terrain)}
     torch.save({"architecture": dict(architecture), "state_dict": network.state_dict(), **record}, content)
@@ -83,7 +83,7 @@ def save_weights(
 def load_weights(path: Path) -> dict[str, Any]:
     """`{"architecture": settings, "state_dict": tensors}` of a file that `save_weights` wrote, on the CPU.
 
-    Raises UserError if the file is missing, damaged, or anything but plain weights.
+    Raises UserError if the file is missing, is damaged or has other content.
     """
     if not path.is_file():
         raise UserError(path, "checkpoint", "no such file", "checkpoints/best.ckpt of a finished run")
@@ -96,7 +96,7 @@ def read_saved(path: Path, field: str, keys: set[str], expected: str) -> dict[st
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = torch.load(path, map_location="cpu", weights_only=True)
-    # Torch documents no error types; damaged bytes raise a dozen.
+    # Torch does not document its errors; damaged files raise many types.
     except Exception as error:
         raise UserError(path, field, str(error) or type(error).__name__, expected) from None
     missing = keys - content.keys() if isinstance(content, dict) else keys

@@ -35,7 +35,7 @@ def test_centre_cell_and_two_neighbours():
     assert first.frame.tolist() == [0, 0, 0]
     assert len(made[1].row) == 0
     assert first.positive.sum() == 3
-    assert not (first.positive & first.free).any()
+    assert not (first.positive & first.ignored).any()
 
 
 def test_neighbours_off_the_grid_are_left_out():
@@ -47,16 +47,16 @@ def test_neighbours_off_the_grid_are_left_out():
 def test_ignored_labels_are_neither_positive_nor_negative():
     made = assign(targets([56.0, 56.0, 72.0, 72.0], frame=[1], wanted=[False]), ANCHORS, (8, 16), SHAPES, 1.5)
     assert len(made[0].row) == 0
-    free = made[0].free.nonzero()
+    ignored = made[0].ignored.nonzero()
     # 16 px box about (64, 64): cell centres nearer than 16 / 4 + 8 / 2 = 8 px, in the anchor that fits.
-    assert free.tolist() == [[1, 2, r, c] for r in (7, 8) for c in (7, 8)]
-    assert not made[1].free.any()
+    assert ignored.tolist() == [[1, 2, r, c] for r in (7, 8) for c in (7, 8)]
+    assert not made[1].ignored.any()
 
 
 def test_empty_batch_and_crowded_batch():
     for part in assign(targets(), ANCHORS, (8, 16), SHAPES, 2.0):
         assert len(part.label) == 0
-        assert not part.free.any()
+        assert not part.ignored.any()
     corner = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 120
     boxes = torch.cat([corner, corner + 6], 1)
     crowd = Targets(boxes, torch.zeros(500, dtype=torch.long), torch.ones(500, dtype=torch.bool))

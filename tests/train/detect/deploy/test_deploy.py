@@ -223,7 +223,7 @@ def test_int8_is_judged_and_kept_only_if_worth_it(
 ):
     """Both verdicts: no loss is small enough, and every one is, while int8 is called the faster."""
     monkeypatch.setattr(int8, "quantise", quantise_once)
-    monkeypatch.setattr(int8, "MOST_LOSS", most_loss)
+    monkeypatch.setattr(int8, "MAX_AP_LOSS", most_loss)
     timed = int8.interleaved
     monkeypatch.setattr(int8, "interleaved", lambda *given: timed(*given) | {"int8": [0.0]})
     verdict = export.export_run(run_folder, tmp_path / "a", ("onnx",), SIZE, dataset_detect, int8=True)
@@ -265,7 +265,7 @@ def test_quantised_files_hold_integers_but_for_gates_and_heads(exported, images,
 def test_when_int8_is_worth_it(loss, seconds, kept):
     verdict = int8.Int8Verdict(0.8, 0.8 - loss, 1.0, seconds, "f32")
     assert verdict.kept == kept
-    assert verdict.words().startswith("int8 kept" if kept else "int8 not kept")
+    assert verdict.summary().startswith("int8 kept" if kept else "int8 not kept")
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,9 @@ from perilune_train.detect.images.labelled import ImageSet, LabelledImage, read_
 from perilune_train.detect.inference.tiling import Tiling
 
 
-def given(boxes, ends_at_edges=False):
+def given(boxes, clipped=False):
     boxes = np.array(boxes, float)
-    return ImageSet([LabelledImage("a.png", Path("a.png"), 100, 100, boxes, np.ones(len(boxes), bool))], ends_at_edges)
+    return ImageSet([LabelledImage("a.png", Path("a.png"), 100, 100, boxes, np.ones(len(boxes), bool))], clipped)
 
 
 def detections(boxes):

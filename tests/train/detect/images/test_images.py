@@ -30,7 +30,7 @@ def test_tables_with_commas_and_tabs(tmp_path, separator):
         text = "\n".join(rows).replace(",", separator)
         tmp_path.joinpath(f"{name}.txt").write_text(text, encoding="utf-8-sig")
     found = read_images(tmp_path)
-    assert not found.ends_at_edges
+    assert not found.clipped
     assert [image.path.name for image in found.images] == ["a.png", "b.png"]
     image = found.images[1]
     assert (image.width_px, image.height_px) == (40, 30)
@@ -99,7 +99,7 @@ def test_coco(tmp_path):
     for place in (path, tmp_path):
         found = read_images(place)
         (image,) = found.images
-        assert found.ends_at_edges
+        assert found.clipped
         assert image.name == "pictures/a b.png"
         assert image.path == tmp_path.resolve() / "pictures" / "a b.png"
         assert image.boxes.tolist() == [[2, 3, 12, 15], [1, 1, 21, 21], [4, 4, 13, 13.5]]
@@ -165,7 +165,7 @@ def test_coco_boxes_without_an_area_are_left_out_and_told(tmp_path, capsys):
     sizes = [(0, 9), (9, 0.0), (0, 0), (9, 10)]
     path = coco(tmp_path, annotations=[{"image_id": 7, "category_id": 1, "bbox": [2, 3, *size]} for size in sizes])
     (image,) = read_images(path).images
-    assert image.boxes.tolist() == [[2, 3, 11, 13]] and image.marked.tolist() == [True]
+    assert image.boxes.tolist() == [[2, 3, 11, 13]] and image.not_ignored.tolist() == [True]
     assert "annotations.json: 3 boxes without width or height are left out" in capsys.readouterr().err
 
 
@@ -225,7 +225,7 @@ def test_pictures_that_are_damaged_or_none(tmp_path):
     with pytest.raises(UserError, match=r"cut\.png: image"):
         read_grey(cut)
     (tmp_path / "text.tif").write_text("<VRTDataset/>")
-    with pytest.raises(UserError, match="does not decode"):
+    with pytest.raises(UserError, match="cannot be decoded"):
         read_grey(tmp_path / "text.tif")
     with pytest.raises(UserError, match="no such file"):
         read_grey(tmp_path / "absent.png")

@@ -117,6 +117,6 @@ def test_what_stays_unread_is_told_in_one_line(tmp_path, monkeypatch, capfd):
     with pytest.raises(UserError, match="image: got a folder, expected a PNG"):
         read_grey(tmp_path)
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(UserError, match=r"got a file that does not decode, expected .* need rasterio \(pip install"):
+    with pytest.raises(UserError, match=r"got a file that cannot be decoded, expected .* need rasterio \(pip install"):
         picture_size(whole)
     assert capfd.readouterr() == ("", "")

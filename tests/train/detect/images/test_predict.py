@@ -128,7 +128,7 @@ def test_what_lies_off_the_map_is_left_out_and_told(run, tmp_path, capsys):
     count = predict_images([path], run, settings_of(run), tmp_path / "out", None, Tiling(tile_px=128))
     shapes = json.loads((tmp_path / "out" / "detections.geojson").read_text())["features"]
     assert 0 < len(shapes) < count == len(pd.read_parquet(tmp_path / "out" / "detections.parquet"))
-    assert f"disc[b].tif: {count - len(shapes)} craters are off its map" in " ".join(capsys.readouterr().err.split())
+    assert f"disc[b].tif: {count - len(shapes)} craters are off the map" in " ".join(capsys.readouterr().err.split())
 
 
 def test_an_image_wholly_off_its_map_is_refused(tmp_path):

@@ -95,7 +95,7 @@ def test_two_processes_share_the_frames_and_end_with_equal_weights(few, tmp_path
     # Position and schedule of the state are those of two processes.
     (run / "metrics.json").unlink()
     config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, settings)
-    with pytest.raises(UserError, match=r"last.ckpt: processes: got 1, expected 2, with which the run began"):
+    with pytest.raises(UserError, match=r"last.ckpt: processes: got 1, expected 2, as in the existing run"):
         run_detect(config, few, tmp_path, "two")
 
 

@@ -142,7 +142,7 @@ def test_a_finished_run_is_left_as_it_is(finished, few, tmp_path, capsys):
     with pytest.raises(UserError, match=r"config.yaml: detect.learning_rate: got 0.01, expected 0.005, .*--overwrite"):
         other = settings("detect.learning_rate=0.01")
         run_detect(other, tmp_path / "absent", finished.root.parents[1], "a")
-    with pytest.raises(UserError, match=r"inputs.json: dataset: got SHA-256 .*with which the run began; --overwrite"):
+    with pytest.raises(UserError, match=r"inputs.json: dataset: got SHA-256 .*as in the existing run; --overwrite"):
         run_detect(settings(), few, finished.root.parents[1], "a")
     assert files() == before
 

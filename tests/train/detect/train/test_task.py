@@ -16,7 +16,7 @@ from perilune_train.detect.evaluate.split_evaluation import match_detections
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.train.loss import detection_loss
 from perilune_train.detect.train.network import build_network, label_sizes
-from perilune_train.detect.train.task import DetectTask, learning_rate_factor, pairs, update_average
+from perilune_train.detect.train.task import DetectTask, learning_rate_factor, paired_tensors, update_average
 
 
 def test_learning_rate_by_hand():
@@ -31,7 +31,7 @@ def test_moving_average_by_hand():
     nn.init.constant_(new.weight, 3.0)
     new.running_mean.fill_(10.0)
     new.num_batches_tracked.fill_(7)
-    update_average(pairs(old, new), 0.9)
+    update_average(paired_tensors(old, new), 0.9)
     assert old.weight.item() == pytest.approx(0.9 * 1 + 0.1 * 3)
     assert old.running_mean.item() == pytest.approx(1.0)
     assert old.num_batches_tracked.item() == 7

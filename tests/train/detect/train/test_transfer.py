@@ -120,8 +120,8 @@ def test_a_backbone_alone_is_filled_from_conv_74_or_for_finer_strides(coco, tmp_
 @pytest.mark.parametrize(
     ("setting", "told"),
     [
-        ("detect.width=0.5", "yolov3.weights: detect.width: got 0.5, expected 1, as Darknet's files have it"),
-        ("detect.in_channels=1", "yolov3.weights: detect.in_channels: got 1, expected 3, as Darknet's files have it"),
+        ("detect.width=0.5", "yolov3.weights: detect.width: got 0.5, expected 1, as in Darknet's files"),
+        ("detect.in_channels=1", "yolov3.weights: detect.in_channels: got 1, expected 3, as in Darknet's files"),
         ("detect.width=1", "yolov3.weights: size: got 24 bytes: a header and 1 floats, expected 40620640 or "),
     ],
 )

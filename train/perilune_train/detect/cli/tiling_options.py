@@ -12,12 +12,14 @@ Scales = Annotated[
         " [default: those of the run]",
     ),
 ]
-TileSide = Annotated[int, typer.Option("--tile", help="Side of the tiles, that of the training frames, pixels.")]
+TileSide = Annotated[
+    int, typer.Option("--tile", help="Side of the tiles, pixels; best is the side of the training frames.")
+]
 BoxMargin = Annotated[
     float,
     typer.Option(
-        help="Margin added to every side of the detected boxes, which end at the crest of the rim, pixels. Use 0.5 for"
-        " labels that are boxes of whole pixels around a crater."
+        help="Margin added to every side of the detected boxes, pixels. They end at the crest of the rim; use 0.5 to"
+        " compare them with labels that are boxes of whole pixels around a crater."
     ),
 ]
-Overlap = Annotated[int, typer.Option(help="Least overlap of two tiles, pixels.")]
+Overlap = Annotated[int, typer.Option(help="Minimum overlap of two tiles, pixels.")]

@@ -17,8 +17,8 @@ def weights(
 ) -> None:
     """Write the weights of a run as a Darknet file, which `detect.init_from` can read.
 
-    NAME.conv.74 holds the 52 convolutions of the backbone, NAME.weights all 75 (a network without attention, strides 8
-    16 32; its output layers have 15 filters: x, y, width, height, objectness of 3 anchors).
+    NAME.conv.74 has the 52 convolutions of the backbone. NAME.weights has all 75 and needs a network without attention
+    and with strides 8 16 32; its output layers have 15 filters: x, y, width, height, objectness of 3 anchors.
     """
     if not out.name.endswith((".conv.74", ".weights")):
         raise UserError(out, "--out", f"the name {out.name}", "a name that ends in .conv.74 or .weights")
@@ -32,5 +32,5 @@ def weights(
     architecture = runs.load_weights(checkpoint)["architecture"]
     content = darknet_content(network, architecture, checkpoint, whole=out.suffix == ".weights")
     write_darknet(out, content)
-    gates = "" if architecture["attention"] == "none" else "; the attention gates have no place in it"
+    gates = "" if architecture["attention"] == "none" else "; attention gates are not included"
     console.print(f"{out}: {len(content.values)} floats{gates}")

@@ -26,7 +26,7 @@ class Targets:
 
 @dataclass(frozen=True)
 class Assignment:
-    """One scale's predictors: positive ones with their labels, and free ones."""
+    """Positive predictors of one scale with their labels, and ignored predictors."""
 
     frame: Tensor
     """Frame of each positive predictor (P,)."""
@@ -38,13 +38,13 @@ class Assignment:
     """Column of its cell (P,)."""
     label: Tensor
     """Its label, a row of Targets (P,)."""
-    free: Tensor
+    ignored: Tensor
     """Predictors that are neither positive nor negative (N, 3, h, w), bool."""
 
     @property
     def positive(self) -> Tensor:
         """The positive predictors (N, 3, h, w), bool."""
-        mask = torch.zeros_like(self.free)
+        mask = torch.zeros_like(self.ignored)
         mask[self.frame, self.anchor, self.row, self.column] = True
         return mask
 
@@ -68,16 +68,16 @@ def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float) -> Tensor:
 def assign(
     targets: Targets, anchors: Tensor, strides: tuple[int, ...], shapes: list[tuple[int, int, int]], ratio: float
 ) -> list[Assignment]:
-    """Positive and free predictors of every scale, for anchors (scales, 3, 2) and grids (N, h, w).
+    """Positive and ignored predictors of every scale, for anchors (scales, 3, 2) and grids (N, h, w).
 
-    Positive is every anchor of every scale within the factor `ratio` of a selected label, in the cell that holds the
-    label's centre and in the nearest cell beside it along x and along y (as in later YOLO versions). Deviation: YOLOv3
+    A predictor is positive if its anchor is within the factor `ratio` of a selected label and its cell contains the
+    label's centre or is the nearest neighbour of that cell along x or y (as in later YOLO versions). Deviation: YOLOv3
     makes one predictor of one scale positive for each label. This gives about nine times as many positives, so that a
     short training suffices.
 
-    Free are predictors with a matching anchor whose cell touches the middle half of an ignored label's box. All others
-    are negative, also those around a selected label. YOLOv3 leaves those free if their boxes overlap the label by more
-    than 0.5; then nothing makes their scores differ from those of better boxes.
+    A predictor is ignored if its anchor matches and its cell touches the middle half of an ignored label's box. All
+    others are negative, including those around a selected label. YOLOv3 ignores those if their boxes overlap the label
+    by more than 0.5; then the loss does not lower their scores below the scores of better boxes.
     """
     matches = matching_anchors(targets.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
     centre = (targets.boxes[:, :2] + targets.boxes[:, 2:]) / 2
@@ -90,8 +90,10 @@ def assign(
         limit = at.new_tensor([width, height])
         grid = (frames, anchors.shape[1], height, width)
         selected = targets.selected[label]
-        ignored = label[~selected]
-        free = _cells_touched(targets.frame[ignored], anchor[~selected], at[~selected], size[ignored] / stride, grid)
+        unselected = label[~selected]
+        ignored = _cells_touched(
+            targets.frame[unselected], anchor[~selected], at[~selected], size[unselected] / stride, grid
+        )
         label, anchor, at = label[selected], anchor[selected], at[selected]
         cell = at.floor()
         side = torch.where(at - cell < 0.5, -1.0, 1.0)
@@ -103,8 +105,8 @@ def assign(
         label, anchor = label.repeat(3), anchor.repeat(3)
         inside = ((cells >= 0) & (cells < limit)).all(1)
         cells, label, anchor = cells[inside].long(), label[inside], anchor[inside]
-        made = Assignment(targets.frame[label], anchor, cells[:, 1], cells[:, 0], label, free)
-        result.append(Assignment(made.frame, made.anchor, made.row, made.column, label, free & ~made.positive))
+        made = Assignment(targets.frame[label], anchor, cells[:, 1], cells[:, 0], label, ignored)
+        result.append(Assignment(made.frame, made.anchor, made.row, made.column, label, ignored & ~made.positive))
     return result
 
 

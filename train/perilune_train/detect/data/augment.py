@@ -67,7 +67,7 @@ def augment(
     """Augment a frame: returns it (height, width) in float32 grey levels, its boxes (M, 4) and which are selected (M,).
 
     A crater is deselected if rescaling moves its radius out of the range `radius_px` or its centre off the image. It is
-    left out if it becomes much smaller than that.
+    removed if it becomes much smaller than that range or leaves the image.
     """
     turned: NDArray = image
     if settings.flips_and_turns:

@@ -62,7 +62,7 @@ def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Ten
 
 
 class ProcessBatches(torch_data.Sampler[list[int]]):
-    """Positions in an epoch's order that one of `processes` takes, batch by batch.
+    """Batches of one of several processes, as positions in an epoch's order of frames.
 
     In every step the processes together take the next `size * processes` positions, each an equal part, so that all
     have the same number of batches and each position is taken once. If the last step has fewer positions than

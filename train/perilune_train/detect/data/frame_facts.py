@@ -1,4 +1,4 @@
-"""Facts about evaluated frames besides their labels: place, altitude, Sun. Real images may lack any of them."""
+"""Metadata of evaluated frames: scene, trajectory, altitude, Sun elevation. Any may be unknown for real images."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class FrameFacts:
     """One entry per frame."""
 
     name: list[str]
-    """For titles (N)."""
+    """Name in titles (N)."""
     sizes_px: NDArray[np.int64]
     """Width and height (N, 2)."""
     scene: list[str]
@@ -32,13 +32,13 @@ class FrameFacts:
 
 
 def unknown_facts(name: list[str], sizes_px: NDArray) -> FrameFacts:
-    """Facts of images of which only name and width and height (N, 2) are known."""
+    """Metadata of images with known name, width and height (N, 2) only."""
     nothing = np.full(len(name), np.nan)
     return FrameFacts(name, np.asarray(sizes_px), [""] * len(name), [""] * len(name), nothing, nothing)
 
 
 def facts_of(frames: FrameStore) -> FrameFacts:
-    """Facts of a dataset's frames."""
+    """Metadata of a dataset's frames."""
     table = frames.table
     height, width = frames.images.shape[1:]
     sun = np.stack([np.asarray(direction, np.float64) for direction in table["sun_direction"]])

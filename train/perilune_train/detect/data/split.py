@@ -23,8 +23,8 @@ _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "e
 _SHAPE = [*_BOX, "radius_px", *_ELLIPSE]
 
 MARGIN = np.sqrt(0.5)
-"""Craters below the least radius are ignored down to this fraction of it; no box in range overlaps smaller ones by
-half."""
+"""Craters below the smallest evaluated radius are ignored down to this fraction of it. Smaller ones cannot reach an IoU
+of 0.5 with a box in the range."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class DetectSplit:
 def load_split(
     dataset: Dataset, split: str, settings: LabelSettings, scale: tuple[float, float] = (1.0, 1.0)
 ) -> DetectSplit:
-    """Load frames and labels of a split. Raises UserError on damaged files and on frames that the network cannot take.
+    """Load frames and labels of a split. Raises UserError on damaged files and on frame sizes unfit for the network.
 
-    `scale` holds the least and the largest zoom factor that will be applied to frames; the range of ignored craters is
-    extended accordingly. For the edge account the largest is 1 / EDGE.
+    `scale` has the smallest and the largest zoom factor that will be applied to frames; the range of ignored craters is
+    extended accordingly. The edge account needs a largest factor of 1 / EDGE.
     """
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
@@ -83,12 +83,12 @@ def load_split(
     rows_of = labels.groupby("frame_id").indices
     craters = dataset.table("craters", _CRATER).to_pandas()
     by_scene = {str(name): (part, *_places(part)) for name, part in craters.groupby("scene_id")}
-    nowhere = (craters.iloc[:0], *_places(craters.iloc[:0]))
+    no_craters = (craters.iloc[:0], *_places(craters.iloc[:0]))
     parts = []
     for frame in frames.table.to_dict("records"):
         rows = rows_of.get(frame["frame_id"], np.empty(0, np.intp))
         # First select by size: a scene has a hundred thousand craters, and the other checks cost more.
-        scene, points, radius_m = by_scene.get(frame["scene_id"], nowhere)
+        scene, points, radius_m = by_scene.get(frame["scene_id"], no_craters)
         near = _right_size(points, radius_m, camera.intrinsics(), frame, _ignored_range(radius_px, scale))
         others = scene[near]
         others = others[~others["crater_id"].isin(ids[rows])]
@@ -125,15 +125,15 @@ def _right_size(
 
 
 def _evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
-    """Least and largest selected radius, pixels; the dataset's labels give limits that the selection leaves open."""
+    """Smallest and largest selected radius, pixels; limits that the selection does not set are those of the labels."""
     if settings.radius_px is None:
         return _labelled_range(dataset)
-    least_px, largest_px = settings.radius_px
-    return least_px, label_bound_px(dataset.info) if largest_px is None else largest_px
+    smallest_px, largest_px = settings.radius_px
+    return smallest_px, label_bound_px(dataset.info) if largest_px is None else largest_px
 
 
 def _labelled_range(dataset: Dataset) -> tuple[float, float]:
-    """Least and largest radius of all labels of a dataset, pixels."""
+    """Smallest and largest radius of all labels of a dataset, pixels."""
     radius_px = dataset.table("labels", ["radius_px"]).to_pandas()["radius_px"]
     return float(radius_px.min()), float(radius_px.max())
 
@@ -147,12 +147,11 @@ def unlabelled_craters(
 ) -> pd.DataFrame:
     """Craters of the scene that a frame shows just outside the labelled range, as rows to ignore.
 
-    A crater of 1.9 px looks like one of 2.1 px. If only the second were in the table, half of the labels near the limit
-    would be trained away as background, and detecting the first would be a false positive. So two kinds of crater are
-    ignored, as COCO ignores objects outside its area range: craters within a factor of sqrt(2) of the range (beyond it
-    no box within the range overlaps them by half) and craters with their centre off the image. If frames will be
-    enlarged or shrunk (`scale`, see load_split), smaller and larger ones are ignored too. `frame` is a row of the
-    table.
+    A crater of 1.9 px looks like one of 2.1 px. If the first were background, training would lower the scores of both,
+    and a detection of the first would be a false positive. So two kinds of crater are ignored, as COCO ignores objects
+    outside its area range: craters within a factor of sqrt(2) of the range (others cannot reach an IoU of 0.5 with a
+    box in the range) and craters with their centre off the image. If frames will be enlarged or shrunk (`scale`, see
+    load_split), smaller and larger ones are ignored too. `frame` is a row of the table.
     """
     low, high = _ignored_range(radius_px, scale)
     points, radius_m = _places(craters)

@@ -9,10 +9,10 @@ from perilune_shared.errors import UserError
 from perilune_train.detect.deploy.engines import Array, Engine
 from perilune_train.models.yolo import YOLOv3
 
-MOST_PX = 1e-3
-"""Largest allowed difference of a box coordinate from torch's float32, pixels, of the boxes compared."""
-MOST_SCORE = 1e-3
-"""Largest allowed difference of a score, of all predictors."""
+MAX_DIFFERENCE_PX = 1e-3
+"""Largest allowed difference of a coordinate of a compared box from torch's float32, pixels."""
+MAX_DIFFERENCE_SCORE = 1e-3
+"""Largest allowed difference of any predictor's score."""
 _CHECKED_BOXES = 100
 
 
@@ -34,11 +34,14 @@ def difference(network: YOLOv3, engine: Engine, images: Array, min_score: float)
 
 
 def check(path: Path, name: str, network: YOLOv3, engine: Engine, images: Array, min_score: float) -> dict[str, float]:
-    """Largest differences of a written file over all images. Raises UserError if one exceeds its limit."""
+    """Largest differences of a file's outputs from torch's. Raises UserError if one exceeds its limit."""
     px, score = difference(network, engine, images, min_score)
-    if not (px <= MOST_PX and score <= MOST_SCORE):
+    if not (px <= MAX_DIFFERENCE_PX and score <= MAX_DIFFERENCE_SCORE):
         raise UserError(
-            path.name, name, f"boxes {px:.2g} px and scores {score:.2g} from torch's", f"{MOST_PX} px, {MOST_SCORE}"
+            path.name,
+            name,
+            f"boxes {px:.2g} px and scores {score:.2g} from torch's",
+            f"at most {MAX_DIFFERENCE_PX} px and {MAX_DIFFERENCE_SCORE}",
         )
     return {"frames": len(images), "largest_px": px, "largest_score": score}
 

@@ -1,4 +1,4 @@
-"""Inference engines: each makes a detector a function from images to boxes and scores."""
+"""Inference engines: functions from images to boxes and scores."""
 
 import contextlib
 import functools
@@ -96,10 +96,10 @@ def has_bf16() -> bool:
 
 @contextlib.contextmanager
 def _readable(path: Path) -> Any:
-    """Raise a one-line UserError if an engine refuses a file; both engines raise their own kinds of RuntimeError."""
+    """Raise UserError if an engine cannot read a file; the engines raise their own kinds of RuntimeError."""
     if not path.is_file():
-        raise UserError(path, "network", "no such file", "a file of `perilune-train detect export`")
+        raise UserError(path, "network", "no such file", "a file written by `perilune-train detect export`")
     try:
         yield
     except Exception as error:
-        raise UserError(path, "network", error, "a file of `perilune-train detect export`") from None
+        raise UserError(path, "network", error, "a file written by `perilune-train detect export`") from None

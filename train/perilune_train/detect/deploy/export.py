@@ -54,7 +54,7 @@ class Trained:
 
 
 def load_trained(root: Path) -> Trained:
-    """Load a finished run's network, settings and threshold. Raises UserError if it is none."""
+    """Load a finished run's network, settings and threshold. Raises UserError if it is not one."""
     config, threshold, best = config_of_run(root), chosen_threshold(root), RunFolder(root).best
     return Trained(load_detector(best), config, threshold, best)
 
@@ -92,7 +92,7 @@ def export_metadata(trained: Trained, size_px: int) -> dict[str, Any]:
 def _terrain(
     checkpoint: Path, calibration: Dataset | None, allow_overlap: bool
 ) -> tuple[Provenance, TerrainCheck | None]:
-    """Terrain record of the exported network, including int8's calibration and validation, and its check."""
+    """Terrain record of the exported network, with the terrain of the int8 calibration, and the check of the latter."""
     provenance = read_provenance(load_weights(checkpoint), checkpoint)
     if calibration is None:
         return provenance, None
@@ -110,14 +110,14 @@ def export_run(
     int8: bool = False,
     allow_overlap: bool = False,
 ) -> Int8Verdict | None:
-    """Write a run's detector into the new folder `out`, checked; with `int8` also quantised, if that is kept.
+    """Export a run's detector to the new folder `out`, and check the files; with `int8` also try quantisation.
 
-    Writes detector.onnx, detector.xml and .bin (as selected), detector-int8.onnx (if kept), detector.json (the facts)
+    Writes detector.onnx, detector.xml and .bin (as selected), detector-int8.onnx (if kept), detector.json (metadata)
     and README.md. Compares on frames of the dataset's validation split, or on noise without a dataset.
 
     Raises UserError, and writes nothing, if a file differs from torch, if the dataset has frames of another size, or if
-    int8 is calibrated on terrain that the run was tested on, or that the dataset's own test split shares with what the
-    network was fitted to. With `allow_overlap` such terrain is allowed, and facts and README say so.
+    int8 would be calibrated on terrain of a test split, the run's or the dataset's. With `allow_overlap` such terrain
+    is allowed, and detector.json and README.md are marked.
     """
     for name in ("onnx", "onnxruntime", *formats, *(("openvino", "onnxruntime.quantization") if int8 else ())):
         package(name)
@@ -128,7 +128,7 @@ def export_run(
         camera = opened.info.camera
         if (camera.width_px, camera.height_px) != (size_px, size_px):
             found = f"{camera.width_px} x {camera.height_px}"
-            raise UserError(opened.root, "frames", found, f"{size_px} x {size_px} pixels; --size-px gives another")
+            raise UserError(opened.root, "frames", found, f"{size_px} x {size_px} pixels; --size-px sets it")
     metadata = export_metadata(trained, size_px)
     terrain, terrain_check = _terrain(trained.checkpoint, opened if int8 else None, allow_overlap)
     metadata["terrain"] = {**terrain.plain(), **(terrain_check.metrics() if terrain_check is not None else {})}
@@ -158,8 +158,8 @@ def export_run(
             )
         if int8 and opened is not None:
             verdict = try_int8(onnx_path, folder / "detector-int8.onnx", opened, val, trained.config)
-            metadata["int8"] = verdict.as_facts()
-            console.print(verdict.words())
+            metadata["int8"] = verdict.as_metadata()
+            console.print(verdict.summary())
         if "onnx" not in formats:
             onnx_path.unlink()
         metadata["files"] = {p.name: sha256_of(p) for p in sorted(folder.iterdir())}

@@ -1,4 +1,4 @@
-"""The detector for flight: inference only, the same function in fewer and simpler operations."""
+"""The detector for flight: inference only, with fewer and simpler operations."""
 
 import copy
 

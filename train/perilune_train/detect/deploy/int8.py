@@ -22,8 +22,8 @@ from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.split_evaluation import match_detections
 from perilune_train.detect.inference.suppression import detections_of
 
-MOST_LOSS = 0.005
-"""Largest loss of average precision on the validation split that is accepted for int8: half a point."""
+MAX_AP_LOSS = 0.005
+"""Largest accepted loss of AP on the validation split."""
 _CALIBRATION_FRAMES = 64
 _TIMED = 30
 _KEPT_FLOAT = ("/squeeze", "/excite", "/spatial", "/heads.")
@@ -32,29 +32,29 @@ _KEPT_FLOAT = ("/squeeze", "/excite", "/spatial", "/heads.")
 
 @dataclass(frozen=True)
 class Int8Verdict:
-    """Accuracy and speed before and after quantisation, by OpenVINO on this machine."""
+    """Accuracy and speed before and after quantisation, measured with OpenVINO on this machine."""
 
     ap50_paper_float: float
-    """AP on the validation split in float32, at scale 1, whatever the run's scales."""
+    """AP on the validation split in float32, at scale 1 only."""
     ap50_paper_int8: float
     """AP of the int8 network, with its other parts in `precision`."""
     float_s: float
-    """Median time of one image before quantisation, in `precision`."""
+    """Median time of one image before quantisation, in `precision`, seconds."""
     int8_s: float
-    """Median time of one image in int8."""
+    """Median time of one image in int8, seconds."""
     precision: EnginePrecision
-    """EnginePrecision of the parts that are not int8: bf16 if the processor has it."""
+    """Precision of the parts that are not int8: bf16 if the processor has it."""
 
     @property
     def kept(self) -> bool:
-        """Whether at most half a point of AP is lost and int8 is faster."""
-        return self.ap50_paper_float - self.ap50_paper_int8 <= MOST_LOSS and self.int8_s < self.float_s
+        """Whether int8 is faster and loses at most MAX_AP_LOSS."""
+        return self.ap50_paper_float - self.ap50_paper_int8 <= MAX_AP_LOSS and self.int8_s < self.float_s
 
-    def as_facts(self) -> dict[str, Any]:
+    def as_metadata(self) -> dict[str, Any]:
         """As plain data."""
         return {**dataclasses.asdict(self), "kept": self.kept}
 
-    def words(self) -> str:
+    def summary(self) -> str:
         """Summary in one line."""
         comparison = (
             f"AP {self.ap50_paper_int8:.4f} (float32 {self.ap50_paper_float:.4f}) on the validation split, "
@@ -64,7 +64,7 @@ class Int8Verdict:
 
 
 def try_int8(source: Path, out: Path, dataset: Dataset, val: DetectSplit, config: DetectConfig) -> Int8Verdict:
-    """Quantise the ONNX file `source` into `out` and evaluate both on `val`; `out` is deleted unless it is kept.
+    """Quantise the ONNX file `source` into `out` and evaluate both on `val`; deletes `out` unless int8 is kept.
 
     Calibrated on 64 frames spread over the training split.
     """
@@ -137,7 +137,7 @@ def average_precision(engine: Engine, split: DetectSplit, config: DetectConfig, 
 
 
 def interleaved(engines: dict[str, Engine], images: Array, rounds: int, warm_up: int = 5) -> dict[str, list[float]]:
-    """Seconds of each call of each engine, called in turn, so that other load on the machine slows all alike."""
+    """Times of each engine's calls, seconds; the engines take turns, so that other load slows all of them equally."""
     for engine in engines.values():
         for _ in range(warm_up):
             engine(images)

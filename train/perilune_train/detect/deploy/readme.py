@@ -55,7 +55,7 @@ def readme(metadata: dict[str, Any]) -> str:
         "|---|---|",
         *(f"| {name} | `{digest}` |" for name, digest in metadata["files"].items()),
         "",
-        "`detector.json` contains these values and all others; the ONNX file contains them as metadata.",
+        "`detector.json` contains these and all other values; the ONNX file contains them as metadata.",
         "OpenVINO computes in bfloat16 if the processor supports it, which is faster but less accurate;",
         "`INFERENCE_PRECISION_HINT=f32` gives the same boxes as torch. Fixing the shape to one image (`model.reshape`)",
         "also makes it faster.",
@@ -65,7 +65,7 @@ def readme(metadata: dict[str, Any]) -> str:
         lines += [
             f"The threshold of {threshold} is for images evaluated {at_scales(tuple(metadata['scales']))}: resize the",
             "image to each scale, run the graph on tiles of its size, divide the boxes by the scale, and apply one",
-            "non-maximum suppression to all of them. One scale alone needs another threshold.",
+            "non-maximum suppression to all of them. A single scale needs another threshold.",
             "",
         ]
     if "detector-int8.onnx" in metadata["files"]:

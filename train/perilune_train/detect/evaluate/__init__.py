@@ -1,1 +1,1 @@
-"""Evaluation of detections over plain data, without torch."""
+"""Evaluation of detections on plain arrays, without torch."""

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 RADIUS_BINS_PX = (2.0, 3.0, 5.0, 10.0, 20.0, 50.0, float("inf"))
 """The paper's range up to 50 px, then one open bin for the larger labels of wider images."""
-_PAPERS_LARGEST_PX = 50.0
+_PAPER_MAX_RADIUS_PX = 50.0
 ALTITUDE_BINS_M = (200.0, 500.0, 1000.0, 1500.0)
 SUN_BINS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 DEPTH_RATIO_BINS = (0.0, 0.04, 0.06, 0.08, 0.1, 0.15, 1.0)
@@ -92,8 +92,8 @@ def figures_by_bin(
     made = []
     for low, high in pairwise(RADIUS_BINS_PX):
         # A radius of exactly 50 px belongs to the paper's largest bin.
-        own = within(overlaps.label_radius_px, low, high, high == _PAPERS_LARGEST_PX)
-        own &= (low < _PAPERS_LARGEST_PX) | (overlaps.label_radius_px > low)
+        own = within(overlaps.label_radius_px, low, high, high == _PAPER_MAX_RADIUS_PX)
+        own &= (low < _PAPER_MAX_RADIUS_PX) | (overlaps.label_radius_px > low)
         evaluated = max(low, radius_px[0]), min(high, radius_px[1])
         part = overlaps.match(match_iou, evaluated, overlaps.label_selected & own)
         made.append(_of_matches("radius", "px", low, high, part, threshold, resamples))

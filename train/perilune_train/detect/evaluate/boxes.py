@@ -1,4 +1,4 @@
-"""Boxes in NumPy: overlap and suppression. A box is x0, y0, x1, y1 in pixels, x1 >= x0, y1 >= y0."""
+"""Overlap and suppression of boxes in NumPy. A box is x0, y0, x1, y1 in pixels, x1 >= x0, y1 >= y0."""
 
 import cv2
 import numpy as np
@@ -20,8 +20,8 @@ def iou_matrix(first: ArrayLike, second: ArrayLike) -> Array:
     return np.divide(overlap, union, out=np.zeros_like(overlap), where=union > 0)
 
 
-def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, most: int) -> NDArray[np.intp]:
-    """Non-maximum suppression (OpenCV's): indices of the kept boxes, best first, at most `most`.
+def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_count: int) -> NDArray[np.intp]:
+    """Non-maximum suppression (OpenCV's): indices of the kept boxes, best first, at most `max_count`.
 
     A box is removed if its IoU with a kept box of a higher score exceeds `threshold_iou`; equal scores keep their
     order. All boxes are considered: several hundred craters with a dozen predictors each would exceed any usual limit
@@ -32,4 +32,4 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, most: in
         return np.empty(0, np.intp)
     corner_and_size = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
     kept = cv2.dnn.NMSBoxes(corner_and_size, scores, 0.0, threshold_iou)  # type: ignore[arg-type]
-    return np.asarray(kept, np.intp).reshape(-1)[:most]
+    return np.asarray(kept, np.intp).reshape(-1)[:max_count]

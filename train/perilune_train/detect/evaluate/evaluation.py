@@ -1,4 +1,4 @@
-"""Evaluation of detections: all computations, over plain data.
+"""Evaluation of detections: all computations, on plain arrays.
 
 Use it for rendered datasets and real images alike::
 
@@ -47,11 +47,11 @@ class Evaluation:
     labels: list[FrameLabels]
     """One entry per frame."""
     facts: FrameFacts
-    """Facts about the frames."""
+    """Metadata of the frames."""
     threshold: float
-    """Least score of the detections that count in precision, recall and F1."""
+    """Minimum score of the detections that count in precision, recall and F1."""
     match_iou: float
-    """Least IoU of a match, except in averages over several IoUs."""
+    """Minimum IoU of a match, except in averages over several IoUs."""
     overlaps: Overlaps
     """Pairs of detections and labels that may match."""
     matches: Matches
@@ -77,7 +77,7 @@ class Evaluation:
         """Flat keys for metrics.json; NaN where undefined.
 
         The keys are those of `metrics.figures`, `figures_over_ious` and `Spread.keys`, <bin>/ap50_paper and others,
-        recall_radius_... and the errors.
+        recall_radius_... and `errors`.
         """
         result: Metrics = {
             **figures(self.matches, self.threshold),
@@ -167,8 +167,8 @@ def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> d
     """Errors of found craters, in pixels and (`_relative`) over the label's radius; NaN if none was found.
 
     The centre is the centre of the box. The radius is sqrt(w h) / 2 of a box, for the detection and for the label. For
-    a rotated ellipse it is slightly larger than sqrt(a b), which a box cannot show. Bias is the mean of detected minus
-    true.
+    a rotated ellipse it is slightly larger than sqrt(a b), which a box does not determine. Bias is the mean of detected
+    minus true.
     """
     own = (matches.label >= 0) & (matches.scores >= threshold)
     ours, truth = overlaps.boxes[own], overlaps.label_boxes[matches.label[own]]

@@ -14,7 +14,7 @@ from perilune_train.detect.evaluate.evaluation import Evaluation
 from perilune_train.detect.evaluate.matching import FALSE, FOUND
 from perilune_train.detect.evaluate.metrics import Curve
 from perilune_train.evaluation.pictures import save_figure
-from perilune_train.evaluation.spread import LEAST_UNITS
+from perilune_train.evaluation.spread import MIN_UNITS
 
 _LABEL, _IGNORED, _FOUND, _FALSE = "#ff4040", "#e0c030", "#19d3e0", "#ff40ff"
 _PANELS = {"radius": "radius, px", "altitude": "altitude, m", "sun": "Sun elevation, degrees"}
@@ -61,7 +61,7 @@ def draw_bins(bins: Sequence[BinFigures], path: Path) -> None:
         axes.set(xlabel=title, ylim=(0, 1), ylabel="AP" if place == 0 else "")
         axes.set_xticks(range(len(parts)), [f"{part.label}\n{part.labels}" for part in parts], fontsize=8)
     figure.suptitle(
-        f"AP (the paper's definition) with 95 % intervals, or a dot per {unit} if there are fewer than {LEAST_UNITS}; "
+        f"AP (the paper's definition) with 95 % intervals, or a dot per {unit} if there are fewer than {MIN_UNITS}; "
         "below each bin: number of labels; dashed line: goal of 0.85, reached by blue bars",
         fontsize=9,
     )

@@ -1,4 +1,4 @@
-"""Matching of detections to labels, over plain data.
+"""Matching of detections to labels, on plain arrays.
 
 Evaluate detections against labels of rendered or real images with::
 
@@ -6,22 +6,22 @@ Evaluate detections against labels of rendered or real images with::
     matches = overlaps.match(0.5, (2.0, 50.0))                 # at one IoU
     curve(matches).ap_paper()                                  # metrics.py
 
-Detections are matched in order of score. Each takes the free selected label of highest IoU, if that is at least the
-given IoU. Only selected labels count in recall. Three accounts differ in which unmatched detections are
-false positives:
+Detections are matched in order of score. Each takes the unmatched selected label of highest IoU, if that is at least
+the given IoU. Only selected labels count in recall. Three accounts differ in which unmatched detections are false
+positives:
 
 - Usual: an unmatched detection is ignored if it overlaps an ignored crater (hardly visible, or just outside the
   labelled range), if its radius sqrt(w h) / 2 is outside the labelled range, or if its centre is off the image. The
   labels cannot decide whether such a detection is right.
-- Edge (`edge_range`): a detection somewhat below the least radius is a false positive too, unless it overlaps a crater,
-  selected or not. In the usual account a detector can report boxes just under the least radius everywhere at no cost,
-  although some of them match a label and count.
+- Edge (`edge_range`): a detection somewhat below the smallest radius is a false positive too, unless it overlaps a
+  crater, selected or not. In the usual account a detector can report boxes just below the smallest radius everywhere:
+  some of them match a label and count, and the others are ignored.
 - Strict: every unmatched detection is a false positive.
 
-Two things differ from COCO (COCOeval without crowds). There an ignored label absorbs one detection, here any number,
-since detections on an ignored crater cannot be evaluated; COCO gives the same metrics if each ignored
-label is repeated once for every detection (a test does that). COCO counts a detection whose centre is off the image as
-a false positive, because the labels given to it have no such centres.
+There are two differences from COCO (COCOeval without crowds). In COCO an ignored label takes only one detection; here
+it takes any number, since detections on an ignored crater cannot be evaluated. COCO gives the same metrics if each
+ignored label is repeated once for every detection (a test does that). COCO counts a detection whose centre is off the
+image as a false positive, because its labels have no such centres.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ Rows = NDArray[np.intp]
 FOUND, FALSE, IGNORED = 1, 0, -1
 NO_LABEL, ON_IGNORED = -1, -2
 EDGE = 0.75
-"""The edge account counts false positives down to this fraction of the least radius."""
+"""The edge account counts false positives down to this fraction of the smallest radius."""
 COCO_IOUS = tuple(np.linspace(0.5, 0.95, 10).tolist())
 """The IoUs over which COCO averages, equal to the last bit."""
 
@@ -114,8 +114,8 @@ class Overlaps:
     pair_detection: Rows
     """Detection of each pair, ascending (P,)."""
     pair_label: Rows
-    """Label of each pair; for one detection by falling IoU, and for equal IoU the later label first, as in COCO
-    (P,)."""
+    """Label of each pair; for one detection by decreasing IoU, and for equal IoU the later label first, as in
+    COCO (P,)."""
     pair_iou: Array
     """IoU of each pair (P,)."""
 
@@ -124,7 +124,7 @@ class Overlaps:
         return np.sqrt(np.prod(np.maximum(self.boxes[:, 2:] - self.boxes[:, :2], 0), axis=1)) / 2
 
     def match(self, match_iou: float, radius_px: tuple[float, float], selected: Flags | None = None) -> Matches:
-        """Match every detection at one IoU, at least that of `find_overlaps`.
+        """Match every detection at one IoU, not below the `min_iou` of `find_overlaps`.
 
         `radius_px` is the evaluated range of radii; unmatched detections outside it are ignored. `selected` (L,)
         replaces `label_selected`.
@@ -148,16 +148,16 @@ class Overlaps:
 
 
 def find_overlaps(
-    found: list[Detections], labels: list[FrameLabels], sizes_px: NDArray, least_iou: float = 0.5
+    found: list[Detections], labels: list[FrameLabels], sizes_px: NDArray, min_iou: float = 0.5
 ) -> Overlaps:
-    """All pairs with an IoU of at least `least_iou`, for frames of the widths and heights `sizes_px` (N, 2)."""
+    """All pairs with an IoU of at least `min_iou`, for frames of the widths and heights `sizes_px` (N, 2)."""
     boxes, scores, detections, others, values, n_found, n_labels = [], [], [], [], [], 0, 0
     for ours, truth in zip(found, labels, strict=True):
         order = np.argsort(-ours.scores, kind="stable")
         boxes.append(ours.boxes[order].reshape(-1, 4))
         scores.append(ours.scores[order])
         overlap = iou_matrix(boxes[-1], truth.boxes)
-        row, column = np.nonzero(overlap >= least_iou)
+        row, column = np.nonzero(overlap >= min_iou)
         iou = overlap[row, column]
         sort = np.lexsort((-column, -iou, row))
         detections.append(row[sort] + n_found)

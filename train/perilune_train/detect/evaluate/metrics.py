@@ -13,10 +13,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Curve:
-    """Precision and recall at falling score thresholds."""
+    """Precision and recall at decreasing score thresholds."""
 
     scores: Array
-    """Thresholds, falling (K,)."""
+    """Thresholds, decreasing (K,)."""
     precision: Array
     """(K,)."""
     recall: Array

@@ -1,4 +1,4 @@
-"""Output files of an evaluation: report.md, pictures, and the curve as a table. Needs no dataset."""
+"""Output files of an evaluation: report.md, pictures, and the curve as a table. Works without a dataset."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from perilune_train.detect.evaluate.evaluation import Evaluation
 from perilune_train.detect.evaluate.figures import draw_bins, draw_curves, draw_frames
 from perilune_train.detect.evaluate.matching import COCO_IOUS, EDGE
 from perilune_train.detect.evaluate.metrics import Curve, curve
-from perilune_train.evaluation.spread import LEAST_UNITS, RESAMPLES, Resamples, Spread
+from perilune_train.evaluation.spread import MIN_UNITS, RESAMPLES, Resamples, Spread
 
 CURVE_FILE = "precision_recall.parquet"
 _CURVE_POINTS = 1000
@@ -51,7 +51,7 @@ def _with_ap(curves: dict[str, Curve]) -> dict[str, Curve]:
 
 
 def write_curve(path: Path, points: Curve) -> None:
-    """Write the table score, precision, recall: at most 1000 points, evenly along the curve, for comparing runs."""
+    """Write the table score, precision, recall: at most 1000 points, evenly spaced along the curve."""
     count = len(points.scores)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _CURVE_POINTS)).astype(int)) if count else np.empty(0, int)
     columns = {name: pa.array(getattr(points, f)[chosen]) for name, f in _CURVE_COLUMNS.items()}
@@ -84,7 +84,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         f"- match at IoU {evaluation.match_iou:g}; precision, recall and F1 at a score of {evaluation.threshold:.4f}",
         f"- {_of_brackets(evaluation.resamples)}",
         "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored; "
-        f"edge: those from {EDGE:g} of the least radius on that overlap no crater are false positives; "
+        f"edge: those down to {EDGE:g} of the smallest radius are false positives, unless they overlap a crater; "
         "strict: every unmatched detection is a false positive",
         "",
         "## All frames",
@@ -116,7 +116,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
             ("radius, bias (detected minus true)", "radius_bias", ""),
         )
     ]
-    lines += [*table(["", "px", "over the radius"], rows), ""]
+    lines += [*table(["", "px", "relative to the radius"], rows), ""]
     return "\n".join(lines)
 
 
@@ -129,11 +129,11 @@ def _cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], key: str
 def _of_brackets(resamples: Resamples) -> str:
     """Explanation of the brackets after a number."""
     count, unit = resamples.count, resamples.unit
-    if count < LEAST_UNITS:
+    if count < MIN_UNITS:
         return f"in brackets: the value of each {unit}; {count} of them are too few for an interval"
     return (
         f"in brackets: 95 % intervals, {RESAMPLES} resamples of {count} {unit}s; the value of each {unit} where fewer "
-        f"than {LEAST_UNITS} have labels"
+        f"than {MIN_UNITS} have labels"
     )
 
 

@@ -64,7 +64,7 @@ def dataset_entries(dataset: Dataset, split: str, config: DetectConfig) -> Metri
 
 
 def report_head(
-    dataset: Dataset, split: str, config: DetectConfig, protocol: str, run: str, chosen_on: str
+    dataset: Dataset, split: str, config: DetectConfig, protocol: str, run: str, threshold_source: str
 ) -> list[str]:
     """Dataset, split and settings of an evaluation, for the head of a report."""
     settings = config.evaluation
@@ -72,7 +72,7 @@ def report_head(
     return [
         f"run `{run}`, best weights; dataset `{dataset.info.name}`, split {split}; protocol: {protocol}",
         f"labels: selection `{config.labels.selection}` ({', '.join(f'{k} {v}' for k, v in thresholds.items())})",
-        f"threshold {chosen_on}",
+        f"threshold {threshold_source}",
         f"detections below a score of {settings.min_score:g} are dropped, suppression at IoU {settings.nms_iou:g}, "
         f"at most {settings.max_detections} are kept in a frame; frames evaluated {at_scales(settings.scales)}",
     ]

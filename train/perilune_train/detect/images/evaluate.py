@@ -1,9 +1,9 @@
 """Evaluation of a run on labelled real images, with the same report as for a dataset.
 
 Boxes of at least `min_size_px` (sqrt(w h)) that are centred in their image are ground truth. Smaller boxes, boxes
-centred off the image and boxes that a COCO file ignores are neither missed nor false positives, nor are detections
-below that size. The threshold is the run's own, from its validation split. The best threshold on the images themselves
-is reported beside it as an oracle: choosing it needs labels.
+centred off the image and boxes that a COCO file ignores are ignored, and so are unmatched detections below that size.
+The threshold is the run's own, from its validation split. The metrics at the best threshold for these images are also
+reported, as an oracle: choosing it needs labels.
 """
 
 from pathlib import Path
@@ -35,7 +35,7 @@ from perilune_train.evaluation.pictures import save_image
 from perilune_train.training import runs
 
 _CROP_PX = 200
-_PAIRS_A_ROW, _MOST_PAIRS = 3, 12
+_PAIRS_PER_ROW, _MAX_PAIRS = 3, 12
 _LABEL, _SMALL = (64, 64, 255), (48, 192, 224)
 _COLOURS = {FOUND: (224, 211, 25), FALSE: (255, 64, 255)}
 
@@ -43,7 +43,7 @@ _COLOURS = {FOUND: (224, 211, 25), FALSE: (255, 64, 255)}
 def evaluate_images(
     run: Path,
     config: DetectConfig,
-    place: Path,
+    source: Path,
     out: Path,
     tiling: Tiling,
     min_size_px: float = 8.0,
@@ -58,10 +58,12 @@ def evaluate_images(
     tiling.check()
     if not 0 < min_size_px < np.inf:
         raise UserError("--min-size", "pixels", min_size_px, "above 0")
-    given = read_images(place)
+    given = read_images(source)
     if not any(image.selected(min_size_px).any() for image in given.images):
-        raise UserError(place, "boxes", f"none of {min_size_px:g} px or more", "at least one to be found")
-    chosen_on = "of the run, chosen on its validation split" if threshold is None else "given on the command line"
+        raise UserError(source, "boxes", f"none of {min_size_px:g} px or more", "at least one")
+    threshold_source = (
+        "of the run, chosen on its validation split" if threshold is None else "given on the command line"
+    )
     threshold = chosen_threshold(run) if threshold is None else threshold
     images = [read_grey(image.path) for image in given.images]
     found = _detect(open_detector(runs.RunFolder(run).best, config), images, tiling)
@@ -69,11 +71,11 @@ def evaluate_images(
     best = curve(evaluation.matches).best_threshold()
     oracle = dict(zip(("precision", "recall", "f1"), at_threshold(evaluation.matches, best), strict=True))
     about = [
-        f"run `{run.resolve().name}`, best weights; {len(images)} images of `{place.name}`",
+        f"run `{run.resolve().name}`, best weights; {len(images)} images of `{source.name}`",
         f"labels: boxes of {min_size_px:g} px or more (sqrt(w h)), centred in the image",
         f"tiles of {tiling.tile_px} px, overlap {tiling.overlap_px} px, at scale {', '.join(map(str, tiling.scales))}"
         + ("" if tiling.box_margin_px == 0 else f"; boxes enlarged by {tiling.box_margin_px:g} px at every side"),
-        f"threshold {chosen_on}",
+        f"threshold {threshold_source}",
         f"oracle: with the threshold of highest F1 on these images ({best:.4f}), which cannot be known without labels: "
         + ", ".join(f"{name} {value:.3f}" for name, value in oracle.items()),
     ]
@@ -83,7 +85,7 @@ def evaluate_images(
     with written_aside(out / "detections.parquet") as aside:
         table.to_parquet(aside, index=False)
     write_crops(out / "crops.png", images, evaluation)
-    figures = {"images/name": place.resolve().name, "images/categories": given.categories} | evaluation.figures()
+    figures = {"images/name": source.resolve().name, "images/categories": given.categories} | evaluation.figures()
     figures |= {f"oracle/{name}": value for name, value in oracle.items()}
     figures |= {"oracle/threshold": best, "min_size_px": min_size_px, "tile_px": tiling.tile_px}
     figures |= {
@@ -106,9 +108,9 @@ def frame_labels(image: LabelledImage, min_size_px: float) -> FrameLabels:
 def evaluate_detections_in_images(
     given: ImageSet, found: list[Detections], threshold: float, min_size_px: float, match_iou: float = 0.5
 ) -> Evaluation:
-    """Evaluate the detections of all images; clip detections at the image's edge if the labels' boxes are clipped."""
+    """Evaluate the detections of all images; clips their boxes at the image's edge if those of labels are clipped."""
     sizes = np.array([[image.width_px, image.height_px] for image in given.images])
-    if given.ends_at_edges:
+    if given.clipped:
         limits = np.tile(sizes, 2).astype(np.float64)
         found = [
             Detections(np.clip(part.boxes, 0, limit), part.scores) for part, limit in zip(found, limits, strict=True)
@@ -139,10 +141,10 @@ def write_crops(path: Path, images: list[NDArray[np.uint8]], evaluation: Evaluat
     Left: labels (selected red, others orange). Right: detections above the threshold (matched cyan, false positives
     magenta, ignored ones left out).
     """
-    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), _MOST_PAIRS)).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), _MAX_PAIRS)).round().astype(int))
     pairs = [_crop_pair(images[index], evaluation, int(index)) for index in chosen]
-    pairs += [np.zeros_like(pairs[0])] * (-len(pairs) % min(_PAIRS_A_ROW, len(pairs)))
-    columns = min(_PAIRS_A_ROW, len(pairs))
+    pairs += [np.zeros_like(pairs[0])] * (-len(pairs) % min(_PAIRS_PER_ROW, len(pairs)))
+    columns = min(_PAIRS_PER_ROW, len(pairs))
     rows = [np.concatenate(pairs[k : k + columns], axis=1) for k in range(0, len(pairs), columns)]
     save_image(path, np.concatenate(rows))
 

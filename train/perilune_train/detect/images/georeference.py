@@ -25,7 +25,7 @@ MOON_CRS = "urn:ogc:def:crs:IAU:2015:30100"
 """Longitude and latitude, degrees, on the sphere of the Moon's mean radius."""
 _CORNERS = 32
 _GRID = 17
-"""Number of sample points per side, to test whether an image is on its map; a disc may leave its corners empty."""
+"""Number of sample points per side, to test whether an image is on its map; a full disc's corners are not."""
 _DECIMALS = 8
 """Decimals of degrees: 0.3 mm on the ground."""
 
@@ -65,13 +65,13 @@ def _lon_lat_from_map(projection: str) -> Any:
 
 
 def read_georeference(path: Path) -> Georeference | None:
-    """Read the georeference of an image; None if it has none or only half of one. Needs rasterio."""
+    """Read the georeference of an image; None if its transform or projection is missing. Needs rasterio."""
     import rasterio
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError
 
     beside = path.with_suffix(".prj")
-    # By default GDAL would open a text file named .tif that refers to other files; PAM files can do so too.
+    # By default GDAL opens text files named .tif that refer to other files. PAM files can also refer to them.
     driver = {"TIFF": "GTiff"}.get(kind := picture_format(path), kind)
     with warnings.catch_warnings(), rasterio.Env(GDAL_PAM_ENABLED="NO"):
         warnings.simplefilter("ignore")
@@ -101,7 +101,7 @@ def features(name: str, found: Detections, reference: Georeference) -> list[dict
     """GeoJSON features of an image's detections: the ellipse in each box as a polygon, with diameter_m.
 
     Longitudes continue past 180 degrees if a polygon crosses it. A polygon around a pole is not valid in longitude and
-    latitude: the corners of such a crater are right, its filling is not. Detections that reach off the map are left
+    latitude: its vertices are correct, but its area is not. Detections that reach off the map are left
     out.
     """
     from pyproj import Geod

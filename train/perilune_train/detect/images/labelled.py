@@ -2,9 +2,8 @@
 
 A table (`<name>.txt` beside `<name>.png`) has a header with X, Y, W and H: left, top, width and height of a box in
 pixels, separated by commas or tabs. COCO is read from annotations.json in the folder, or from a given file. Its images
-are beside the file or where COCO puts them: in the folder images next to the file's own, or in a folder that the file's
-name ends with (train2017 for instances_train2017.json), there or in images. Coordinates are assumed to begin at the
-outer corner of the top-left pixel.
+are searched in the file's folder, ../images, ../images/NAME and ../NAME, where NAME is the last part of the file's name
+(train2017 for instances_train2017.json). Coordinates are assumed to begin at the outer corner of the top-left pixel.
 """
 
 import json
@@ -32,7 +31,7 @@ class LabelledImage:
     """One image and its labels; the pixels stay in the file."""
 
     name: str
-    """Path within the folder, used in tables and pictures."""
+    """Path within the folder, for tables and pictures."""
     path: Path
     """The image file."""
     width_px: int
@@ -41,7 +40,7 @@ class LabelledImage:
     """Height, pixels."""
     boxes: Array
     """x0, y0, x1, y1 in pixels (M, 4); they may extend beyond the image."""
-    marked: NDArray[np.bool_]
+    not_ignored: NDArray[np.bool_]
     """False for a box that its source marks as ignored (M,)."""
 
     @property
@@ -50,10 +49,10 @@ class LabelledImage:
         return np.sqrt(np.prod(self.boxes[:, 2:] - self.boxes[:, :2], axis=1))
 
     def selected(self, min_size_px: float) -> NDArray[np.bool_]:
-        """Which boxes are ground truth (M,): marked, centred in the image, and of at least this size."""
+        """Which boxes are ground truth (M,): not ignored, centred in the image, and of at least this size."""
         centre = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
         inside = ((centre >= 0) & (centre < [self.width_px, self.height_px])).all(axis=1)
-        return self.marked & inside & (self.sizes_px >= min_size_px)
+        return self.not_ignored & inside & (self.sizes_px >= min_size_px)
 
 
 @dataclass(frozen=True)
@@ -62,11 +61,11 @@ class ImageSet:
 
     images: list[LabelledImage]
     """Sorted by name, or in the order of the COCO file."""
-    ends_at_edges: bool
+    clipped: bool
     """Whether boxes are clipped at the image's edge (as in COCO), so that detections must be clipped before
     matching."""
     categories: str = ""
-    """Categories of a COCO file that were taken as craters, in words; "" if there was no choice."""
+    """Text that names the categories of a COCO file taken as craters; "" if there was no choice."""
 
 
 def read_images(place: Path) -> ImageSet:
@@ -84,7 +83,7 @@ def read_images(place: Path) -> ImageSet:
     for path in paths:
         boxes = read_table(path.with_suffix(".txt"))
         images.append(LabelledImage(path.name, path, *picture_size(path), boxes, np.ones(len(boxes), bool)))
-    return ImageSet(images, ends_at_edges=False)
+    return ImageSet(images, clipped=False)
 
 
 def read_table(path: Path) -> Array:
@@ -127,7 +126,7 @@ def _box(values: Any, path: Path, field: str, may_be_empty: bool = False) -> tup
     if not all(math.isfinite(v) and abs(v) <= _LARGEST_PX for v in (x, y, w, h)) or not (
         least > 0 or (may_be_empty and least == 0)
     ):
-        raise UserError(path, field, values, f"a width and height above 0, and nothing beyond {_LARGEST_PX:.0f} px")
+        raise UserError(path, field, values, f"a width and height above 0, and no number beyond {_LARGEST_PX:.0f} px")
     return x, y, x + w, y + h
 
 
@@ -144,7 +143,7 @@ def _read_coco(path: Path) -> ImageSet:
     if not images or len(place) < len(images):
         raise UserError(path, "images", "none" if not images else "duplicate ids", "images with an id each")
     boxes: list[list] = [[] for _ in images]
-    marked: list[list[bool]] = [[] for _ in images]
+    not_ignored: list[list[bool]] = [[] for _ in images]
     n_empty = 0
     for n, annotation in enumerate(_records(content, "annotations", path)):
         field = f"annotations[{n}]"
@@ -158,7 +157,7 @@ def _read_coco(path: Path) -> ImageSet:
             n_empty += 1
             continue
         boxes[row].append(box)
-        marked[row].append(not annotation.get("iscrowd") and not annotation.get("ignore"))
+        not_ignored[row].append(not annotation.get("iscrowd") and not annotation.get("ignore"))
     result = []
     for k, image in enumerate(images):
         picture = _picture(path, image.get("file_name"), f"images[{k}].file_name")
@@ -166,22 +165,22 @@ def _read_coco(path: Path) -> ImageSet:
         stated = image.get("width", size[0]), image.get("height", size[1])
         if stated != size:
             raise UserError(
-                picture, "size", f"{size[0]} x {size[1]}", f"{stated[0]} x {stated[1]}, as {path.name} says"
+                picture, "size", f"{size[0]} x {size[1]}", f"{stated[0]} x {stated[1]}, as stated in {path.name}"
             )
         own = np.array(boxes[k], np.float64).reshape(-1, 4)
-        result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(marked[k], bool)))
+        result.append(LabelledImage(image["file_name"], picture, *size, own, np.array(not_ignored[k], bool)))
     if n_empty:
         console.print(f"{path.name}: {n_empty} boxes without width or height are left out", markup=False)
     if chosen:
         console.print(f"{path.name}: {chosen}", markup=False)
-    return ImageSet(result, ends_at_edges=True, categories=chosen)
+    return ImageSet(result, clipped=True, categories=chosen)
 
 
 def _records(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
     """A list of objects; a missing list of categories counts as an empty one."""
     found = content.get(name, [] if name == "categories" else None)
     if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
-        raise UserError(path, name, type(found).__name__, "a list of objects, as COCO has it")
+        raise UserError(path, name, type(found).__name__, "a list of objects, as in COCO")
     return found
 
 
@@ -193,9 +192,9 @@ def _identity(record: dict[str, Any], name: str, field: str, path: Path) -> int 
 
 
 def _crater_categories(categories: list[dict[str, Any]], path: Path) -> tuple[list[int | str] | None, str]:
-    """The ids of all categories named crater or craters, in any case, and their names in words.
+    """The ids of all categories named crater or craters, in upper or lower case, and a text that names them.
 
-    There may be several, since Roboflow's exports have a placeholder category too. With fewer than two categories in
+    There may be several, since exports of Roboflow also have a placeholder category. With fewer than two categories in
     the file every object is a crater: None and "".
     """
     if len(categories) < 2:
@@ -227,7 +226,7 @@ def _below(folder: Path, name: Any, path: Path, field: str) -> Path:
     if isinstance(name, str) and name and "\0" not in name:
         try:
             picture = folder.joinpath(name).resolve()
-        except (OSError, RuntimeError):  # links that lead to themselves
+        except (OSError, RuntimeError):  # circular links
             picture = folder
         if picture != folder and picture.is_relative_to(folder):
             return picture

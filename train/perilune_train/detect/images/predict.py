@@ -73,7 +73,7 @@ def predict_images(
                 shapes += own
                 if len(own) < len(found.boxes):
                     left_out = len(found.boxes) - len(own)
-                    message = f"{path.name}: {left_out} craters are off its map and not in detections.geojson"
+                    message = f"{path.name}: {left_out} craters are off the map and not in detections.geojson"
                     console.print(message, markup=False)
         table = pd.concat(tables, ignore_index=True)
         table.to_parquet(folder / "detections.parquet", index=False)
@@ -87,7 +87,9 @@ def _reference(path: Path) -> Georeference | None:
     if can_read_georeferences():
         return read_georeference(path)
     if path.suffix.lower() in (".tif", ".tiff") or path.with_suffix(".prj").is_file():
-        console.print(f"{path.name}: its georeference needs rasterio and pyproj (pip install 'perilune-train[geo]')")
+        console.print(
+            f"{path.name}: reading its georeference needs rasterio and pyproj (pip install 'perilune-train[geo]')"
+        )
     return None
 
 

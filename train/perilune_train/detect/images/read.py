@@ -1,7 +1,7 @@
 """Read an image as 8-bit grey: PNG, TIFF and JPEG of any size and depth.
 
-Pillow opens most of them. It reduces colours of 16 bits to 8, so OpenCV reads such a PNG. TIFFs of float64, or of
-several bands deeper than 8 bits, are read by rasterio (the extra `geo`), since OpenCV misreads some of them.
+Pillow reads most of them. It reduces 16-bit colours to 8 bits, so OpenCV reads such PNGs. rasterio (the extra `geo`)
+reads TIFFs of float64 or with several bands deeper than 8 bits, since OpenCV misreads some of them.
 """
 
 import warnings
@@ -18,8 +18,8 @@ from perilune_shared.errors import UserError
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _FORMATS = ("PNG", "TIFF", "JPEG")
 _LARGEST_PIXELS = 2**29
-"""Limit on the pixels of an image: twice a whole Narrow Angle Camera image. A small file may claim to unpack to any
-size."""
+"""Limit on the pixels of an image: twice a whole Narrow Angle Camera image. The header of a small file can state
+any size."""
 _STRETCH_PERCENT = (0.05, 99.95)
 _SAMPLE = 1_000_000
 _LARGEST_VALUE = 1e30
@@ -64,7 +64,7 @@ def _opened(path: Path) -> Any:
     Image.MAX_IMAGE_PIXELS = None
     picture: Any
     with warnings.catch_warnings():
-        # Serious errors raise; warnings about metadata would only distract the user.
+        # Serious errors raise an exception; warnings are about metadata only.
         warnings.simplefilter("ignore")
         try:
             picture = Image.open(path, formats=_FORMATS)
@@ -83,7 +83,7 @@ def _opened(path: Path) -> Any:
 
 
 def _opened_by_rasterio(path: Path) -> Any:
-    found, expected = "a file that does not decode", "a PNG, TIFF or JPEG"
+    found, expected = "a file that cannot be decoded", "a PNG, TIFF or JPEG"
     try:
         import rasterio
         from rasterio.errors import RasterioError
@@ -91,7 +91,7 @@ def _opened_by_rasterio(path: Path) -> Any:
         hint = "; float64 and deep colours in TIFF need rasterio (pip install 'perilune-train[geo]')"
         raise UserError(path, "image", found, expected + hint) from None
     try:
-        # By default GDAL would open a text file named .tif that refers to other files; PAM files can do so too.
+        # By default GDAL opens text files named .tif that refer to other files. PAM files can also refer to them.
         with rasterio.Env(GDAL_PAM_ENABLED="NO"):
             return rasterio.open(path.resolve(), driver="GTiff")
     except RasterioError:
@@ -107,7 +107,7 @@ def _by_pillow(path: Path, picture: Any) -> NDArray:
         picture.load()
         deep = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if deep is None or deep.dtype != np.uint16 or deep.ndim != 3:
-            raise ValueError("16-bit colours that do not decode")
+            raise ValueError("16-bit colours that cannot be decoded")
         return _grey(deep[..., 2::-1].transpose(2, 0, 1).astype(np.float32))
     return np.asarray(picture.convert("L"))
 

@@ -21,13 +21,13 @@ def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[
     """Resize an image (height, width); returns the same object if the size is the same."""
     if image.shape == (height_px, width_px):
         return image
-    # Area averaging, when shrinking, keeps noise from aliasing into craters.
+    # When shrinking, area averaging avoids aliased noise, which looks like craters.
     how = cv2.INTER_AREA if width_px < image.shape[1] else cv2.INTER_CUBIC
     return np.asarray(cv2.resize(image, (width_px, height_px), interpolation=how), np.uint8)
 
 
 def scaled_size(height_px: int, width_px: int, factor: float) -> tuple[int, int]:
-    """Height and width, pixels, nearest to `factor` times those of a frame that the network accepts."""
+    """Height and width, pixels, that the network accepts and that are nearest to `factor` times those of a frame."""
     if factor == 1:
         return height_px, width_px
     height, width = (max(1, round(side * factor / COARSEST_STRIDE)) for side in (height_px, width_px))

@@ -1,4 +1,4 @@
-"""Detections of whole batches: score floor, aspect, non-maximum suppression."""
+"""Detections of whole batches: minimum score, aspect limit, non-maximum suppression."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.models.boxes import iou
 
 _BLOCK = 256
-"""Boxes decided together: a larger block computes more overlaps, a smaller one needs more steps."""
+"""Number of boxes of a block: a larger one computes more overlaps, a smaller one needs more steps."""
 
 
 def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> list[Detections]:
@@ -47,39 +47,43 @@ def suppress_batch(boxes: Tensor, scores: Tensor, allowed: Tensor, threshold_iou
     Takes boxes (N, K, 4), scores (N, K) and a mask (N, K) of the boxes to consider. Returns indices (N, M) of the kept
     boxes of each frame, best first, padded with -1.
 
-    Boxes are decided in blocks by falling score. Within a block the greedy rule is a fixed point: a box is kept unless
-    a kept box of a higher score overlaps it. The overlap matrix is strictly triangular, so the iteration converges to
-    it. The kept boxes of a block then remove others, and the remaining boxes move up, so that later blocks hold no
-    decided box.
+    Boxes are processed in blocks by decreasing score. Within a block the greedy rule is a fixed point: a box is kept
+    unless a kept box of a higher score overlaps it. The overlap matrix is strictly triangular, so an iteration
+    converges to it. The kept boxes of a block then remove others, and the remaining boxes move up, so that later blocks
+    contain no removed box.
     """
     rows = torch.arange(len(boxes), device=boxes.device)[:, None]
-    # Use float32 scores as OpenCV; equal scores keep their order.
+    # Use float32 scores like OpenCV; equal scores keep their order.
     order = torch.where(allowed, scores.float(), -1.0).sort(dim=1, descending=True, stable=True).indices
     order = order[:, : int(allowed.sum(1).amax())] if allowed.any() else order[:, :0]
-    alive, corners = allowed.gather(1, order), boxes.double()[rows, order]
+    candidates, corners = allowed.gather(1, order), boxes.double()[rows, order]
     # OpenCV's rectangles store a corner and a size.
     corners = torch.cat([corners[..., :2], corners[..., :2] + (corners[..., 2:] - corners[..., :2])], dim=-1)
     kept = []
-    while alive.shape[1]:
-        block, own = corners[:, :_BLOCK], alive[:, :_BLOCK]
-        beaten = (_overlap(block, block) > threshold_iou).triu(1)
+    while candidates.shape[1]:
+        block, own = corners[:, :_BLOCK], candidates[:, :_BLOCK]
+        overlapped = (_overlap(block, block) > threshold_iou).triu(1)
         chosen = own
         while True:
-            again = own & ~(beaten & chosen[:, :, None]).any(1)
-            if torch.equal(again, chosen):
+            updated = own & ~(overlapped & chosen[:, :, None]).any(1)
+            if torch.equal(updated, chosen):
                 break
-            chosen = again
+            chosen = updated
         kept.append(torch.where(chosen, order[:, :_BLOCK], -1))
         # Kept boxes first, so that overlaps are computed only for these.
         first = chosen.byte().argsort(dim=1, descending=True, stable=True)[:, : int(chosen.sum(1).amax())]
         removed = (_overlap(block[rows, first], corners[:, _BLOCK:]) > threshold_iou) & chosen.gather(1, first)[
             ..., None
         ]
-        alive = alive[:, _BLOCK:] & ~removed.any(1)
-        left = alive.byte().argsort(dim=1, descending=True, stable=True)[
-            :, : int(alive.sum(1).amax()) if alive.numel() else 0
+        candidates = candidates[:, _BLOCK:] & ~removed.any(1)
+        left = candidates.byte().argsort(dim=1, descending=True, stable=True)[
+            :, : int(candidates.sum(1).amax()) if candidates.numel() else 0
         ]
-        order, corners, alive = order[:, _BLOCK:][rows, left], corners[:, _BLOCK:][rows, left], alive.gather(1, left)
+        order, corners, candidates = (
+            order[:, _BLOCK:][rows, left],
+            corners[:, _BLOCK:][rows, left],
+            candidates.gather(1, left),
+        )
     if not kept:
         return order
     merged = torch.cat(kept, dim=1)

@@ -2,8 +2,8 @@
 
 The network was trained on frames of one size, each normalised by its own mean and standard deviation. So an image is
 cut into tiles of that size, each normalised separately. Where tiles overlap, a box is taken from the tile whose borders
-are farthest from it. Near a border the network does not see whole craters, and keeping the boxes of both
-tiles would add false positives.
+are farthest from it. Near a border the network does not see whole craters, and keeping the boxes of both tiles would
+add false positives.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,11 +20,11 @@ from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.inference.tiling import Tiling
 
 Array = NDArray[np.float64]
-_AT_ONCE = 5_000
+_MAX_TOGETHER = 5_000
 """Largest number of boxes that are suppressed together; above it, block by block."""
 _TOLERANCE_PX = 2.0
-"""Tolerance of the distance to a tile's border. Two tiles place a crater slightly differently; without a tolerance each
-could leave it to the other."""
+"""Tolerance of the distance to a tile's border. Two tiles detect a crater at slightly different positions; without a
+tolerance both could drop it."""
 
 
 def tile_starts(length_px: int, tile_px: int, overlap_px: int) -> NDArray[np.intp]:
@@ -87,7 +87,7 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
     centres farther apart do not overlap by half). Only long chains of boxes that suppress each other could give another
     result.
     """
-    if len(boxes) <= _AT_ONCE:
+    if len(boxes) <= _MAX_TOGETHER:
         return suppress(boxes, scores, threshold_iou, len(boxes))
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
     margin = max(block_px / 2, float((boxes[:, 2:] - boxes[:, :2]).max()) / 2)
@@ -104,7 +104,7 @@ def suppress_in_blocks(boxes: Array, scores: Array, threshold_iou: float, block_
 def _detect_tiles(
     detector: Detector, image: NDArray[np.uint8], tiling: Tiling, advance: Callable[[int], object]
 ) -> Iterator[Detections]:
-    """Detections of each tile of an image, in pixels of the image, without those left to another tile."""
+    """Detections of each tile of an image, in pixels of the image, without boxes that another tile keeps."""
     tops, lefts = (tile_starts(side, tiling.tile_px, tiling.overlap_px) for side in image.shape)
     places = [(int(top), int(left)) for top in tops for left in lefts]
     tile_h, tile_w = (min(tiling.tile_px, side) for side in image.shape)
@@ -127,7 +127,7 @@ def _detect_tiles(
 
 
 def _clearance(spans: Array, starts: NDArray[np.intp], tile_px: int, length_px: int) -> Array:
-    """Least distance (D, T) of spans (D, 2) from the tile borders along a side; the image's own edges do not count."""
+    """Distance (D, T) of spans (D, 2) to the nearest border of each tile along a side; image edges do not count."""
     low = np.where(starts > 0, spans[:, :1] - starts, np.inf)
     high = np.where(starts + tile_px < length_px, starts + tile_px - spans[:, 1:], np.inf)
     return np.minimum(low, high)

@@ -19,9 +19,9 @@ def size_iou(sizes: Array, anchors: Array) -> Array:
 def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator) -> Array:
     """`count` anchors (count, 2), width and height in pixels, sorted by area, for sizes (N, 2) > 0.
 
-    Clusters 20,000 sizes drawn by `rng`, weighted by the inverse square root of the frequency of each size. Without the
-    weights all anchors would go to small craters: craters of 40 px are a hundred times rarer than those of 5 px. Starts
-    from evenly spaced logarithms of the area. An empty cluster takes the size with the worst fit.
+    Clusters 20,000 sizes drawn with `rng`, weighted by the inverse square root of the frequency of each size. Without
+    the weights all anchors would go to small craters: craters of 40 px are a hundred times rarer than those of 5 px.
+    Starts from evenly spaced logarithms of the area. An empty cluster takes the size with the worst fit.
     """
     sizes = np.asarray(sizes_px, np.float64)
     if len(sizes) == 0:

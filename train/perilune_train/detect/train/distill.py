@@ -9,8 +9,8 @@ from torch import Tensor
 from perilune_train.detect.train.loss import ciou_loss
 from perilune_train.models.yolo import YOLOv3, decode_grid
 
-_SURE = 0.1
-"""Least teacher score of the predictors whose boxes are learnt; below it the teacher's boxes are meaningless."""
+_MIN_TEACHER_SCORE = 0.1
+"""Minimum teacher score of the predictors whose boxes are learned; below it the teacher's boxes are meaningless."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Teacher:
 def distill_loss(
     student: list[Tensor], teacher: list[Tensor], anchors: Tensor, strides: tuple[int, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Distillation losses of a student's raw outputs (N, 3, h, w, 5) per scale: of boxes, of objectness.
+    """Distillation losses, of boxes and of objectness, from raw outputs (N, 3, h, w, 5) per scale.
 
     Boxes: mean CIoU loss against the teacher's boxes, over predictors with a teacher score of at least 0.1, weighted by
     that score. Objectness: mean over all predictors of the Kullback-Leibler divergence of the student's score from the
@@ -37,11 +37,11 @@ def distill_loss(
     and strides, so that their predictors correspond.
     """
     box, weights, confidence, predictors = student[0].new_zeros(()), student[0].new_zeros(()), [], 0
-    for raw, target, prior, stride in zip(student, teacher, anchors, strides, strict=True):
+    for raw, target, own_anchors, stride in zip(student, teacher, anchors, strides, strict=True):
         target = target.detach().float()
         score = target[..., 4].sigmoid()
-        sure = score >= _SURE
-        own, expected = (decode_grid(part.float(), prior, stride)[sure] for part in (raw, target))
+        sure = score >= _MIN_TEACHER_SCORE
+        own, expected = (decode_grid(part.float(), own_anchors, stride)[sure] for part in (raw, target))
         box = box + (score[sure] * ciou_loss(own, expected, "standard")).sum()
         weights = weights + score[sure].sum()
         # Cross-entropy minus the teacher's own entropy.

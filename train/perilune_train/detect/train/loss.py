@@ -52,9 +52,9 @@ def detection_loss(
 
     For each scale, L_ciou is the mean over its positive predictors, 0 if there are none. L_obj is the sum of the binary
     cross-entropy of the objectness over positive and (times lambda_noobj) negative predictors, divided by the number of
-    all predictors of the scale. The scales are averaged with weights 1 / stride. Deviation: the paper writes plain sums
-    over all scales. The means let both parts train with the paper's weights 0.05 and 1. The weights of the scales let
-    the coarse scales train, whose craters are a hundred times rarer.
+    all predictors of the scale. The scales are averaged with weights 1 / stride. Deviation: the paper has plain sums
+    over all scales. With means, both parts train with the paper's weights 0.05 and 1. The weights 1 / stride raise the
+    coarse scales relative to a plain sum, because their craters are a hundred times rarer.
 
     The objectness target of a positive predictor is 1 (`hard`, YOLOv3) or the IoU of its box with its label (`iou`).
     With `iou` the score measures how well a box fits, and suppression keeps the best box on a crater.
@@ -62,30 +62,30 @@ def detection_loss(
     shapes = [(raw.shape[0], raw.shape[2], raw.shape[3]) for raw in outputs]
     box, confidence = outputs[0].new_zeros(()), outputs[0].new_zeros(())
     total = sum(1 / stride for stride in strides)
-    for raw, prior, stride, found in zip(
+    for raw, own_anchors, stride, found in zip(
         outputs, anchors, strides, assign(targets, anchors, strides, shapes, ratio), strict=True
     ):
         place = (found.frame, found.anchor, found.row, found.column)
         chosen = raw[place].float()
         cells = torch.stack([found.column, found.row], 1)
-        boxes, labels = decode(chosen, cells, prior[found.anchor], stride), targets.boxes[found.label]
+        boxes, labels = decode(chosen, cells, own_anchors[found.anchor], stride), targets.boxes[found.label]
         share = 1 / stride / total
-        # The sum over nothing keeps the graph, so that a batch of empty frames remains differentiable.
+        # An empty sum keeps the graph, so that a batch of empty frames remains differentiable.
         box = box + share * ciou_loss(boxes, labels, settings.aspect).sum() / max(len(labels), 1)
         positive = found.positive
-        weight = torch.where(positive, 1.0, settings.lambda_noobj * (~found.free))
-        goal = positive.float()
+        weight = torch.where(positive, 1.0, settings.lambda_noobj * (~found.ignored))
+        target = positive.float()
         if settings.objectness == "iou":
             # If two labels share a predictor, use the larger IoU.
-            _, anchors_here, height, width = goal.shape
+            _, anchors_here, height, width = target.shape
             flat = ((found.frame * anchors_here + found.anchor) * height + found.row) * width + found.column
-            goal = (
-                torch.zeros_like(goal)
+            target = (
+                torch.zeros_like(target)
                 .view(-1)
                 .scatter_reduce(0, flat, iou(boxes.detach(), labels), "amax")
-                .view_as(goal)
+                .view_as(target)
             )
         logits = raw[..., 4].float()
-        entropy = F.binary_cross_entropy_with_logits(logits, goal, weight, reduction="sum")
+        entropy = F.binary_cross_entropy_with_logits(logits, target, weight, reduction="sum")
         confidence = confidence + share * entropy / logits.numel()
     return box, confidence

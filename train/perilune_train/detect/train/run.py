@@ -51,9 +51,11 @@ def run_detect(
     """Train and evaluate a detector; all output is in the returned folder.
 
     Resumes an interrupted run of the same settings and dataset, and leaves a finished one unchanged; `overwrite`
-    replaces both. Raises UserError if the run's settings or dataset were different, if its last state is damaged, if
-    the dataset, weights or settings cannot be trained with, and, unless `allow_overlap`, if a network that it starts or
-    learns from was fitted to terrain of the test split.
+    replaces both.
+
+    Raises UserError if the existing run has other settings or another dataset; if its last state is damaged; if the
+    dataset or the initial weights are unsuitable; or if the network of the initial weights or the teacher was fitted to
+    terrain of the test split (unless `allow_overlap`).
     """
     console.quiet = not runs.is_first_process()
     run = runs.RunFolder(runs_root / "detect" / name)
@@ -139,10 +141,10 @@ def evaluate(
     found_val, _ = detect_split(detector, splits["val"], "val")
     found, rate = detect_split(detector, splits["test"], "test")
     matches = match_detections(splits["val"], found_val, config)
-    threshold, chosen_as = curve(matches).operating_threshold(config.evaluation.min_precision)
+    threshold, rule = curve(matches).operating_threshold(config.evaluation.min_precision)
     evaluation = evaluate_split(splits["test"], found, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found)
-    about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{chosen_as} on val")
+    about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{rule} on val")
     about.append(anchor_report(detector.network, label_sizes(splits["train"]), config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), about)
     metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}

@@ -35,10 +35,10 @@ def learning_rate_factor(step: int, warmup_steps: int, total_steps: int) -> floa
     return _FINAL_RATE + (1 - _FINAL_RATE) * (1 + math.cos(math.pi * min(progress, 1.0))) / 2
 
 
-Pairs = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]
+TensorPairs = tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]
 
 
-def pairs(average: nn.Module, network: nn.Module) -> Pairs:
+def paired_tensors(average: nn.Module, network: nn.Module) -> TensorPairs:
     """Pairs of tensors of an average and of its network: first the floats, then the counters."""
     old, new = list(average.state_dict().values()), list(network.state_dict().values())
     floats = [value.is_floating_point() for value in old]
@@ -51,7 +51,7 @@ def pairs(average: nn.Module, network: nn.Module) -> Pairs:
 
 
 @torch.no_grad()
-def update_average(tensors: Pairs, decay: float) -> None:
+def update_average(tensors: TensorPairs, decay: float) -> None:
     """Move an average of weights and batch statistics towards the network by 1 - decay; copy the counters.
 
     Lightning's EMAWeightAveraging is not used: its decay is constant, it deep-copies the task with the frames that it
@@ -65,7 +65,7 @@ def update_average(tensors: Pairs, decay: float) -> None:
 class DetectTask(lightning.LightningModule):
     """Training with AdamW, warm-up and cosine; a moving average of the weights is evaluated in their place.
 
-    While frozen, the backbone keeps its weights and batch statistics, and only its attention gates learn.
+    A frozen backbone keeps its weights and batch statistics, except the weights of its attention gates.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class DetectTask(lightning.LightningModule):
             nn.utils.clip_grads_with_norm_(self.network.parameters(), self.config.gradient_clip, norm, foreach=True)
 
     def on_train_start(self) -> None:
-        self.tensors = pairs(self.evaluated, self.network)
+        self.tensors = paired_tensors(self.evaluated, self.network)
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         super().optimizer_step(*args, **kwargs)

@@ -24,8 +24,8 @@ from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
-"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. A power of two scales without
-rounding."""
+"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. Dividing by a
+power of two is exact."""
 _GATES = "backbone.attentions."
 DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}
 
@@ -35,9 +35,9 @@ def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"
     """Change the stem of a backbone so that it gives the same features for another scale of its input.
 
     Darknet's files were trained on grey values from 0 to 1 (`grey`). Our networks take frames with zero mean and unit
-    standard deviation (`normalised`). Without this change a frozen backbone would get an input some four times stronger
-    than its batch statistics expect. grey = 0.25 normalised + 0.45 is folded into the stem's weights and its batch
-    norm's mean. This is exact except for rounding and for the border, where zero padding then means grey.
+    standard deviation (`normalised`). Without this change the input of a frozen backbone would be about four times
+    stronger than in its own training. grey = 0.25 normalised + 0.45 is folded into the stem's weights and its batch
+    norm's mean. This is exact except for rounding and for the border, where zero padding then means mean grey.
     """
     stem: Any = backbone.stem
     weight, mean = stem.conv.weight, stem.norm.running_mean
@@ -79,7 +79,7 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
 def check_gates(path: Path, config: DetectConfig) -> None:
     """Raise UserError if a frozen backbone would have plain gates with random initial weights.
 
-    Each such gate scales its input by about 0.25, so that the frozen layers get features that they were not trained on:
+    Each such module scales its input by about 0.25, so that the frozen layers get features they were not trained on:
     their cosine similarity to those of the plain backbone falls to about 0.5 (`make bench-transfer`).
     """
     if config.frozen_epochs and config.attention == "cbam":
@@ -90,10 +90,10 @@ def check_gates(path: Path, config: DetectConfig) -> None:
 
 
 def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenance]:
-    """Terrain records of the networks that a run starts or learns from.
+    """Terrain records of the network of the initial weights and of the teacher.
 
-    A resumed run has them in its last state, `last`. Darknet's files were trained on photographs of the Earth. Raises
-    UserError if a checkpoint is missing or damaged.
+    A resumed run has them in its last state, `last`. Darknet's files have none: they were trained on photographs of the
+    Earth. Raises UserError if a checkpoint is missing or damaged.
     """
     if last is not None:
         content = runs.read_saved(last, "last state", {"state_dict"}, "the state of an interrupted run")
@@ -114,7 +114,7 @@ def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> Non
     """
     for key, value in DARKNET_SHAPE.items():
         if getattr(config, key) != value:
-            raise UserError(path, f"detect.{key}", getattr(config, key), f"{value:g}, as Darknet's files have it")
+            raise UserError(path, f"detect.{key}", getattr(config, key), f"{value:g}, as in Darknet's files")
     backbone = backbone_slots(network.backbone)
     with torch.device("meta"):
         whole = YOLOv3()
@@ -131,7 +131,7 @@ def start_from_darknet(network: YOLOv3, path: Path, config: DetectConfig) -> Non
 
 
 def darknet_content(network: YOLOv3, architecture: dict[str, Any], checkpoint: Path, whole: bool) -> DarknetFile:
-    """Darknet file of a trained network, its backbone or the whole with 15 output filters. Changes the network.
+    """Darknet file of a network's backbone, or of the whole network with 15 output filters. Changes the network.
 
     These files cannot hold attention gates. Raises UserError if the network does not have the file's shape.
     """

@@ -1,4 +1,4 @@
-"""Batches of sequences of one epoch of navigation training, drawn from a key."""
+"""Batches of one epoch of navigation training."""
 
 from collections.abc import Iterator
 
@@ -9,11 +9,11 @@ from perilune_train.navigate.data.trajectories import Trajectory
 
 
 class EpochBatches:
-    """One epoch of batches of sequences, each pair about once, drawn from the key (seed, epoch) only.
+    """One epoch of batches of sequences; depends on trajectories and key (seed, epoch) only.
 
-    Each trajectory is cut into runs of `n_pairs` (at most the length of the shortest trajectory) that begin at a random
-    offset. Iterates over lists of `batch` sequences; `augmented` sequences are mirrored and, with `jitter`, moved (see
-    `pair_sequence`).
+    A trajectory gives as many sequences of `n_pairs` (at most the length of the shortest trajectory) as fit into it,
+    each with its own random start. Iterates over lists of `batch` sequences; `augmented` sequences are mirrored and,
+    with `jitter`, moved (see `pair_sequence`).
     """
 
     def __init__(

@@ -56,12 +56,12 @@ def pair_sequence(
     """The pairs start .. start + n_pairs of a trajectory; augmented if a generator is given.
 
     Augmentation applies one of the eight symmetries of the square image to the whole sequence (four if the image is not
-    square). With `jitter` it also draws a small extra motion of each second camera independently: the second frame is
-    resampled over the ground plane as the moved camera would see it, so that a pair shows new residuals in every epoch.
-    The plane is that of the nominal altitude and attitude. The resampled frame is exact only if these are the true
-    ones, for a pure rotation and for flat ground. Off nominal by 8 m and 0.3 degrees, a jitter of 0.3 times that is
-    wrong by 0.04 px of 1.2 px (RMS over 200 to 1500 m; 0.14 px at 200 m; 128 px over 50 degrees; the error is measured
-    in tests/train/navigate/test_data.py).
+    square). With `jitter` it also moves each second camera at random, so that a pair has new residuals in every epoch:
+    the second frame is resampled over the ground plane to what the moved camera would see. The plane is that of the
+    nominal altitude and attitude. The result is exact for a pure rotation, or if the ground is flat and the true
+    altitude and attitude are nominal. For true poses off nominal by 8 m and 0.3 degrees and a jitter of 0.3 times that,
+    the jitter moves points by 1.2 px and the error is 0.04 px (0.14 px at 200 m). These are RMS values for frames of
+    128 px over 50 degrees at 200 to 1500 m; see tests/train/navigate/test_data.py.
     """
     span = slice(start, start + n_pairs)
     translation, rotation = (values[span] for values in trajectory.motion)
@@ -76,7 +76,7 @@ def pair_sequence(
             turn = matrix_from_rotation_vector(rng.normal(size=3) * jitter.rotation_rad)
             true = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
             translation[i], rotation[i] = translation[i] + shift, turn @ rotation[i]
-            # Second image of the moved camera: new image 2 -> image 1 over the plane -> old image 2.
+            # From the moved camera's image 2 over the plane to image 1, then to the original image 2.
             moved = _homography(trajectory.camera, trajectory.down_c, translation[i], rotation[i], altitude[i])
             change = true @ np.linalg.inv(moved)
         if warp:
@@ -99,7 +99,7 @@ def pair_sequence(
 
 
 def mirrored(sequence: Sequence, camera: Camera, rng: np.random.Generator) -> Sequence:
-    """Apply a random mirroring of left and right, up and down and, in a square image, x and y to a sequence.
+    """Mirror a sequence at random: left-right, up-down and, for square images, x with y.
 
     A mirroring D of the image about its centre maps t to D t, the ground normal n to D n and R to D R D, with D
     extended by 1 along z. Applied only if the principal point is the image's centre.

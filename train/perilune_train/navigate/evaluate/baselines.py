@@ -8,20 +8,20 @@ from perilune_train.navigate.data.trajectories import Motion, Trajectory
 
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:
     """The training set's mean motion, for every pair of the trajectory."""
-    translation = np.concatenate([d.motion[0] for d in training]).mean(0)
-    rotation = _mean_rotation(np.concatenate([d.motion[1] for d in training]))
+    translation = np.concatenate([one.motion[0] for one in training]).mean(0)
+    rotation = _mean_rotation(np.concatenate([one.motion[1] for one in training]))
     return np.tile(translation, (trajectory.n_pairs, 1)), np.tile(rotation, (trajectory.n_pairs, 1, 1))
 
 
 def mean_motion_at_step(training: list[Trajectory], trajectory: Trajectory) -> Motion:
-    """The training set's mean motion at each step; beyond its longest trajectory, that of its last step."""
+    """The training set's mean motion at each step; after its last step, the mean motion at that step."""
     translations, rotations = [], []
-    longest = max(d.n_pairs for d in training)
+    longest = max(one.n_pairs for one in training)
     for step in range(trajectory.n_pairs):
         motions = [
-            (d.motion[0][min(step, longest - 1)], d.motion[1][min(step, longest - 1)])
-            for d in training
-            if d.n_pairs > min(step, longest - 1)
+            (one.motion[0][min(step, longest - 1)], one.motion[1][min(step, longest - 1)])
+            for one in training
+            if one.n_pairs > min(step, longest - 1)
         ]
         translations.append(np.mean([t for t, _ in motions], axis=0))
         rotations.append(_mean_rotation(np.stack([r for _, r in motions])))

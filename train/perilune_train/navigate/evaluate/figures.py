@@ -27,25 +27,25 @@ def draw_trajectory(
     """Draw one trajectory: true and dead-reckoned paths from the side and from above, and errors by step."""
     figure = Figure(figsize=(16, 9), layout="constrained")
     axes = figure.subplots(2, 3)
-    side, top, away = axes[0]
+    side, top, drift = axes[0]
     true = trajectory.position_m
     side.plot(_along(true), true[:, 2], color="black", linewidth=3, label="true")
     top.plot(true[:, 0], true[:, 1], color="black", linewidth=3, label="true")
-    away.axhline(0, color="black", linewidth=1)
+    drift.axhline(0, color="black", linewidth=1)
     steps = np.arange(1, len(true))
     for method, (translation, rotation) in motions.items():
         found, _ = dead_reckoning(true[0], trajectory.rotation_camera_from_site[0], translation, rotation)
         style = {"color": COLOURS[method], "label": method}
         side.plot(_along(found), found[:, 2], **style)
         top.plot(found[:, 0], found[:, 1], **style)
-        away.plot(steps, np.linalg.norm(found - true, axis=1)[1:], **style)
+        drift.plot(steps, np.linalg.norm(found - true, axis=1)[1:], **style)
         own = errors[method].query("scene_id == @trajectory.ids[0] and trajectory_id == @trajectory.ids[1]")
         axes[1, 0].plot(own["altitude_m"], own["position_error_m"], **style)
         axes[1, 1].plot(own["altitude_m"], own["orientation_error_deg"], **style)
     _label(side, "path from the side", "distance from the site (m)", "altitude (m)")
     _label(top, "path from above", "x, west (m)", "y, south (m)")
     top.axis("equal")
-    _label(away, "dead-reckoned position", "step", "error (m)")
+    _label(drift, "dead-reckoned position", "step", "error (m)")
     _label(axes[1, 0], "position error of each step", "altitude (m)", "error (m)")
     _label(axes[1, 1], "orientation error of each step", "altitude (m)", "error (deg)")
     for axis in axes[1, :2]:

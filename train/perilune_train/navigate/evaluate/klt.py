@@ -27,10 +27,10 @@ _CONSISTENCY_PX = 0.5
 _TUKEY = 4.685
 _PRIOR_TURN_RAD = np.radians(0.5)
 _PRIOR_SHIFT = 0.02
-"""Standard deviations of a weak prior around the nominal motion, for rotation and for shift over altitude. Few or
+"""Standard deviations of a weak prior around the nominal motion: of rotation, and of shift divided by altitude. Few or
 crowded corners cannot separate tilt from sideways shift, which look alike from above."""
 _ITERATIONS = 15
-_LEAST_TRACKS = 8
+_MIN_TRACKS = 8
 
 
 def klt_trajectory(trajectory: Trajectory) -> Motion:
@@ -77,7 +77,7 @@ def klt_motion(
         camera.matrix, nominal_translation_m, nominal_rotation_c2_from_c1, plane_normal_c1, altitude_m
     )
     pixels_1, pixels_2 = _tracks(image_1, image_2, nominal)
-    if len(pixels_1) < _LEAST_TRACKS:
+    if len(pixels_1) < _MIN_TRACKS:
         return nominal_translation_m, nominal_rotation_c2_from_c1, 0
     rays = camera.rays(pixels_1)
     points_c1 = rays * (altitude_m / (rays @ plane_normal_c1))[:, None]
@@ -125,21 +125,21 @@ def _fit(
         weights = np.clip(1 - (distance / (_TUKEY * spread)) ** 2, 0, None) ** 2
         x, y, z = points.T
         zero = np.zeros_like(z)
-        # Derivative of the pixel by the point in camera 2, then of that point by a rotation (left) and a shift.
+        # Derivatives: of the pixel by the point in camera 2; of that point by a rotation (from the left) and a shift.
         by_point = np.stack([1 / z, zero, -x / z**2, zero, 1 / z, -y / z**2], axis=1).reshape(-1, 2, 3)
         by_point *= focal[:, None]
         cross = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(-1, 3, 3)
         jacobian = np.concatenate([by_point @ cross, by_point], axis=2)
         weighted = jacobian * weights[:, None, None]
         normal = np.einsum("nij,nik->jk", weighted, jacobian)
-        # Metres and radians differ by the altitude; scaling to a unit diagonal keeps the system well conditioned.
         normal += np.diag(prior) * spread**2
-        away = np.concatenate(
+        offset = np.concatenate(
             [rotation_vectors(rotation @ nominal_rotation.T), rotation @ (nominal_translation_m - translation_m)]
         )
+        # Metres and radians have very different scales; a unit diagonal keeps the system well conditioned.
         scale = 1 / np.sqrt(np.diag(normal))
-        slope = scale * (np.einsum("nij,ni->j", weighted, error) + prior * spread**2 * away)
-        step = -scale * np.linalg.lstsq(normal * np.outer(scale, scale), slope, rcond=None)[0]
+        gradient = scale * (np.einsum("nij,ni->j", weighted, error) + prior * spread**2 * offset)
+        step = -scale * np.linalg.lstsq(normal * np.outer(scale, scale), gradient, rcond=None)[0]
         turn = matrix_from_rotation_vector(step[:3])
         # X2' = T (R (X1 - t)) + s = T R (X1 - t'), with t' = t - (T R)^T s.
         rotation = turn @ rotation

@@ -43,7 +43,7 @@ def motion_errors(trajectories: list[Trajectory], motions: list[Motion]) -> pd.D
 def summary(errors: pd.DataFrame) -> dict[str, float]:
     """Root mean squares over all pairs of all trajectories; drift (length) over all frames and at the last frames.
 
-    Each RMSE in two forms, see `squared_errors`, and by axis. docs/reference/metrics.md has the formulas.
+    Each RMSE has two forms (`squared_errors`) and is also given by axis. docs/reference/metrics.md has the formulas.
     """
     ends = errors.groupby(["scene_id", "trajectory_id"])["drift_m"].last()
     figures = {key: float(np.sqrt(np.mean(values))) for key, values in squared_errors(errors).items()}
@@ -55,7 +55,7 @@ def summary(errors: pd.DataFrame) -> dict[str, float]:
 
 
 def squared_errors(errors: pd.DataFrame) -> dict[str, Array]:
-    """Squares (pairs,) for each RMSE, by its key: the RMSE is the root of their mean.
+    """Squared errors (pairs,) by key of the RMSE, which is the root of their mean.
 
     per_component is the paper's RMSE: each of the three components of each pair is one variable. vector and angle use
     the length of the error vector and are sqrt(3) times as large. The components of the orientation are those of the

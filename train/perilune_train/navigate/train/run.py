@@ -1,4 +1,4 @@
-"""One navigation run: train the selected networks, evaluate them beside the baselines, write tables and pictures."""
+"""One navigation run: train and evaluate the selected networks, evaluate the baselines, write tables and pictures."""
 
 import os
 import time
@@ -57,9 +57,10 @@ def navigate_run(
     Resumes interrupted runs of the same settings, dataset and detector, and leaves finished ones unchanged; `overwrite`
     replaces both.
 
-    `detector` is the default checkpoint for the stack network's backbone, used if it exists and fits;
-    `settings.detector` must fit. Raises UserError on bad data, a checkpoint of another architecture, a detector that
-    was fitted to terrain of the test split (unless `allow_overlap`), or under torchrun with several processes.
+    `detector` is the default checkpoint for the stack network's backbone, used if it exists and has the same
+    architecture; `settings.detector` must have it. Raises UserError on bad data, a checkpoint of another architecture,
+    a detector that was fitted to terrain of the test split (unless `allow_overlap`), or under torchrun with several
+    processes.
     """
     processes = os.environ.get("WORLD_SIZE", "1")
     if processes != "1":
@@ -82,7 +83,7 @@ def navigate_run(
     trajectories = load_trajectories(opened)
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     motions = _baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
-    # stack comes first, so that the run of warp, finished last, has the table of both.
+    # stack comes first, so that the table of the warp run, which finishes last, has both.
     for fusion, run in folders.items():
         seconds = None
         if states[fusion] != "finished":
@@ -140,13 +141,13 @@ def _detector_backbone(
 ) -> tuple[dict[str, Tensor] | None, str, list[Provenance]]:
     """A detector's backbone weights, their source and the records of its terrain.
 
-    If no weights fit: None, the reason, and no record.
+    If no detector has the same architecture: None, the reason, and no record.
     """
     path = settings.detector or default
     if path is None or (settings.detector is None and not path.is_file()):
-        why = "from scratch: no detect run to start from"
-        console.print(f"stack: backbone {why}")
-        return None, why, []
+        reason = "from scratch: no detect run to start from"
+        console.print(f"stack: backbone {reason}")
+        return None, reason, []
     content = load_weights(path)
     expected = {
         "in_channels": settings.in_channels,
@@ -155,9 +156,9 @@ def _detector_backbone(
     }
     other = [key for key, value in expected.items() if content["architecture"].get(key) != value]
     if other and settings.detector is None:
-        why = f"from scratch: {path} differs in {', '.join(other)}"
-        console.print(f"stack: backbone {why}")
-        return None, why, []
+        reason = f"from scratch: {path} differs in {', '.join(other)}"
+        console.print(f"stack: backbone {reason}")
+        return None, reason, []
     check_architecture(path, content["architecture"], expected)
     weights = content["state_dict"].items()
     state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
@@ -195,11 +196,11 @@ def _write(
     draw_errors(run.root / "errors.png", errors)
     metrics: Metrics = {}
     for method, row in rows.items():
-        place = method if method in ("stack", "warp") else f"baseline/{method}"
-        place = "test" if method == fusion else place
-        metrics |= {f"{place}/{key}": value for key, value in row.items()}
+        prefix = method if method in ("stack", "warp") else f"baseline/{method}"
+        prefix = "test" if method == fusion else prefix
+        metrics |= {f"{prefix}/{key}": value for key, value in row.items()}
         for key, spread in summary_spreads(errors[method]).items():
-            metrics |= spread.keys(f"{place}/{key}")
+            metrics |= spread.keys(f"{prefix}/{key}")
     mark_files(run.root, _WRITTEN, str(details["terrain/mark"]))
     write_metrics(run.root, metrics | details)
 

@@ -21,7 +21,7 @@ from perilune_train.navigate.network import (
     Scales,
     build,
     decoded_rotation,
-    estimated,
+    network_output,
     predict,
     stacked,
     translation_units,
@@ -31,7 +31,7 @@ from perilune_train.navigate.network import (
 class NavigationTask(lightning.LightningModule):
     """Training of one network: the paper's coarse, then fine stage; AdamW, short warm-up, cosine to zero.
 
-    Errors are standardised: P over the unit of the translation, phi (Euler angles) over the spread of the rotation.
+    Errors are standardised: P by the unit of the translation, phi (Euler angles) by the spread of the rotation.
     Coarse: L^(S1) = |dP|^2 + kappa |dphi|^2. Fine: L^(S2) = e^-s_p |dP|^2 + e^-s_phi |dphi|^2 + s_p + s_phi with learnt
     s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles; warp's pairs are
     mirrored and jittered (see data/sequences.py).
@@ -47,7 +47,7 @@ class NavigationTask(lightning.LightningModule):
         super().__init__()
         self.settings, self.fusion = settings, fusion
         self.own: FusionConfig = getattr(settings, fusion)
-        self.scales = Scales.measured([d for d in trajectories if d.split == "train"], fusion)
+        self.scales = Scales.measured([one for one in trajectories if one.split == "train"], fusion)
         self.architecture = {
             "fusion": fusion,
             "size_px": self.own.size_px,
@@ -69,8 +69,8 @@ class NavigationTask(lightning.LightningModule):
             self.network.backbone.load_state_dict(pretrained, strict=False)
         self.terrain: dict[str, Any] | None = None
         self.log_weights = nn.Parameter(torch.zeros(2))
-        self.training_trajectories = [d.shrunk(self.own.size_px) for d in trajectories if d.split == "train"]
-        self.validation_trajectories = [d.shrunk(self.own.size_px) for d in trajectories if d.split == "val"]
+        self.training_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "train"]
+        self.validation_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "val"]
         jitter, scales = self.own.jitter, self.scales
         self.jitter = Jitter(jitter * np.array(scales.spread_m), jitter * scales.rotation_rad) if jitter else None
 
@@ -99,7 +99,7 @@ class NavigationTask(lightning.LightningModule):
         return DataLoader(self.validation_trajectories, batch_size=None)  # type: ignore[arg-type]
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
-        return batch  # Sequences are NumPy arrays; the steps move what they need.
+        return batch  # Sequences are NumPy arrays; `network_output` moves them.
 
     def on_train_epoch_start(self) -> None:
         for name, parameter in self.network.backbone.named_parameters():
@@ -109,7 +109,7 @@ class NavigationTask(lightning.LightningModule):
                 module.train(not (self.coarse and f"{name}.weight" in self.pretrained))
 
     def training_step(self, batch: list[Sequence], batch_idx: int) -> Tensor:
-        output, flow_px = estimated(self.network, batch, self.device)
+        output, flow_px = network_output(self.network, batch, self.device)
         reference, unit = translation_units(batch, self.scales, self.fusion)
         expected = (stacked([s.translation_m for s in batch]) - reference) / unit
         angles = euler_from_rotation(stacked([s.rotation_c2_from_c1 for s in batch])) / self.scales.rotation_rad
@@ -146,7 +146,7 @@ class NavigationTask(lightning.LightningModule):
     def configure_optimizers(self) -> Any:
         total = max(1, (self.own.coarse_epochs + self.own.fine_epochs) * len(self.train_dataloader()))
         warm = max(1, min(50, total // 10))
-        # The two loss weights have to change by about 1 within the run, whatever learning rate suits the network.
+        # The two loss weights must change by about 1 during the run, whatever the learning rate of the network is.
         optimizer = torch.optim.AdamW(
             [
                 {"params": list(self.network.parameters()), "lr": self.own.learning_rate, "weight_decay": 1e-3},
