@@ -3,9 +3,9 @@
 `python -m benchmarks.train.contrast DATASET RUN` takes a dataset and a detect run on it. Evaluates on the test split,
 for the craters of the selection `visible` without its contrast threshold: the area under the ROC curve (AUC) of
 contrast, depth ratio and radius, overall and by radius; the fraction found by contrast; and the metrics of the run's
-detections with each selection. A crater is found if a detection with at least the run's threshold overlaps it by IoU
-0.5, highest scores first. Writes runs/bench/contrast.json, and with --picture FRAME_ID contrast.jpg, an enlarged frame,
-plain and coloured by contrast.
+detections with each selection. A crater is found if a detection with a score of at least the run's threshold has an IoU
+of at least 0.5 with it; detections are matched in order of score. Writes runs/bench/contrast.json, and with --picture
+FRAME_ID contrast.jpg, an enlarged frame, plain and coloured by contrast.
 """
 
 import json

@@ -62,7 +62,7 @@ def loss_of(network: YOLOv3, batch: Batch, config: DetectConfig) -> Tensor:
 
 
 def train(network: YOLOv3, split: DetectSplit, config: DetectConfig, steps: int) -> list[float]:
-    """Train for a number of steps; returns the losses. What is frozen or in evaluation mode stays so."""
+    """Train for `steps` steps and return the loss of each; keeps frozen parameters and the modes of modules."""
     learnt = [p for p in network.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(learnt, lr=config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: learning_rate_factor(s, 20, steps))

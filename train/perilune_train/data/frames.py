@@ -95,7 +95,7 @@ def _portions(frames: Iterable[tuple[str, bytes]], size: int) -> Iterator[list[t
 def normalised(images: NDArray) -> NDArray[np.float32]:
     """Subtract each image's mean and divide by its standard deviation, at least 1. Images are (..., height, width).
 
-    A constant image becomes zero. The exposure of a frame has no information about craters or motion.
+    A constant image becomes zero. The exposure of a frame carries no information about craters or motion.
     """
     pixels = images.astype(np.float32)
     mean = pixels.mean(axis=(-2, -1), keepdims=True)

@@ -79,7 +79,7 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
 
 
 def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, str]:
-    """Terrain status of an evaluation, and the mark that its output must carry ("" for none)."""
+    """Terrain status of an evaluation, and the mark for its output ("" for none)."""
     if "images/name" in metrics:
         return "real images", ""
     status, mark = metrics.get("terrain/status"), metrics.get("terrain/mark")

@@ -94,8 +94,8 @@ class EvaluationSettings(Section):
     """Detection from the network's outputs, and its evaluation."""
 
     scales: Annotated[tuple[Annotated[float, Field(ge=0.25, le=4)], ...], Field(min_length=1, max_length=4)] = (1.0,)
-    """Factors by which frames are resized before inference; detections at all scales are merged. 1 with 2 finds more of
-    the smallest craters at five times the cost. Validation during training uses scale 1 only."""
+    """Factors by which frames are resized before inference; detections at all scales are merged. 1 and 2 together
+    find more of the smallest craters at five times the cost. Validation during training uses scale 1 only."""
     match_iou: Annotated[float, Field(gt=0, lt=1)] = 0.5
     """Minimum IoU of a detection and a label for a match."""
     nms_iou: Annotated[float, Field(gt=0, lt=1)] = 0.45
@@ -144,7 +144,7 @@ class DetectConfig(Section):
     warmup_steps: Annotated[int, Field(ge=0)] = 100
     """Number of steps of the warm-up."""
     weight_decay: Annotated[float, Field(ge=0)] = 0.01
-    """Weight decay of AdamW, per step, times the learning rate."""
+    """Weight decay of AdamW; each step multiplies it by the learning rate."""
     gradient_clip: Positive = 10.0
     """Largest norm of all gradients together; larger gradients are scaled down to it."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
@@ -174,7 +174,7 @@ class DetectConfig(Section):
     """Minutes between saves of the training state within an epoch; 0: after every step. It is always saved after an
     epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0
-    """Worker processes that augment frames; 0 augments in the training process, best on few cores."""
+    """Worker processes that augment frames; 0 augments in the training process, which is best on few cores."""
 
     @model_validator(mode="after")
     def _check(self) -> "DetectConfig":

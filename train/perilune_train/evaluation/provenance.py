@@ -146,7 +146,7 @@ class TerrainCheck:
 
     @property
     def mark(self) -> str:
-        """Text that all output must carry; empty for disjoint terrain and for terrain shared by protocol."""
+        """Text that marks all output; empty for disjoint terrain and for terrain shared by protocol."""
         if self.status == "overlap":
             return f"TERRAIN OVERLAP, no test of unseen terrain: {', '.join(self.scenes)}"
         return "TRAINING TERRAIN UNKNOWN: the checkpoint has no record of it" if self.status == "unknown" else ""

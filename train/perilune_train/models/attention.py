@@ -74,7 +74,7 @@ class CBAM(nn.Module):
         return mask, mask.to(x.dtype) * x
 
     def spatial_mask(self, x: Tensor) -> Tensor:
-        """The spatial mask M_s (N, 1, H, W) that `forward` multiplies with."""
+        """The spatial mask M_s (N, 1, H, W) by which `forward` multiplies the features."""
         return self.gated(x)[0]
 
     def forward(self, x: Tensor) -> Tensor:

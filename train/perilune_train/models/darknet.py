@@ -30,7 +30,7 @@ def conv_block(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Se
 
 
 class ResidualUnit(nn.Module):
-    """x + f(x), f a 1 x 1 convolution to half the channels and a 3 x 3 one back. Shape: (N, C, H, W) to the same."""
+    """x + f(x), where f is a 1 x 1 convolution to half the channels and a 3 x 3 one back. (N, C, H, W) to the same."""
 
     def __init__(self, channels: int):
         super().__init__()

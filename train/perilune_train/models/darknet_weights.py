@@ -24,7 +24,7 @@ from perilune_train.models.darknet import UNITS, AttentionDarknet53
 from perilune_train.models.yolo import ANCHORS_PER_SCALE, OUTPUTS, YOLOv3
 
 COCO_FILTERS = 255
-"""Channels of an output layer of yolov3.weights: 3 anchors x (box, objectness, 80 classes). Ours have 15."""
+"""Channels of an output layer of yolov3.weights: 3 anchors x (box, objectness, 80 classes). `YOLOv3` has 15."""
 _FILTERS = ANCHORS_PER_SCALE * OUTPUTS
 _VERSION = struct.Struct("<3i")
 _NEW_HEADER = _VERSION.pack(0, 2, 0) + struct.pack("<Q", 0)

@@ -121,9 +121,9 @@ class WarpNavigator(nn.Module):
     def fitted_motion(self, flow_px: Tensor, weight: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
         """Fit translation and rotation vector (N, 6), in units of their spreads, to flows (N, h, w, 2).
 
-        `altitude_m` (N,) is in metres. Minimises the sum of
-        weight |J m - flow|^2 + prior |m|^2; weight (N, h, w) is in 1 / px^2. The prior decides
-        between tilt and sideways shift, which look alike from above. J is the flow of a plane at right angles to the
+        `altitude_m` (N,) is in metres. Minimises the sum of weight |J m - flow|^2 + prior |m|^2; weight (N, h, w) is in
+        1 / px^2. The prior decides
+        between tilt and sideways shift, which look alike from above. J is the flow of a plane perpendicular to the
         view (Longuet-Higgins & Prazdny 1980, doi 10.1098/rspb.1980.0057), to first order in the motion; it neglects the
         nominal step compared with the altitude.
         """

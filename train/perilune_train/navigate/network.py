@@ -32,7 +32,7 @@ class Scales:
     spread_m: list[float]
     """Standard deviation of the translation about the mean (stack) or the nominal one (warp), metres (3,)."""
     rotation_rad: float
-    """Standard deviation of a motion's rotation about one axis, radians."""
+    """Root mean square of a motion's rotation about one axis, radians."""
 
     @classmethod
     def measured(cls, trajectories: list[Trajectory], fusion: Fusion) -> "Scales":

@@ -37,7 +37,7 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
     """Decide what to do with a run's folder; all processes get the same decision.
 
     new: start from the beginning, since there is no state or `overwrite` is given. resume: continue from last.ckpt.
-    finished: leave the run unchanged; a message says so.
+    finished: leave the run unchanged and print a message.
 
     Raises UserError if the existing run has other settings or inputs, if the folder holds no run of this task, or if
     the first process resumes but this one has no last.ckpt (several machines, no shared folder).

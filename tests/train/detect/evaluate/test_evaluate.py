@@ -134,7 +134,7 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
         (["--out", "."], "the run's own folder"),
         (["--scale", "9"], "--scale: detect.evaluation.scales.0: got 9.0, expected"),
         (["--scale", "nan"], "--scale: detect.evaluation.scales.0"),
-        (["--tile", "256"], "--tile: options: got no --images, expected also --images, or no --tile"),
+        (["--tile", "256"], "--tile: options: got no --images, expected --images, or no --tile"),
         (["--overlap", "32"], "--overlap: options: got no --images"),
         (["--box-margin", "0.5"], "--box-margin: options: got no --images"),
         (["--min-size", "8"], "--min-size: options: got no --images"),

@@ -106,8 +106,8 @@ def test_the_command(run, folder, tmp_path):
     written = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert (written["scales"], written["min_size_px"], written["threshold"]) == ("0.5", 20, 0.02)
     for option, value, told in (
-        ("--dataset", "data", "--dataset: options: got also --images, expected only one of them"),
-        ("--split", "test", "--split: options: got also --images, expected only one of them"),
+        ("--dataset", "data", "--dataset: options: got together with --images, expected only one of them"),
+        ("--split", "test", "--split: options: got together with --images, expected only one of them"),
         ("--set", "detect.labels.selection=all", "--set: detect.labels.selection: got together with --images"),
         ("--scale", "9", "--scale: factor: got [9.0]"),
     ):

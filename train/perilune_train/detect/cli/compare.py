@@ -14,7 +14,7 @@ def compare(
     out: Annotated[Path, typer.Option(help="Folder to write into.")] = Path("runs/detect/compare"),
     allow_overlap: AllowOverlap = False,
 ) -> None:
-    """Compare runs: compare.md, one table with the protocol of each, and their precision-recall curves."""
+    """Compare runs or evaluations: writes compare.md (a table) and precision_recall.png."""
     # matplotlib and torch take seconds to load.
     from perilune_train.detect.compare_runs import compare_folders
 

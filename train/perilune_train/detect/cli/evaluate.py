@@ -70,14 +70,14 @@ def evaluate(
         raise UserError("--threshold", "score", threshold, "a number from 0 to 1")
     if choose_threshold and (threshold is not None or images is not None or split == "val"):
         other = "--threshold" if threshold is not None else "--images" if images is not None else "--split val"
-        raise UserError("--choose-threshold", "options", f"also {other}", "only one of them")
+        raise UserError("--choose-threshold", "options", f"together with {other}", "only one of them")
     for name in _FOR_IMAGES if images is None else _FOR_DATASETS:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
             option = "--" + name.replace("_", "-")
             if images is None:
-                raise UserError(option, "options", "no --images", f"also --images, or no {option}")
-            raise UserError(option, "options", "also --images", "only one of them")
+                raise UserError(option, "options", "no --images", f"--images, or no {option}")
+            raise UserError(option, "options", "together with --images", "only one of them")
     config = config_of_run(run, tuple(set_ or ()))
     if images is not None:
         for text in set_ or ():

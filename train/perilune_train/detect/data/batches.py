@@ -104,7 +104,7 @@ class Collate:
 def loader(
     frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: ProcessBatches | None = None
 ) -> torch_data.DataLoader:
-    """Batches (images (N, in_channels, H, W), Targets) in the given order, or of a share if one is given."""
+    """Batches (images (N, in_channels, H, W), Targets) in the given order; with `share` only its frames."""
     return torch_data.DataLoader(
         frames,
         batch_sampler=share or ProcessBatches(len(frames), config.batch_size),

@@ -51,7 +51,7 @@ class Int8Verdict:
         return self.ap50_paper_float - self.ap50_paper_int8 <= MAX_AP_LOSS and self.int8_s < self.float_s
 
     def as_metadata(self) -> dict[str, Any]:
-        """As plain data."""
+        """The verdict as plain data, for detector.json."""
         return {**dataclasses.asdict(self), "kept": self.kept}
 
     def summary(self) -> str:

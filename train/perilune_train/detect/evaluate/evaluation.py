@@ -43,9 +43,9 @@ class Evaluation:
     """Evaluated detections, with all values that a report prints."""
 
     found: list[Detections]
-    """One entry per frame."""
+    """Detections, one entry per frame."""
     labels: list[FrameLabels]
-    """One entry per frame."""
+    """Labels, one entry per frame."""
     facts: FrameFacts
     """Metadata of the frames."""
     threshold: float
@@ -164,7 +164,7 @@ def evaluate_detections(
 
 
 def errors_of_found(overlaps: Overlaps, matches: Matches, threshold: float) -> dict[str, float]:
-    """Errors of found craters, in pixels and (`_relative`) over the label's radius; NaN if none was found.
+    """Errors of found craters, in pixels and (`_relative`) divided by the label's radius; NaN if none was found.
 
     The centre is the centre of the box. The radius is sqrt(w h) / 2 of a box, for the detection and for the label. For
     a rotated ellipse it is slightly larger than sqrt(a b), which a box does not determine. Bias is the mean of detected

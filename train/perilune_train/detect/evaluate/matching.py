@@ -40,7 +40,7 @@ NO_LABEL, ON_IGNORED = -1, -2
 EDGE = 0.75
 """The edge account counts false positives down to this fraction of the smallest radius."""
 COCO_IOUS = tuple(np.linspace(0.5, 0.95, 10).tolist())
-"""The IoUs over which COCO averages, equal to the last bit."""
+"""The IoUs over which COCO averages, bit-identical to COCO's."""
 
 
 def edge_range(radius_px: tuple[float, float]) -> tuple[float, float]:
@@ -55,7 +55,7 @@ class Detections:
     boxes: Array
     """x0, y0, x1, y1 in pixels (D, 4)."""
     scores: Array
-    """(D,), in (0, 1)."""
+    """Scores (D,), in (0, 1)."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,9 @@ class Matches:
     """All detections of some frames, matched at one IoU."""
 
     scores: Array
-    """(D,)."""
+    """Scores (D,)."""
     outcome: NDArray[np.int8]
-    """FOUND, FALSE or IGNORED (D,)."""
+    """Outcome of each detection: FOUND, FALSE or IGNORED (D,)."""
     label: Rows
     """Matched label, a row of Overlaps; NO_LABEL or ON_IGNORED if there is none (D,)."""
     frame: Rows

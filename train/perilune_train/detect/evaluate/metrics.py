@@ -18,9 +18,9 @@ class Curve:
     scores: Array
     """Thresholds, decreasing (K,)."""
     precision: Array
-    """(K,)."""
+    """Precision at each threshold (K,)."""
     recall: Array
-    """(K,)."""
+    """Recall at each threshold (K,)."""
 
     def ap_paper(self) -> float:
         """The paper's AP, the headline metric: sum of (R_n - R_(n-1)) P_n over all thresholds, with raw precision.

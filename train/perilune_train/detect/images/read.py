@@ -18,7 +18,7 @@ from perilune_shared.errors import UserError
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 _FORMATS = ("PNG", "TIFF", "JPEG")
 _LARGEST_PIXELS = 2**29
-"""Limit on the pixels of an image: twice a whole Narrow Angle Camera image. The header of a small file can state
+"""Largest number of pixels of an image: twice a whole Narrow Angle Camera image. The header of a small file can state
 any size."""
 _STRETCH_PERCENT = (0.05, 99.95)
 _SAMPLE = 1_000_000

@@ -18,7 +18,7 @@ class Teacher:
     """A trained network. Not an nn.Module: the student's weights and checkpoints must not contain it."""
 
     network: YOLOv3
-    """In evaluation mode."""
+    """The network, in evaluation mode."""
 
     @torch.no_grad()
     def __call__(self, images: Tensor) -> list[Tensor]:

@@ -164,8 +164,8 @@ class DetectTask(lightning.LightningModule):
         return loss
 
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
-        # Lightning's own clipping refuses fused optimisers because of float16's scaled gradients, which are not used
-        # here.
+        # Lightning's own clipping raises an error for fused optimisers because of float16's scaled gradients, which are
+        # not used here.
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         norm = nn.utils.get_total_norm(gradients, foreach=True)
         # On a CPU reading the norm is free, and most steps need no second pass over all gradients.

@@ -24,7 +24,7 @@ from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
-"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. Dividing by a
+"""Approximate mean and standard deviation of photographs on Darknet's scale of 0 to 1. Scaling by a
 power of two is exact."""
 _GATES = "backbone.attentions."
 DARKNET_SHAPE = {"width": 1.0, "in_channels": 3}

@@ -11,9 +11,9 @@ from perilune_train.navigate.data.trajectories import Trajectory
 class EpochBatches:
     """One epoch of batches of sequences; depends on trajectories and key (seed, epoch) only.
 
-    A trajectory gives as many sequences of `n_pairs` (at most the length of the shortest trajectory) as fit into it,
-    each with its own random start. Iterates over lists of `batch` sequences; `augmented` sequences are mirrored and,
-    with `jitter`, moved (see `pair_sequence`).
+    A trajectory gives about as many sequences of `n_pairs` (at most the length of the shortest trajectory) as fit into
+    it, each with its own random start. Iterates over lists of `batch` sequences; `augmented` sequences are mirrored
+    and, with `jitter`, moved (see `pair_sequence`).
     """
 
     def __init__(

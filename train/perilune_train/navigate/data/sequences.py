@@ -41,7 +41,7 @@ class Sequence:
     down_c: Array
     """Unit vector (3,) towards the ground in O_C of a level body, mirrored with the frames."""
     flow_px: Array | None = None
-    """For warp: residual flow of the ground plane (n, height / 8, width / 8, 2), from first to second."""
+    """For warp: residual flow of the ground plane (n, height / 8, width / 8, 2), pixels, from first to second."""
 
 
 def pair_sequence(
@@ -53,7 +53,7 @@ def pair_sequence(
     rng: np.random.Generator | None = None,
     jitter: Jitter | None = None,
 ) -> Sequence:
-    """The pairs start .. start + n_pairs of a trajectory; augmented if a generator is given.
+    """The pairs start to start + n_pairs - 1 of a trajectory; augmented if a generator is given.
 
     Augmentation applies one of the eight symmetries of the square image to the whole sequence (four if the image is not
     square). With `jitter` it also moves each second camera at random, so that a pair has new residuals in every epoch:

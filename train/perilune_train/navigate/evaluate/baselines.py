@@ -14,7 +14,7 @@ def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:
 
 
 def mean_motion_at_step(training: list[Trajectory], trajectory: Trajectory) -> Motion:
-    """The training set's mean motion at each step; after its last step, the mean motion at that step."""
+    """The training set's mean motion at each step; that of its last step for all later steps."""
     translations, rotations = [], []
     longest = max(one.n_pairs for one in training)
     for step in range(trajectory.n_pairs):

@@ -2,7 +2,7 @@
 
 The second frame is first warped onto the first by the nominal motion, so that the tracker (Lucas & Kanade 1981,
 pyramids after Bouguet 2001, as in OpenCV) only has to find a small residual at the same scale. The points of frame 1
-are projected onto the ground plane at the nominal altitude. The motion is fitted to them by Gauss-Newton on the
+are projected onto the ground plane at the estimated altitude. The motion is fitted to them by Gauss-Newton on the
 reprojection error with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/00401706.1974.10489171).
 """
 
