@@ -45,7 +45,7 @@ class DarknetFile:
 
 @dataclass(frozen=True)
 class Slot:
-    """A place in the file, and the tensor of a network that belongs there."""
+    """A position in the file, and the tensor of a network that belongs there."""
 
     name: str
     """Name for messages: number of the convolution, from 0, and kind of tensor."""

@@ -1,4 +1,4 @@
-"""Resume, keep, replace or refuse an existing run of the same name."""
+"""Resume, keep, replace or reject an existing run of the same name."""
 
 import functools
 import json

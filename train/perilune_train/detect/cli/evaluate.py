@@ -98,6 +98,6 @@ def evaluate(
     # Importing torch takes seconds; check the settings first.
     from perilune_train.detect.evaluate_run import evaluate_again
 
-    place = dataset or Path("data", run.resolve().name, "detect")
-    folder = evaluate_again(run, config, place, split, threshold, out, choose_threshold, allow_overlap)
+    root = dataset or Path("data", run.resolve().name, "detect")
+    folder = evaluate_again(run, config, root, split, threshold, out, choose_threshold, allow_overlap)
     console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")

@@ -152,11 +152,11 @@ def _bins(title: str, parts: list[BinFigures]) -> list[str]:
         ]
         for part in parts
     ]
-    least = min(parts, key=lambda part: part.ap50_paper)
+    lowest = min(parts, key=lambda part: part.ap50_paper)
     return [
         f"## {title}",
         "",
-        f"Lowest AP: {number(least.ap50_paper)} at {least.label}.",
+        f"Lowest AP: {number(lowest.ap50_paper)} at {lowest.label}.",
         "",
         *table([title.lower(), "frames", "labels", "AP", "precision", "recall", "F1"], rows),
         "",

@@ -68,17 +68,17 @@ class ImageSet:
     """Text that names the categories of a COCO file taken as craters; "" if there was no choice."""
 
 
-def read_images(place: Path) -> ImageSet:
+def read_images(source: Path) -> ImageSet:
     """Read the labelled images of a folder or a COCO file. Raises UserError, naming file and line, on invalid input."""
-    if place.is_file():
-        return _read_coco(place)
-    if not place.is_dir():
-        raise UserError(place, "--images", "no such folder", "a folder of images with boxes, or a COCO file")
-    if (place / "annotations.json").is_file():
-        return _read_coco(place / "annotations.json")
-    paths = sorted(path for path in place.iterdir() if path.suffix.lower() in SUFFIXES)
+    if source.is_file():
+        return _read_coco(source)
+    if not source.is_dir():
+        raise UserError(source, "--images", "no such folder", "a folder of images with boxes, or a COCO file")
+    if (source / "annotations.json").is_file():
+        return _read_coco(source / "annotations.json")
+    paths = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
     if not paths:
-        raise UserError(place, "--images", "no PNG, TIFF or JPEG", "images with boxes beside them")
+        raise UserError(source, "--images", "no PNG, TIFF or JPEG", "images with boxes beside them")
     images = []
     for path in paths:
         boxes = read_table(path.with_suffix(".txt"))
@@ -122,9 +122,9 @@ def _box(values: Any, path: Path, field: str, may_be_empty: bool = False) -> tup
         x, y, w, h = (float(value) for value in values)
     except (TypeError, ValueError, OverflowError):
         raise UserError(path, field, values, "four numbers: left, top, width, height") from None
-    least = min(w, h)
+    shorter = min(w, h)
     if not all(math.isfinite(v) and abs(v) <= _LARGEST_PX for v in (x, y, w, h)) or not (
-        least > 0 or (may_be_empty and least == 0)
+        shorter > 0 or (may_be_empty and shorter == 0)
     ):
         raise UserError(path, field, values, f"a width and height above 0, and no number beyond {_LARGEST_PX:.0f} px")
     return x, y, x + w, y + h
@@ -139,8 +139,8 @@ def _read_coco(path: Path) -> ImageSet:
         raise UserError(path, "JSON", type(content).__name__, "an object with images and annotations")
     craters, chosen = _crater_categories(_records(content, "categories", path), path)
     images = _records(content, "images", path)
-    place = {_identity(image, "id", f"images[{k}]", path): k for k, image in enumerate(images)}
-    if not images or len(place) < len(images):
+    row_of = {_identity(image, "id", f"images[{k}]", path): k for k, image in enumerate(images)}
+    if not images or len(row_of) < len(images):
         raise UserError(path, "images", "none" if not images else "duplicate ids", "images with an id each")
     boxes: list[list] = [[] for _ in images]
     not_ignored: list[list[bool]] = [[] for _ in images]
@@ -149,7 +149,7 @@ def _read_coco(path: Path) -> ImageSet:
         field = f"annotations[{n}]"
         if craters is not None and annotation.get("category_id") not in craters:
             continue
-        row = place.get(_identity(annotation, "image_id", field, path))
+        row = row_of.get(_identity(annotation, "image_id", field, path))
         if row is None:
             raise UserError(path, f"{field}.image_id", annotation["image_id"], "the id of one of the images")
         box = _box(annotation.get("bbox"), path, f"{field}.bbox", may_be_empty=True)
