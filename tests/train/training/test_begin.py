@@ -62,7 +62,7 @@ def test_the_same_command_resumes_and_needs_the_same_settings_and_dataset(tmp_pa
     with pytest.raises(UserError, match=r"inputs.json: dataset: got nothing, expected 1, as in the existing run"):
         begin(tmp_path, Settings(), dataset=None)
     run.inputs.write_text('{"dataset": null}')
-    with pytest.raises(UserError, match=r"inputs.json: dataset: got SHA-256 1, expected nothing, with which the run"):
+    with pytest.raises(UserError, match=r"dataset: got SHA-256 1, expected nothing, as in the existing run"):
         begin(tmp_path, Settings())
     assert run.last.exists() and run.config.read_text() == "detect:\n  rate: 0.1\n"
     for text in ("[", "[]"):

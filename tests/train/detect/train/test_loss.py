@@ -65,7 +65,7 @@ def test_loss_by_hand():
     label = Targets(torch.tensor([[8.0, 8.0, 16.0, 16.0]]), torch.tensor([0]), torch.tensor([True]))
     box, confidence = detection_loss([raw], label, anchors, (8,), 1.5, LossSettings(lambda_noobj=0.5))
     # Centre (12, 12): cell (1, 1) exactly, its neighbours right and below 8 px off; 3 of 48 predictors positive.
-    # Shifted boxes: IoU 0, distance 64 / (256 + 64). Reach of the free ones: 8 / 4 + 4 = 6 px, only cell (1, 1).
+    # Shifted boxes: IoU 0, distance 64 / (256 + 64). Reach of the ignored ones: 8 / 4 + 4 = 6 px, only cell (1, 1).
     assert box.item() == pytest.approx((0 + 2 * (1 + 64 / 320)) / 3, abs=1e-5)
     assert confidence.item() == pytest.approx((3 + 0.5 * 45) * math.log(2) / 48, rel=1e-5)
 
