@@ -176,6 +176,14 @@ def test_every_folder_of_the_packages_is_in_contributing():
     assert [folder for folder in folders if f"| `{folder}` |" not in page] == []
 
 
+def test_no_docstring_has_the_double_colon_of_another_markup():
+    """Docstrings are Markdown, which shows both colons."""
+    files = [path for house in ("shared", "render", "train") for path in (TOP / house).glob("perilune_*/**/*.py")]
+    assert len(files) > 100
+    wrong = [path.name for path in files if re.search(r"\w::$", path.read_text(encoding="utf-8"), re.MULTILINE)]
+    assert not wrong
+
+
 def test_targets_of_make_exist():
     known = set(re.findall(r"^([a-z-]+):", (TOP / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     for page, text in texts():

@@ -59,8 +59,3 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Redirect links from Jupyter notebooks to their pages."""
     return markdown.replace(".ipynb)", ".md)")
-
-
-def on_page_content(html: str, **_: Any) -> str:
-    """Show one colon where a docstring has two, the mark of an indented block."""
-    return html.replace("::</p>", ":</p>")

@@ -1,6 +1,6 @@
 """Read, validate, edit and export datasets of labelled lunar landing trajectories.
 
-Use::
+Use:
 
     import perilune_shared as ps
 

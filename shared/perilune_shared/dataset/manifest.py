@@ -1,6 +1,6 @@
 """Read a dataset: dataset.json, Parquet parts under manifest/, frames under frames/ or packed in images/.
 
-Parts are written atomically and never rewritten. Use::
+Parts are written atomically and never rewritten. Use:
 
     dataset = open_dataset("data/small/detect")
     dataset.labels, dataset[0].image                                                    # pandas, NumPy

@@ -1,7 +1,7 @@
 """Export to Croissant: describe files, tables and columns in JSON-LD for dataset search and ML tools.
 
 Format: Croissant 1.1 (https://docs.mlcommons.org/croissant/docs/croissant-spec-1.1.html). The file must be in the
-dataset's folder, since its paths are relative. mlcroissant reads records from the local files::
+dataset's folder, since its paths are relative. mlcroissant reads records from the local files:
 
     dataset = mlcroissant.Dataset("data/small/detect/croissant.json")
     for record in dataset.records("labels"):

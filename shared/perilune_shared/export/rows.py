@@ -1,6 +1,6 @@
 """Read the rows of a dataset scene by scene; used by all exports.
 
-Use::
+Use:
 
     for scene in scenes_of(open_dataset("data/small/detect"), split="test"):
         print(scene.scene_id, len(scene.frames), len(scene.labels))

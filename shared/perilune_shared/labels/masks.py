@@ -4,7 +4,7 @@ A pixel belongs to a crater if the ray through the pixel's centre intersects the
 exact, with and without lens distortion. The pixel is visible unless the terrain in the frame's EXR (depth, channel Z)
 is nearer than the disc; the crater's own floor lies behind the disc. Since the terrain around the disc is rough, it
 hides a pixel only if it is nearer by more than a tenth of the radius and by more than two pixel widths, as for
-`visible_fraction`. Use::
+`visible_fraction`. Use:
 
     depth_m = perilune_render.imaging.exr.read_exr(dataset.file(frame.exr_path))["Z"]
     for mask in frame_masks(dataset, frame_id, depth_m=depth_m):

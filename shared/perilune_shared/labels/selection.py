@@ -1,6 +1,6 @@
 """Read labels and select them by the thresholds of `perilune_shared.labels.thresholds`.
 
-Use::
+Use:
 
     labels = read_labels(dataset, split="test")
     seen = labels[selected(labels, SELECTIONS["visible"])]

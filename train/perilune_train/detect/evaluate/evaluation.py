@@ -1,6 +1,6 @@
 """Evaluation of detections: all computations, on plain arrays.
 
-Use it for rendered datasets and real images alike::
+Use it for rendered datasets and real images alike:
 
     evaluation = evaluate_detections(found, labels, facts, threshold, radius_px=(2.0, 50.0))
     figures = evaluation.figures()                       # flat keys, for metrics.json

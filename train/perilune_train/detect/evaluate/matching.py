@@ -1,6 +1,6 @@
 """Matching of detections to labels, on plain arrays.
 
-Evaluate detections against labels of rendered or real images with::
+Evaluate detections against labels of rendered or real images with:
 
     overlaps = find_overlaps(found, labels, sizes_px)          # list[Detections], list[FrameLabels], (N, 2)
     matches = overlaps.match(0.5, (2.0, 50.0))                 # at one IoU
