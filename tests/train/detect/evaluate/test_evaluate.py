@@ -153,7 +153,7 @@ def test_folders_that_are_no_finished_runs(run, dataset_detect, tmp_path):
     with pytest.raises(UserError, match=r"metrics.json: metrics: got no such file"):
         call("compare", run, tmp_path, "--out", tmp_path / "out")
     (tmp_path / "metrics.json").write_text("[1, 2]")
-    with pytest.raises(UserError, match="expected flat keys"):
+    with pytest.raises(UserError, match="expected a flat JSON object"):
         call("compare", tmp_path, "--out", tmp_path / "out")
     (tmp_path / "metrics.json").write_text("{}")
     with pytest.raises(UserError, match=r"precision_recall.parquet: curve: got no such file"):
