@@ -108,12 +108,25 @@ def inside(root: Path, relative: str) -> Path:
         raise UserError(root, "path", repr(relative), "a relative POSIX path of plain names inside the dataset")
     path = root.joinpath(*PurePosixPath(relative).parts)
     try:
-        is_inside = path.resolve().is_relative_to(root.resolve())
+        is_inside = _without_links(path).is_relative_to(root.resolve())
     except (OSError, RuntimeError):  # cyclic links
         is_inside = False
     if not is_inside:
         raise UserError(root, "path", repr(relative), "a path without links that leave the dataset")
     return path
+
+
+def _without_links(path: Path) -> Path:
+    """Resolve a path that need not exist. Raises OSError or RuntimeError on cyclic links.
+
+    From Python 3.13 on, `Path.resolve` raises on cyclic links only if `strict`, which it also does on missing files.
+    """
+    try:
+        return path.resolve(strict=True)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise
+        return path.resolve()
 
 
 def check_plain_file(path: Path) -> int:
