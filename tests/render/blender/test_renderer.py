@@ -153,7 +153,7 @@ def test_label_ellipses_lie_on_rendered_rims():
     assert (index[floor] == 1).all() and (index[between] == -1).all()
 
 
-def test_a_hidden_rim_and_a_dark_crater_are_told():
+def test_a_hidden_rim_and_a_dark_crater_are_reported():
     """A low Sun leaves the crater behind a wall dark; a wall between hides its rim from a slanted view."""
     n = 401
     height = np.zeros((n, n))

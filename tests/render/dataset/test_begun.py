@@ -136,7 +136,7 @@ def test_what_is_no_picture_is_far_from_one(drawn):
 
 def test_scenes_over_one_elevation_model_share_terrain():
     scenes = KindConfig(n_scenes=3, trajectories_per_scene=1, n_frames=4, split_by="scene")
-    for dem, told in ((None, "scene"), ("a.tif", "trajectory")):
+    for dem, expected in ((None, "scene"), ("a.tif", "trajectory")):
         config = config_with(detect=scenes, terrain=TerrainConfig(dem=dem))
         info = new_info(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
-        assert info.split_by == told
+        assert info.split_by == expected

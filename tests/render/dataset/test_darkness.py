@@ -35,8 +35,8 @@ def rendered(tmp_path_factory):
 def warning(done, n_frames):
     """Count and first frame of the one warning that a command printed."""
     (line,) = [line for line in done.stderr.splitlines() if line.startswith("warning")]
-    told = r"warning: scene-0000: (\d) of (\d) frames are dark \(less than 1% .* first (\S+); the Sun is 0\.1 .*"
-    n_dark, n, first = re.fullmatch(told, line).groups()
+    pattern = r"warning: scene-0000: (\d) of (\d) frames are dark \(less than 1% .* first (\S+); the Sun is 0\.1 .*"
+    n_dark, n, first = re.fullmatch(pattern, line).groups()
     assert int(n) == n_frames
     return n_dark, first
 

@@ -104,7 +104,7 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
     assert set(new.table("frames")["split"].to_pylist()) == {"train", "test"}
     again = run("dataset", "--manifest", tmp_path / "s", "--out", tmp_path / "out")
     assert again.returncode == 0 and f"{n} of {n}" in again.stdout
-    for arguments, told in (
+    for arguments, message in (
         (["--manifest", tmp_path / "s", "--set", "dataset.seed=3", "--out", tmp_path / "o"], "--set"),
         (["--manifest", tmp_path / "s"], "--out"),
         (["--manifest", tmp_path / "s", "--preset", "tiny", "--out", tmp_path / "o"], "--preset"),
@@ -112,7 +112,7 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
         (["--manifest", tmp_path / "none", "--out", tmp_path / "o"], "no such file"),
     ):
         refused = run("dataset", *arguments)
-        assert refused.returncode == 2 and told in refused.stderr and not (tmp_path / "o").exists()
+        assert refused.returncode == 2 and message in refused.stderr and not (tmp_path / "o").exists()
 
 
 def test_developed_frames_are_made_again_with_the_first_camera_ground(tiny, tmp_path):
@@ -128,7 +128,7 @@ def test_verify_counts_what_is_the_same(tiny_detect):
     assert made.returncode == 0 and "3 frames: 3 identical" in made.stdout
 
 
-def test_a_frame_from_elsewhere_is_compared_and_told(tiny_detect, tmp_path):
+def test_a_frame_from_elsewhere_is_compared_and_reported(tiny_detect, tmp_path):
     """As another machine would have rendered it: a few grey levels off, or another picture."""
     part = sorted((tiny_detect / "manifest/frames").glob("scene-0000*"))[0]
     rows = pq.read_table(part).to_pandas()
@@ -141,21 +141,23 @@ def test_a_frame_from_elsewhere_is_compared_and_told(tiny_detect, tmp_path):
     ids = [f"scene-0000/trajectory-0000/00000{k}" for k in range(3)]
     outcomes = again(tiny_detect, tmp_path / "out", ids)
     assert [o.png for o in outcomes] == ["within tolerance", "different", "identical"]
-    told = run("regenerate", "--manifest", tiny_detect, "--out", tmp_path / "o", "--frames", ids[0], "--frames", ids[1])
-    assert told.returncode == 2 and "1 within tolerance" in told.stdout and "1 different" in told.stdout
+    result = run(
+        "regenerate", "--manifest", tiny_detect, "--out", tmp_path / "o", "--frames", ids[0], "--frames", ids[1]
+    )
+    assert result.returncode == 2 and "1 within tolerance" in result.stdout and "1 different" in result.stdout
 
 
-def test_another_ground_is_told(tiny_detect):
+def test_another_ground_is_reported(tiny_detect):
     part = tiny_detect / "manifest/scenes/scene-0001.parquet"
     rows = pq.read_table(part).to_pandas()
     rows["content_sha256"] = "0" * 64
     pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["scenes"], preserve_index=False), part)
-    told = run("regenerate", "--manifest", tiny_detect, "--verify", "--frames", "scene-0001/trajectory-0000/000000")
-    assert told.returncode == 2 and "1 identical" in told.stdout and "terrain hash mismatch" in told.stdout
+    result = run("regenerate", "--manifest", tiny_detect, "--verify", "--frames", "scene-0001/trajectory-0000/000000")
+    assert result.returncode == 2 and "1 identical" in result.stdout and "terrain hash mismatch" in result.stdout
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (["--verify", "--frames", "scene-0001/trajectory-0000/000099"], "a frame of the manifest, such as scene-0000"),
         (["--frames", "scene-0001/trajectory-0000/000001"], "--out"),
@@ -163,9 +165,9 @@ def test_another_ground_is_told(tiny_detect):
         ([], "--verify"),
     ],
 )
-def test_mistakes_are_told_in_one_line(tiny, arguments, told):
+def test_mistakes_are_reported_in_one_line(tiny, arguments, message):
     made = run("regenerate", "--manifest", tiny / "detect", *arguments)
-    assert made.returncode == 2 and told in made.stderr and len(made.stderr.strip().splitlines()) == 1
+    assert made.returncode == 2 and message in made.stderr and len(made.stderr.strip().splitlines()) == 1
 
 
 def changed_recipe(root, change):
@@ -179,8 +181,8 @@ def changed_recipe(root, change):
 
 def test_a_recipe_opens_no_file_of_its_own_choice(tiny_detect):
     changed_recipe(tiny_detect, lambda recipe: recipe["config"]["terrain"].update(dem="/etc/passwd"))
-    told = run("regenerate", "--manifest", tiny_detect, "--verify")
-    assert told.returncode == 2 and "recipes" in told.stderr
+    result = run("regenerate", "--manifest", tiny_detect, "--verify")
+    assert result.returncode == 2 and "recipes" in result.stderr
     info = open_dataset_with_right_key(tiny_detect)
     with pytest.raises(UserError, match="--dem with this machine's copy"):
         again(info, tiny_detect / "out", ["scene-0000/trajectory-0000/000000"])
@@ -243,6 +245,6 @@ def test_ctrl_c_in_a_plan_leaves_nothing(tmp_path):
             time.sleep(0.005)
         time.sleep(seconds)
         process.send_signal(signal.SIGINT)
-        told = process.communicate(timeout=60)[1]
-        assert process.returncode == 130 and "Traceback" not in told
+        stderr = process.communicate(timeout=60)[1]
+        assert process.returncode == 130 and "Traceback" not in stderr
         assert list(tmp_path.iterdir()) == []

@@ -117,8 +117,8 @@ def test_ctrl_c_is_answered_in_one_line(tmp_path):
     while not any(tmp_path.rglob("*.png")) and time.monotonic() < deadline:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    told = process.communicate(timeout=60)[1]
-    assert process.returncode == 130 and "Traceback" not in told and "again to resume" in told
+    stderr = process.communicate(timeout=60)[1]
+    assert process.returncode == 130 and "Traceback" not in stderr and "again to resume" in stderr
 
 
 def test_a_finished_dataset_is_reused_and_other_settings_are_refused(tmp_path):

@@ -88,11 +88,11 @@ def test_a_distortion_that_folds_back_is_refused():
         camera_of(CameraConfig(distortion=DistortionConfig(k1=-1.5)))
 
 
-def test_frames_that_the_detector_cannot_take_are_told_before_anything_is_made(tmp_path):
+def test_frames_that_the_detector_cannot_take_are_reported_before_anything_is_made(tmp_path):
     (tmp_path / "full.txt").touch()
-    for kind, told in (("detect", True), ("nav", False)):
+    for kind, warned in (("detect", True), ("nav", False)):
         size = ("--set", "dataset.camera.width_px=200", "--set", "dataset.camera.height_px=96")
         made = in_process.call(main, "plan", "--preset", "tiny", "--kind", kind, *size, "--out", tmp_path)
         assert made.returncode == 2 and "--out" in made.stderr
-        assert ("dataset.camera.width_px: 200 is not a multiple of 32" in made.stderr) == told
+        assert ("dataset.camera.width_px: 200 is not a multiple of 32" in made.stderr) == warned
         assert "height_px" not in made.stderr

@@ -92,7 +92,7 @@ def test_a_plan_is_checked_before_its_ground_is_grown(scene):
 
 @pytest.mark.parametrize("command", ["dataset", "plan"])
 @pytest.mark.parametrize(
-    ("settings", "told"),
+    ("settings", "message"),
     [
         (["dataset.detect.sun.elevation_deg=-5"], "dataset.detect.sun"),
         (["dataset.labels.min_radius_px=60", "dataset.labels.max_radius_px=60"], "dataset.labels"),
@@ -109,12 +109,12 @@ def test_a_plan_is_checked_before_its_ground_is_grown(scene):
     ],
 )
 def test_an_impossible_configuration_ends_the_command_with_one_line(
-    command, settings, told, tmp_path, monkeypatch, capsys
+    command, settings, message, tmp_path, monkeypatch, capsys
 ):
     out = tmp_path / "out"
     chosen = [*COARSE, *(f"--set={setting}" for setting in settings)]
     argv = ["perilune-render", command, "--preset", "tiny", "--kind", "detect", "--out", str(out), *chosen]
-    assert told in refusal(argv, monkeypatch, capsys)
+    assert message in refusal(argv, monkeypatch, capsys)
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 

@@ -65,11 +65,11 @@ DAMAGES = {
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_an_exr_of_ill_will_is_refused(name, tmp_path):
-    damage, told = DAMAGES[name]
+    damage, message = DAMAGES[name]
     path = exr(tmp_path / "a.exr")
     assert read_radiance(path, (32, 24)).depth_m.shape == (24, 32)
     damage(path)
-    with pytest.raises(UserError, match=told) as error:
+    with pytest.raises(UserError, match=message) as error:
         read_radiance(path, (32, 24))
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 

@@ -50,7 +50,7 @@ def changed(copy, module, pattern, replacement):
 
 
 @pytest.mark.parametrize(
-    ("module", "name", "wanted"),
+    ("module", "name", "expected"),
     [
         ("perilune_render.terrain.scene", "_LEAST_RIM", {"generator"}),
         ("perilune_render.terrain.craters.profile", "REACH", {"generator"}),
@@ -68,12 +68,12 @@ def changed(copy, module, pattern, replacement):
         ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "imaging"}),
     ],
 )
-def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, wanted):
-    assert changed(copy, module, rf"^{name} = .*$", f"{name} = 123.25") == wanted
+def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, expected):
+    assert changed(copy, module, rf"^{name} = .*$", f"{name} = 123.25") == expected
 
 
 @pytest.mark.parametrize(
-    ("module", "pattern", "replacement", "wanted"),
+    ("module", "pattern", "replacement", "expected"),
     [
         ("perilune_render.imaging.resampling", "INTER_LANCZOS4", "INTER_CUBIC", {"imaging"}),
         ("perilune_render.imaging.exr", "ZIP_COMPRESSION", "NO_COMPRESSION", {"imaging"}),
@@ -82,8 +82,8 @@ def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, wante
         ("perilune_render.terrain.noise", r"njit\(\)", "njit(fastmath=True)", {"generator"}),
     ],
 )
-def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, replacement, wanted):
-    assert changed(copy, module, pattern, replacement) == wanted
+def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, replacement, expected):
+    assert changed(copy, module, pattern, replacement) == expected
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,8 @@ def run(root):
     environment = {**os.environ, "PYTHONPATH": paths, "XDG_CACHE_HOME": str(root / "cache")}
     environment.pop("NUMBA_CACHE_DIR", None)
     command = [sys.executable, "-m", "perilune_render.caller"]
-    told = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
-    return [int(word) for word in told.split()]
+    printed = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+    return [int(word) for word in printed.split()]
 
 
 def test_a_change_in_another_file_is_compiled_into_its_callers(tmp_path):

@@ -105,7 +105,7 @@ def test_real_craters_are_measured_on_the_model_and_kept_beside_ours(tmp_path, m
         ("longitude_deg,latitude_deg,diameter_m\n1,2,-5\n", "c.csv:2: diameter_m: got -5"),
     ],
 )
-def test_faults_are_told_with_their_line(tmp_path, model, text, part):
+def test_faults_are_reported_with_their_line(tmp_path, model, text, part):
     path = tmp_path / "c.csv"
     if text is not None:
         path.write_text(text)

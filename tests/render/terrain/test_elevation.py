@@ -113,7 +113,7 @@ def test_craters_on_the_model_are_only_those_below_what_it_resolves(tmp_path, ca
     ],
 )
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-def test_bad_elevation_models_are_told_in_one_line(tmp_path, change, part):
+def test_bad_elevation_models_are_reported_in_one_line(tmp_path, change, part):
     path = ramp_to_the_north(tmp_path / "bad.tif")
     change(path)
     with pytest.raises(UserError, match=part) as caught:

@@ -33,9 +33,9 @@ def scene() -> Scene:
 def test_the_size_frequency_asked_for(law):
     config = CratersConfig(equilibrium=law, equilibrium_share=Span(low=1.3, high=1.3), min_diameter_spacings=8)
     craters = draw_craters(config, EVEN, 5)
-    wanted = Minimum(NeukumProduction(age_gyr=3.5), EQUILIBRIA[law](share=1.3))
+    population_law = Minimum(NeukumProduction(age_gyr=3.5), EQUILIBRIA[law](share=1.3))
     edges = np.array([8.0, 12, 18, 30, 50, 90, 200, 799])
-    expected = -np.diff(wanted.csfd(edges)) * 3000.0**2
+    expected = -np.diff(population_law.csfd(edges)) * 3000.0**2
     found = np.histogram(craters.diameter_m, edges)[0]
     assert (np.abs(found - expected) < 4 * np.sqrt(expected) + 1).all() and expected[0] > 1000
 
