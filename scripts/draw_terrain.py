@@ -1,7 +1,7 @@
-"""Draw the pictures of docs/explanation/terrain.md: profiles, altitudes, Suns, regions, a real elevation model.
+"""Draw the pictures of docs/explanation/terrain.md: profiles, altitudes, Sun elevations, regions, an elevation model.
 
 `python scripts/draw_terrain.py docs/pictures/terrain [--dem file.tif]` writes them into that folder.
-The package itself generates and renders everything.
+Scenes and frames are made by perilune_render.
 """
 
 import argparse
@@ -31,7 +31,7 @@ SEED = 23
 
 
 def draw_profiles(path: Path) -> None:
-    """Draw sections through craters. Above: fresh craters by size and law. Below: one size by age."""
+    """Draw sections through craters: fresh craters by size and law (top row), one size by age (bottom row)."""
     figure, axes = plt.subplots(2, 2, figsize=(10, 6), sharex=True)
     x = np.linspace(-2, 2, 1201)
     for ax, name in zip(axes[0], ("fassett_thomson", "pangu"), strict=True):
@@ -42,7 +42,7 @@ def draw_profiles(path: Path) -> None:
             ax.plot(x, height / d, label=f"{d:g} m")
         flat = rim * profile.fresh_rim(np.abs(x), name) + depth * profile.fresh_bowl(np.abs(x), name, flat=True)
         ax.plot(x, flat / d, ":", color="tab:red", label="600 m, flat floor")
-        ax.set(title=f"new, {name}", ylabel="height / diameter")
+        ax.set(title=f"fresh, {name}", ylabel="height / diameter")
         ax.legend(fontsize=8)
     for ax, d in zip(axes[1], (20.0, 300.0), strict=True):
         tables = profile.profile_tables()
@@ -55,7 +55,7 @@ def draw_profiles(path: Path) -> None:
             at = np.abs(x) * crest * (len(shape) - 1) / profile.REACH
             age = wear * (d / 2) ** 2 / (5.5 * (d / 1000) ** 0.9)
             ax.plot(x, np.interp(at, np.arange(len(shape)), shape) / d, label=f"{age:.3g} Myr, K/R² {wear:g}")
-        ax.set(title=f"{d:g} m, by age", xlabel="distance / today's crest radius", ylabel="height / diameter")
+        ax.set(title=f"{d:g} m, by age", xlabel="distance / current crest radius", ylabel="height / diameter")
         ax.legend(fontsize=8)
     with written_aside(path) as aside:
         figure.savefig(aside, dpi=90, bbox_inches="tight")
@@ -69,7 +69,7 @@ def settings(*changes: str, config_file: Path | None = None) -> DatasetConfig:
     return resolve(DatasetConfig, "dataset", "perilune_render", "small", config_file, (*size, *wide, *changes))
 
 
-def photographs(
+def nadir_frames(
     config: DatasetConfig, scene: Scene, views: list[tuple[float, float]], centre_m: tuple[float, float] = (0.0, 0.0)
 ) -> list[np.ndarray]:
     """Grey frames from nadir for altitudes (metres) and Sun elevations (degrees)."""
@@ -108,16 +108,16 @@ def main() -> None:
     flight = config.detect.flight
     scene = cached_scene(config, view_envelope(camera_of(config.camera), flight), SEED)
     altitudes = (1500.0, 800.0, 400.0, 200.0)
-    frames = photographs(config, scene, [(a, 28.0) for a in altitudes])
+    frames = nadir_frames(config, scene, [(a, 28.0) for a in altitudes])
     write_row(out / "altitudes.jpg", frames, [f"{a:.0f} m, Sun 28 deg" for a in altitudes])
     suns = (8.0, 20.0, 40.0, 65.0)
-    frames = photographs(config, scene, [(600.0, s) for s in suns])
+    frames = nadir_frames(config, scene, [(600.0, s) for s in suns])
     write_row(out / "suns.jpg", frames, [f"600 m, Sun {s:.0f} deg" for s in suns])
     frames, captions = [], []
     for region in ("mare", "highland"):
         own = settings(config_file=Path("configs") / f"{region}.yaml")
         grown = cached_scene(own, view_envelope(camera_of(own.camera), flight), SEED)
-        frames += photographs(own, grown, [(1200.0, 25.0), (300.0, 25.0)])
+        frames += nadir_frames(own, grown, [(1200.0, 25.0), (300.0, 25.0)])
         captions += [f"{region}, 1200 m", f"{region}, 300 m"]
     write_row(out / "regions.jpg", frames, captions)
     if arguments.dem is not None:
@@ -127,10 +127,10 @@ def main() -> None:
             "dataset.terrain.craters.max_diameter_m=0.1",
             "dataset.terrain.relief.rms_slope_deg={low: 0.0, high: 0.0}",
         )
-        for name, changes in (("the model alone", bare), ("with our detail", ())):
+        for name, changes in (("the model alone", bare), ("with generated detail", ())):
             own = settings(f"dataset.terrain.dem={arguments.dem}", *changes)
             grown = cached_scene(own, view_envelope(camera_of(own.camera), flight), SEED)
-            frames += photographs(own, grown, [(1000.0, 15.0), (250.0, 15.0)], (-150.0, 200.0))
+            frames += nadir_frames(own, grown, [(1000.0, 15.0), (250.0, 15.0)], (-150.0, 200.0))
             captions += [f"{name}, 1000 m", f"{name}, 250 m"]
         write_row(out / "elevation.jpg", frames, captions)
 

@@ -25,7 +25,7 @@ def lowest(project: Path) -> dict[str, str]:
 
 
 def main() -> None:
-    """Print the bounds; if both projects have one, the higher."""
+    """Print the lowest version of each dependency; the higher one if the projects differ."""
     bounds: dict[str, str] = {}
     for project in ("shared", "train"):
         for name, version in lowest(_ROOT / project).items():

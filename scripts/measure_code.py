@@ -43,6 +43,7 @@ def import_depth(modules: dict[str, Path], package: str) -> int:
 
 
 def main() -> None:
+    """Print the two tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).parent.parent)
     root = parser.parse_args().root

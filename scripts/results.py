@@ -1,4 +1,4 @@
-"""The headline figures: from what runs and benchmarks wrote to docs/results.md and README.md.
+"""Write the headline figures of runs and benchmarks into docs/results.md and README.md.
 
     python scripts/results.py record runs/bench/labels.json runs/detect/small/metrics.json
     python scripts/results.py write
@@ -24,7 +24,7 @@ from perilune_shared.storage.files import write_text
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
 PAGES = {ROOT / "docs/results.md": False, ROOT / "README.md": True}
-"""Pages with a table between the marks, and whether they have only the rows for the README."""
+"""Pages with a table between BEGIN and END, and whether it has only the rows for the README."""
 BEGIN, END = "<!-- results: written by `make results` -->", "<!-- end of results -->"
 _COMMIT = re.compile(r"[0-9a-f]{7,40}")
 _NEEDED = "a file that a run or a benchmark of this version wrote"
@@ -40,7 +40,7 @@ class Record(BaseModel):
     source: str
     """The file that the run wrote; or "transcribed from ..." if that file was not kept."""
     commit: str = Field(pattern=f"^{_COMMIT.pattern}$")
-    """Commit of the code that made the figures; of a transcribed record, the commit that put them into the page."""
+    """Commit of the code that made the figures; for a transcribed record, the commit that added them to the page."""
     date: str = Field(pattern=r"^\d{4}-\d\d-\d\d$")
     """UTC day of the run."""
     hardware: str
@@ -52,7 +52,7 @@ class Record(BaseModel):
     figures: dict[str, Any]
     """What the run wrote, unchanged."""
     quotes: tuple[str, ...] = ()
-    """Of a transcribed record: the text of the page that has the figures."""
+    """For a transcribed record, the text of the page with the figures."""
 
     @property
     def transcribed(self) -> bool:
@@ -129,10 +129,10 @@ def record_name(file: Path) -> str:
 
 
 def _record_of(file: Path) -> Record:
-    """The record of a file. Raises UserError if the file does not say how it was made, or by committed code."""
+    """The record of a file. Raises UserError if it does not record how it was made, or was made by uncommitted code."""
     try:
         figures = json.loads(file.read_text(encoding="utf-8"))
-        # Benchmarks write one table, runs flat keys.
+        # Benchmarks write a table `run`, runs write keys that begin with run/.
         made = figures.pop("run", None) or {
             key.removeprefix("run/"): figures.pop(key) for key in list(figures) if key.startswith("run/")
         }
@@ -150,7 +150,7 @@ def _record_of(file: Path) -> Record:
             figures=figures,
         )
     except ValidationError as error:
-        raise UserError(file, "run", str(made), f"{_NEEDED}, of a commit: {error.errors()[0]['msg']}") from None
+        raise UserError(file, "run", str(made), f"{_NEEDED}, with committed code: {error.errors()[0]['msg']}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise UserError(file, "run", "no commit, hardware and command", _NEEDED) from None
     if re.search(r"(^|[\s=])/", command):
@@ -203,20 +203,20 @@ def table(for_readme: bool, rows: list[Row], records: dict[str, Record]) -> str:
 
 
 def value(row: Row, records: dict[str, Record]) -> str:
-    """The cell of the figure."""
+    """The cell of the value."""
     if row.not_measured:
         return f"not measured since {row.not_measured}"
     mark = " (transcribed)" if records[row.record].transcribed else ""
-    return f"{shown(row, figure(row, records))}{mark}"
+    return f"{formatted(row, figure(row, records))}{mark}"
 
 
 def interval(row: Row, records: dict[str, Record]) -> str:
     """The cell of the interval: a dash where the record has none."""
     if row.not_measured:
         return "—"
-    near = beside(row, records)
+    near = enclosing_table(row, records)
     low, high = (near.get(f"{row.keys[-1]}_{end}") for end in ("low", "high"))
-    return "—" if low is None or high is None else f"{shown(row, low)} to {shown(row, high)}"
+    return "—" if low is None or high is None else f"{formatted(row, low)} to {formatted(row, high)}"
 
 
 def goal(row: Row, records: dict[str, Record]) -> str:
@@ -241,8 +241,8 @@ def made_cells(row: Row, records: dict[str, Record]) -> list[str]:
     return [found.commit[:7], f"{found.hardware}{load}", f"`{found.command}`"]
 
 
-def beside(row: Row, records: dict[str, Record]) -> dict[str, Any]:
-    """The table of a record that has the figure of a row."""
+def enclosing_table(row: Row, records: dict[str, Record]) -> dict[str, Any]:
+    """The innermost table of a record that contains the figure of a row."""
     found: Any = records[row.record].figures
     for key in row.keys[:-1]:
         found = found[key]
@@ -251,10 +251,10 @@ def beside(row: Row, records: dict[str, Record]) -> dict[str, Any]:
 
 def figure(row: Row, records: dict[str, Record]) -> float:
     """The figure of a row."""
-    return float(beside(row, records)[row.keys[-1]])
+    return float(enclosing_table(row, records)[row.keys[-1]])
 
 
-def shown(row: Row, number: float) -> str:
+def formatted(row: Row, number: float) -> str:
     """A number with the row's digits and unit."""
     text = f"{number:.{row.digits}g}"
     return f"{float(text):,.15g} {row.unit}".strip()

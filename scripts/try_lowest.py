@@ -1,6 +1,7 @@
 """Import every module of perilune-shared and perilune-train and train one step of `tiny` for each network.
 
-Usage: try_lowest.py FOLDER, an empty folder for datasets and runs. Part of scripts/test-lowest.
+Usage: try_lowest.py FOLDER, an empty folder for datasets and runs. Used by scripts/test-lowest and
+scripts/test-wheels.
 """
 
 import importlib

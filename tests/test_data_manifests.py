@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from perilune_render.dataset.regenerate import OUTLIERS, png_far, regenerate
+from perilune_render.dataset.regenerate import OUTLIERS, png_outlier_share, regenerate
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.validation.validate import validate
 
@@ -63,6 +63,6 @@ def test_a_frame_is_made_again(name, tmp_path):
         (outcome,) = regenerate(open_dataset(FOLDER / name), [frame_id], tmp_path, progress, dem)
     assert outcome.same_ground
     again = outcome.png_path.read_bytes()
-    assert png_far(reference.read_bytes(), again) <= OUTLIERS
+    assert png_outlier_share(reference.read_bytes(), again) <= OUTLIERS
     image = cv2.imdecode(np.frombuffer(again, np.uint8), cv2.IMREAD_UNCHANGED)
     assert image.shape == (256, 256) and image.std() > 5

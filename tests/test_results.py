@@ -42,7 +42,7 @@ def test_a_changed_figure_changes_the_tables():
     for row in ROWS:
         if row.record:
             records = {name: record.model_copy(deep=True) for name, record in RECORDS.items()}
-            near = results.beside(row, records)
+            near = results.enclosing_table(row, records)
             near[row.keys[-1]] = 2 * near[row.keys[-1]]
             assert results.table(False, ROWS, records) != before, row.metric
 
@@ -86,8 +86,8 @@ def test_a_run_becomes_a_record(tmp_path):
     ("changes", "message"),
     [
         ({"commit": "0" * 40}, "expected a commit of this branch"),
-        ({"commit": "a" * 40 + " modified"}, "of a commit"),
-        ({"commit": "unknown"}, "of a commit"),
+        ({"commit": "a" * 40 + " modified"}, "with committed code"),
+        ({"commit": "unknown"}, "with committed code"),
         ({"command": "make it OUT=/home/me/out"}, "expected paths relative to the repository"),
     ],
 )

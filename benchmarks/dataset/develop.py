@@ -1,8 +1,8 @@
 """Frames per second of `perilune-render develop` on one core.
 
 Covers reading EXRs, sensor, PNG, hash and manifest. First renders a dataset with EXRs (256 x 256 px, small ground, half
-a minute). Then develops it in this process on one core, with unchanged settings and for a distorted camera, whose
-labels are computed again. Writes runs/bench/develop.json.
+a minute). Then develops it in this process on one core: with unchanged settings, and for a distorted camera, for
+which the labels are computed again. Writes runs/bench/develop.json.
 """
 
 import os
@@ -58,7 +58,7 @@ def main() -> None:
         "frames": n,
         "frames_per_s": n / statistics.median(seconds["as it is"]),
         "frames_per_s_with_new_labels": n / statistics.median(seconds["distorted"]),
-        # Frame rate of a core that no other program uses.
+        # Per second of CPU time, so without the load of other programs.
         "frames_per_cpu_s": n / statistics.median(cpu_s["as it is"]),
         "frames_per_cpu_s_with_new_labels": n / statistics.median(cpu_s["distorted"]),
         "exr_bytes": float(exr_bytes.mean()),

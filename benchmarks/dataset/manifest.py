@@ -55,7 +55,7 @@ _WORKS = {
 
 
 def main() -> None:
-    """Write the tables, measure, write the figures."""
+    """Write the tables, measure the reading, write the figures."""
     with tempfile.TemporaryDirectory() as folder:
         parts, whole = Path(folder) / "parts", Path(folder) / "whole"
         with progress_bar() as progress:
@@ -73,12 +73,14 @@ def main() -> None:
 
 
 def _measured(root: Path, work: str) -> tuple[float, float, float]:
+    """Run one of `_WORKS` in a new process: seconds, peak memory and memory after the imports, GiB."""
     command = [sys.executable, "-c", _MEASURED.format(work=work), str(root)]
     seconds, peak, base = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     return float(seconds), float(peak), float(base)
 
 
 def _fill(root: Path, progress) -> None:
+    """Write a dataset of random numbers, as parts."""
     rng = np.random.default_rng(1)
     camera = Camera.from_field_of_view(256, 256, 50.0)
     recipe = Recipe(preset="bench", kind="detect", seed=1, config={}, versions={"perilune_shared": "0"})

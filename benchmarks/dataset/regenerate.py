@@ -1,6 +1,6 @@
-"""How many frames come out equal, byte for byte, when they are rendered again from the manifest alone.
+"""Number of frames that are byte-identical when they are rendered again from the manifest alone.
 
-Renders 30 frames of three scenes of `small`, then again from their tables, with the terrain grown again. Writes
+Renders 30 frames of three scenes of `small`, then again from their tables, with terrain generated again. Writes
 runs/bench/regenerate.json.
 """
 

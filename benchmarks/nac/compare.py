@@ -37,11 +37,11 @@ FRAME_PX, FOV_DEG = 400, 12.0
 THRESHOLDS_PX = (8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)
 DEPTH_RATIOS = (0.02, 0.03, 0.04, 0.05, 0.06)
 CLEAR = 0.04
-"""Least depth over diameter of a rendered crater that counts as clear enough for a human to mark."""
+"""Smallest depth over diameter of rendered craters that a person is assumed to mark."""
 LEAST_PX = 8.0
-"""Least diameter, pixels: smaller craters were not marked."""
+"""Smallest diameter of marked craters, pixels."""
 HIGHEST_ABOVE = 1.6
-"""Start altitude over the frame's altitude: extends the ground beyond the frame, within the vertex limit."""
+"""Start altitude over the frame's altitude: extends the ground beyond the frame, as far as the vertex limit allows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,14 +73,21 @@ def read_crops(folder: Path, latitude_deg: float, longitude_deg: float) -> list[
             raise UserError(path, "name", path.name, "a name that begins with a product number, M and 9 or 10 digits")
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if image is None or not image.any() or min(image.shape) < FRAME_PX:
-            raise UserError(path, "image", "no such picture", f"a PNG of at least {FRAME_PX} x {FRAME_PX} pixels")
+            raise UserError(
+                path, "image", "an unreadable, black or small file", f"a PNG of at least {FRAME_PX} x {FRAME_PX} pixels"
+            )
         boxes_path = path.with_suffix(".txt")
         if not boxes_path.is_file():
             raise UserError(boxes_path, "boxes", "no such file", "a text file of crater boxes beside each PNG")
         circles = st.box_circles(st.read_boxes(boxes_path), image.shape[1], image.shape[0])
         azimuth, elevation = sun_over(latitude_deg, longitude_deg, time)
         if elevation <= 0:
-            raise UserError(path, "Sun", f"{elevation:.1f} degrees", "a crop of the site by day (dataset.terrain)")
+            raise UserError(
+                path,
+                "Sun",
+                f"{elevation:.1f} degrees",
+                "a crop of the site in dataset.terrain, with the Sun above the horizon",
+            )
         crops.append(
             Picture(path.name.split("_")[0], image, azimuth, elevation, circles, np.full(len(circles), np.nan))
         )
@@ -89,8 +96,8 @@ def read_crops(folder: Path, latitude_deg: float, longitude_deg: float) -> list[
     return sorted(crops, key=lambda crop: crop.elevation_deg)
 
 
-def downward(config: DatasetConfig, sampling_m: float) -> tuple[DatasetConfig, Camera, FlightConfig]:
-    """Configuration with a narrow nadir camera at the altitude where a pixel is `sampling_m` wide."""
+def nadir_view(config: DatasetConfig, sampling_m: float) -> tuple[DatasetConfig, Camera, FlightConfig]:
+    """Configuration, camera and flight of a narrow nadir view whose pixels are `sampling_m` wide on the ground."""
     settings = CameraConfig(width_px=FRAME_PX, height_px=FRAME_PX, horizontal_fov_deg=FOV_DEG)
     camera = Camera.from_field_of_view(FRAME_PX, FRAME_PX, FOV_DEG)
     altitude = sampling_m * camera.fx_px
@@ -132,7 +139,7 @@ def _developed(radiance: Radiance, config: DatasetConfig, camera: Camera, seed: 
 
 def take_frames(config: DatasetConfig, crops: list[Picture], n_scenes: int, sampling_m: float) -> list[list[Picture]]:
     """For each crop, one frame of each scene under the crop's Sun."""
-    config, camera, flight = downward(config, sampling_m)
+    config, camera, flight = nadir_view(config, sampling_m)
     frames: list[list[Picture]] = [[] for _ in crops]
     with progress_bar() as bar:
         task = bar.add_task("frames", total=n_scenes * len(crops), unit="frames")
@@ -147,7 +154,7 @@ def take_frames(config: DatasetConfig, crops: list[Picture], n_scenes: int, samp
 
 
 def figures_of(pictures: list[Picture], least_depth_ratio: float | None = None) -> dict:
-    """Statistics over several pictures: medians of each figure and of the spectrum, and the pooled count."""
+    """Statistics over several pictures: medians of the figures and of the spectrum, and the count of all craters."""
     single = [st.summary(picture.image) for picture in pictures]
     area = sum(picture.image.size for picture in pictures)
     diameter = np.concatenate([_circles(picture, least_depth_ratio)[:, 2] for picture in pictures])
@@ -201,16 +208,16 @@ def count_distances(ours: list[float], real: list[float]) -> dict[str, float | N
 
 
 def compare(crops: list[Picture], frames: list[list[Picture]]) -> dict:
-    """All figures: each crop and the frames under its Sun, medians of their differences, and pooled craters."""
+    """All figures: each crop and the frames under its Sun, medians of their differences, counts of all craters."""
     rows = []
     for crop, taken in zip(crops, frames, strict=True):
         ours, real = figures_of(taken), figures_of([crop])
         sun = {"azimuth_deg": crop.azimuth_deg, "elevation_deg": crop.elevation_deg}
         ours["crater_contrast"], real["crater_contrast"] = contrasts(taken, CLEAR), contrasts([crop])
         rows.append({"crop": crop.name, "sun": sun, "real": real, "ours": ours, "distances": distances(ours, real)})
-    everything = [frame for taken in frames for frame in taken]
+    all_frames = [frame for taken in frames for frame in taken]
     real_counts = figures_of(crops)["craters"]
-    by_ratio = {f"{ratio:.2f}": figures_of(everything, ratio)["craters"] for ratio in DEPTH_RATIOS}
+    by_ratio = {f"{ratio:.2f}": figures_of(all_frames, ratio)["craters"] for ratio in DEPTH_RATIOS}
     return {
         "distances": {n: float(np.median([row["distances"][n] for row in rows])) for n in rows[0]["distances"]},
         "crater_log_ratio": {ratio: count_distances(counts, real_counts) for ratio, counts in by_ratio.items()},
@@ -222,7 +229,7 @@ def compare(crops: list[Picture], frames: list[list[Picture]]) -> dict:
 
 
 def draw_sheet(path: Path, crops: list[Picture], frames: list[list[Picture]]) -> None:
-    """Draw pairs by ascending Sun: a crop's part of median contrast, and the frame closest in share of shadow."""
+    """Draw pairs by ascending Sun: the part of a crop with median contrast, the frame nearest in share of shadow."""
     pairs = []
     for crop, taken in zip(crops, frames, strict=True):
         n = FRAME_PX
@@ -245,8 +252,8 @@ def main(
     preset: str = "small",
     config: Annotated[Path | None, typer.Option()] = None,
     setting: Annotated[list[str] | None, typer.Option("--set")] = None,
-    scenes: Annotated[int, typer.Option(min=1, help="How many terrains.")] = 2,
-    sampling: Annotated[float, typer.Option(min=0.05, help="Metres per pixel of the crops.")] = 0.75,
+    scenes: Annotated[int, typer.Option(min=1, help="Number of terrains.")] = 2,
+    sampling: Annotated[float, typer.Option(min=0.05, help="Ground sampling of the crops, metres per pixel.")] = 0.75,
     out: Path = Path("runs/nac"),
 ) -> None:
     """Compare rendered frames with real NAC crops."""
@@ -260,7 +267,7 @@ def main(
     write_figures(out / "nac.json", figures)
     draw_curves(out, figures, [crop.image for crop in crops], [f.image for taken in frames for f in taken])
     draw_sheet(out / "sheet.png", crops, frames)
-    print(f"{out}: curves, and sheet.png, which holds real pixels: keep it out of the project")
+    print(f"{out}: curves, and sheet.png, which contains real pixels: do not publish it")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ GRADIENT_EDGES = np.linspace(-3, 0.5, 71)
 BRIGHTNESS_EDGES = np.linspace(0, 3, 76)
 """Edges of the brightness histogram, in units of the image's mean."""
 LEAST_POWER = 1e-9
-"""Least power of a spectrum: a completely black tile has no power."""
+"""Smallest power of a spectrum, since a completely black tile has none."""
 DARK = 0.2
 """Pixels below this share of the mean count as shadow."""
 
@@ -35,7 +35,7 @@ def read_boxes(path: Path) -> Array:
             if len(boxes[-1]) < 4:
                 raise ValueError
         except ValueError:
-            raise UserError(path, f"line {number}", line, "ID, X, Y, W, H by commas or tabs") from None
+            raise UserError(path, f"line {number}", line, "ID, X, Y, W, H separated by commas or tabs") from None
     return np.array(boxes, np.float64).reshape(-1, 4)
 
 
@@ -118,5 +118,5 @@ def summary(image: np.ndarray) -> dict[str, float]:
 
 def log_difference(ours: Array, real: Array, low: float, high: float) -> Array:
     """log10 of the ratio of two spectra, for the bands between two frequencies."""
-    wanted = np.isfinite(ours * real) & np.less_equal(low, FREQUENCY) & np.less_equal(FREQUENCY, high)
-    return np.log10(ours[wanted] / real[wanted])
+    used = np.isfinite(ours * real) & np.less_equal(low, FREQUENCY) & np.less_equal(FREQUENCY, high)
+    return np.log10(ours[used] / real[used])

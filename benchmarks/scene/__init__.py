@@ -1,1 +1,1 @@
-"""Scenes: speed of the terrain, radiance and labels compared with the geometry."""
+"""Scenes: time of terrain generation; errors of radiance, labels, depth and normals."""

@@ -1,8 +1,8 @@
 """Error of label ellipses: their distance from glowing rings rendered on the same rim circles.
 
 Generates scenes of `small` for their rim circles, tilts included. At altitudes of 200 to 1500 m and views of up to 45
-degrees from nadir, `label_frame` makes the labels. Blender renders rings on the labelled circles through the project's
-camera with 8 x 8 pixels for each of its pixels. Ring and ellipse are compared along 64 normals of each label. The same
+degrees from nadir, `label_frame` makes the labels. Blender renders rings on the labelled circles with the project's
+camera at 8 x 8 times its number of pixels. Ring and ellipse are compared along 64 normals of each label. The same
 is repeated with lens distortion, and at the frame's own resolution, where only large craters can be measured. Writes
 runs/bench/labels.json and, with `--picture FILE`, a histogram.
 """
@@ -59,7 +59,7 @@ class Measured:
     n_labels: int
     """Number of labels of the frame, measured or not."""
     n_too_narrow: int
-    """Number of those that are too narrow to be measured in the picture, entirely in the frame or not."""
+    """Number of labels that are too narrow to be measured, including those only partly in the frame."""
 
     @property
     def error_px(self) -> Array:
@@ -76,7 +76,7 @@ class Measured:
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description="label ellipses against rendered rings")
+    parser = argparse.ArgumentParser(description="compare label ellipses with rendered rings")
     parser.add_argument("--picture", type=Path, default=Path("runs/bench/labels.png"), help="the histogram to write")
     picture = parser.parse_args().picture
     start = time.perf_counter()
@@ -115,7 +115,7 @@ def main() -> None:
 
 
 def view(scene: Scene, altitude_m: float, tilt_deg: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Position (3,) and rotation_camera_from_site, with random roll, of a camera whose axis meets the ground nearby."""
+    """Position (3,) and rotation_camera_from_site (3, 3) of a camera, with random roll, that looks at ground nearby."""
     turn, aside = rng.uniform(0, 2 * np.pi, 2)
     lean = np.radians(tilt_deg) * np.array([np.cos(aside), np.sin(aside), 0.0])
     turned = matrix_from_rotation_vector(np.array([0.0, 0.0, turn]))
@@ -181,7 +181,7 @@ def draw_histogram(path: Path, measured: list[Measured]) -> None:
     bins = np.linspace(0, 0.011, 45)
     wholes = [[j.error_px for j in measured if j.tilt_deg == tilt] for tilt in TILTS_DEG]
     ellipses = [[j.ellipse_error_px for j in measured if j.tilt_deg == tilt] for tilt in TILTS_DEG]
-    titles = ("all 64 directions", "shift, size, flattening and turn alone")
+    titles = ("all 64 directions", "shift, size, flattening and rotation only")
     for axes, parts, title in zip(panels, (wholes, ellipses), titles, strict=True):
         values = [np.minimum(np.concatenate(part), bins[-1]) for part in parts]
         axes.hist(values, bins=list(bins), stacked=True, color=list(colours), label=[f"{t:g}°" for t in TILTS_DEG])
@@ -189,7 +189,7 @@ def draw_histogram(path: Path, measured: list[Measured]) -> None:
         axes.set_title(title, fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("craters")
-    panels[1].legend(frameon=False, fontsize=8, title="from straight down", title_fontsize=8)
+    panels[1].legend(frameon=False, fontsize=8, title="tilt from nadir", title_fontsize=8)
     with written_aside(path) as aside:
         figure.savefig(aside, dpi=100)
     plt.close(figure)

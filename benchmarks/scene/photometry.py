@@ -1,4 +1,4 @@
-"""Compare rendered radiance with the formulas, over all directions of light and view.
+"""Compare rendered radiance with the photometric laws, over all directions of light and view.
 
 For each law and phase angle, one image of a mosaic of small tilted planes is rendered through the project's own
 material, lamp and Cycles settings into an EXR. Every pixel whose four corners lie on one plane is compared with the law
@@ -76,7 +76,7 @@ def tilted_normals(sun: Array) -> Array:
 
 
 def corners(normals: Array, centres_m: Array, half_m: float) -> Array:
-    """Corners (N, 4, 3) of square planes."""
+    """Corners (N, 4, 3), metres, of square planes of half side `half_m`."""
     sides = [plane_basis(normal) for normal in normals]
     return np.stack(
         [c + half_m * np.array([-x - y, x - y, x + y, y - x]) for c, (x, y) in zip(centres_m, sides, strict=True)]

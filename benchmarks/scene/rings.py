@@ -2,7 +2,7 @@
 
 A ring is a tube around the circle. In the picture its middle line is the image of the circle: the outlines of a thin
 tube are symmetric about it, except for terms of the tube's width squared over distance and radius. Along a normal of a
-label's ellipse the ring's brightness is a hump; its centre of gravity is the position of the middle line.
+label's ellipse the ring's brightness has one maximum; its centroid is the position of the middle line.
 """
 
 from pathlib import Path
@@ -26,14 +26,16 @@ TUBE_PX = 1.5
 REACH_PX = 6.0
 """Search distance from the ellipse, pixels of the picture."""
 LEAST_AXIS_PX = REACH_PX + TUBE_PX + 1
-"""Least semi-minor axis, pixels of the picture: the far side of a narrower ring would be within reach."""
+"""Smallest semi-minor axis, pixels of the picture: the far side of a narrower ring would be within REACH_PX."""
 LEAST_BEND_PX = 2 * TUBE_PX
-"""Least radius of curvature, pixels of the picture: at sharper ends both sides are within reach."""
+"""Smallest radius of curvature, pixels of the picture: at sharper ends both sides would be within REACH_PX."""
 APART_PX = REACH_PX + TUBE_PX + 4
-"""Least distance between rings, pixels of the picture."""
+"""Smallest distance between rings, pixels of the picture."""
 N_DIRECTIONS = 64
 _N_AROUND, _N_TUBE = 512, 8
+"""Number of vertices around the circle, and around the tube."""
 _STEP_PX = 0.125
+"""Distance between brightness samples along a normal, pixels of the picture."""
 
 
 def labels_of(circles: RimCircles, camera: Camera, position_m: Array, rotation_camera_from_site: Array) -> Labels:
@@ -138,10 +140,10 @@ def ring_offsets(picture: np.ndarray, scale: int, ellipses: Ellipses) -> Array:
     points, normals = outline(ellipses, N_DIRECTIONS)
     steps = np.arange(-REACH_PX, REACH_PX + 0.5 * _STEP_PX, _STEP_PX)
     places = scale * points[..., None, :] + steps[:, None] * normals[..., None, :] - 0.5
-    hump = map_coordinates(picture, np.moveaxis(places[..., ::-1], -1, 0), order=1)
-    mass = hump.sum(axis=-1) * _STEP_PX
-    whole = (mass > TUBE_PX) & (hump[..., 0] < 0.01) & (hump[..., -1] < 0.01)
-    return np.where(whole, (hump @ steps) * _STEP_PX / np.where(whole, mass, 1.0), np.nan) / scale
+    brightness = map_coordinates(picture, np.moveaxis(places[..., ::-1], -1, 0), order=1)
+    total = brightness.sum(axis=-1) * _STEP_PX
+    whole = (total > TUBE_PX) & (brightness[..., 0] < 0.01) & (brightness[..., -1] < 0.01)
+    return np.where(whole, (brightness @ steps) * _STEP_PX / np.where(whole, total, 1.0), np.nan) / scale
 
 
 def errors_px(offsets: Array, scale: int) -> Array:

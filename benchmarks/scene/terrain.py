@@ -1,8 +1,7 @@
 """Time and memory of terrain generation on one core.
 
-Measures a 4 km scene, stamping craters, and a second trajectory from the cache. Runs on one core (it gives up the
-others). Compilation by numba is done once and cached, so a small scene warms everything up first. Writes
-runs/bench/terrain.json.
+Measures a 4 km scene, stamping craters, and a second trajectory from the cache. Runs on one core. A small
+scene is generated first, so that compilation by numba is not measured. Writes runs/bench/terrain.json.
 """
 
 import os
@@ -42,16 +41,16 @@ def mesh_of(scene: Scene) -> int:
     return sum(array.nbytes for array in (*ground, *stones))
 
 
-def lay(grid: Grid, craters: Craters) -> float:
-    """Time in seconds to stamp craters on flat ground."""
+def stamping_s(grid: Grid, craters: Craters) -> float:
+    """Time, seconds, to stamp craters on flat ground."""
     height, albedo = np.zeros(grid.n_vertices), np.ones(grid.n_vertices)
     start = time.perf_counter()
     stamp_craters(height, albedo, grid, craters, np.zeros(len(craters)))
     return time.perf_counter() - start
 
 
-def numbered(grid: Grid, n: int, seed: int) -> Craters:
-    """n craters of the default law, oldest first, at the density that this number requires."""
+def draw_n_craters(grid: Grid, n: int, seed: int) -> Craters:
+    """Draw n craters from the default law, oldest first, with the density adjusted to this number."""
     config = CratersConfig(equilibrium_share=Span(low=1.0, high=1.0))
     drawn = draw_craters(config, grid, seed)
     share = 1.3 * n / len(drawn)
@@ -68,7 +67,7 @@ def main() -> None:
     tiny = resolve(DatasetConfig, "dataset", "perilune_render", "tiny")
     grow_scene(config, view_envelope(camera_of(tiny.camera), FlightConfig()), 1)
     flight = config.detect.flight.model_copy(update={"downrange_m": 1090.0})
-    # Building the profile tables is part of the measured work; only numba's compiled code is kept.
+    # Computing the profile tables is part of the measurement.
     profile_tables.cache_clear()
     start, cpu_start = time.perf_counter(), time.process_time()
     scene = grow_scene(config, view_envelope(camera, flight), 7)
@@ -79,12 +78,12 @@ def main() -> None:
     grid = graded_grid(config.terrain, view_envelope(camera, config.detect.flight))
     times = []
     with progress_bar() as bar:
-        for n in bar.track(COUNTS, description="laying craters"):
-            craters = numbered(grid, n, 3)
-            times.append(min(lay(grid, craters) for _ in range(3)))
+        for n in bar.track(COUNTS, description="stamping craters"):
+            craters = draw_n_craters(grid, n, 3)
+            times.append(min(stamping_s(grid, craters) for _ in range(3)))
     figures = {
         "scene_s": scene_s,
-        # Time of a core that no other program uses.
+        # CPU time, so without the load of other programs.
         "scene_cpu_s": scene_cpu_s,
         "grown_s": grown_s,
         "extent_m": scene.grid.extent_m,
@@ -98,12 +97,12 @@ def main() -> None:
         "slope": float(np.polyfit(np.log(COUNTS), np.log(times), 1)[0]),
         "slope_from_30000": float(np.polyfit(np.log(COUNTS[3:]), np.log(times[3:]), 1)[0]),
         "laying_s": dict(zip(map(str, COUNTS), times, strict=True)),
-        **second_descent(config),
+        **first_frame_times(config),
     }
     write_figures(Path("runs/bench/terrain.json"), figures)
 
 
-def second_descent(config: DatasetConfig) -> dict[str, float]:
+def first_frame_times(config: DatasetConfig) -> dict[str, float]:
     """Time in seconds from the settings to the first rendered frame, without and with the scene in the cache."""
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     plan = make_plan(config, "detect")

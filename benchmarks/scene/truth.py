@@ -1,7 +1,7 @@
-"""Depth and normals of EXRs against those of rays through the pixels' centres, which Embree casts (by trimesh).
+"""Errors of depth and normals in EXRs, compared with rays that Embree (by trimesh) casts through the pixels' centres.
 
-Independent of Blender: rays, hits (in double precision, from the plane of the hit triangle) and normals of
-the vertices. Shared with it: vertices and faces. Writes runs/bench/truth.json.
+Rays, hits (in double precision, from the plane of the hit triangle) and vertex normals are computed without Blender.
+Vertices and faces are those given to Blender. Writes runs/bench/truth.json.
 """
 
 import tempfile
@@ -34,7 +34,7 @@ POSES = [(200.0, 0.0, 10.0), (200.0, 45.0, 250.0), (600.0, 20.0, 130.0), (1000.0
 
 
 def pose(scene: Scene, altitude_m: float, tilt_deg: float, azimuth_deg: float) -> tuple[Array, Array]:
-    """Position (3,) and rotation_camera_from_site of a camera whose axis meets the ground near the site."""
+    """Position (3,) and rotation_camera_from_site (3, 3) of a camera that looks at ground near the site."""
     tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
     lean = tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     rotation = ROTATION_CAMERA_FROM_BODY @ matrix_from_rotation_vector(lean)
@@ -43,7 +43,7 @@ def pose(scene: Scene, altitude_m: float, tilt_deg: float, azimuth_deg: float) -
 
 
 def vertex_normals(points: Array, quads: np.ndarray) -> Array:
-    """Unit normals (V, 3): of the quads (their vector areas' directions), weighted by their angle at the vertex."""
+    """Unit normals (V, 3) of vertices: mean of their quads' normals, weighted by the quads' angles at the vertex."""
     corner = points[quads]
     area = np.cross(corner[:, 2] - corner[:, 0], corner[:, 3] - corner[:, 1])
     area /= np.linalg.norm(area, axis=1, keepdims=True)
@@ -59,20 +59,20 @@ def vertex_normals(points: Array, quads: np.ndarray) -> Array:
 
 @dataclass(frozen=True)
 class Hits:
-    """What N rays meet."""
+    """First hits of N rays."""
 
     depth: Array
     """Distance in lengths of the ray's direction, inf for none (N,)."""
     normal: Array
-    """Shading normal: smooth on the ground, the facet's on rocks (N, 3)."""
+    """Shading normal: interpolated on the ground, the triangle's on boulders (N, 3)."""
     facet: Array
     """Normal of the triangle (N, 3)."""
     rock: np.ndarray
-    """Whether it is a rock (N,)."""
+    """Whether the hit is on a boulder (N,)."""
 
 
 class Caster:
-    """Rays through a scene's ground and boulders, without Blender."""
+    """Casts rays at a scene's ground and boulders, without Blender."""
 
     def __init__(self, scene: Scene):
         ground, quads = vertices(scene.grid, scene.height_m).astype(np.float64), scene.grid.quads()
@@ -84,14 +84,14 @@ class Caster:
         self.engine = RayMeshIntersector(trimesh.Trimesh(self.points, self.faces, process=False))
 
     def cast(self, position: Array, directions: Array) -> Hits:
-        """What rays from a position (3,) along directions (N, 3) meet first."""
+        """First hits of rays from a position (3,), metres, along directions (N, 3), O_L."""
         face = self.engine.intersects_first(np.broadcast_to(position, directions.shape), directions)
         hit, rock = face >= 0, face >= self.first_rock
         a, b, c = np.moveaxis(self.points[self.faces[face]], 1, 0)
         facet = np.cross(b - a, c - a)
         along = np.sum((a - position) * facet, axis=1) / np.sum(directions * facet, axis=1)
         place = position + directions * along[:, None]
-        # Barycentric coordinates by the areas of the three triangles that the place makes.
+        # Barycentric coordinates, from the areas of the three triangles between hit and corners.
         square = np.sum(facet**2, axis=1)
         shares = [np.sum(np.cross(q - p, place - p) * facet, axis=1) / square for p, q in ((b, c), (c, a), (a, b))]
         corners = np.where((hit & ~rock)[:, None], self.faces[face], 0)
@@ -136,21 +136,21 @@ def rendered_frames() -> list[Frame]:
 
 
 def depth_errors(frame: Frame) -> tuple[Array, np.ndarray]:
-    """Relative errors of depth (N,) where both hit the ground, and whether each of these pixels is a rock (N,)."""
+    """Relative errors of depth (N,) where EXR and ray both hit, and whether each pixel is on a boulder (N,)."""
     depth, hits = frame.radiance.depth_m.ravel(), frame.hits
     both = np.isfinite(depth) & np.isfinite(hits.depth)
     return np.abs(depth[both] / hits.depth[both] - 1), hits.rock[both]
 
 
 def normal_errors_deg(frame: Frame) -> tuple[Array, np.ndarray]:
-    """Angles between the normals (N,), degrees, for the pixels of `depth_errors`, and whether each is a rock (N,)."""
+    """Angles between the normals (N,), degrees, for the pixels of `depth_errors`, and whether each is on a boulder."""
     both = np.isfinite(frame.radiance.depth_m.ravel()) & np.isfinite(frame.hits.depth)
     apart = np.linalg.norm(frame.radiance.normal.reshape(-1, 3) - frame.hits.normal, axis=1)[both]
     return np.degrees(2 * np.arcsin(np.minimum(apart / 2, 1))), frame.hits.rock[both]
 
 
 def projection_errors_px(frame: Frame) -> Array:
-    """Distances (N, 2) of pixel centres from the projections of the points that the depth gives, in float32."""
+    """Projected points minus pixel centres (N, 2), pixels; the points are computed from the depth, in float32."""
     depth = frame.radiance.depth_m.reshape(-1, 1)
     hit = np.isfinite(depth[:, 0])
     place = frame.position_m + (RAYS[hit] * depth[hit]) @ frame.rotation

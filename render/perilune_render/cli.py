@@ -25,7 +25,7 @@ app = typer.Typer(
 
 
 def _warn_of_size(config: DatasetConfig) -> None:
-    """Warn, before hours of rendering, of a frame size that the detector cannot be trained on."""
+    """Warn before rendering if the detector cannot be trained on frames of this size."""
     sides = {"width_px": config.camera.width_px, "height_px": config.camera.height_px}
     for name, side in sides.items():
         if side % 32:
@@ -42,7 +42,9 @@ def _resolve(
     paths = {name: str(path) for name, path in (("dem", dem), ("catalogue", catalogue)) if path is not None}
     terrain = resolved.terrain.model_copy(update=paths)
     if terrain.catalogue is not None and terrain.dem is None:
-        raise UserError("--catalogue", "catalogue", terrain.catalogue, "--dem with the elevation model that it is of")
+        raise UserError(
+            "--catalogue", "catalogue", terrain.catalogue, "--dem as well, the elevation model of this catalogue"
+        )
     return resolved.model_copy(update={"terrain": terrain})
 
 
@@ -52,7 +54,7 @@ def config(
     config: Config = None,
     settings: Setting = None,
     show: Annotated[
-        bool, typer.Option("--show/--plain", help="With meaning, unit and default; or values alone.")
+        bool, typer.Option("--show/--plain", help="Print meaning, unit and default of each setting, or only values.")
     ] = True,
 ) -> None:
     """Print every setting as a configuration file to start from."""
@@ -71,11 +73,11 @@ def dataset(
     kind: Annotated[KindChoice, typer.Option(help="Crater detection, navigation, or both.")] = "both",
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for the datasets `detect` and `nav`; data/<preset> unless given."),
+        typer.Option(help="Folder for the datasets `detect` and `nav`; default: data/<preset>."),
     ] = None,
     manifest: Annotated[
         Path | None,
-        typer.Option(help="Render a manifest or plan into --out instead of a preset."),
+        typer.Option(help="Manifest or plan to render into --out, in place of a preset."),
     ] = None,
 ) -> None:
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
@@ -111,8 +113,10 @@ def _render_manifest(
 ) -> None:
     if out is None or others:
         found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
-        wanted = "--out, and --dem and --catalogue where its recipe names them; the rest is the manifest's"
-        raise UserError("--manifest", "options", found, wanted)
+        expected = (
+            "--out, and --dem and --catalogue if the recipe names them; all other settings come from the manifest"
+        )
+        raise UserError("--manifest", "options", found, expected)
     given = ps.open_dataset(manifest)
     from perilune_render.dataset.from_manifest import compare_hashes, plan_from_manifest
     from perilune_render.dataset.render import render_plan
@@ -121,9 +125,11 @@ def _render_manifest(
     with progress_bar() as progress:
         made = render_plan(plan, config, info, out, progress, manifest)
     same, known, other_scenes = compare_hashes(given, made)
-    told = f"; {same} of {known} frames are the manifest's byte for byte" if known else ""
-    told += f"; {other_scenes} scenes have other ground" if other_scenes else "; the ground is the manifest's"
-    Console().print(f"{out}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{told}", soft_wrap=True)
+    comparison = f"; {same} of {known} frames are byte-identical to the manifest's" if known else ""
+    comparison += f"; terrain hash mismatch in {other_scenes} scenes" if other_scenes else "; terrain hashes match"
+    Console().print(
+        f"{out}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{comparison}", soft_wrap=True
+    )
 
 
 @app.command()
@@ -165,44 +171,48 @@ def plan(
     with progress_bar() as progress:
         write_manifest_only(resolved, one_kind(kind), preset, out, progress)
     counts = ps.open_dataset(out).info.counts
-    Console().print(f"{out}: {counts.scenes} scenes, {counts.trajectories} descents, {counts.frames} frames planned")
+    Console().print(
+        f"{out}: {counts.scenes} scenes, {counts.trajectories} trajectories, {counts.frames} frames planned"
+    )
 
 
 @app.command()
 def regenerate(
     manifest: Annotated[Path, typer.Option(help="Folder of a dataset or of its manifest alone.")],
     frames: Annotated[
-        list[str] | None, typer.Option(help="A frame_id, as scene-0000/trajectory-0000/000003; may be repeated.")
+        list[str] | None, typer.Option(help="A frame_id such as scene-0000/trajectory-0000/000003; may be repeated.")
     ] = None,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Compare the frames without keeping them; without --frames, a sample of them."),
+        typer.Option("--verify", help="Compare frames, then delete them; a sample unless --frames or --all."),
     ] = False,
-    sample: Annotated[int, typer.Option(min=1, help="Frames of the sample, evenly spread.")] = 12,
+    sample: Annotated[int, typer.Option(min=1, help="Number of frames in the sample, evenly spread.")] = 12,
     everything: Annotated[bool, typer.Option("--all", help="All frames of the manifest.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for the frames; with --verify a temporary one.")] = None,
-    dem: Annotated[Path | None, typer.Option(help="This machine's copy of the elevation model.")] = None,
-    catalogue: Annotated[Path | None, typer.Option(help="This machine's copy of the crater catalogue.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the frames; optional with --verify.")] = None,
+    dem: Annotated[Path | None, typer.Option(help="Local copy of the elevation model that the recipe names.")] = None,
+    catalogue: Annotated[
+        Path | None, typer.Option(help="Local copy of the crater catalogue that the recipe names.")
+    ] = None,
 ) -> None:
     """Render frames from a manifest alone and compare them with its hashes. Exit code 2 if one differs."""
     if not verify and (out is None or not (frames or everything)):
         raise UserError("regenerate", "--frames (or --all) and --out", "not given", "both, or --verify")
     dataset = ps.open_dataset(manifest)
     from perilune_render.dataset.regenerate import State, spread
-    from perilune_render.dataset.regenerate import regenerate as make_again
+    from perilune_render.dataset.regenerate import regenerate as regenerate_frames
 
     if frames and everything:
         raise UserError("regenerate", "options", "--frames and --all", "one of them")
     ids = list(dict.fromkeys(frames or ())) or spread(dataset, dataset.info.counts.frames if everything else sample)
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
-        outcomes = make_again(dataset, ids, out or Path(folder), progress, dem, catalogue)
+        outcomes = regenerate_frames(dataset, ids, out or Path(folder), progress, dem, catalogue)
     counts = {state: sum(o.state == state for o in outcomes) for state in get_args(State)}
     for outcome in outcomes:
         if outcome.state != "identical" and not verify:
             Console().print(f"{outcome.png_path}: {outcome.state}", soft_wrap=True)
-    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
+    states = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
     ground = "" if all(o.same_ground for o in outcomes) else "; terrain hash mismatch"
-    Console().print(f"{len(outcomes)} frames: {told}{ground}", soft_wrap=True)
+    Console().print(f"{len(outcomes)} frames: {states}{ground}", soft_wrap=True)
     if counts["different"] or ground:
         raise typer.Exit(EXIT_USER_ERROR)
 
@@ -216,8 +226,10 @@ def preview(
     setting: Setting = None,
     dem: Dem = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Whose first scene and descent (detect or nav).")] = "detect",
-    out: Annotated[Path, typer.Option(help="File of the picture.")] = Path("preview.png"),
+    kind: Annotated[
+        KindChoice, typer.Option(help="Dataset whose first scene and trajectory are shown (detect or nav).")
+    ] = "detect",
+    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("preview.png"),
 ) -> None:
     """Render a contact sheet of a configuration, with and without labels, in seconds."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
@@ -234,12 +246,14 @@ def export(
     setting: Setting = None,
     dem: Dem = None,
     catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Whose first scene (detect or nav).")] = "detect",
-    step: Annotated[int, typer.Option(min=1, help="Times the mesh's own vertex spacing.")] = 4,
-    pixel_m: Annotated[float, typer.Option(min=0.01, help="Ground size of a GeoTIFF's pixel, metres.")] = 1.0,
-    out: Annotated[Path, typer.Option(help="A .glb, .ply, .obj or .stl mesh, or a .tif of heights.")] = Path(
-        "scene.glb"
-    ),
+    kind: Annotated[KindChoice, typer.Option(help="Dataset whose first scene is exported (detect or nav).")] = "detect",
+    step: Annotated[
+        int, typer.Option(min=1, help="Vertex spacing of the exported mesh, as a multiple of the scene's.")
+    ] = 4,
+    pixel_m: Annotated[float, typer.Option(min=0.01, help="Pixel size of a GeoTIFF on the ground, metres.")] = 1.0,
+    out: Annotated[
+        Path, typer.Option(help="File to write: .glb, .ply, .obj or .stl for a mesh, .tif for heights.")
+    ] = Path("scene.glb"),
 ) -> None:
     """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
     resolved = _resolve(preset, config, setting, dem, catalogue)

@@ -9,7 +9,7 @@ from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
 
 KindChoice = Literal[Kind, "both"]
-"""Which of a preset's two datasets."""
+"""One of a preset's two datasets, or both."""
 Preset = Annotated[
     str,
     typer.Option(
@@ -31,12 +31,12 @@ Catalogue = Annotated[
 
 
 def first_kind(kind: KindChoice) -> Kind:
-    """The dataset of this kind; detect for `both`."""
+    """The kind itself; `detect` for `both`."""
     return "detect" if kind == "both" else kind
 
 
 def one_kind(kind: KindChoice) -> Kind:
-    """The dataset of this kind. Raises UserError for `both`."""
+    """The kind itself. Raises UserError for `both`."""
     if kind == "both":
-        raise UserError("--kind", "kind", "both", "detect or nav: one dataset")
+        raise UserError("--kind", "kind", "both", "detect or nav (one dataset)")
     return first_kind(kind)

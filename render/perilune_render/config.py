@@ -66,7 +66,7 @@ class FlightConfig(Section):
     """Correlation time of the perturbations (squared-exponential kernel), seconds."""
 
     @model_validator(mode="after")
-    def _sinking(self) -> "FlightConfig":
+    def _end_below_start(self) -> "FlightConfig":
         if self.end_altitude_m >= self.start_altitude_m:
             raise ValueError(f"end_altitude_m below start_altitude_m, {self.start_altitude_m}")
         return self
@@ -81,7 +81,7 @@ class SunConfig(Section):
     """Elevation above the ground plane, above 0 and at most 90, degrees."""
 
     @model_validator(mode="after")
-    def _risen(self) -> "SunConfig":
+    def _sun_above_horizon(self) -> "SunConfig":
         if not (self.elevation_deg.low > 0 and self.elevation_deg.high <= 90):
             raise ValueError("elevation_deg above 0 (the horizon) and at most 90")
         return self
@@ -99,16 +99,16 @@ class KindConfig(Section):
     split_by: SplitUnit
     """Unit of the split: each scene, trajectory or frame belongs to one split as a whole."""
     val_share: Share = 0.1
-    """Share of these units in the validation split."""
+    """Share of the units of the split that are in the validation split."""
     test_share: Share = 0.1
-    """Share of these units in the test split."""
+    """Share of the units of the split that are in the test split."""
     flight: FlightConfig = FlightConfig()
     """Trajectories."""
     sun: SunConfig = SunConfig()
     """Direction of the Sun."""
 
     @model_validator(mode="after")
-    def _units(self) -> "KindConfig":
+    def _shares_below_one(self) -> "KindConfig":
         if self.val_share + self.test_share >= 1:
             raise ValueError("val_share + test_share below 1")
         return self
@@ -126,7 +126,7 @@ class LightConfig(Section):
     albedo_variation: NotNegative = 1.0
     """Strength of bright ejecta, rays and albedo patches; 0 for uniform albedo."""
     bounce: bool = False
-    """Whether ground is also lit by light that other ground scattered once, so that shadows are not fully black."""
+    """Whether to add light that other ground scattered once; without it and earthshine, shadows are black."""
     earthshine: bool = False
     """Whether the Earth also lights the ground where it is above the horizon."""
 
@@ -135,7 +135,7 @@ class SensorConfig(Section):
     """Sensor model, from radiance factor to grey values (EMVA 1288)."""
 
     exposure: Literal["automatic", "fixed"] = "automatic"
-    """Automatic brings exposure_percentile of each frame to exposure_level; fixed uses exposure_time_s."""
+    """Automatic exposure brings exposure_percentile of each frame to exposure_level; fixed uses exposure_time_s."""
     exposure_percentile: Annotated[float, Field(gt=0, le=100)] = 99.0
     """Percentile of the frame's radiance factor that automatic exposure uses."""
     exposure_level: Annotated[float, Field(gt=0, le=1)] = 0.8
@@ -214,7 +214,7 @@ class LabelsConfig(Section):
 _GROUND_FIELDS = ("start_altitude_m", "end_altitude_m", "downrange_m")
 """Flight settings that must agree if both kinds share terrain: they set the ground's extent and spacing."""
 _SPREAD_FIELDS = ("position_sigma_m", "attitude_sigma_deg")
-"""Flight settings of which shared terrain uses the larger value."""
+"""Flight settings for which shared terrain uses the larger of both kinds' values."""
 
 
 class DatasetConfig(Section):
@@ -244,7 +244,7 @@ class DatasetConfig(Section):
     """Dataset for navigation."""
 
     @model_validator(mode="after")
-    def _one_ground(self) -> "DatasetConfig":
+    def _same_ground(self) -> "DatasetConfig":
         if self.shared_terrain and self.detect.sun != self.nav.sun:
             raise ValueError("detect.sun equal to nav.sun, since shared_terrain is true")
         for field in _GROUND_FIELDS if self.shared_terrain else ():
@@ -257,7 +257,7 @@ class DatasetConfig(Section):
         return self.detect if name == "detect" else self.nav
 
     def ground_flight(self, kind: str) -> FlightConfig:
-        """Flight settings that the ground of `detect` or `nav` must cover: both kinds' with `shared_terrain`."""
+        """Flight settings that set the ground of `detect` or `nav`; with `shared_terrain`, both kinds' combined."""
         if not self.shared_terrain:
             return self.kind(kind).flight
         first, second = self.detect.flight, self.nav.flight

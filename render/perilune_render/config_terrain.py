@@ -35,7 +35,7 @@ class CratersConfig(Section):
     secondary_share: Share = 0.08
     """Share of craters under 30 m that belong to clusters of secondaries."""
     n_rayed: Annotated[int, Field(ge=0, le=100)] = 4
-    """Number of craters with bright rays: the largest of the fresh ones."""
+    """Number of craters with bright rays; the largest fresh craters have them."""
 
 
 class BouldersConfig(Section):
@@ -64,7 +64,7 @@ class ReliefConfig(Section):
     """Longest wavelength, metres."""
 
     @model_validator(mode="after")
-    def _gentle(self) -> "ReliefConfig":
+    def _slope_in_range(self) -> "ReliefConfig":
         if not 0 <= self.rms_slope_deg.low <= self.rms_slope_deg.high <= 30:
             raise ValueError("rms_slope_deg from 0 to 30")
         return self
@@ -88,7 +88,7 @@ class TerrainConfig(Section):
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 177.6
     """Longitude of the site, degrees; an elevation model overrides it."""
     spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
-    """Vertex spacing at each place, relative to the smallest ground size of a pixel there."""
+    """Vertex spacing, in pixels: relative to the smallest ground size that a pixel has at each place."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
     """Largest number of ground vertices; a camera and flight that need more are an error."""
     craters: CratersConfig = CratersConfig()

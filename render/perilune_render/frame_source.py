@@ -1,11 +1,11 @@
-"""The frame source: a frame from a pose and a random seed, by any rendering engine.
+"""The frame source: makes a frame from a pose and a random seed, with any rendering engine.
 
     with Renderer(scene, config, exr_camera, sun) as engine:
         source = FrameSource.of(engine, config, camera, RimCircles.of_scene(scene))
         frame = source.take(Shot(position_m, rotation_camera_from_site, velocity_mps, seed))
         labels = source.labels(frame)
 
-The engine makes the radiance; the rest is the same for all engines: sensor, labels, contrast, crater index.
+The engine renders the radiance. Sensor, labels, contrast and crater index are the same for all engines.
 """
 
 from dataclasses import dataclass
@@ -32,9 +32,9 @@ class Shot:
     rotation_camera_from_site: Array
     """Rotation matrix (3, 3)."""
     velocity_mps: Array
-    """Velocity of the camera, O_L, metres per second (3,): it blurs the image."""
+    """Velocity of the camera, O_L, metres per second (3,); causes motion blur."""
     seed: int
-    """Random seed of the sequence of frames; in a dataset that of the trajectory."""
+    """Random seed of the sequence of frames; in a dataset, the seed of the trajectory."""
     index: int = 0
     """Index of the frame in the sequence. Frames that differ in seed or index have independent noise."""
 
@@ -50,7 +50,7 @@ class Shot:
 
 
 class Engine(Protocol):
-    """What renders a lit scene, such as `perilune_render.blender.renderer.Renderer`."""
+    """A renderer of a lit scene, such as `perilune_render.blender.renderer.Renderer`."""
 
     @property
     def camera(self) -> Camera:
@@ -66,7 +66,7 @@ class Engine(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame, as a frame source takes it."""
+    """One frame of a frame source."""
 
     shot: Shot
     """Pose, velocity and random seed."""
@@ -83,7 +83,7 @@ class FrameSource:
     """Takes frames of one lit scene with one sensor, and labels them. Create it with `FrameSource.of`."""
 
     engine: Engine
-    """Makes the radiance."""
+    """Renders the radiance."""
     camera: Camera
     """Camera of images and labels."""
     circles: RimCircles
@@ -93,11 +93,11 @@ class FrameSource:
     pattern: FixedPattern
     """Fixed pattern of the sensor."""
     bounds: LabelsConfig
-    """Which craters become labels."""
+    """Limits on the radius of labels."""
 
     @classmethod
     def of(cls, engine: Engine, config: DatasetConfig, camera: Camera, circles: RimCircles) -> "FrameSource":
-        """The source with a configuration's sensor, labels and random seed (of the sensor's fixed pattern).
+        """The source with a configuration's sensor and label limits; the configuration's seed draws the fixed pattern.
 
         Raises ValueError if the engine's camera does not cover the view of `camera`.
         """

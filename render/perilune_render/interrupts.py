@@ -13,7 +13,7 @@ _NOTICE = b"\nstopping after this step; press Ctrl-C again to end at once\n"
 def interrupts_held() -> Iterator[None]:
     """Delay KeyboardInterrupt until the block ends. A second Ctrl-C ends the process at once.
 
-    Without the delay, Cycles' Python callback swallows the interrupt and rendering continues, and Numba may crash if it
+    Without the delay, Cycles' Python callback discards the interrupt and rendering continues, and Numba may crash if it
     is interrupted while it loads compiled code. If Ctrl-C is ignored, as in a process that a shell started in the
     background, it stays ignored.
     """

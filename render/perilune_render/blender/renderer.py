@@ -31,10 +31,11 @@ _LIT = 1e-4
 
 
 _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
+"""Renderers of this process that are not closed."""
 
 
 class Renderer:
-    """Renders frames of one scene. Use as a context manager, since it holds a temporary folder and Blender's one scene.
+    """Renders frames of one scene. Use as a context manager: it holds a temporary folder and Blender's only scene.
 
     It is an `Engine` of `perilune_render.frame_source`: `camera` has no distortion, `sun` (3,) is the unit vector
     towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only one scene.
@@ -43,7 +44,9 @@ class Renderer:
     def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array):
         self.camera, self.sun = camera, sun
         if _open:
-            raise RuntimeError("another Renderer is open in this process, and Blender holds one scene: close it first")
+            raise RuntimeError(
+                "another Renderer is open in this process; close it first, since Blender holds only one scene"
+            )
         _open.add(self)
         try:
             self._build(scene, config, camera, sun)
@@ -152,7 +155,7 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     cycles.use_denoising = False
     cycles.max_bounces = cycles.diffuse_bounces = int(light.bounce)
     cycles.use_light_tree = False
-    # Cycles drops contributions below this threshold at random; at its default of 0.01 that is most ground at low Sun.
+    # Cycles drops contributions below this threshold at random. At the default of 0.01 this is most ground at low Sun.
     cycles.light_sampling_threshold = 0.0
     cycles.pixel_filter_type = "BOX"
     # A box of one pixel: the sensor model applies its point spread later.

@@ -114,7 +114,7 @@ def surface_material(name: str, law: str, sun: Array, albedo_attribute: str | No
 
 
 def lamp_object(name: str, towards: Array, angular_diameter_deg: float, suns: float = 1.0) -> bpy.types.Object:
-    """A lamp at infinity with the irradiance `suns` x pi; with pi for the Sun, radiance is the radiance factor."""
+    """A lamp at infinity of irradiance `suns` x pi; with pi for the Sun, radiance equals the radiance factor."""
     lamp = bpy.data.lights.new(name, "SUN")
     lamp.energy = suns * np.pi
     lamp.angle = np.radians(angular_diameter_deg)

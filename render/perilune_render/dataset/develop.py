@@ -65,11 +65,11 @@ def develop_dataset(
 
     `config_file` and `settings` may change `dataset.sensor` and `dataset.camera` only. Scenes, craters, boulders and
     trajectories are copied. With the same camera the labels are copied and only their contrast is measured again; with
-    another camera all labels are made again. Raises UserError if another setting is changed, if the source is
+    another camera all labels are computed again. Raises UserError if another setting is changed, if the source is
     incomplete or lacks EXRs, or if the EXRs do not cover the camera's view.
     """
     if len(source.info.recipes) != 1:
-        raise UserError(source.root, "recipes", len(source.info.recipes), "one: the dataset as it was rendered")
+        raise UserError(source.root, "recipes", len(source.info.recipes), "one recipe (a dataset that was not merged)")
     old = source.info.recipe()
     config = _changed(source, config_file, settings)
     camera, exr_camera = _cameras(source, config)
@@ -113,7 +113,7 @@ def _develop(
     out: Path,
     progress: Progress,
 ) -> Dataset:
-    """Begin or resume the dataset in `out`; `cameras` are that of its PNGs and that of the source's EXRs."""
+    """Begin or resume the dataset in `out`; `cameras`: the camera of its PNGs, then that of the source's EXRs."""
     camera, exr_camera = cameras
     info = begin_or_resume(out, info)
     if info.complete:
@@ -122,12 +122,12 @@ def _develop(
     for scene_id in source.scene_ids():
         _copy_scene(source, out, scene_id, info.recipe())
         circles = RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
-        for descent in source.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pylist():
-            frames = source.table("frames", scene_id=scene_id, trajectory_id=descent["trajectory_id"])
-            if not is_finished(out, scene_id, descent["trajectory_id"]):
-                renderings = Renderings.of(source, frames, descent["seed"], exr_camera)
+        for trajectory in source.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pylist():
+            frames = source.table("frames", scene_id=scene_id, trajectory_id=trajectory["trajectory_id"])
+            if not is_finished(out, scene_id, trajectory["trajectory_id"]):
+                renderings = Renderings.of(source, frames, trajectory["seed"], exr_camera)
                 frame_source = FrameSource.of(renderings, config, camera, circles)
-                _develop_trajectory(source, out, frame_source, frames, descent["seed"])
+                _develop_trajectory(source, out, frame_source, frames, trajectory["seed"])
             progress.advance(task, len(frames))
     return finish(out, info)
 
@@ -139,19 +139,19 @@ def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...
     before = resolve_over(DatasetConfig, "dataset", where, given)
     after = resolve_over(DatasetConfig, "dataset", where, given, config_file, settings)
     kept = set(DatasetConfig.model_fields) - {"sensor", "camera"}
-    theirs, ours = before.model_dump(include=kept), after.model_dump(include=kept)
-    if theirs != ours:
+    fixed_before, fixed_after = before.model_dump(include=kept), after.model_dump(include=kept)
+    if fixed_before != fixed_after:
         raise UserError(
             "--set or --config",
             "dataset",
-            first_difference(theirs, ours),
-            "changes of dataset.sensor and dataset.camera alone; all else needs a new rendering",
+            first_difference(fixed_before, fixed_after),
+            "changes to dataset.sensor and dataset.camera only; other changes need a new rendering",
         )
     return after
 
 
 def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
-    """The camera to develop for, and that of the EXRs, which must cover the view of the first."""
+    """The camera of the new frames and that of the EXRs. Raises UserError if the EXRs do not cover the new view."""
     if not source.info.complete:
         raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
     camera = camera_of(config.camera)
@@ -160,9 +160,9 @@ def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
         raise UserError(
             "--set or --config",
             "dataset.camera",
-            f"a view that leaves the EXRs' {exr_camera.width_px} x {exr_camera.height_px} px of {exr_camera.fx_px:.6g}"
-            " px focal length",
-            "a camera whose every pixel the EXRs show",
+            f"a view that the EXRs ({exr_camera.width_px} x {exr_camera.height_px} px, focal length"
+            f" {exr_camera.fx_px:.6g} px) do not cover",
+            "a view within that of the EXRs",
         )
     return camera, exr_camera
 

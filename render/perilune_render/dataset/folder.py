@@ -43,7 +43,7 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
 
 
 def writing(out: Path) -> contextlib.AbstractContextManager[None]:
-    """The lock of a dataset's folder; none for a finished dataset, which is only read, maybe from a read-only disk."""
+    """The lock of a dataset's folder; no lock for a finished dataset, which may be on a read-only disk."""
     return contextlib.nullcontext() if (out / SUMS_NAME).exists() else locked(out)
 
 
@@ -51,8 +51,8 @@ def is_begun(out: Path) -> bool:
     """Whether a folder holds a dataset. Raises UserError if it holds something else."""
     begun = (out / "dataset.json").exists()
     if not begun and out.exists() and any(not path.name.startswith(LOCK_NAME) for path in out.iterdir()):
-        wanted = "an empty or new folder, or a dataset to resume"
-        raise UserError(out, "--out", "a folder with other content", wanted)
+        expected = "an empty or new folder, or a dataset to resume"
+        raise UserError(out, "--out", "a folder with other content", expected)
     return begun
 
 
@@ -66,17 +66,17 @@ def begin_or_resume(out: Path, info: DatasetInfo) -> DatasetInfo:
         return info
     existing = open_dataset(out).info
     if len(existing.recipes) != 1 or existing.history != info.history:
-        raise UserError(out, "--out", f"a dataset put together otherwise: {existing.name}", "another folder")
+        raise UserError(out, "--out", f"a dataset with other recipes or history: {existing.name}", "another folder")
     if existing.images != info.images:
         raise UserError(out, "--out", f"a dataset whose frames are {existing.images}", "another folder")
     for name in ("kind", "config", "versions", "developed_from"):
-        theirs, ours = (_compared(each.recipe(), name) for each in (existing, info))
-        if theirs != ours:
+        recorded, requested = (_compared(each.recipe(), name) for each in (existing, info))
+        if recorded != requested:
             raise UserError(
                 out / "dataset.json",
                 name,
-                first_difference(theirs, ours),
-                "the settings that this dataset was begun with, or another --out",
+                first_difference(recorded, requested),
+                "the settings that this dataset was started with, or another --out",
             )
     return existing
 
@@ -96,16 +96,18 @@ def check_begun(out: Path, plan: Plan) -> None:
             or rows["split"].to_pylist() != list(own.splits)
             or not np.allclose(rows["position_m"].to_pylist(), own.flight.position_m, rtol=0, atol=_SAME_PLACE_M)
         ):
-            raise UserError(part, "frames", "those of another plan", "the manifest that it was begun with")
+            raise UserError(part, "frames", "those of another plan", "the manifest that the dataset was started with")
     for part in sorted(out.joinpath("manifest", "trajectories").glob("[A-Za-z0-9]*.parquet")):
         found = read_part(part, "trajectories", ["trajectory_id", "seed", "n_frames", "split"]).to_pydict()
-        wanted = [(t.trajectory_id, t.seed, len(t.splits), t.split) for t in plan.of_scene(part.stem)]
-        if list(zip(*found.values(), strict=True)) != wanted:
-            raise UserError(part, "trajectories", "those of another plan", "the manifest that it was begun with")
+        expected = [(t.trajectory_id, t.seed, len(t.splits), t.split) for t in plan.of_scene(part.stem)]
+        if list(zip(*found.values(), strict=True)) != expected:
+            raise UserError(
+                part, "trajectories", "those of another plan", "the manifest that the dataset was started with"
+            )
 
 
 def finish(out: Path, info: DatasetInfo) -> Dataset:
-    """Complete a dataset of which all parts are written: overview, counts, checksums."""
+    """Complete a dataset whose parts are all written: write overview, counts, checksums."""
     dataset = Dataset(out, info)
     write_overview(dataset)
     write_info(out, info.model_copy(update={"counts": count_rows(dataset), "complete": True}))
@@ -126,10 +128,10 @@ def _compared(recipe: Recipe, name: str) -> object:
     return {k: v for k, v in value.items() if not k.startswith("perilune")} if name == "versions" else value
 
 
-def first_difference(theirs: object, ours: object, path: str = "") -> str:
+def first_difference(recorded: object, requested: object, path: str = "") -> str:
     """The first setting, in order of names, in which two trees of plain data differ, with both values."""
-    if isinstance(theirs, dict) and isinstance(ours, dict):
-        for key in sorted({*theirs, *ours}):
-            if theirs.get(key) != ours.get(key):
-                return first_difference(theirs.get(key), ours.get(key), f"{path}.{key}".lstrip("."))
-    return f"{path} {theirs!r} there, {ours!r} asked for".strip()
+    if isinstance(recorded, dict) and isinstance(requested, dict):
+        for key in sorted({*recorded, *requested}):
+            if recorded.get(key) != requested.get(key):
+                return first_difference(recorded.get(key), requested.get(key), f"{path}.{key}".lstrip("."))
+    return f"{path} {requested!r} in place of the recorded {recorded!r}".strip()

@@ -20,7 +20,7 @@ from perilune_shared.storage.files import sha256_of
 def plan_from_manifest(
     manifest: Dataset, dem: Path | None = None, catalogue: Path | None = None
 ) -> tuple[Plan, DatasetConfig, DatasetInfo]:
-    """The plan of a manifest's scenes, trajectories and frames, its settings, and the dataset.json to begin with.
+    """The plan of a manifest's scenes, trajectories and frames, its settings, and the initial dataset.json.
 
     Names, seeds, poses and splits come from the manifest; `dem` and `catalogue` are the user's copies of the files that
     its recipe names. Raises UserError if the manifest has several recipes (merged from different datasets), if its
@@ -28,12 +28,12 @@ def plan_from_manifest(
     """
     info, where = manifest.info, manifest.root / "dataset.json"
     if len(info.recipes) != 1:
-        wanted = "one recipe; take its scenes apart with `perilune-manifest subset --where \"recipe == '...'\"`"
-        raise UserError(where, "recipes", len(info.recipes), wanted)
+        expected = "one recipe; select its scenes with `perilune-manifest subset --where \"recipe == '...'\"`"
+        raise UserError(where, "recipes", len(info.recipes), expected)
     recipe = info.recipe()
     if recipe.developed_from is not None:
-        wanted = "a rendered dataset; render its source, then `perilune-render develop`"
-        raise UserError(where, "developed_from", recipe.developed_from.name, wanted)
+        expected = "a rendered dataset; render its source, then `perilune-render develop`"
+        raise UserError(where, "developed_from", recipe.developed_from.name, expected)
     config = config_of(recipe, where, dem, catalogue)
     _check_dem(manifest, config)
     camera = camera_of(config.camera)
@@ -43,10 +43,10 @@ def plan_from_manifest(
         ScenePlan(row["scene_id"], row["seed"], row["sun_azimuth_deg"], row["sun_elevation_deg"])
         for row in manifest.table("scenes").sort_by("scene_id").to_pylist()
     ]
-    descents = [descent for scene in scenes for descent in _descents(manifest, scene.scene_id)]
+    trajectories = [trajectory for scene in scenes for trajectory in _trajectories(manifest, scene.scene_id)]
     exr_camera = camera.covering_pinhole()
     view = view_envelope(exr_camera, config.ground_flight(recipe.kind))
-    plan = Plan(camera, exr_camera, view, tuple(scenes), tuple(descents))
+    plan = Plan(camera, exr_camera, view, tuple(scenes), tuple(trajectories))
     begun = new_info(config, plan, recipe_of(config, recipe.kind, recipe.preset))
     kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     return plan, config, begun.model_copy(update=kept)
@@ -57,12 +57,12 @@ def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
     if dem is None or not dem.is_file():  # reported when it is opened
         return
     found = f"sha256:{sha256_of(dem)}"
-    for wanted in manifest.table("scenes", ["dem_source"])["dem_source"].unique().to_pylist():
-        if not same_source(found, wanted):
-            raise UserError("--dem", "elevation model", found, wanted)
+    for expected in manifest.table("scenes", ["dem_source"])["dem_source"].unique().to_pylist():
+        if not same_source(found, expected):
+            raise UserError("--dem", "elevation model", found, expected)
 
 
-def _descents(manifest: Dataset, scene_id: str) -> list[TrajectoryPlan]:
+def _trajectories(manifest: Dataset, scene_id: str) -> list[TrajectoryPlan]:
     found = []
     for row in manifest.table("trajectories", scene_id=scene_id).sort_by("trajectory_id").to_pylist():
         frames = manifest.table("frames", scene_id=scene_id, trajectory_id=row["trajectory_id"])
@@ -80,7 +80,7 @@ def _descents(manifest: Dataset, scene_id: str) -> list[TrajectoryPlan]:
 
 
 def compare_hashes(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:
-    """Number of frames whose hash equals the manifest's, of frames with a hash there, and of scenes that differ."""
+    """Numbers of frames with equal hashes, of frames with a hash in the manifest, and of scenes with other ground."""
     old, new = (
         dict(zip(*(d.table("frames", ["frame_id", "png_sha256"]).to_pydict().values()), strict=True))
         for d in (manifest, made)

@@ -1,4 +1,4 @@
-"""Write the manifest of a dataset before its frames: scenes, trajectories and poses as Parquet, to render later."""
+"""Write the manifest of a planned dataset, without frames, to render it later: scenes, trajectories and poses."""
 
 from pathlib import Path
 

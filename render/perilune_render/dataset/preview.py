@@ -23,9 +23,9 @@ from perilune_shared.labels.thresholds import SELECTIONS
 
 
 def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 4) -> None:
-    """Write a contact sheet of the first scene and trajectory: frames evenly spaced in time, and below with labels.
+    """Write a contact sheet of the first scene and trajectory: frames evenly spaced in time.
 
-    The lower row also shows the outline of the elevation model, if there is one.
+    The lower row shows the same frames with labels and, if there is one, the outline of the elevation model.
     """
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]

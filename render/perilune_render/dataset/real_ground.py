@@ -11,6 +11,7 @@ from perilune_shared.geometry.frames import Array, site_from_selenographic
 
 _POINTS_PER_SIDE = 200
 _OUTLINE = (230, 190, 60)
+"""Colour of the outline, BGR."""
 
 
 def real_ground_share(

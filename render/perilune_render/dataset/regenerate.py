@@ -1,4 +1,4 @@
-"""Make frames again from a manifest alone: seeds, poses and the recorded recipe.
+"""Regenerate frames from a manifest alone: seeds, poses and the recorded recipe.
 
 On the same kind of machine a frame is identical byte for byte. On another kind, rounding may change where a ray hits
 the ground and so change single pixels: frames are then compared within a tolerance.
@@ -67,7 +67,7 @@ class Outcome:
 
     @property
     def state(self) -> State:
-        """The worse state of both files."""
+        """The worse of the states of PNG and EXR."""
         return max((state for state in (self.png, self.exr) if state is not None), key=_ORDER.index)
 
 
@@ -79,7 +79,7 @@ def regenerate(
     dem: Path | None = None,
     catalogue: Path | None = None,
 ) -> list[Outcome]:
-    """Make frames again as `out`/frames/<frame_id>.png and .exr, and compare them with the manifest.
+    """Regenerate frames as `out`/frames/<frame_id>.png and .exr, and compare them with the manifest.
 
     `dem` and `catalogue` are the user's copies of the files that the recipes name; a path in a recipe is never opened.
     Raises UserError on frames that are not in the manifest, on recipes that this version does not support, and if `out`
@@ -99,7 +99,7 @@ def regenerate(
         for scene in dataset.table("scenes").sort_by("scene_id").to_pylist():
             own = frames.filter(pc.equal(frames["scene_id"], scene["scene_id"])).sort_by("frame_id").to_pylist()
             if own:
-                progress.update(task, note=f"{scene['scene_id']}: growing")
+                progress.update(task, note=f"{scene['scene_id']}: generating ground")
                 outcomes += _of_scene(dataset, scene, own, out, dem, catalogue, lambda: progress.advance(task))
     return outcomes
 
@@ -155,20 +155,18 @@ def _of_scene(
 
 
 def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> DatasetConfig:
-    """The settings that ground and EXRs were made with; those of a developed dataset have the source's camera."""
+    """The settings of ground and EXRs; for a developed dataset, its settings with the camera of its source."""
     origin = recipe.developed_from
     if origin is None:
         return config
     if origin.camera_config is None:
-        raise UserError(
-            where, "developed_from", "no camera", "a dataset that says which camera its ground was made for"
-        )
+        raise UserError(where, "developed_from", "no camera", "a dataset that records the camera of its source")
     camera = resolve_over(CameraConfig, "dataset.camera", str(where), origin.camera_config)
     return config.model_copy(update={"camera": camera})
 
 
 def _compared(dataset: Dataset, row: dict, kind: ImageKind, out: Path) -> State:
-    """Compare a new file with the old one's hash and, if the hash differs, with the old file if it is present."""
+    """Compare a new file with the recorded hash and, if they differ, with the old file's pixels if it is present."""
     new = out / frame_path(row["frame_id"], kind)
     if row[f"{kind}_sha256"] is None:
         return "new"
@@ -178,19 +176,19 @@ def _compared(dataset: Dataset, row: dict, kind: ImageKind, out: Path) -> State:
         if kind == "png" and dataset.info.images in ("files", "packed"):
             frames = dataset.table("frames", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
             old = dict(dataset.pngs(frames.filter(pc.equal(frames["frame_id"], row["frame_id"]))))[row["frame_id"]]
-            return _state(png_far(old, new.read_bytes()))
+            return _state(png_outlier_share(old, new.read_bytes()))
         if kind == "exr" and dataset.info.images == "files":
-            return _state(exr_far(read_exr(dataset.file(row["exr_path"])), read_exr(new)))
+            return _state(exr_outlier_share(read_exr(dataset.file(row["exr_path"])), read_exr(new)))
     except UserError:
         pass  # the old file is missing or damaged, and the hash differs
     return "different"
 
 
-def _state(far: float) -> State:
-    return "within tolerance" if far <= OUTLIERS else "different"
+def _state(outlier_share: float) -> State:
+    return "within tolerance" if outlier_share <= OUTLIERS else "different"
 
 
-def png_far(first: bytes, second: bytes) -> float:
+def png_outlier_share(first: bytes, second: bytes) -> float:
     """Share of the pixels of two PNGs that differ by more than GREY_TOLERANCE; 1 if their shapes differ."""
     try:
         # A small file may decompress to any size: compare the headers first.
@@ -205,7 +203,7 @@ def png_far(first: bytes, second: bytes) -> float:
     return float((np.abs(one.astype(float) - two) * scale > GREY_TOLERANCE).mean())
 
 
-def exr_far(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> float:
+def exr_outlier_share(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> float:
     """Largest share, over the channels, of pixels that differ by more than RELATIVE_TOLERANCE; 1 if shapes differ."""
     if {k: v.shape for k, v in first.items()} != {k: v.shape for k, v in second.items()}:
         return 1.0

@@ -56,11 +56,11 @@ def make_dataset(config: DatasetConfig, kind: Kind, preset: str, out: Path, prog
 def render_plan(
     plan: Plan, config: DatasetConfig, info: DatasetInfo, out: Path, progress: Progress, where: object
 ) -> Dataset:
-    """Render a plan into `out`, or resume it; `info` is the dataset.json to begin with.
+    """Render a plan into `out`, or resume it; `info` is the initial dataset.json.
 
     Raises UserError if `out` holds something else, if another process is writing it, or if a pose does not fit the
-    ground; the last error names `where`, the origin of the plan. The first scene is checked before anything is written,
-    every other one before its first frame is rendered.
+    ground; the error about a pose names `where`, the origin of the plan. The first scene is checked before anything is
+    written, each other scene before its first frame is rendered.
     """
     check_ground(config, plan.view)
     check_plan(plan, graded_grid(config.terrain, plan.view), where)
@@ -84,11 +84,11 @@ def _render(
     )
     for scene_plan in plan.scenes:
         trajectories = plan.of_scene(scene_plan.scene_id)
-        waiting = [t for t in trajectories if not is_finished(out, t.scene_id, t.trajectory_id)]
-        progress.advance(task, sum(len(t.splits) for t in trajectories) - sum(len(t.splits) for t in waiting))
-        if not waiting:
+        unfinished = [t for t in trajectories if not is_finished(out, t.scene_id, t.trajectory_id)]
+        progress.advance(task, sum(len(t.splits) for t in trajectories) - sum(len(t.splits) for t in unfinished))
+        if not unfinished:
             continue
-        progress.update(task, note=f"{scene_plan.scene_id}: growing")
+        progress.update(task, note=f"{scene_plan.scene_id}: generating ground")
         scene = grown.pop(scene_plan.scene_id, None) or _grow(plan, scene_plan, config, where)
         _write_scene(out, scene_plan, scene, config, info.recipe().key, trajectories)
         progress.update(task, note=scene_plan.scene_id)
@@ -96,12 +96,12 @@ def _render(
             source = FrameSource.of(engine, config, plan.camera, RimCircles.of_scene(scene))
             dark = [
                 frame_id
-                for trajectory in waiting
+                for trajectory in unfinished
                 for frame_id in _render_trajectory(
                     out, source, trajectory, scene, config.render.exr, lambda: progress.advance(task)
                 )
             ]
-        n_rendered = sum(len(t.splits) for t in waiting)
+        n_rendered = sum(len(t.splits) for t in unfinished)
         warn_of_dark_frames(scene_plan.scene_id, dark, n_rendered, scene_plan.sun_elevation_deg)
     return finish(out, info)
 
@@ -124,11 +124,11 @@ def _write_scene(
         "trajectories": tables.trajectory_table(trajectories),
     }
     paths = {name: out / "manifest" / name / f"{plan.scene_id}.parquet" for name in parts}
-    there = {name: read_part(paths[name], name) if paths[name].exists() else parts[name] for name in _GROUND}
-    # Compared by content hash, since craters computed on another processor differ in the last digits.
-    if content_sha256(*there.values()) != content_sha256(*(parts[name] for name in _GROUND)):
-        wanted = "the elevation model and catalogue that it was begun with"
-        raise UserError(paths["craters"], "craters", "other craters or boulders", wanted)
+    existing = {name: read_part(paths[name], name) if paths[name].exists() else parts[name] for name in _GROUND}
+    # Compared by content hash, since craters computed on another processor may differ in the last digits.
+    if content_sha256(*existing.values()) != content_sha256(*(parts[name] for name in _GROUND)):
+        expected = "the elevation model and catalogue that the dataset was started with"
+        raise UserError(paths["craters"], "craters", "other craters or boulders", expected)
     for name, rows in parts.items():
         if not paths[name].exists():
             write_part(out, name, plan.scene_id, rows)

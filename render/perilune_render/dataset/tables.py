@@ -113,7 +113,7 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table `frames` for one trajectory; `files` holds each frame's columns png_*, exr_* and measures."""
+    """Part of the table `frames` for one trajectory; `files`: columns png_*, exr_* and measurements of each frame."""
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],

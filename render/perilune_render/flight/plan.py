@@ -77,7 +77,7 @@ class Plan:
     exr_camera: Camera
     """Camera of the rendering and the EXRs: a pinhole that covers the view of `camera`."""
     view: ViewEnvelope
-    """The views that the ground of every scene must serve."""
+    """The views that the mesh of every scene is made for."""
     scenes: tuple[ScenePlan, ...]
     """All scenes."""
     trajectories: tuple[TrajectoryPlan, ...]
@@ -118,13 +118,13 @@ def camera_of(config: CameraConfig) -> Camera:
             "configuration",
             "dataset.camera.distortion",
             camera.distortion,
-            f"a weaker one: it needs a rendering of {covering.width_px} x {covering.height_px} pixels",
+            f"a weaker one (this one needs a rendering of {covering.width_px} x {covering.height_px} pixels)",
         )
     return camera
 
 
 def make_plan(config: DatasetConfig, kind: str) -> Plan:
-    """The plan of the dataset `detect` or `nav`. Raises UserError on an impossible camera.
+    """The plan of the dataset `detect` or `nav`. Raises UserError if the distortion is too strong.
 
     Seeds are derived from the configuration's seed, its name and the kind. Presets therefore share no terrain. The
     two kinds of one preset share it only with `shared_terrain`.

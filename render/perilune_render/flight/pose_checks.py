@@ -41,7 +41,7 @@ class Poses:
 
 
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
-    """Check what needs no terrain heights: the Sun is up, poses are over the mesh, no horizon is in view.
+    """Make the checks that need no terrain heights: the Sun is up, poses are over the mesh, no horizon is in view.
 
     Raises UserError with `where` (the configuration or the manifest) and the first scene or frame that fails.
     """
@@ -77,10 +77,8 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
         beyond.any(axis=1),
         poses,
         where,
-        lambda n: f"{beyond[n].mean():.0%} of the image's edge looks past the terrain's edge",
-        lambda n: (
-            f"only ground in view: within {scene.grid.extent_m / 2:.0f} m of the site; lower, nearer, less tilted"
-        ),
+        lambda n: f"{beyond[n].mean():.0%} of the image's edge is beyond the terrain's edge",
+        lambda n: f"a view within {scene.grid.extent_m / 2:.0f} m of the site: a lower, nearer or less tilted camera",
     )
 
 
@@ -133,8 +131,8 @@ def _leaving(position_m: Array, rays: Array, half_m: float) -> tuple[Array, Arra
     return position_m[:, None, 2] + way * rays[..., 2], place[..., 0], place[..., 1]
 
 
-def _refuse(faulty: np.ndarray, poses: Poses, where: object, found, wanted) -> None:
-    """Raise UserError for the first true value of `faulty` (N,); `found` and `wanted` make texts from its index."""
+def _refuse(faulty: np.ndarray, poses: Poses, where: object, found, expected) -> None:
+    """Raise UserError for the first true value of `faulty` (N,); `found` and `expected` make texts from its index."""
     if faulty.any():
         n = int(np.argmax(faulty))
-        raise UserError(where, f"frame {poses.frame_id[n]}", found(n), wanted(n))
+        raise UserError(where, f"frame {poses.frame_id[n]}", found(n), expected(n))

@@ -42,7 +42,7 @@ def fly(config: FlightConfig, n_frames: int, seed: int) -> Flight:
 
     Position and attitude deviate from the nominal motion by independent stationary Gaussian processes with the kernel
     sigma^2 exp(-dt^2 / (2 tau^2)) on each axis. The paper states "small perturbations with Gaussian distribution"
-    without sizes; white noise on each frame would not be a motion that a lander can make. The velocity is the exact
+    without sizes; white noise on each frame would not be a possible motion of a lander. The velocity is the exact
     derivative of the position.
     """
     rng = stream(seed, "flight")

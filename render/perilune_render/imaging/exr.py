@@ -1,4 +1,4 @@
-"""EXR files: read those that Blender writes, and read and write those of datasets."""
+"""Read the EXR files that Blender writes; read and write the EXR files of datasets."""
 
 import errno
 from pathlib import Path
@@ -43,11 +43,11 @@ def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np
         with OpenEXR.File(str(path), separate_channels=True) as image:
             return {name: channel.pixels for name, channel in image.channels().items()}
     except (RuntimeError, ValueError, TypeError, MemoryError) as error:
-        raise UserError(path, "exr", error, "a whole EXR file") from None
+        raise UserError(path, "exr", error, "a complete, undamaged EXR file") from None
 
 
 def _check_header(path: Path, image: OpenEXR.File, size_px: tuple[int, int] | None) -> None:
-    """Raises UserError if the header of an EXR file is not one to decompress."""
+    """Raises UserError if an EXR file is too large to read, or has several parts or subsampled channels."""
     if len(image.parts) != 1:
         raise UserError(path, "parts", len(image.parts), "one")
     header = image.parts[0].header

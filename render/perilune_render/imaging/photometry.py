@@ -35,7 +35,7 @@ class HapkeParameters:
     b_s0: float
     """Amplitude of the shadow-hiding opposition surge."""
     h_s: float
-    """Width of the surge, radians of tan(g/2)."""
+    """Width of the surge, the value of tan(g/2) at which it has half its amplitude."""
     theta_bar_deg: float = 23.657
     """Mean slope of macroscopic roughness, > 0, degrees (Sato et al. 2014)."""
 
@@ -47,7 +47,8 @@ MARE = HapkeParameters(0.222, 0.254, 0.160, 1.993, 0.0597)
 MEAN = HapkeParameters(0.2242, 0.24575, 0.2425, 1.8395, 0.06345)
 """The mean Moon: b, c, B_S0 and h_S midway between mare and highland, w fitted by us.
 
-w makes the mean ratio of the law to a published fit to NAC images 1, over incidences of 5 to 80 degrees in nadir view.
+With this w the mean ratio of the law to a published fit to NAC images is 1, over incidences of 5 to 80 degrees in nadir
+view.
 The published fit is ln(I/F) = -2.98 - 0.011 g - 0.81 cos e + 1.32 cos i. The ratio is 0.92 to 1.19 up to 70 degrees and
 falls to 0.63 at 80 degrees, where the law is darker than the fit.
 """
@@ -104,7 +105,7 @@ def roughness(theta_bar_deg: float, mu0: Any, mu: Any, cos_phase: Any) -> tuple[
     # Hapke's eta of each angle: its effective cosine without the other angle.
     alone_l = sin_l * e2_l / open_l * slope + cos_l
     alone_s = sin_s * e2_s / open_s * slope + cos_s
-    # All four lack the factor chi: one factor 1 / chi remains in the shadowing.
+    # The four effective cosines above lack the factor chi: in the shadowing one factor 1 / chi remains.
     shadowing = (1 / chi) / (alone_l * (seen_as_one * (cos_s - alone_s) + alone_s))
     return larger * chi, smaller * chi, shadowing
 
@@ -154,7 +155,7 @@ LAWS: dict[str, Law] = {
 
 
 def reflectance_factor(law: str, mu0: Any, mu: Any, cos_phase: Any) -> Any:
-    """I/F over mu0 of a named law for mu0, mu > 0, the colour of a diffuse shader of radiance I/F; arrays broadcast."""
+    """I/F over mu0 of a named law for mu0, mu > 0: the colour that gives a diffuse shader the radiance I/F."""
     return LAWS[law](mu0, mu, cos_phase)
 
 

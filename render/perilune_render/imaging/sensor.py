@@ -200,7 +200,7 @@ def _rays(camera: Camera) -> np.ndarray:
 
 
 def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """The mean of an image over an exposure centred on its time; its content moves by `motion` (h, w, 2), pixels."""
+    """The mean of an image over the exposure, in which its content moves by `motion` (h, w, 2), pixels."""
     longest = float(np.sqrt(np.square(motion).sum(axis=-1).max()))
     if longest < _LEAST_MOTION_PX:
         return light

@@ -9,6 +9,7 @@ from perilune_render.labels.frame_labels import Labels
 from perilune_shared.storage.files import write_bytes
 
 _CHOSEN, _OTHER = (80, 220, 80), (60, 140, 255)
+"""Colours of the ellipses, BGR."""
 
 
 def draw_labels(image: np.ndarray, labels: Labels, chosen: np.ndarray, scale: int = 2) -> np.ndarray:

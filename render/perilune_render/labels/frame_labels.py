@@ -31,7 +31,7 @@ class Labels:
     contrast: Array
     """Amplitude of the crater's shading over its standard error from noise and clutter; NaN if not measured (N,)."""
     n_above: int | None = None
-    """Number of craters centred in the image whose radius exceeds the largest of a label; None if not counted."""
+    """Number of craters centred in the image that are too large for a label; None if not counted."""
 
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "Labels":

@@ -41,7 +41,7 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
 
 
 def settings_of(recipe: Recipe) -> dict[str, Any]:
-    """The settings of a recipe with a section for both kinds, as in a configuration."""
+    """The settings of a recipe with a section for each kind; if only one is recorded, it is used for both."""
     other = _OTHER[recipe.kind]
     return {other: recipe.config[recipe.kind], **recipe.config} if recipe.kind in recipe.config else recipe.config
 
@@ -64,9 +64,9 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
     terrain = dict(terrain)
     for name in _FILES:
         if terrain.get(name) is None and given[name] is not None:
-            raise UserError(f"--{name}", name, given[name], "no such option: the recipe is of procedural ground")
+            raise UserError(f"--{name}", name, given[name], f"no --{name}, since the recipe names no such file")
         if terrain.get(name) is not None:
             if given[name] is None:
-                raise UserError(where, f"terrain.{name}", terrain[name], f"--{name} with this machine's copy of it")
+                raise UserError(where, f"terrain.{name}", terrain[name], f"--{name} with a local copy of it")
             terrain[name] = str(given[name])
     return resolve_over(DatasetConfig, "dataset", str(where), {**settings_of(recipe), "terrain": terrain})

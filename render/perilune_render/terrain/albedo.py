@@ -16,6 +16,7 @@ from perilune_shared.geometry.frames import Array
 _PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03))
 """Wavelengths, metres, and relative amplitudes of the patches."""
 _RAYS_REACH = 9.0
+"""Length of the longest ray from the centre, crater radii."""
 _RAYED_WEAR = 0.004
 """Wear K/R^2 of a crater at which its rays have vanished."""
 

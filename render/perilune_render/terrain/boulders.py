@@ -84,7 +84,7 @@ def _fields(
     young = np.clip(1 - age / 4000, 0, 1) ** 3 * np.exp(-craters.wear_m2 / (0.05 * radius**2))
     young = np.where((craters.diameter_m >= 10) & (craters.origin == 0), young, 0.0)
     local = config.min_diameter_spacings * grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
-    # The boulders of a field are at most a twentieth of its crater.
+    # The boulders of a field are at most a twentieth as large as its crater.
     largest = np.minimum(config.max_diameter_m, craters.diameter_m / 20)
     per_area = np.where(largest > local, law.csfd(local) - law.csfd(np.maximum(largest, local)), 0.0)
     # The integral of exp(-(x - 1) / a) over the plane outside the rim is 2 pi R^2 (a + a^2).
@@ -133,7 +133,7 @@ def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple
     """All boulders as one mesh: vertices (V, 3) float32 in O_L, metres, and triangles (F, 3) int32.
 
     Every boulder is a copy of one of the seed's rocks; boulders below _FULL_SPACINGS local vertex spacings use the rock
-    with fewer faces. All are one mesh, since Cycles needs time for every object in every frame.
+    with fewer faces. All are one mesh, since each object adds to the time of every frame in Cycles.
     """
     local = grid.spacing_at(np.maximum(np.abs(boulders.x_m), np.abs(boulders.y_m)))
     full = boulders.diameter_m >= _FULL_SPACINGS * local

@@ -1,4 +1,4 @@
-"""The view envelope: from how low a camera sees the ground, at each distance from the site."""
+"""The view envelope: the lowest height from which the camera sees ground at each distance from the site."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from perilune_shared.geometry.frames import Array
 
 @dataclass(frozen=True, slots=True)
 class ViewEnvelope:
-    """The views that a scene's ground must serve: the mesh's extent and spacing follow from them.
+    """The views that a scene's mesh is made for: they determine its extent and vertex spacing.
 
     Ground at the distance `reach_m[i]` from the site is never seen from less than `height_m[i]` above it; in between,
     the height is interpolated linearly. Ground beyond the last reach is never seen. The envelope of a flight is

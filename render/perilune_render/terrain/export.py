@@ -56,7 +56,7 @@ def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
     """
     n = int(np.floor(scene.grid.extent_m / pixel_m))
     if not 1 <= n <= _LARGEST_SIDE:
-        raise UserError(path, "pixel size", f"{pixel_m} m makes {n} pixels a side", f"1 to {_LARGEST_SIDE}")
+        raise UserError(path, "pixel size", f"{pixel_m} m, which makes {n} pixels per side", f"1 to {_LARGEST_SIDE}")
     centre = (np.arange(n) + 0.5 - n / 2) * pixel_m
     # O_L's x points west and y south; a raster's columns go east and its rows south.
     place = f"+lat_0={scene.latitude_deg!r} +lon_0={scene.longitude_deg!r}"

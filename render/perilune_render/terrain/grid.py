@@ -1,12 +1,12 @@
-"""The graded grid: an even square around the site, and square rings around it whose spacing grows with distance.
+"""The graded grid: a square of uniform spacing around the site, and square rings whose spacing grows with distance.
 
 Every ring has as many vertices as the inner square's border, so a ring of twice the half-width has twice the spacing;
 the distance between rings grows likewise. Neighbouring rings are joined vertex to vertex, so the mesh has no hanging
 vertices and no gaps. The spacing at each place is set by the lowest height from which a camera can see it.
 
 Vertices are stored in one list: the inner square row by row (y, then x), then ring by ring, each counter-clockwise from
-its corner at -x, -y. `lines_in` returns the vertices in a window as straight lines of evenly spaced vertices, which
-stamping craters and adding waves are based on.
+its corner at -x, -y. `lines_in` returns the vertices in a window as straight lines of evenly spaced vertices;
+craters and waves are added line by line.
 """
 
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class Grid:
 
     @property
     def spacings_m(self) -> Array:
-        """Spacing of the inner square and each ring, the larger of along and across, metres (n_rings + 1,)."""
+        """Spacing of the inner square and each ring, the larger of both directions, metres (n_rings + 1,)."""
         across = np.diff(self.half_widths_m, prepend=self.half_widths_m[0] * (1 - 1 / self.n_half))
         return np.maximum(self.half_widths_m / self.n_half, across)
 
@@ -87,7 +87,7 @@ class Grid:
 
 
 def graded_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
-    """The grid for the views of a camera: everywhere the spacing is at most `terrain.spacing_px` smallest pixels.
+    """The grid for the views of a camera: spacing at most `terrain.spacing_px` times the smallest ground pixel.
 
     Raises UserError if that needs more than `terrain.max_vertices`.
     """
@@ -104,20 +104,20 @@ def graded_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
 
 
 def _wider(spacing_px: float, n_vertices: int, most: int, view: ViewEnvelope) -> str:
-    """The advice if a spacing needs more than `most` vertices: the smallest spacing allowed, rounded up to 0.01."""
+    """Advice if a spacing needs more than `most` vertices: the smallest allowed spacing, rounded up to 0.01."""
     hundredths = int(np.ceil(100 * spacing_px * np.sqrt(n_vertices / most)))
     # The number of vertices is only roughly proportional to 1 / spacing^2.
     while hundredths > 1 and _grid_of((hundredths - 1) / 100, view).n_vertices <= most:
         hundredths -= 1
     while hundredths <= 100 * LARGEST_SPACING_PX:
         if _grid_of(hundredths / 100, view).n_vertices <= most:
-            return f"at least {hundredths / 100:g}, or more dataset.terrain.max_vertices"
+            return f"at least {hundredths / 100:g}, or a larger dataset.terrain.max_vertices"
         hundredths += 1
-    return "more dataset.terrain.max_vertices, fewer or wider pixels of dataset.camera, or a higher end_altitude_m"
+    return "a larger dataset.terrain.max_vertices, fewer or wider pixels of dataset.camera, or a higher end_altitude_m"
 
 
 def _grid_of(spacing_px: float, view: ViewEnvelope) -> Grid:
-    """The grid of a spacing in pixels, with any number of vertices."""
+    """The grid of a spacing in pixels, without a limit on the number of vertices."""
     reach = view.reach_m
     spacing = spacing_px * view.height_m / view.focal_px
     n_half = int(np.ceil((reach / spacing).max()))

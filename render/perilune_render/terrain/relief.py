@@ -29,7 +29,7 @@ def check_waves(config: ReliefConfig, grid: Grid) -> None:
             "configuration",
             "dataset.terrain.relief.longest_wavelength_m",
             config.longest_wavelength_m,
-            f"at least {np.ceil(least_m * 100) / 100:g} m: three vertex spacings, and 1 m",
+            f"at least {np.ceil(least_m * 100) / 100:g} m (three vertex spacings, but no less than 1 m)",
         )
 
 

@@ -26,6 +26,7 @@ _NEUKUM_2001 = (
     8.25e-4,
     5.54e-5,
 )
+"""Coefficients of log10(D / 1 km)^1 to ^11 in the logarithm of the number."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,13 +47,13 @@ class SizeFrequency(ABC):
         return float(area_m2 * (self.csfd(self.min_diameter_m) - self.csfd(self.max_diameter_m)))
 
     def cdf(self, diameter_m: ArrayLike) -> Array:
-        """Share of the population of the support below a diameter (metres)."""
+        """Share of the population, within the support, that is smaller than a diameter (metres)."""
         most, least = self.csfd(self.min_diameter_m), self.csfd(self.max_diameter_m)
         inside = np.clip(np.asarray(diameter_m, np.float64), self.min_diameter_m, self.max_diameter_m)
         return (most - self.csfd(inside)) / (most - least)
 
     def ppf(self, share: ArrayLike) -> Array:
-        """Diameter (metres) of a quantile `share`: the inverse of `cdf`.
+        """Quantile: the diameter (metres) below which a `share` of the population is; the inverse of `cdf`.
 
         Interpolated in logarithms between 2000 nodes, which is exact for power laws and within 1e-5 for the others.
         """

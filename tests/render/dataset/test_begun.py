@@ -13,7 +13,7 @@ from perilune_render.config_terrain import TerrainConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.develop import develop_dataset
 from perilune_render.dataset.folder import begin_or_resume, check_begun, new_info, open_finished
-from perilune_render.dataset.regenerate import png_far, regenerate
+from perilune_render.dataset.regenerate import png_outlier_share, regenerate
 from perilune_render.dataset.render import render_plan
 from perilune_render.flight.plan import make_plan
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
@@ -131,7 +131,7 @@ def test_an_elevation_model_goes_by_its_content():
 
 def test_what_is_no_picture_is_far_from_one(drawn):
     png = (drawn / "frames/s000/t000/000000.png").read_bytes()
-    assert png_far(png, png) == 0 and png_far(b"no picture", png) == 1
+    assert png_outlier_share(png, png) == 0 and png_outlier_share(b"no picture", png) == 1
 
 
 def test_scenes_over_one_elevation_model_share_terrain():

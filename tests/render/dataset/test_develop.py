@@ -138,9 +138,9 @@ def test_another_camera_makes_new_labels_that_fit(tiny, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "parts"),
     [
-        (settings("camera.principal_x_px=66"), ["dataset.camera", "EXRs show"]),
-        (settings("camera.focal_length_px=100"), ["dataset.camera", "EXRs show"]),
-        (settings("camera.distortion.k1=-0.1"), ["dataset.camera", "EXRs show"]),
+        (settings("camera.principal_x_px=66"), ["dataset.camera", "EXRs"]),
+        (settings("camera.focal_length_px=100"), ["dataset.camera", "EXRs"]),
+        (settings("camera.distortion.k1=-0.1"), ["dataset.camera", "EXRs"]),
         (settings("camera.distortion.k1=-3"), ["dataset.camera.distortion", "fold"]),
         (settings("seed=5"), ["seed", "new rendering"]),
         (settings("labels.min_radius_px=4"), ["min_radius_px", "new rendering"]),

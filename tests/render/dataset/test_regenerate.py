@@ -18,7 +18,7 @@ from rich.progress import Progress
 from tests.helpers import in_process
 
 from perilune_render.cli import main
-from perilune_render.dataset.regenerate import exr_far, png_far, regenerate, spread
+from perilune_render.dataset.regenerate import exr_outlier_share, png_outlier_share, regenerate, spread
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.editing.diff import differences
@@ -95,7 +95,7 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
     made = run("dataset", "--manifest", tmp_path / "s", "--out", tmp_path / "out")
     assert made.returncode == 0, made.stderr
     n = len(open_dataset(tmp_path / "s").table("frames"))
-    assert f"{n} of {n} frames are the manifest's byte for byte; the ground is the manifest's" in made.stdout
+    assert f"{n} of {n} frames are byte-identical to the manifest's; terrain hashes match" in made.stdout
     new, old = open_dataset(tmp_path / "out"), open_dataset(tiny / "detect")
     assert validate(new) == [] and new.info.counts.scenes == 2
     ids = new.table("frames", ["frame_id"])["frame_id"]
@@ -108,7 +108,7 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
         (["--manifest", tmp_path / "s", "--set", "dataset.seed=3", "--out", tmp_path / "o"], "--set"),
         (["--manifest", tmp_path / "s"], "--out"),
         (["--manifest", tmp_path / "s", "--preset", "tiny", "--out", tmp_path / "o"], "--preset"),
-        (["--manifest", tmp_path / "s", "--dem", __file__, "--out", tmp_path / "o"], "procedural"),
+        (["--manifest", tmp_path / "s", "--dem", __file__, "--out", tmp_path / "o"], "names no such file"),
         (["--manifest", tmp_path / "none", "--out", tmp_path / "o"], "no such file"),
     ):
         refused = run("dataset", *arguments)
@@ -184,7 +184,7 @@ def test_a_recipe_opens_no_file_of_its_own_choice(tiny_detect):
     result = run("regenerate", "--manifest", tiny_detect, "--verify")
     assert result.returncode == 2 and "recipes" in result.stderr
     info = open_dataset_with_right_key(tiny_detect)
-    with pytest.raises(UserError, match="--dem with this machine's copy"):
+    with pytest.raises(UserError, match="--dem with a local copy"):
         again(info, tiny_detect / "out", ["scene-0000/trajectory-0000/000000"])
 
 
@@ -215,12 +215,12 @@ def test_distances_by_hand():
     other = grey.copy()
     other[0, :3] = [102, 103, 90]
     one, two = (cv2.imencode(".png", image)[1].tobytes() for image in (grey, other))
-    assert png_far(one, one) == 0 and png_far(one, two) == pytest.approx(0.002)
-    assert png_far(one, cv2.imencode(".png", grey[:5])[1].tobytes()) == 1
+    assert png_outlier_share(one, one) == 0 and png_outlier_share(one, two) == pytest.approx(0.002)
+    assert png_outlier_share(one, cv2.imencode(".png", grey[:5])[1].tobytes()) == 1
     z = np.full((10, 10), 500, np.float32)
     off = z.copy()
     off[0, 0], off[0, 1] = 501, np.inf
-    assert exr_far({"Z": z}, {"Z": off}) == pytest.approx(0.02) and exr_far({"Z": z}, {"R": z}) == 1
+    assert exr_outlier_share({"Z": z}, {"Z": off}) == pytest.approx(0.02) and exr_outlier_share({"Z": z}, {"R": z}) == 1
 
 
 def test_nothing_is_left_of_a_failed_plan(tmp_path):

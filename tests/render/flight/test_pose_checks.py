@@ -48,8 +48,8 @@ def ground():
         ((400, 0, 250), "a camera -50.0 m above the ground"),
         ((5000, 0, 500), "a camera at x 5000 m"),
         ((0, 0, 500, 75), "75 degrees from straight down, with the horizon in view"),
-        ((0, 0, 500, 45), "of the image's edge looks past the terrain's edge"),
-        ((0, 0, 2500), "100% of the image's edge looks past the terrain's edge"),
+        ((0, 0, 500, 45), "of the image's edge is beyond the terrain's edge"),
+        ((0, 0, 2500), "100% of the image's edge is beyond the terrain's edge"),
         ((0, np.nan, 500), "position"),
     ],
 )
@@ -67,7 +67,7 @@ def test_a_mountain_at_the_edge_hides_what_lies_behind(camera):
     side = np.linspace(-1000, 1000, 201)
     _, y = np.meshgrid(side, side)
     tilted = pose(0, 0, 200, 54)
-    with pytest.raises(UserError, match="past the terrain's edge"):
+    with pytest.raises(UserError, match="beyond the terrain's edge"):
         check_poses(tilted, camera, flat_scene(2000.0, 201), "plan")
     check_poses(tilted, camera, flat_scene(2000.0, 201, height_m=np.where(np.abs(y) > 900, 190.0, 0.0)), "plan")
 

@@ -69,7 +69,7 @@ def test_a_model_far_smaller_than_the_ground_cannot_be_mirrored(tmp_path):
     model = read_elevation(
         write(tmp_path / "a.tif", np.ones((20, 20)), POLAR, rasterio.Affine(0.05, 0, 1e5, 0, -0.05, 0))
     )
-    with pytest.raises(UserError, match="similar extent"):
+    with pytest.raises(UserError, match="a model that covers more of it"):
         base_heights(model, Grid.even(600, 30), "mirror")
     assert np.isfinite(base_heights(model, Grid.even(600, 30))[0]).all()
 

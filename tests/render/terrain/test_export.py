@@ -40,6 +40,6 @@ def test_a_raster_comes_back_as_the_same_ground(scene, tmp_path):
 
 
 def test_a_raster_too_large_is_refused(scene, tmp_path):
-    with pytest.raises(UserError, match="pixels a side"):
+    with pytest.raises(UserError, match="pixels per side"):
         export_raster(scene, tmp_path / "scene.tif", 0.01)
     assert not list(tmp_path.iterdir())

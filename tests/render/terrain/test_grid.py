@@ -121,5 +121,5 @@ def test_too_many_vertices_are_refused_and_a_spacing_is_named_that_passes(most):
 
 
 def test_a_mesh_that_no_spacing_makes_small_enough_names_none():
-    with pytest.raises(UserError, match=r"expected more dataset.terrain.max_vertices, fewer or wider pixels"):
+    with pytest.raises(UserError, match=r"expected a larger dataset.terrain.max_vertices, fewer or wider pixels"):
         graded_grid(config_with(terrain={"max_vertices": 10_000}).terrain, VIEW)

@@ -28,7 +28,7 @@ class _Plane(NamedTuple):
 
 @njit(inline="always")
 def _fit_plane(height, x, y, radius, lines, count):
-    """Fit a plane to the ground around (x, y) by least squares; returns whether there are enough vertices, and it."""
+    """Least-squares plane of the ground around (x, y); returns whether it has enough vertices, and the plane."""
     s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
     n_rim = n_floor = h_rim = h_floor = 0.0
     square_r = radius**2

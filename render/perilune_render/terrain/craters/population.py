@@ -34,7 +34,9 @@ ORIGINS = ("primary", "secondary", "elevation model")
 _LARGEST_VISIBLE_WEAR = 0.11
 """Wear K/R^2 at which a crater has lost three quarters of its depth and is rarely counted."""
 _LARGEST_SECONDARY_M = 30.0
+"""Diameter below which craters are moved into clusters, metres."""
 _PER_CLUSTER = 40
+"""Mean number of craters in a cluster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +176,7 @@ def _cluster(
     if not len(chosen):
         return x, y, age, clustered
     n_clusters = max(len(chosen) // _PER_CLUSTER, 1)
-    # Craters sorted by (randomised) size form a cluster with their neighbours, since a cluster scales with its craters.
+    # A cluster is made of craters of similar (randomised) size, since its extent is proportional to their size.
     chosen = chosen[np.argsort(diameter[chosen] * rng.uniform(0.5, 2, len(chosen)), kind="stable")]
     cluster = np.minimum(np.arange(len(chosen)) * n_clusters // len(chosen), n_clusters - 1)
     first = np.searchsorted(cluster, np.arange(n_clusters))

@@ -5,9 +5,10 @@ With x = r/R a fresh profile is h = h_rim rim(x) + d bowl(x). `rim` holds rim an
 end of the ejecta blanket would render as a ring.
 
 - `fassett_thomson`: Fassett & Thomson 2014, eq. 4 (doi 10.1002/2014JE004698). Deviations: the outer polynomial is
-  scaled by 13 % to meet the crest (as printed it leaves a step of 0.004 D). Cubics round the crest and the end of the
-  blanket, where the source has a flat crest and ends at x = 1.5 with a slope. The bowl is scaled to the given depth,
-  and a soft minimum rounds its floor, where the source cuts it flat. `flat` keeps that cut, softened.
+  scaled by 13 % to meet the crest (as printed it leaves a step of 0.004 D). The crest and the end of the
+  blanket are rounded by cubics; in the source the crest is flat, and the blanket ends at x = 1.5 with a slope. The bowl
+  is scaled to the given depth, and a soft minimum rounds its floor, which is cut flat in the source. With `flat` the
+  floor is flat, with a soft edge.
 - `pangu`: a parabolic bowl, a cubic flank and ejecta that thin as x^-3, as in the simulator PANGU (Martin, Parkes &
   Dunstan 2014, doi 10.1109/TAES.2014.120282). Deviations: its printed constants beta and h3 are not used, since they
   give unrealistic shapes; the crest is rounded, and the ejecta end at REACH.
@@ -16,8 +17,8 @@ Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solve
 it depends on K/R^2 alone, K = kappa t. The profile is linear in h_rim and d, and diffusion is linear, so one table for
 each part serves all craters. Another table holds the share of the older ground that the crater has removed. It is
 diffused too, so that its edge widens with wear and leaves no ridge. A bowl is steeper than its flank, so wear
-moves the crest outwards. `crest` holds how far, so that a crater is stamped with its current crest on its label's
-circle.
+moves the crest outwards. The table `crest` holds its radius; with it, a crater is stamped such that its current crest
+lies on its label's circle.
 """
 
 import functools
@@ -34,9 +35,13 @@ REACH = 3.0
 DEPTH_OVER_RIM = np.linspace(1.5, 9.0, 16)
 """Ratios of fresh depth to fresh rim height for which the crest's radius is tabulated."""
 _FARTHEST_CREST = 1.5
+"""Largest radius of a worn crest, fresh crater radii."""
 _DOMAIN, _N_RADIAL = 6.0, 600
+"""Radius of the grid on which diffusion is solved, crater radii, and its number of cells."""
 _CREST = 0.036822
+"""Height of the inner polynomial of Fassett & Thomson at x = 0.98, where the crest begins, over the diameter."""
 LEAST_WEAR, MOST_WEAR, N_WEAR = 2e-4, 0.6, 56
+"""Smallest and largest wear K/R^2 in the tables, and their number of rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +137,7 @@ def fresh_rim_height_m(diameter_m: Array, depth_m: Array, profile: str = "fasset
     """Height of the crest above the plain around a newly formed crater, metres.
 
     `fassett_thomson`: 0.184 of the depth, the ratio of Pike's rim height to Pike's depth. At 1 km this is 0.0368 D, the
-    source's value for craters of 1 km. Used for all sizes, 0.0368 D would make small, shallow craters mostly rim.
+    source's value for craters of 1 km. At all sizes, a rim of 0.0368 D would be too high for small, shallow craters.
     `pangu`: the smaller of the ejecta's thickness at the rim, 0.14 R^0.74 (McGetchin et al. 1973), and Pike's rim
     height, 0.036 D^1.014 km with D in km.
     """
@@ -194,6 +199,7 @@ def _crests(x: Array, rim: Array, bowl: Array) -> Array:
 
 def crest_radius(wear: Array, depth_over_rim: Array, profile: str = "fassett_thomson") -> Array:
     """Radius (N,) of the crest of craters over their fresh radius, from wear K/R^2 and fresh depth over rim height.
+
     At most 1.5: with more wear hardly any crest is left.
     """
     tables = profile_tables(profile)

@@ -35,8 +35,8 @@ class _Ground(NamedTuple):
     albedo: Array
     """Factor on the reflectance (n_vertices,)."""
     log_left: Array
-    """Logarithm of the share of the initial ground that is left (n_vertices,). The difference of two values is the loss
-    of a rim since it was stamped."""
+    """Logarithm of the share of the initial ground that is left (n_vertices,). Its change since a rim was stamped is
+    the loss of that rim."""
     n_half: int
     """`Grid.n_half`."""
     half_widths: Array

@@ -67,7 +67,7 @@ def plane(height_m: Array, row: Array, column: Array) -> Array:
 
 
 def mean_slope(height_m: Array, row: Array, column: Array, beyond_m: Array, side_m: float) -> Array:
-    """The mean plus the deviation of `plane` from it, which fades beyond the model.
+    """The mean height plus the model's mean slope (`plane`), metres; beyond the model the slope's part fades.
 
     It fades as 1 / (1 + (d / side)^2), where `side_m` is the model's shorter side.
     """

@@ -22,8 +22,9 @@ from perilune_shared.storage.files import sha256_of
 _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
 _LARGEST_PIXELS = 100_000_000
 _RESOLVED_PIXELS = 4.0
+"""Diameter from which a model shows a crater, pixels."""
 _SWELL_M = 120.0
-"""Standard deviation of the low-pass for a mirrored model, metres; long waves are above about four times this."""
+"""Standard deviation of the low-pass filter for a mirrored model, metres; long waves exceed about 4 times this."""
 _SEAM_M = 100.0
 """Width of the band along a mirrored model's edge in which short waves are point-reflected too, metres."""
 
@@ -109,7 +110,7 @@ def read_elevation(path: Path) -> ElevationModel:
 
 
 def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
-    """Raises UserError if a coordinate system has no ellipsoid or not the Moon's, within one percent.
+    """Raises UserError unless the ellipsoid of a coordinate system has the Moon's radius, within one percent.
 
     PROJ refuses to transform between bodies, but its error message states neither body.
     """
@@ -169,7 +170,7 @@ def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
 
 
 def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
-    """Lines that inform the user about a model before the ground is made from it."""
+    """Messages to the user about a model, one per line, shown before its ground is generated."""
     lines = []
     name = model.source.split(" sha256:")[0]
     if model.step_m:
@@ -185,6 +186,7 @@ def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
 
 def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedural") -> tuple[Array, Array]:
     """Heights (n_vertices,) of the model on the grid, and distances (n_vertices,) from known ground, both in metres.
+
     The site is at height 0. Heights are interpolated bicubically. Beyond the model the ground continues smoothly
     (`perilune_render.terrain.elevation.continuation`), and relief and craters are added later; with `outside` "mirror"
     it is the model's mirror image. Raises UserError if the ground extends beyond the model and `outside` is "refuse".
@@ -208,7 +210,9 @@ def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedur
         margin = min(margin, int(np.ceil(margin_m(sides) / min(model.pixel_sides_m))) + 2)
     if (rows + 2 * margin) * (columns + 2 * margin) > _LARGEST_PIXELS:
         ground = f"{grid.extent_m:.0f} m of ground"
-        raise UserError(model.source, "dem", f"{rows} x {columns} pixels for {ground}", "a model of similar extent")
+        raise UserError(
+            model.source, "dem", f"{rows} x {columns} pixels for {ground}", "a model that covers more of it"
+        )
     places = [row - 0.5 + margin, column - 0.5 + margin]
     if outside == "mirror":
         padded = _mirrored(model.height_m, margin, model.pixel_m)

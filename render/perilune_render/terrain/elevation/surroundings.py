@@ -63,8 +63,8 @@ def add_fitted_relief(
 ) -> None:
     """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
-    They are added beyond the model only. Each grows as the model's relief of its wavelength fades
-    (`continuation.fade`).
+    They are added beyond the model only. The amplitude of a wave grows with distance as the model's relief of the same
+    wavelength fades (`continuation.fade`).
     """
     outside = np.flatnonzero(beyond_m > 0)
     for length, amplitude in zip(fitted.wavelength_m, fitted.amplitude_m, strict=True):
