@@ -240,9 +240,9 @@ def draw_sheet(path: Path, crops: list[Picture], frames: list[list[Picture]]) ->
         real = parts[len(parts) // 2]
         shadow = st.summary(real)["shadow_share"]
         ours = min(taken, key=lambda frame: abs(st.summary(frame.image)["shadow_share"] - shadow)).image
-        for image, whose in ((real, "real"), (ours, "ours")):
+        for image, origin in ((real, "real"), (ours, "ours")):
             shown = np.clip(image * (100 / image.mean()), 0, 255).astype(np.uint8)
-            text = f"{whose} {crop.elevation_deg:.0f} deg"
+            text = f"{origin} {crop.elevation_deg:.0f} deg"
             pairs.append(cv2.putText(shown, text, (6, n - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 255, 1, cv2.LINE_AA))
     write_sheet(path, pairs, 6)
 

@@ -52,8 +52,8 @@ def _draw_spectra(path: Path, rows: list[dict]) -> None:
     thirds = [part for part in np.array_split(np.arange(len(rows)), 3) if len(part)]
     figure, axes = plt.subplots(1, len(thirds), figsize=(4.2 * len(thirds), 3.8), sharey=True, squeeze=False)
     for ax, part in zip(axes[0], thirds, strict=True):
-        for whose, colour in (("real", REAL), ("ours", OURS)):
-            _band(ax, st.FREQUENCY, np.array([rows[i][whose]["spectrum"] for i in part]), colour, whose)
+        for origin, colour in (("real", REAL), ("ours", OURS)):
+            _band(ax, st.FREQUENCY, np.array([rows[i][origin]["spectrum"] for i in part]), colour, origin)
         suns = [rows[i]["sun"]["elevation_deg"] for i in part]
         ax.set(xscale="log", yscale="log", xlabel="cycles per pixel", title=f"Sun {suns[0]:.0f} to {suns[-1]:.0f} deg")
     axes[0, 0].set_ylabel("power over squared mean, px$^2$")

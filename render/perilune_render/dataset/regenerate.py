@@ -59,7 +59,7 @@ class Outcome:
     png: State
     """The PNG compared with the manifest's hash, then with the dataset's file; new if the manifest has no hash."""
     exr: State | None
-    """The EXR compared likewise; None if the frame has none."""
+    """The same comparison for the EXR; None if the frame has none."""
     same_ground: bool
     """Whether the content hash of craters and boulders equals that of the scene's row."""
     png_path: Path
@@ -86,7 +86,7 @@ def regenerate(
     holds a dataset.
     """
     if (out / "dataset.json").exists():
-        raise UserError(out, "--out", "a dataset, whose frames would be replaced", "another folder")
+        raise UserError(out, "--out", "a dataset; its frames would be replaced", "another folder")
     frames = dataset.table("frames")
     known = set(frames["frame_id"].to_pylist())
     for frame_id in frame_ids:

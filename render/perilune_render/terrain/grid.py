@@ -1,8 +1,8 @@
 """The graded grid: a square of uniform spacing around the site, and square rings whose spacing grows with distance.
 
 Every ring has as many vertices as the inner square's border, so a ring of twice the half-width has twice the spacing;
-the distance between rings grows likewise. Neighbouring rings are joined vertex to vertex, so the mesh has no hanging
-vertices and no gaps. The spacing at each place is set by the lowest height from which a camera can see it.
+the distance between rings grows in the same proportion. Neighbouring rings are joined vertex to vertex, so the mesh has
+no hanging vertices and no gaps. The spacing at each place is set by the lowest height from which a camera can see it.
 
 Vertices are stored in one list: the inner square row by row (y, then x), then ring by ring, each counter-clockwise from
 its corner at -x, -y. `lines_in` returns the vertices in a window as straight lines of evenly spaced vertices;

@@ -17,8 +17,8 @@ Wear: topographic diffusion dh/dt = kappa laplacian h (Fassett & Thomson), solve
 it depends on K/R^2 alone, K = kappa t. The profile is linear in h_rim and d, and diffusion is linear, so one table for
 each part serves all craters. Another table holds the share of the older ground that the crater has removed. It is
 diffused too, so that its edge widens with wear and leaves no ridge. A bowl is steeper than its flank, so wear
-moves the crest outwards. The table `crest` holds its radius; with it, a crater is stamped such that its current crest
-lies on its label's circle.
+moves the crest outwards. The table `crest` has the crest's radius, so that stamping can put the current crest on the
+label's circle.
 """
 
 import functools
