@@ -18,7 +18,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from pyarrow.fs import LocalFileSystem
 
-from perilune_shared.dataset.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
+from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.pages import pages_of
@@ -58,10 +58,10 @@ class Part:
         """Open a part. Raises UserError if it is no Parquet file, of another table or schema version, or too large.
 
         `schema` replaces the table's schema in TABLES, for older versions. Unknown columns are ignored. Missing columns
-        of `OPTIONAL` are read as null.
+        of `MAY_BE_ABSENT` are read as null.
         """
         self.path, self.schema = path, schema or TABLES[table]
-        self._optional = OPTIONAL.get(table, ()) if schema is None else ()
+        self._may_be_absent = MAY_BE_ABSENT.get(table, ()) if schema is None else ()
         self._n_bytes = files.check_plain_file(path)
         self._checked: set[tuple[int, str]] = set()
         try:
@@ -147,7 +147,7 @@ class Part:
         chosen = list(range(self.n_groups) if groups is None else groups)
         names = list(columns) if columns is not None else self.schema.names
         schema = pa.schema([self.schema.field(name) for name in names], metadata=self.schema.metadata)
-        missing = [name for name in names if name in self._optional and name not in self.found.names]
+        missing = [name for name in names if name in self._may_be_absent and name not in self.found.names]
         present = [name for name in names if name not in missing]
         for field in map(schema.field, present):
             place = self.found.get_field_index(field.name)

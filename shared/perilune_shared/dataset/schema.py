@@ -10,11 +10,12 @@ _TEXT, _REAL, _INTEGER = pa.string(), pa.float64(), pa.int64()
 
 
 def complete(table: str, rows: pa.Table) -> pa.Table:
-    """Return `rows` with exactly the table's columns, in order and with their types; missing optional ones become null.
+    """Return `rows` with exactly the table's columns, in order and with their types.
 
-    Raises pyarrow's error if a required column is missing or a column cannot be cast to its type.
+    Missing columns of `MAY_BE_ABSENT` become null. Raises pyarrow's error if another column is missing or a column
+    cannot be cast to its type.
     """
-    for name in OPTIONAL.get(table, ()):
+    for name in MAY_BE_ABSENT.get(table, ()):
         if name not in rows.column_names:
             rows = rows.append_column(name, pa.nulls(len(rows), TABLES[table].field(name).type))
     return rows.select(TABLES[table].names).cast(TABLES[table])
@@ -24,8 +25,8 @@ def _vector(length: int) -> pa.DataType:
     return pa.list_(_REAL, length)
 
 
-def _column(name: str, kind: pa.DataType, unit: str, meaning: str, *, optional: bool = False) -> pa.Field:
-    return pa.field(name, kind, nullable=optional, metadata={"unit": unit, "meaning": meaning})
+def _column(name: str, kind: pa.DataType, unit: str, meaning: str, *, nullable: bool = False) -> pa.Field:
+    return pa.field(name, kind, nullable=nullable, metadata={"unit": unit, "meaning": meaning})
 
 
 def _table(name: str, *columns: pa.Field) -> pa.Schema:
@@ -64,8 +65,8 @@ TABLES: dict[str, pa.Schema] = {
         _column("normal_z", _REAL, "", "rim circle's unit normal, O_L"),
         _column("diameter_m", _REAL, "m", "rim crest to rim crest"),
         _column("depth_m", _REAL, "m", "rim to floor on the finished height field, less the sag of older ground"),
-        _column("fresh_depth_m", _REAL, "m", "rim to floor when it formed; null where not known", optional=True),
-        _column("age_myr", _REAL, "Myr", "time since it formed; null where not known", optional=True),
+        _column("fresh_depth_m", _REAL, "m", "rim to floor when it formed; null where not known", nullable=True),
+        _column("age_myr", _REAL, "Myr", "time since it formed; null where not known", nullable=True),
         _column(
             "origin", _TEXT, "", "primary, secondary (drawn in a cluster), or elevation model (real, from a catalogue)"
         ),
@@ -89,7 +90,7 @@ TABLES: dict[str, pa.Schema] = {
         _TRAJECTORY,
         _column("seed", _INTEGER, "", "seed of the descent's own random streams"),
         _column("n_frames", _INTEGER, "", "number of frames"),
-        _column("split", _TEXT, "", f"{_SPLIT}; null where frames of one descent are split", optional=True),
+        _column("split", _TEXT, "", f"{_SPLIT}; null where frames of one descent are split", nullable=True),
         _column("nominal_position_m", _vector(3), "m", "nominal curve at time 0, O_L"),
         _column("nominal_velocity_mps", _vector(3), "m/s", "nominal curve at time 0, O_L"),
         _column("nominal_acceleration_mps2", _vector(3), "m/s^2", "nominal curve, constant, O_L"),
@@ -114,24 +115,24 @@ TABLES: dict[str, pa.Schema] = {
         _column("velocity_mps", _vector(3), "m/s", "camera, O_L"),
         _column("sun_direction", _vector(3), "", "unit vector towards the Sun, O_L"),
         _column("png_path", _TEXT, "", "relative to the dataset"),
-        _column("png_sha256", _TEXT, "", "of the whole file; null where never rendered", optional=True),
-        _column("png_bytes", _INTEGER, "B", "file size; null where never rendered", optional=True),
-        _column("exr_path", _TEXT, "", "relative to the dataset; null where not written", optional=True),
-        _column("exr_sha256", _TEXT, "", "of the whole file; null where not written", optional=True),
-        _column("exr_bytes", _INTEGER, "B", "file size; null where not written", optional=True),
+        _column("png_sha256", _TEXT, "", "of the whole file; null where never rendered", nullable=True),
+        _column("png_bytes", _INTEGER, "B", "file size; null where never rendered", nullable=True),
+        _column("exr_path", _TEXT, "", "relative to the dataset; null where not written", nullable=True),
+        _column("exr_sha256", _TEXT, "", "of the whole file; null where not written", nullable=True),
+        _column("exr_bytes", _INTEGER, "B", "file size; null where not written", nullable=True),
         _column(
             "real_ground_share",
             _REAL,
             "",
             "share of the frame's ground that is an elevation model's, not procedural; null where not known",
-            optional=True,
+            nullable=True,
         ),
         _column(
             "n_craters_above_max_radius",
             _INTEGER,
             "",
             "craters with their centre in the image that are too large for a label; null where not known",
-            optional=True,
+            nullable=True,
         ),
     ),
     "labels": _table(
@@ -155,13 +156,13 @@ TABLES: dict[str, pa.Schema] = {
             _REAL,
             "",
             "the crater's own shading over its standard error, from noise and clutter; null where not known",
-            optional=True,
+            nullable=True,
         ),
     ),
 }
-OPTIONAL: dict[str, tuple[str, ...]] = {"frames": ("real_ground_share", "n_craters_above_max_radius")}
+MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {"frames": ("real_ground_share", "n_craters_above_max_radius")}
 """Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
-writers always write them. To add one, append a column with `optional=True` to its table and add its name here."""
+writers always write them. To add one, append a column with `nullable=True` to its table and add its name here."""
 KEYS: dict[str, list[str]] = {
     "scenes": ["scene_id"],
     "craters": ["scene_id", "crater_id"],

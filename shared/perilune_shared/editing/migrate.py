@@ -15,7 +15,7 @@ from perilune_shared.dataset.info_file import INFO_NAME, checked_info, read_obje
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo, Recipe
 from perilune_shared.dataset.parts import Part
-from perilune_shared.dataset.schema import OPTIONAL, SCHEMA_VERSION, TABLES, complete
+from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.dataset.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
@@ -31,7 +31,7 @@ def _without(tables: dict[str, pa.Schema], added: Mapping[str, tuple[str, ...]])
     return kept
 
 
-_TABLES_2 = _without(_without(TABLES, OPTIONAL), _ADDED_IN_3)
+_TABLES_2 = _without(_without(TABLES, MAY_BE_ABSENT), _ADDED_IN_3)
 OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
 """Schemas of the tables in older versions."""
 
@@ -108,7 +108,7 @@ class _OldDataset(Dataset):
         columns = {
             name: rows[name] if name in schema.names else self._added(table, name, rows, scene_id)
             for name in TABLES[table].names
-            if name not in OPTIONAL.get(table, ())
+            if name not in MAY_BE_ABSENT.get(table, ())
         }
         return complete(table, pa.table(columns, schema=pa.schema(map(TABLES[table].field, columns))))
 

@@ -19,7 +19,7 @@ import pyarrow as pa
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.parts import Part
-from perilune_shared.dataset.schema import KEYS, OPTIONAL, TABLES
+from perilune_shared.dataset.schema import KEYS, MAY_BE_ABSENT, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.added_files import add_files, check_sums
 from perilune_shared.progress import NO_PROGRESS, Progress
@@ -121,7 +121,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
         # Omit optional columns that a file lacks: mlcroissant would not find them.
         missing = {
             name
-            for name in OPTIONAL.get(table, ())
+            for name in MAY_BE_ABSENT.get(table, ())
             for part in dataset.parts(table)
             if name not in Part(part, table).found.names
         }

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, is_whole
-from perilune_shared.dataset.schema import OPTIONAL, TABLES
+from perilune_shared.dataset.schema import MAY_BE_ABSENT, TABLES
 from perilune_shared.errors import UserError, one_line, shortened
 
 _PATH = r"^[A-Za-z0-9][A-Za-z0-9._/-]{0,199}$"
@@ -107,7 +107,7 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
     try:
         part = dataset.open_part(path, table)
         names, known = part.found.names, TABLES[table].names
-        missing = set(known) - set(names) - set(OPTIONAL.get(table, ()))
+        missing = set(known) - set(names) - set(MAY_BE_ABSENT.get(table, ()))
         odd = sorted({name for name in names if name not in known and not matches(_COLUMN, name)} | missing)
         # Unknown columns are ignored: a later version may have added them.
         present = [name for name in names if name in known]

@@ -11,7 +11,7 @@ from tests.helpers.hostile import rewrite
 
 from perilune_shared.dataset import parts
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.schema import OPTIONAL, TABLES
+from perilune_shared.dataset.schema import MAY_BE_ABSENT, TABLES
 from perilune_shared.editing.attach import attach
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.migrate import migrate
@@ -64,13 +64,13 @@ def test_large_tables_become_several_readable_parts(little, tmp_path, monkeypatc
 
 
 def test_files_without_optional_columns_read_as_null(little, tmp_path, monkeypatch):
-    """A column that was added later is null in older files, and every tool writes it (OPTIONAL in schema.py)."""
+    """A column that was added later is null in older files, and every tool writes it (MAY_BE_ABSENT in schema.py)."""
     later = pa.field("later_share", pa.float64(), metadata={"unit": "", "meaning": "a later column"})
     schema = TABLES["frames"].append(later)
     monkeypatch.setitem(TABLES, "frames", schema)
     with pytest.raises(UserError, match="no later_share"):
         open_dataset(little).table("frames")
-    monkeypatch.setitem(OPTIONAL, "frames", (*OPTIONAL.get("frames", ()), "later_share"))
+    monkeypatch.setitem(MAY_BE_ABSENT, "frames", (*MAY_BE_ABSENT.get("frames", ()), "later_share"))
     source = open_dataset(little)
     assert validate(source) == []
     frames = source.table("frames", ["later_share", "frame_id"], split="val")
