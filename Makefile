@@ -54,7 +54,7 @@ $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pypr
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV) (some minutes the first time)"
 	@$(BIN)/python -m pip install -q -c constraints.txt setuptools wheel torch
-	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[export]" -r requirements-dev.txt
+	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[export,geo]" -r requirements-dev.txt
 	@touch $@
 
 demo: setup ## run all steps: set-up, datasets, detection, navigation, explanation (PRESET=small)
