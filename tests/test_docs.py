@@ -79,10 +79,10 @@ def fault(line: str, *, complete: bool) -> str | None:
     used = [word.split("=")[0] for word in rest if word.startswith("--")]
     if unknown := [option for option in used if option not in {*known, "--help"}]:
         return f"no option {unknown}"
-    wanted = [p for p in command.params if p.required and complete]
-    if missing := [p.opts for p in wanted if p.param_type_name == "option" and not set(p.opts) & set(used)]:
+    expected = [p for p in command.params if p.required and complete]
+    if missing := [p.opts for p in expected if p.param_type_name == "option" and not set(p.opts) & set(used)]:
         return f"without {missing}"
-    n_arguments = sum(p.param_type_name == "argument" for p in wanted)
+    n_arguments = sum(p.param_type_name == "argument" for p in expected)
     if n_arguments and (not rest or rest[0].startswith("--")):
         return "without its argument"
     return None
@@ -202,9 +202,9 @@ def test_generated_pages_have_every_command_column_and_key():
     columns = GENERATED["reference/columns.md"]
     for name, schema in TABLES.items():
         section = columns.split(f"## {name}\n")[1].split("\n## ")[0]
-        told = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", section, re.MULTILINE)
-        wanted = [(f.name, f.metadata[b"unit"].decode(), f.metadata[b"meaning"].decode(), f.nullable) for f in schema]
-        assert [(column, unit, meaning, "or null" in kind) for column, kind, unit, meaning in told] == wanted
+        reported = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| ([^|]*) \|", section, re.MULTILINE)
+        expected = [(f.name, f.metadata[b"unit"].decode(), f.metadata[b"meaning"].decode(), f.nullable) for f in schema]
+        assert [(column, unit, meaning, "or null" in kind) for column, kind, unit, meaning in reported] == expected
     for name, (model, package) in CONFIGS.items():
         page = GENERATED[f"reference/configuration/{package.removeprefix('perilune_')}.md"]
         shown = annotated_yaml(name, resolve(model, name, package, "small"))

@@ -112,7 +112,7 @@ def test_a_row_has_a_figure_or_a_reason():
 
 def test_goals_and_intervals():
     record = RECORDS["train"].model_copy(update={"figures": {"x": 0.5, "x_low": 0.4, "x_high": 0.6}})
-    for bound, told in (("at_most", "≤ 0.45 px, missed"), ("at_least", "≥ 0.45 px")):
+    for bound, reported in (("at_most", "≤ 0.45 px, missed"), ("at_least", "≥ 0.45 px")):
         row = results.Row(metric="m", record="r", keys=("x",), unit="px", **{bound: 0.45})
-        assert results.goal(row, {"r": record}) == told
+        assert results.goal(row, {"r": record}) == reported
         assert results.interval(row, {"r": record}) == "0.4 px to 0.6 px"

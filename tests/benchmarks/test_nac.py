@@ -28,8 +28,8 @@ def test_white_noise_has_a_flat_spectrum_of_its_variance_whatever_the_brightness
 
 def test_a_power_law_is_recovered():
     spectrum = st.power_spectrum(noise(2.0) - noise(2.0).mean() + 10)
-    wanted = st.FREQUENCY > 0.03
-    slope = np.polyfit(np.log(st.FREQUENCY[wanted]), np.log(spectrum[wanted]), 1)[0]
+    selected = st.FREQUENCY > 0.03
+    slope = np.polyfit(np.log(st.FREQUENCY[selected]), np.log(spectrum[selected]), 1)[0]
     assert slope == pytest.approx(-2, abs=0.1)
     apart = st.log_difference(4 * spectrum, spectrum, 0.02, 0.4)
     assert np.allclose(apart, np.log10(4)) and 0 < len(apart) < len(spectrum)

@@ -34,11 +34,11 @@ def bomb(width, height):
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [(b"no image", "not a PNG"), (bomb(60_000, 60_000), "60000 x 60000"), (bomb(16, 16), "cannot be decoded")],
 )
-def test_a_frame_that_is_no_image_is_refused(content, told):
-    with pytest.raises(UserError, match=told):
+def test_a_frame_that_is_no_image_is_refused(content, message):
+    with pytest.raises(UserError, match=message):
         decode(content, "0.png", 16, 16)
 
 

@@ -126,19 +126,19 @@ def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect)
     """A worn crater and one without contrast are background, though they are labelled."""
     settings = ExplainConfig(n_frames=8)
     config = config_of_run(checkpoints[0].parent.parent, ())
-    _, truth, told = detect_frames(settings, config, dataset_detect)
+    _, truth, reported = detect_frames(settings, config, dataset_detect)
     labels = read_labels(open_dataset(dataset_detect), ["ellipse_cx_px", "ellipse_cy_px"], "test")
     seen = (labels["contrast"] >= 4) & (labels["depth_m"] >= 0.04 * labels["diameter_m"])
     values = {True: [], False: []}
     for (_, rows), mask in zip(labels.groupby("frame_id"), truth, strict=True):
         for row in rows.itertuples():
-            wanted = rows[seen[rows.index]]
-            gap = np.hypot(wanted["ellipse_cx_px"] - row.ellipse_cx_px, wanted["ellipse_cy_px"] - row.ellipse_cy_px)
-            if seen[row.Index] or (gap > 1.4 * wanted["radius_px"] + 2).all():
+            expected = rows[seen[rows.index]]
+            gap = np.hypot(expected["ellipse_cx_px"] - row.ellipse_cx_px, expected["ellipse_cy_px"] - row.ellipse_cy_px)
+            if seen[row.Index] or (gap > 1.4 * expected["radius_px"] + 2).all():
                 values[bool(seen[row.Index])].append(mask[int(row.ellipse_cy_px), int(row.ellipse_cx_px)])
     assert len(values[True]) > 10 and len(values[False]) > 5
     assert set(values[True]) == {0} and set(values[False]) == {1}
-    assert told["labels/min_contrast"] == 4
+    assert reported["labels/min_contrast"] == 4
 
 
 def test_masks_are_those_of_the_network_at_the_frames_size(dataset_detect, tmp_path):

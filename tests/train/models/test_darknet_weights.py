@@ -116,9 +116,9 @@ def test_a_file_of_another_size_is_refused_by_name(tmp_path, size, found, n_floa
     os.truncate(path, size if size in (0, 11, 15, 19, 20) else 20 + 4 * n_floats + size)
     with pytest.raises(UserError) as caught:
         read_darknet(path, (40_620_640, 62_001_757))
-    told = str(caught.value)
-    assert told.startswith(f"{path}: size: got ") and found in told and "\n" not in told
-    assert told.endswith("expected 40620640 or 62001757 floats")
+    message = str(caught.value)
+    assert message.startswith(f"{path}: size: got ") and found in message and "\n" not in message
+    assert message.endswith("expected 40620640 or 62001757 floats")
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

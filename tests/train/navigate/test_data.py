@@ -176,15 +176,15 @@ def test_flow_labels_of_a_mirrored_pair_are_the_mirrored_labels(trajectories):
         if flips in seen:
             continue
         seen.add(flips)
-        wanted = plain
+        expected = plain
         if flips[0]:
-            wanted = wanted[:, :, ::-1] * [-1, 1]
+            expected = expected[:, :, ::-1] * [-1, 1]
         if flips[1]:
-            wanted = wanted[:, ::-1] * [1, -1]
+            expected = expected[:, ::-1] * [1, -1]
         if flips[2]:
-            wanted = wanted.transpose(0, 2, 1, 3)[..., ::-1]
+            expected = expected.transpose(0, 2, 1, 3)[..., ::-1]
         found = pair_sequence(d, 0, 2, warp=True, rng=np.random.default_rng(seed)).flow_px
-        np.testing.assert_allclose(found, wanted, atol=1e-9)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
     assert len(seen) == 8
 
 

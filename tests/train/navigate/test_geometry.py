@@ -65,9 +65,9 @@ def test_sixd_of_a_quarter_turn_by_hand_and_back():
 
 
 def test_euler_angles_of_a_product_of_turns():
-    wanted = [0.1, -0.2, 0.3]
-    x, y, z = (matrix_from_rotation_vector(a * np.eye(3)[i]) for i, a in enumerate(wanted))
-    np.testing.assert_allclose(geometry.euler_from_rotation(torch.from_numpy(z @ y @ x)), wanted, atol=1e-12)
+    expected = [0.1, -0.2, 0.3]
+    x, y, z = (matrix_from_rotation_vector(a * np.eye(3)[i]) for i, a in enumerate(expected))
+    np.testing.assert_allclose(geometry.euler_from_rotation(torch.from_numpy(z @ y @ x)), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 2.0])

@@ -77,18 +77,18 @@ def test_a_dataset_is_known_by_its_checksums(dataset_detect, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("config", "told"),
+    ("config", "message"),
     [
         (Larger(), None),
         (Larger(workers=3), None),
         (Larger(part=Part(size=4)), r"detect.part: got {'size': 4.* expected nothing"),
     ],
 )
-def test_a_run_older_than_a_setting_has_its_default(tmp_path, config, told):
+def test_a_run_older_than_a_setting_has_its_default(tmp_path, config, message):
     run, _ = begin(tmp_path, Settings())
-    if told is None:
+    if message is None:
         return check_settings(run, "detect", config)
-    with pytest.raises(UserError, match=told):
+    with pytest.raises(UserError, match=message):
         check_settings(run, "detect", config)
 
 

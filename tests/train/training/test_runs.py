@@ -202,9 +202,9 @@ def test_a_last_state_that_cannot_be_gone_on_with(tmp_path, fault):
         run.last.write_bytes(contents[fault])
     with pytest.raises(UserError) as caught:
         fit(run, task, 2, resume=True)
-    told = str(caught.value)
-    assert told.startswith(f"{run.last}: ") and "\n" not in told
-    assert ("weight: got (1, 1), expected (1, 2)" if fault == "other" else "--overwrite replaces it") in told
+    message = str(caught.value)
+    assert message.startswith(f"{run.last}: ") and "\n" not in message
+    assert ("weight: got (1, 1), expected (1, 2)" if fault == "other" else "--overwrite replaces it") in message
 
 
 def test_best_keeps_the_best_not_the_last(tmp_path):

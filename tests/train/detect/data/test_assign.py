@@ -8,12 +8,12 @@ ANCHORS = torch.tensor([[[4.0, 4.0], [8.0, 8.0], [16.0, 16.0]], [[32.0, 32.0], [
 SHAPES = [(2, 16, 16), (2, 8, 8)]
 
 
-def targets(*boxes, frame=None, wanted=None):
+def targets(*boxes, frame=None, selected=None):
     count = len(boxes)
     return Targets(
         torch.tensor(boxes).view(-1, 4),
         torch.tensor(frame or [0] * count, dtype=torch.long),
-        torch.tensor(wanted or [True] * count, dtype=torch.bool),
+        torch.tensor(selected or [True] * count, dtype=torch.bool),
     )
 
 
@@ -45,7 +45,7 @@ def test_neighbours_off_the_grid_are_left_out():
 
 
 def test_ignored_labels_are_neither_positive_nor_negative():
-    made = assign(targets([56.0, 56.0, 72.0, 72.0], frame=[1], wanted=[False]), ANCHORS, (8, 16), SHAPES, 1.5)
+    made = assign(targets([56.0, 56.0, 72.0, 72.0], frame=[1], selected=[False]), ANCHORS, (8, 16), SHAPES, 1.5)
     assert len(made[0].row) == 0
     ignored = made[0].ignored.nonzero()
     # 16 px box about (64, 64): cell centres nearer than 16 / 4 + 8 / 2 = 8 px, in the anchor that fits.

@@ -1,4 +1,4 @@
-"""Labels that are wanted, augmentation, order, batches."""
+"""Labels that are selected, augmentation, order, batches."""
 
 from dataclasses import replace
 
@@ -136,25 +136,25 @@ def test_the_eight_turns_differ():
 
 def changed(split, settings, seed=0, index=0):
     image, labels = split.frames.images[index], split.labels[index]
-    pixels, boxes, wanted = augment(
+    pixels, boxes, selected = augment(
         image, labels.boxes, labels.selected, split.radius_px, settings, np.random.default_rng(seed)
     )
-    return image, labels, pixels, boxes, wanted
+    return image, labels, pixels, boxes, selected
 
 
 def test_augmentation_off_changes_nothing(split):
-    image, labels, pixels, boxes, wanted = changed(split, PLAIN)
+    image, labels, pixels, boxes, selected = changed(split, PLAIN)
     np.testing.assert_allclose(pixels, image, atol=1e-3)
     np.testing.assert_array_equal(boxes, labels.boxes)
-    np.testing.assert_array_equal(wanted, labels.selected)
+    np.testing.assert_array_equal(selected, labels.selected)
 
 
 @pytest.mark.parametrize("setting", [{"gain": 0.5}, {"gamma": 0.5}, {"blur_px": 3.0}, {"noise": 5.0}])
 def test_each_augmentation_changes_the_pixels_alone(split, setting):
-    image, labels, pixels, boxes, wanted = changed(split, PLAIN.model_copy(update=setting), 1)
+    image, labels, pixels, boxes, selected = changed(split, PLAIN.model_copy(update=setting), 1)
     assert np.abs(pixels - image).mean() > 0.3
     np.testing.assert_array_equal(boxes, labels.boxes)
-    np.testing.assert_array_equal(wanted, labels.selected)
+    np.testing.assert_array_equal(selected, labels.selected)
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.0, 1.37, 2.5])
@@ -177,12 +177,12 @@ def test_rescaling_moves_boxes_with_the_pixels(factor, place):
 def test_what_rescaling_takes_out_of_range_or_off_the_image_is_wanted_no_more(split):
     for seed in range(8):
         settings = PLAIN.model_copy(update={"scale": (0.5, 2.0)})
-        _, labels, pixels, boxes, wanted = changed(split, settings, seed)
+        _, labels, pixels, boxes, selected = changed(split, settings, seed)
         assert pixels.shape == split.frames.images[0].shape
         centre, radius = (boxes[:, :2] + boxes[:, 2:]) / 2, np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(1)) / 2
         assert 0 < len(boxes) <= len(labels.boxes)
-        assert ((centre[wanted] >= 0) & (centre[wanted] < 96)).all()
-        assert (radius[wanted] >= split.radius_px[0]).all() and wanted.any()
+        assert ((centre[selected] >= 0) & (centre[selected] < 96)).all()
+        assert (radius[selected] >= split.radius_px[0]).all() and selected.any()
 
 
 def test_stretching_clips_the_given_share_at_most(split):

@@ -78,8 +78,8 @@ def test_a_size_that_no_stride_divides():
 def run_folder(tmp_path_factory):
     """A run as training leaves it, with lively weights."""
     run = runs.RunFolder(tmp_path_factory.mktemp("runs") / "detect" / "a")
-    told = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [4, 8, 16]}
-    runs.save_weights(run.best, told, lively())
+    message = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [4, 8, 16]}
+    runs.save_weights(run.best, message, lively())
     text = "detect:\n  width: 0.125\n  in_channels: 1\n  attention: cbam_identity\n  strides: [4, 8, 16]\n"
     run.config.write_text(text, encoding="utf-8")
     write_metrics(run.root, {"test/threshold": 0.4})
@@ -157,16 +157,16 @@ def test_no_batch_norm_remains_and_the_facts_are_inside(exported):
     kinds = {node.op_type for node in model.graph.node}
     assert "Conv" in kinds
     assert "BatchNormalization" not in kinds
-    told = json.loads((exported / "detector.json").read_text())
+    message = json.loads((exported / "detector.json").read_text())
     inside = {entry.key: json.loads(entry.value) for entry in model.metadata_props}
     for key in ("anchors_px", "strides", "score_threshold", "input", "outputs", "nms_iou"):
-        assert inside[key] == told[key], key
-    assert told["score_threshold"] == 0.4
-    assert told["strides"] == [4, 8, 16]
-    np.testing.assert_allclose(told["anchors_px"], lively().anchors, rtol=1e-6)
-    assert told["compared_on"] == "validation frames"
-    assert set(told["files"]) == {"detector.onnx", "detector.xml", "detector.bin"}
-    for found in told["differences_from_torch"].values():
+        assert inside[key] == message[key], key
+    assert message["score_threshold"] == 0.4
+    assert message["strides"] == [4, 8, 16]
+    np.testing.assert_allclose(message["anchors_px"], lively().anchors, rtol=1e-6)
+    assert message["compared_on"] == "validation frames"
+    assert set(message["files"]) == {"detector.onnx", "detector.xml", "detector.bin"}
+    for found in message["differences_from_torch"].values():
         assert found["largest_px"] <= 1e-3
 
 
@@ -230,9 +230,9 @@ def test_int8_is_judged_and_kept_only_if_worth_it(
     assert verdict.kept == (most_loss > 0)
     assert 0 <= verdict.ap50_paper_int8 <= 1 and verdict.float_s > 0
     assert (tmp_path / "a" / "detector-int8.onnx").exists() == verdict.kept
-    told = json.loads((tmp_path / "a" / "detector.json").read_text())
-    assert told["int8"]["kept"] == verdict.kept
-    assert ("detector-int8.onnx" in told["files"]) == verdict.kept
+    message = json.loads((tmp_path / "a" / "detector.json").read_text())
+    assert message["int8"]["kept"] == verdict.kept
+    assert ("detector-int8.onnx" in message["files"]) == verdict.kept
     assert not (tmp_path / "a" / "detector.xml").exists()
 
 

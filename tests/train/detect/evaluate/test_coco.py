@@ -25,10 +25,10 @@ def our_average_precisions(found, labels):
     return both
 
 
-def labels_of(boxes, wanted):
+def labels_of(boxes, selected):
     boxes = np.asarray(boxes, np.float64).reshape(-1, 4)
     radius = np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)) / 2
-    return FrameLabels(boxes, radius, np.zeros((len(boxes), 5)), wanted, wanted)
+    return FrameLabels(boxes, radius, np.zeros((len(boxes), 5)), selected, selected)
 
 
 def random_frames(seed, n_frames, crowd_px, on_grid, ignored_share, score_levels):
@@ -77,7 +77,7 @@ def test_ignored_labels_that_absorb_any_number(seed, crowd_px, score_levels):
 
 
 def test_where_ours_and_cocos_ignored_labels_differ():
-    """A wanted label found, and two better detections on an ignored one: COCO counts the second of these as false."""
+    """A selected label found, and two better detections on an ignored one: COCO counts the second of these as false."""
     square = [0.0, 0.0, 10.0, 10.0]
     labels = [labels_of([square, [50, 50, 60, 60]], np.array([False, True]))]
     found = [Detections(np.array([square, square, [50, 50, 60, 60]]), np.array([0.9, 0.8, 0.7]))]

@@ -26,22 +26,22 @@ def test_a_detector_that_finds_what_shows(dataset_detect, tmp_path):
     dataset = open_dataset(dataset_detect)
     box = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
     labels = read_labels(dataset, box, "test")
-    wanted = labels[selected(labels, SELECTIONS["visible"])]
-    large = wanted["radius_px"] > 3
+    chosen = labels[selected(labels, SELECTIONS["visible"])]
+    large = chosen["radius_px"] > 3
     table = {
-        name: wanted[column].to_numpy() for name, column in zip(("x0_px", "y0_px", "x1_px", "y1_px"), box, strict=True)
+        name: chosen[column].to_numpy() for name, column in zip(("x0_px", "y0_px", "x1_px", "y1_px"), box, strict=True)
     }
-    table |= {"frame_id": wanted["frame_id"].tolist(), "score": np.where(large, 0.9, 0.2)}
+    table |= {"frame_id": chosen["frame_id"].tolist(), "score": np.where(large, 0.9, 0.2)}
     pq.write_table(pa.table(table), tmp_path / "detections.parquet")
     (tmp_path / "metrics.json").write_text(json.dumps({"test/threshold": 0.5}))
-    frame = wanted["frame_id"].iloc[0]
+    frame = chosen["frame_id"].iloc[0]
     contrast.main(dataset_detect, tmp_path, frame, tmp_path / "out")
     result = json.loads((tmp_path / "out/contrast.json").read_text())
     every = result["auc"]["2-50 px"]
-    assert every["labels"] == len(wanted) and every["found"] == pytest.approx(large.mean(), abs=0.02)
+    assert every["labels"] == len(chosen) and every["found"] == pytest.approx(large.mean(), abs=0.02)
     assert every["radius_px"] > 0.98 and every["contrast"] == 0.5
     assert result["auc"]["2-3 px"]["found"] < 0.1 and result["auc"]["5-10 px"]["found"] == 1
-    assert [row["labels"] for row in result["found_by_contrast"]][-1] == len(wanted)
+    assert [row["labels"] for row in result["found_by_contrast"]][-1] == len(chosen)
     assert result["judged"]["visible"]["precision"] > 0.98
     assert result["judged"]["paper"]["labels"] > result["judged"]["visible"]["labels"]
     assert (tmp_path / "out/contrast.jpg").stat().st_size > 5000

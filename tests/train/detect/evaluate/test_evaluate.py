@@ -76,10 +76,10 @@ def test_other_labels_another_threshold_another_split(run, dataset_detect, tmp_p
 
 @pytest.mark.usefixtures("no_pictures")
 def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path):
-    judged = ("evaluate", "--run", run, "--dataset", dataset_detect, "--scale", 1, "--scale", 2)
-    call(*judged, "--out", tmp_path / "own")
-    call(*judged, "--choose-threshold", "--out", tmp_path / "chosen")
-    call(*judged, "--split", "val", "--out", tmp_path / "val")
+    evaluate_run = ("evaluate", "--run", run, "--dataset", dataset_detect, "--scale", 1, "--scale", 2)
+    call(*evaluate_run, "--out", tmp_path / "own")
+    call(*evaluate_run, "--choose-threshold", "--out", tmp_path / "chosen")
+    call(*evaluate_run, "--split", "val", "--out", tmp_path / "val")
     own, chosen, val = (figures(tmp_path / name) for name in ("own", "chosen", "val"))
     assert own["test/threshold"] == figures(run)["test/threshold"] != chosen["test/threshold"]
     assert own["test/ap50_paper"] == chosen["test/ap50_paper"] != figures(run)["test/ap50_paper"]
@@ -89,14 +89,14 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
     table = call("compare", run, tmp_path / "chosen", "--out", tmp_path / "both")
     assert "| 1 |" in table and "| 1 2 |" in table
     # The threshold is the best on val, by the same detections that --split val finds.
-    call(*judged, "--split", "val", "--threshold", chosen["test/threshold"], "--out", tmp_path / "best")
+    call(*evaluate_run, "--split", "val", "--threshold", chosen["test/threshold"], "--out", tmp_path / "best")
     assert figures(tmp_path / "best")["val/f1"] >= val["val/f1"]
     # Another operating point on the same val: the words, the precision wished, and no less recall.
     wished = ("--set", f"detect.evaluation.min_precision={val['val/precision'] / 2}")
-    call(*judged, "--choose-threshold", *wished, "--out", tmp_path / "recall")
+    call(*evaluate_run, "--choose-threshold", *wished, "--out", tmp_path / "recall")
     assert "of highest recall at a precision of at least" in (tmp_path / "recall/report.md").read_text()
     more = figures(tmp_path / "recall")
-    call(*judged, "--split", "val", "--threshold", more["test/threshold"], "--out", tmp_path / "val-recall")
+    call(*evaluate_run, "--split", "val", "--threshold", more["test/threshold"], "--out", tmp_path / "val-recall")
     assert figures(tmp_path / "val-recall")["val/precision"] >= val["val/precision"] / 2
     assert figures(tmp_path / "val-recall")["val/recall"] >= val["val/recall"]
     for other in (("--threshold", 0.5), ("--split", "val"), ("--images", tmp_path)):
@@ -125,7 +125,7 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (["--split", "tset"], "--split: split: got tset, expected one of train, val, test"),
         (["--threshold", "2"], "--threshold: score: got 2.0, expected a number from 0 to 1"),
@@ -140,11 +140,11 @@ def test_runs_side_by_side(run, dataset_detect, tmp_path):
         (["--min-size", "8"], "--min-size: options: got no --images"),
     ],
 )
-def test_wrong_options_in_one_line(run, dataset_detect, options, told, monkeypatch):
+def test_wrong_options_in_one_line(run, dataset_detect, options, message, monkeypatch):
     monkeypatch.chdir(run)
     with pytest.raises(UserError) as error:
         call("evaluate", "--run", run, "--dataset", dataset_detect, *options)
-    assert told in str(error.value)
+    assert message in str(error.value)
 
 
 def test_folders_that_are_no_finished_runs(run, dataset_detect, tmp_path):

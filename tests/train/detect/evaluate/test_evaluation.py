@@ -24,13 +24,13 @@ def circles(*rows):
     return np.stack([x - radius, y - radius, x + radius, y + radius], axis=1)
 
 
-def labels(*rows, wanted=None, depth_ratio=None):
+def labels(*rows, selected=None, depth_ratio=None):
     boxes = circles(*rows)
     radius = (boxes[:, 2] - boxes[:, 0]) / 2
-    wanted = np.ones(len(boxes), bool) if wanted is None else np.array(wanted)
+    selected = np.ones(len(boxes), bool) if selected is None else np.array(selected)
     ellipses = np.stack([*(boxes[:, :2] + radius[:, None]).T, radius, radius, 0 * radius], axis=1)
     ratio = None if depth_ratio is None else np.array(depth_ratio)
-    return FrameLabels(boxes, radius, ellipses, wanted, np.ones(len(boxes), bool), ratio)
+    return FrameLabels(boxes, radius, ellipses, selected, np.ones(len(boxes), bool), ratio)
 
 
 def found(*rows):
@@ -101,7 +101,7 @@ def test_altitude_and_sun_bins_hold_whole_frames():
 def test_freshness_has_recall_alone():
     ratio = [0.05, 0.05, 0.12, np.nan, 0.01]
     truth = [
-        labels(*[(20 + 30 * k, 20, 5) for k in range(5)], depth_ratio=ratio, wanted=[True, True, True, True, False])
+        labels(*[(20 + 30 * k, 20, 5) for k in range(5)], depth_ratio=ratio, selected=[True, True, True, True, False])
     ]
     ours = [found((20, 20, 5, 0.9), (50, 20, 5, 0.2), (80, 20, 5, 0.9))]
     evaluation = evaluate_detections(ours, truth, facts("a"), 0.5, radius_px=(2.0, 50.0))
@@ -151,13 +151,13 @@ def test_resampled_average_precision_is_that_of_the_frames_repeated(n_detections
     drawn = average_precisions(matches, resamples)
     for weights, value in zip(resamples.weights, drawn, strict=True):
         times = weights[resamples.of_row].astype(int)
-        rows, wanted = (np.repeat(np.arange(len(f)), times[f]) for f in (matches.frame, matches.selected_frame))
+        rows, selected = (np.repeat(np.arange(len(f)), times[f]) for f in (matches.frame, matches.selected_frame))
         repeated = Matches(
             matches.scores[rows],
             matches.outcome[rows],
             matches.label[rows],
             matches.frame[rows],
-            matches.selected_frame[wanted],
+            matches.selected_frame[selected],
         )
         assert value == pytest.approx(curve(repeated).ap_paper(), abs=tolerance)
 

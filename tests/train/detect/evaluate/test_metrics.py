@@ -21,10 +21,10 @@ def square(x, y, side=10.0):
     return [x, y, x + side, y + side]
 
 
-def labels(boxes, wanted=None):
+def labels(boxes, selected=None):
     boxes = np.array(boxes, float).reshape(-1, 4)
-    wanted = np.ones(len(boxes), bool) if wanted is None else np.array(wanted)
-    return FrameLabels(boxes, (boxes[:, 2] - boxes[:, 0]) / 2, np.zeros((len(boxes), 5)), wanted, wanted)
+    selected = np.ones(len(boxes), bool) if selected is None else np.array(selected)
+    return FrameLabels(boxes, (boxes[:, 2] - boxes[:, 0]) / 2, np.zeros((len(boxes), 5)), selected, selected)
 
 
 def detections(boxes, scores=None):
@@ -36,7 +36,7 @@ def match_frame(found, truth, match_iou):
     return find_overlaps([found], [truth], [[100, 100]]).match(match_iou, (2.0, 50.0)).label
 
 
-def judge(found, truth):
+def match_one(found, truth):
     return match_split([found], [truth], (100, 100), 0.5, (2.0, 50.0))
 
 
@@ -52,14 +52,14 @@ def test_a_detection_takes_the_free_label_of_highest_overlap():
 
 def test_wanted_labels_come_before_ignored_ones():
     truth = labels([square(0, 0), square(2, 0)], [False, True])
-    # The first lies exactly on the ignored label, yet overlaps the wanted one enough; the second only the ignored.
+    # The first lies exactly on the ignored label, yet overlaps the selected one enough; the second only the ignored.
     assert match_frame(detections([square(0, 0), square(-1, 0), square(0, 0)]), truth, 0.5).tolist() == [1, -2, -2]
 
 
 def test_what_no_one_can_judge_is_left_out_unless_strict():
     truth = labels([square(10, 10), square(40, 40)], [True, False])
     found = detections([square(10, 10), square(40, 40), square(-9, 20), square(70, 70, 3.0), square(70, 20)])
-    matches = judge(found, truth)
+    matches = match_one(found, truth)
     # On a worn crater, centre off the image, radius 1.5 px: ignored. In the open: false.
     assert matches.outcome.tolist() == [FOUND, IGNORED, IGNORED, IGNORED, FALSE]
     assert matches.strict().outcome.tolist() == [FOUND, FALSE, FALSE, FALSE, FALSE]
@@ -76,14 +76,14 @@ def test_at_the_edge_only_what_lies_on_no_crater_is_false():
     assert overlaps.match(0.5, edge_range((4.0, 50.0))).outcome.tolist() == [FOUND, IGNORED, FALSE, IGNORED]
 
 
-def outcomes(*kinds, wanted):
+def outcomes(*kinds, selected):
     count = len(kinds)
     none = np.zeros(count, np.intp)
-    return Matches(np.linspace(0.9, 0.1, count), np.array(kinds, np.int8), none, none, np.zeros(wanted, np.intp))
+    return Matches(np.linspace(0.9, 0.1, count), np.array(kinds, np.int8), none, none, np.zeros(selected, np.intp))
 
 
 def test_average_precision_by_hand():
-    points = curve(outcomes(FOUND, FALSE, FOUND, FALSE, wanted=4))
+    points = curve(outcomes(FOUND, FALSE, FOUND, FALSE, selected=4))
     assert points.precision.tolist() == pytest.approx([1, 1 / 2, 2 / 3, 1 / 2])
     assert points.recall.tolist() == [0.25, 0.25, 0.5, 0.5]
     assert points.ap_paper() == pytest.approx(0.25 * 1 + 0.25 * 2 / 3)
@@ -93,7 +93,7 @@ def test_average_precision_by_hand():
 
 
 def test_only_the_envelope_takes_the_best_later_precision():
-    points = curve(outcomes(FALSE, FOUND, FOUND, wanted=2))
+    points = curve(outcomes(FALSE, FOUND, FOUND, selected=2))
     assert points.ap_envelope() == pytest.approx(2 / 3)
     # Precisions 0, 1/2, 2/3 at recalls 0, 1/2, 1.
     assert points.ap_paper() == pytest.approx(0.5 * 1 / 2 + 0.5 * 2 / 3)
@@ -111,8 +111,8 @@ def test_the_papers_sum_takes_equal_scores_together():
 
 
 def test_ignored_detections_do_not_move_the_curve():
-    with_ignored = curve(outcomes(FOUND, IGNORED, FALSE, FOUND, IGNORED, wanted=2))
-    without = curve(outcomes(FOUND, FALSE, FOUND, wanted=2))
+    with_ignored = curve(outcomes(FOUND, IGNORED, FALSE, FOUND, IGNORED, selected=2))
+    without = curve(outcomes(FOUND, FALSE, FOUND, selected=2))
     assert with_ignored.ap_paper() == pytest.approx(without.ap_paper())
 
 
@@ -135,18 +135,18 @@ def test_threshold_of_most_recall_at_a_precision():
 
 
 def test_nothing_found_and_nothing_wanted():
-    none = judge(detections([]), labels([square(0, 0)]))
+    none = match_one(detections([]), labels([square(0, 0)]))
     assert curve(none).ap_paper() == 0
     assert curve(none).ap_coco101() == 0
     assert curve(none).best_threshold() == 1.0
     assert at_threshold(none, 0.5) == (0, 0, 0)
-    nothing_wanted = judge(detections([square(20, 20)]), labels([]))
-    assert curve(nothing_wanted).ap_paper() == 0
+    nothing_selected = match_one(detections([square(20, 20)]), labels([]))
+    assert curve(nothing_selected).ap_paper() == 0
 
 
 def test_figures_of_both_accounts():
     truth = labels([square(0, 0, 8), square(20, 0, 8), square(40, 40, 30)], [True, True, False])
-    result = figures(judge(detections([square(0, 0, 8), square(40, 40, 30)], [0.9, 0.8]), truth), threshold=0.5)
+    result = figures(match_one(detections([square(0, 0, 8), square(40, 40, 30)], [0.9, 0.8]), truth), threshold=0.5)
     assert result["recall"] == result["strict/recall"] == result["ap50_paper"] == result["ap50_envelope"] == 0.5
     assert "ap50" not in result
     assert (result["precision"], result["strict/precision"]) == (1, 0.5)

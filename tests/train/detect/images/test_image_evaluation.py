@@ -1,4 +1,4 @@
-"""Judging on labelled images: what is wanted, what does not count, and what is left in the folder."""
+"""Judging on labelled images: what is expected, what does not count, and what is left in the folder."""
 
 import json
 from pathlib import Path
@@ -30,7 +30,7 @@ def detections(boxes):
 @pytest.mark.parametrize(
     ("found", "precision", "recall"),
     [
-        # The wanted one alone; then with finds of what is ignored, which change nothing.
+        # The expected one alone; then with finds of what is ignored, which change nothing.
         ([[10, 10, 20, 20]], 1.0, 1.0),
         ([[10, 10, 20, 20], [50, 50, 57, 57], [96, 10, 116, 30]], 1.0, 1.0),
         # Small ones that find nothing do not count, large ones are false.
@@ -40,7 +40,7 @@ def detections(boxes):
     ],
 )
 def test_small_and_outer_craters_do_not_count(found, precision, recall):
-    # 10 px wanted, 7 px too small, the third centred off the image.
+    # 10 px expected, 7 px too small, the third centred off the image.
     images = given([[10, 10, 20, 20], [50, 50, 57, 57], [96, 10, 116, 30]])
     figures = evaluate_detections_in_images(images, detections(found), 0.1, 8.0).figures()
     assert (figures["precision"], figures["recall"], figures["labels"]) == (precision, recall, 1)
@@ -74,14 +74,14 @@ def test_a_folder_is_judged(run, folder, tmp_path):
     figures = evaluate_images(run, settings_of(run), folder, out, Tiling(tile_px=96, overlap_px=32))
     written = json.loads((out / "metrics.json").read_text())
     assert written["threshold"] == THRESHOLD and written["frames"] == 2
-    wanted = [image.selected(8.0).sum() for image in read_images(folder).images]
-    assert written["labels"] == sum(wanted) > 40
+    expected = [image.selected(8.0).sum() for image in read_images(folder).images]
+    assert written["labels"] == sum(expected) > 40
     assert 0 < written["ap50_paper"] < 1 and written["oracle/f1"] >= written["f1"] > 0
     assert written["ap50_paper"] == pytest.approx(figures["ap50_paper"])
     for name in ("report.md", "precision_recall.png", "detections.png", "detections.parquet", "crops.png"):
         assert (out / name).stat().st_size > 0, name
     assert "oracle" in (out / "report.md").read_text()
-    # What is found does not hang on the least size, what is wanted does.
+    # What is found does not hang on the least size, what is expected does.
     larger = evaluate_images(
         run, settings_of(run), folder, tmp_path / "larger", Tiling(tile_px=96, overlap_px=32), 30.0, 0.5
     )
@@ -105,14 +105,14 @@ def test_the_command(run, folder, tmp_path):
     assert result.exit_code == 0, result.output
     written = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert (written["scales"], written["min_size_px"], written["threshold"]) == ("0.5", 20, 0.02)
-    for option, value, told in (
+    for option, value, message in (
         ("--dataset", "data", "--dataset: options: got together with --images, expected only one of them"),
         ("--split", "test", "--split: options: got together with --images, expected only one of them"),
         ("--set", "detect.labels.selection=all", "--set: detect.labels.selection: got together with --images"),
         ("--scale", "9", "--scale: factor: got [9.0]"),
     ):
         refused = CliRunner().invoke(app, [*arguments, option, value])
-        assert isinstance(refused.exception, UserError) and told in str(refused.exception)
+        assert isinstance(refused.exception, UserError) and message in str(refused.exception)
 
 
 def test_the_runs_own_folder_keeps_its_figures(run, folder):
@@ -130,8 +130,8 @@ def test_compare_shows_images(run, folder, tmp_path):
     figures = evaluate_images(run, settings_of(run), folder, tmp_path / "a", Tiling(96, 32, (0.5, 1.0)), 12.0)
     text = compare_folders([tmp_path / "a"], tmp_path / "both")
     cells = [cell.strip() for cell in text.splitlines()[-1].strip("| ").split("|")]
-    wanted = ["images", "images", "-", "real images", "from 12.0 px", "0.5 1.0", "2", str(figures["labels"])]
-    assert cells[1:9] == wanted
+    expected = ["images", "images", "-", "real images", "from 12.0 px", "0.5 1.0", "2", str(figures["labels"])]
+    assert cells[1:9] == expected
     assert cells[9].startswith(f"{figures['ap50_paper']:.3f} (a.png ") and "-" not in cells[10:16]
     assert f"{figures['lowest_ap50_paper_by_radius']:.3f}" == cells[16]
 
@@ -140,7 +140,7 @@ def test_compare_shows_images(run, folder, tmp_path):
 def test_images_are_looked_at_as_the_run_was_judged(folder, tmp_path):
     run = store_run(tmp_path / "runs", "evaluation.scales=[1,2]")
     arguments = ["detect", "evaluate", "--run", str(run), "--images", str(folder), "--out"]
-    for name, given, wanted in (("own", (), "1.0 2.0"), ("other", ("--scale", "0.5"), "0.5")):
+    for name, given, expected in (("own", (), "1.0 2.0"), ("other", ("--scale", "0.5"), "0.5")):
         result = CliRunner().invoke(app, [*arguments, str(tmp_path / name), *given])
         assert result.exit_code == 0, result.output
-        assert json.loads((tmp_path / name / "metrics.json").read_text())["scales"] == wanted
+        assert json.loads((tmp_path / name / "metrics.json").read_text())["scales"] == expected

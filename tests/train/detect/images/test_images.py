@@ -42,7 +42,7 @@ def test_tables_with_commas_and_tabs(tmp_path, separator):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "line 1: got no header, expected a column X"),
         ("ID,X,Y,W\n0,1,2,3", "line 1: got ID,X,Y,W, expected a column H"),
@@ -53,12 +53,12 @@ def test_tables_with_commas_and_tabs(tmp_path, separator):
         ("X,Y,W,H\n1e9,2,3,4", "line 2: got"),
     ],
 )
-def test_broken_tables_are_named_with_their_line(tmp_path, text, told):
+def test_broken_tables_are_named_with_their_line(tmp_path, text, message):
     path = tmp_path / "a.txt"
     path.write_text(text)
     with pytest.raises(UserError) as caught:
         read_table(path)
-    assert f"a.txt: {told}" in str(caught.value)
+    assert f"a.txt: {message}" in str(caught.value)
 
 
 def test_tables_that_are_missing_or_no_text(tmp_path):
@@ -107,7 +107,7 @@ def test_coco(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"images": [{"id": 7, "file_name": "../x.png"}]}, r"images\[0\].file_name: got ../x.png"),
         ({"images": [{"id": 7, "file_name": "/etc/passwd"}]}, r"images\[0\].file_name: got /etc/passwd"),
@@ -124,8 +124,8 @@ def test_coco(tmp_path):
         ({"annotations": [{"image_id": 7, "category_id": 1}]}, r"annotations\[0\].bbox: got None"),
     ],
 )
-def test_odd_coco_files_are_refused_in_one_line(tmp_path, changes, told):
-    with pytest.raises(UserError, match=told) as caught:
+def test_odd_coco_files_are_refused_in_one_line(tmp_path, changes, message):
+    with pytest.raises(UserError, match=message) as caught:
         read_images(coco(tmp_path, **changes))
     assert "\n" not in str(caught.value)
 
@@ -144,15 +144,15 @@ def test_coco_beside_a_folder_of_images(tmp_path, folder):
     root = tmp_path / "given"
     path = coco(root / "annotations", images=[{"id": 7, "file_name": "a.png"}])
     path = path.rename(path.with_name("instances_train2017.json"))
-    wanted = picture(root / folder / "a.png")
-    assert read_images(path).images[0].path == wanted.resolve()
+    expected = picture(root / folder / "a.png")
+    assert read_images(path).images[0].path == expected.resolve()
     # Names that lead out of these folders, and links, stay refused, whatever is there.
     picture(tmp_path / "outside.png")
-    wanted.unlink()
-    wanted.symlink_to(tmp_path / "outside.png")
+    expected.unlink()
+    expected.symlink_to(tmp_path / "outside.png")
     with pytest.raises(UserError, match=r"file_name: got a.png"):
         read_images(path)
-    wanted.unlink()
+    expected.unlink()
     with pytest.raises(UserError, match=r"annotations/a.png: image: got no such file"):
         read_images(path)
     coco(root / "annotations", images=[{"id": 7, "file_name": "../images/b.png"}]).replace(path)

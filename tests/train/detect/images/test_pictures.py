@@ -29,7 +29,7 @@ def tiff(path, bands, dtype, **more):
 
 
 @pytest.mark.parametrize(
-    ("dtype", "nodata", "told"),
+    ("dtype", "nodata", "reported"),
     [
         ("float32", ISIS_NULL, None),
         ("float32", ISIS_NULL, ISIS_NULL),
@@ -43,10 +43,10 @@ def tiff(path, bands, dtype, **more):
         ("uint16", 65535, 65535),
     ],
 )
-def test_pixels_without_data_are_black_and_leave_the_rest_its_range(tmp_path, dtype, nodata, told):
+def test_pixels_without_data_are_black_and_leave_the_rest_its_range(tmp_path, dtype, nodata, reported):
     pixels = ramp()
     pixels[:8] = nodata
-    path = tiff(tmp_path / "n.tif", pixels, dtype, nodata=told)
+    path = tiff(tmp_path / "n.tif", pixels, dtype, nodata=reported)
     read = read_grey(path)
     assert (read[:8] == 0).all()
     rest = read[8:]

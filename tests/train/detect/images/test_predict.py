@@ -85,9 +85,9 @@ def test_the_named_system_is_the_moons():
 def test_places_and_diameters_on_the_moon(tmp_path, crs, transform, place, diameter_m):
     reference = read_georeference(geotiff(tmp_path / "g.tif", crs, transform))
     (feature,) = features("g.tif", Detections(np.array([[10.0, 10, 30, 30]]), np.array([0.5])), reference)
-    told = feature["properties"]
-    assert (told["longitude_deg"] % 360, told["latitude_deg"]) == pytest.approx(place, abs=1e-6)
-    assert told["diameter_m"] == pytest.approx(diameter_m, rel=1e-4)
+    reported = feature["properties"]
+    assert (reported["longitude_deg"] % 360, reported["latitude_deg"]) == pytest.approx(place, abs=1e-6)
+    assert reported["diameter_m"] == pytest.approx(diameter_m, rel=1e-4)
     ring = np.array(feature["geometry"]["coordinates"][0])
     assert np.ptp(ring[:, 0]) < 5.0, "torn at 180 degrees"
     x, y = ring.T - ring[0][:, None]

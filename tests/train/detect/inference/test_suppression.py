@@ -31,8 +31,8 @@ def test_a_batch_keeps_the_boxes_that_opencv_keeps(count):
         kept = suppress_batch(boxes, scores, allowed, threshold)
         for frame, found in enumerate(kept):
             own = allowed[frame]
-            wanted = suppress(boxes[frame][own].double(), scores[frame][own].double(), threshold, count)
-            assert found[found >= 0].tolist() == torch.nonzero(own)[:, 0][torch.from_numpy(wanted)].tolist()
+            expected = suppress(boxes[frame][own].double(), scores[frame][own].double(), threshold, count)
+            assert found[found >= 0].tolist() == torch.nonzero(own)[:, 0][torch.from_numpy(expected)].tolist()
 
 
 def test_nothing_to_suppress():

@@ -88,13 +88,13 @@ def test_an_image_of_one_tile_gets_what_frames_get(detector):
     images = np.random.default_rng(3).integers(0, 256, (2, 128, 128), np.uint8)
     frames = detect_at_scales(detector, images)
     assert min(len(part.scores) for part in frames) > 20
-    for image, wanted in zip(images, frames, strict=True):
+    for image, expected in zip(images, frames, strict=True):
         found = detect_image(detector, image, Tiling(tile_px=128))
-        assert found.scores == pytest.approx(wanted.scores, abs=1e-6)
+        assert found.scores == pytest.approx(expected.scores, abs=1e-6)
         # One image or two in a batch round differently, so that nearly equal scores may change places.
-        apart_px = np.abs(found.boxes[:, None] - wanted.boxes).max(axis=2)
+        apart_px = np.abs(found.boxes[:, None] - expected.boxes).max(axis=2)
         assert apart_px.min(axis=0).max() < 1e-3 and apart_px.min(axis=1).max() < 1e-3
-        assert found.scores[apart_px.argmin(axis=0)] == pytest.approx(wanted.scores, abs=1e-6)
+        assert found.scores[apart_px.argmin(axis=0)] == pytest.approx(expected.scores, abs=1e-6)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 300), (100, 64), (33, 257)])
@@ -129,9 +129,9 @@ def test_many_boxes_are_suppressed_as_few_are():
     boxes = np.concatenate([corner, corner + rng.uniform(4, 60, (6_000, 1))], axis=1)
     scores = rng.permutation(6_000) / 6_000 + 1e-5
     kept = suppress_in_blocks(boxes, scores, 0.3)
-    wanted = suppress(boxes, scores, 0.3, len(boxes))
-    assert 1000 < len(wanted) < 5_500
-    assert np.array_equal(kept, wanted)
+    expected = suppress(boxes, scores, 0.3, len(boxes))
+    assert 1000 < len(expected) < 5_500
+    assert np.array_equal(kept, expected)
 
 
 def test_long_boxes_go_before_suppression(detector):

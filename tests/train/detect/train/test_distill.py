@@ -108,8 +108,8 @@ def settings(*more):
 def teacher_path(tmp_path_factory):
     path = tmp_path_factory.mktemp("teacher") / "best.ckpt"
     torch.manual_seed(1)
-    told = {"in_channels": 1, "width": 0.25, "attention": "none", "strides": [4, 8, 16]}
-    runs.save_weights(path, told, outspoken(torch.rand(3, 3, 2) + 6))
+    reported = {"in_channels": 1, "width": 0.25, "attention": "none", "strides": [4, 8, 16]}
+    runs.save_weights(path, reported, outspoken(torch.rand(3, 3, 2) + 6))
     return path
 
 
@@ -131,8 +131,8 @@ def test_the_teacher_adds_to_the_loss(teacher_path, dataset_detect):
     network = build_network(config, label_sizes(split), dataset_detect).eval()
     batch = next(iter(loader(EvaluationFrames(split), config)))
     costs = []
-    for told in (None, teacher):
-        task = DetectTask(network, config, split, split, 0, told)
+    for reported in (None, teacher):
+        task = DetectTask(network, config, split, split, 0, reported)
         task.log_dict = lambda *_, **__: None
         costs.append(task.training_step(batch, 0).item())
     box, confidence = distill_loss(network(batch[0]), teacher(batch[0]), network.anchors, network.strides)

@@ -14,12 +14,12 @@ LN2 = math.log(2)
 """Cross-entropy of a raw objectness of 0, whatever its target."""
 
 
-def labels(*boxes, frame=None, wanted=None):
+def labels(*boxes, frame=None, selected=None):
     count = len(boxes)
     return Targets(
         torch.tensor(boxes, dtype=torch.float32).view(-1, 4),
         torch.tensor(frame or [0] * count, dtype=torch.long),
-        torch.tensor(wanted or [True] * count, dtype=torch.bool),
+        torch.tensor(selected or [True] * count, dtype=torch.bool),
     )
 
 
@@ -81,7 +81,7 @@ def test_a_frame_without_labels_beside_one_with(empty):
     assert box.item() == pytest.approx(2 * (1 + 64 / 320) / 3, abs=1e-5)
     assert confidence.item() == pytest.approx(LN2, rel=1e-5)
     (box + confidence).backward()
-    # The empty frame is told only that it is empty: s(0) / 96 at every predictor.
+    # The empty frame is reported only that it is empty: s(0) / 96 at every predictor.
     assert raw.grad[empty, ..., :4].abs().max() == 0
     torch.testing.assert_close(raw.grad[empty, ..., 4], torch.full((3, 4, 4), 0.5 / 96))
     assert raw.grad[1 - empty, 0, 1, 1, 4] < 0
@@ -126,7 +126,7 @@ def test_500_craters_on_one_spot():
 def test_no_gradient_at_predictors_on_ignored_craters():
     raw = raw_zero()
     # 16 px about (16, 16): the four cells around it, 4 px off, within the reach of 16 / 4 + 8 / 2 = 8 px.
-    box, confidence = losses(raw, labels([8, 8, 24, 24], wanted=[False]))
+    box, confidence = losses(raw, labels([8, 8, 24, 24], selected=[False]))
     (box + confidence).backward()
     ignored = torch.zeros(3, 4, 4, dtype=torch.bool)
     ignored[1, 1:3, 1:3] = True
@@ -138,7 +138,7 @@ def test_no_gradient_at_predictors_on_ignored_craters():
 def test_a_wanted_crater_is_learned_where_an_ignored_one_lies_on_it():
     raw = raw_zero()
     one = [8, 8, 16, 16]
-    box, confidence = losses(raw, labels(one, one, wanted=[True, False]))
+    box, confidence = losses(raw, labels(one, one, selected=[True, False]))
     (box + confidence).backward()
     assert box.item() == pytest.approx(2 * (1 + 64 / 320) / 3, abs=1e-5)
     # Its box fits (IoU 1), so that its objectness is drawn up to 1: (s(0) - 1) / 48.

@@ -71,8 +71,8 @@ def test_a_run_stores_the_selection_that_it_used(finished):
     stored = parse_yaml(finished.config.read_text(), "")["detect"]["labels"]
     assert stored == {**visible, "radius_px": [2.0, None]}
     metrics = json.loads(finished.metrics.read_text())
-    told = {key.removeprefix("labels/"): value for key, value in metrics.items() if key.startswith("labels/")}
-    assert told == {**visible, "min_radius_px": 2.0, "max_radius_px": 50.0}
+    message = {key.removeprefix("labels/"): value for key, value in metrics.items() if key.startswith("labels/")}
+    assert message == {**visible, "min_radius_px": 2.0, "max_radius_px": 50.0}
     # The stored file alone resolves to the same.
     assert config_of_run(finished.root).labels == settings().labels
 
@@ -86,7 +86,7 @@ def test_a_selection_is_named_and_its_thresholds_replaced():
 
 
 @pytest.mark.parametrize(
-    ("setting", "told"),
+    ("setting", "message"),
     [
         ("selection=visibel", "detect.labels.selection: got 'visibel', expected visible (nearest known)"),
         ("selection=3", "detect.labels.selection: got 3, expected "),
@@ -95,10 +95,10 @@ def test_a_selection_is_named_and_its_thresholds_replaced():
         ("min_depth_ratio=deep", "detect.labels.min_depth_ratio: got 'deep', expected "),
     ],
 )
-def test_an_unknown_selection_is_refused_in_one_line(setting, told):
+def test_an_unknown_selection_is_refused_in_one_line(setting, message):
     with pytest.raises(UserError) as caught:
         settings(f"detect.labels.{setting}")
-    assert told in str(caught.value) and "\n" not in str(caught.value)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_the_table_of_detections(finished, dataset_detect):
@@ -154,7 +154,7 @@ def unjudged(monkeypatch):
 
 
 def test_weights_to_start_from_are_not_needed_to_go_on(finished, few, tmp_path, unjudged):
-    """The last state of a run that was stopped while it was judged: all trained, no figures yet."""
+    """The last state of a run that was stopped while it was evaluated: all trained, no figures yet."""
     first = tmp_path / "first.ckpt"
     shutil.copy(finished.best, first)
     config = settings("detect.epochs=1", f"detect.init_from={first}")

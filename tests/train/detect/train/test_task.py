@@ -73,9 +73,9 @@ def test_long_gradients_are_shortened_and_short_ones_left_alone(split, tmp_path)
     # A frozen weight has none.
     drawn = [torch.randn(p.shape, generator=random) for p in parameters[1:]]
     length = torch.cat([gradient.flatten() for gradient in drawn]).norm()
-    for wanted, factor in ((50.0, 2.0 / 50), (2.5, 2.0 / 2.5), (1.9, 1.0)):
+    for expected, factor in ((50.0, 2.0 / 50), (2.5, 2.0 / 2.5), (1.9, 1.0)):
         for p, gradient in zip(parameters[1:], drawn, strict=True):
-            p.grad = gradient * (wanted / length)
+            p.grad = gradient * (expected / length)
         given = [p.grad.clone() for p in parameters[1:]]
         task.configure_gradient_clipping(None)
         assert parameters[0].grad is None

@@ -91,8 +91,8 @@ def test_yolov3_fills_backbone_neck_and_heads_but_no_output(coco):
     layers = by_hand.cfg()
     with torch.no_grad():
         out = by_hand.run(layers, by_hand.HEADER + values.tobytes(), grey, 1.0)
-    wanted = [out[index - 2] for index, layer in enumerate(layers) if layer[0] == "yolo"]
-    for one, other in zip(features_before_outputs(network, grey), wanted, strict=True):
+    expected = [out[index - 2] for index, layer in enumerate(layers) if layer[0] == "yolo"]
+    for one, other in zip(features_before_outputs(network, grey), expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3 * float(other.abs().max()))
     after = network.state_dict()
     assert all(torch.equal(after[key], outputs[key]) for key in outputs if key.startswith("heads."))
@@ -118,7 +118,7 @@ def test_a_backbone_alone_is_filled_from_conv_74_or_for_finer_strides(coco, tmp_
 
 
 @pytest.mark.parametrize(
-    ("setting", "told"),
+    ("setting", "message"),
     [
         ("detect.width=0.5", "yolov3.weights: detect.width: got 0.5, expected 1, as in Darknet's files"),
         ("detect.in_channels=1", "yolov3.weights: detect.in_channels: got 1, expected 3, as in Darknet's files"),
@@ -126,14 +126,14 @@ def test_a_backbone_alone_is_filled_from_conv_74_or_for_finer_strides(coco, tmp_
     ],
 )
 def test_a_network_or_file_of_another_shape_is_refused_before_anything_is_written(
-    dataset_detect, tmp_path, setting, told
+    dataset_detect, tmp_path, setting, message
 ):
     path = tmp_path / "yolov3.weights"
     path.write_bytes(by_hand.HEADER + bytes(4))
     config = resolve(DetectConfig, "detect", "perilune_train", "paper", None, (f"detect.init_from={path}", setting))
     with pytest.raises(UserError) as caught:
         run_detect(config, dataset_detect, tmp_path / "runs", "a")
-    assert told in str(caught.value) and "\n" not in str(caught.value)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
     assert not (tmp_path / "runs").exists()
 
 
@@ -161,20 +161,20 @@ def test_a_run_is_written_as_a_darknet_file_and_comes_back(tmp_path, suffix):
     again = YOLOv3(None, 3, 1.0, "none")
     start_from(again, out, DetectConfig(attention="none"))
     filled = again if suffix == ".weights" else again.backbone
-    wanted = (network if suffix == ".weights" else network.backbone).state_dict()
+    expected = (network if suffix == ".weights" else network.backbone).state_dict()
     for key, value in filled.state_dict().items():
         if "num_batches" in key:
             continue
         if key.endswith("stem.norm.running_mean"):  # rescaled there and back
-            torch.testing.assert_close(value, wanted[key], rtol=0, atol=1e-6)
+            torch.testing.assert_close(value, expected[key], rtol=0, atol=1e-6)
         else:
-            assert torch.equal(value, wanted[key]), key
+            assert torch.equal(value, expected[key]), key
     for path in tmp_path.iterdir():
         path.unlink()
 
 
 @pytest.mark.parametrize(
-    ("name", "shape", "told"),
+    ("name", "shape", "message"),
     [
         ("a.bin", {}, "a.bin: --out: got the name a.bin, expected a name that ends in .conv.74 or .weights"),
         ("a.conv.74", {"width": 0.125}, "best.ckpt: width: got 0.125, expected 1.0"),
@@ -182,11 +182,11 @@ def test_a_run_is_written_as_a_darknet_file_and_comes_back(tmp_path, suffix):
         ("absent.weights", None, "best.ckpt: checkpoint: got no such file"),
     ],
 )
-def test_what_has_no_darknet_file_is_refused(tmp_path, name, shape, told):
+def test_what_has_no_darknet_file_is_refused(tmp_path, name, shape, message):
     if shape:
         saved(tmp_path / "best.ckpt", **shape)
     result = call(tmp_path / "best.ckpt", "--out", tmp_path / name)
-    assert isinstance(result.exception, UserError) and told in str(result.exception)
+    assert isinstance(result.exception, UserError) and message in str(result.exception)
     assert not (tmp_path / name).exists()
 
 
