@@ -233,6 +233,8 @@ def preview(
 ) -> None:
     """Render a contact sheet of a configuration, with and without labels, in seconds."""
     resolved = _resolve(preset, config, setting, dem, catalogue)
+    if out.suffix != ".png":
+        raise UserError(out, "format", out.suffix or "none", ".png")
     from perilune_render.dataset.preview import write_preview
 
     write_preview(resolved, first_kind(kind), out)

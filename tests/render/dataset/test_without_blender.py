@@ -48,3 +48,9 @@ def test_datasets_are_developed_without_blender(tiny, tmp_path):
 def test_rendering_without_blender_says_what_is_missing(tmp_path):
     done = run("preview", "--preset", "tiny", "--out", tmp_path / "a.png")
     assert done.returncode != 0 and "bpy cannot be loaded" in done.stderr and not (tmp_path / "a.png").exists()
+
+
+def test_a_preview_is_a_png(tmp_path):
+    """Any other suffix is refused before rendering."""
+    done = run("preview", "--preset", "tiny", "--out", tmp_path / "a.jpg")
+    assert done.returncode == 2 and done.stderr.strip() == f"error: {tmp_path}/a.jpg: format: got .jpg, expected .png"
