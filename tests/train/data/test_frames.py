@@ -42,6 +42,19 @@ def test_a_frame_that_is_no_image_is_refused(content, message):
         decode(content, "0.png", 16, 16)
 
 
+def test_a_frame_that_is_cut_short_is_refused(few, tmp_path):
+    """Without its last chunk, the 12 bytes of IEND, a decoder may still return all pixels."""
+    root = shutil.copytree(few, tmp_path / "cut")
+    dataset = open_dataset(root)
+    name = dataset.table("frames", ["png_path"], split="train")["png_path"][0].as_py()
+    whole = (root / name).read_bytes()
+    (root / name).write_bytes(whole[:-12])
+    with pytest.raises(UserError) as told:
+        load_frames(dataset, "train")
+    assert f"{root}/{name}: png_bytes: got {len(whole) - 12} bytes, expected {len(whole)} bytes" in str(told.value)
+    assert "perilune-manifest validate" in str(told.value)
+
+
 def test_frames_that_no_memory_holds_are_refused(few, tmp_path, monkeypatch):
     """A few bytes of dataset.json and of PNG can ask for any room. On a machine of 512 MiB."""
     root = shutil.copytree(few, tmp_path / "bomb")

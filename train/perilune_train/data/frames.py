@@ -41,7 +41,8 @@ def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int
     """
     # A decoder may fill the missing rows of a truncated file silently, so check the length.
     if size_bytes is not None and len(png) != size_bytes:
-        raise UserError(name, "png_bytes", f"{len(png)} bytes", f"{size_bytes} bytes; the file is damaged")
+        expected = f"{size_bytes} bytes; see `perilune-manifest validate`, and render the damaged frames again"
+        raise UserError(name, "png_bytes", f"{len(png)} bytes", expected)
     try:
         header = png_header(png)
     except ValueError as error:
