@@ -115,10 +115,7 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
             yield Fault.of(where, None, "schema", odd or "another order", f"the columns of {table}")
             return
         for found, expected in ((part.found.field(name), TABLES[table].field(name)) for name in present):
-            if (found.type, found.nullable) != (
-                expected.type,
-                expected.nullable,
-            ) or found.metadata != expected.metadata:
+            if _definition(found) != _definition(expected):
                 yield Fault.of(where, None, found.name, found.metadata, f"{expected.type} with {expected.metadata}")
         first_row = 0
         for group in range(part.n_groups):
@@ -129,6 +126,12 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
             first_row += len(rows)
     except UserError as error:
         yield Fault.from_error(where, None, error)
+
+
+def _definition(field: pa.Field) -> tuple[object, ...]:
+    """Return all that must agree. Versions may word the meaning of a column differently."""
+    metadata = {key: value for key, value in (field.metadata or {}).items() if key != b"meaning"}
+    return field.type, field.nullable, metadata
 
 
 def _name_faults(where: str, first_row: int, stem: str, rows: pa.Table) -> Iterator[Fault]:

@@ -53,4 +53,4 @@ def test_the_manifest_and_the_card_say_how_much_ground_is_real(tmp_path):
     page, _ = write_card(dataset, tmp_path / "card.md", Progress(disable=True))
     low, high = (f"{100 * share:.0f}" for share in shares)
     assert 0 < shares[0] < 0.5 and shares[1] == 1
-    assert f"from {low} to {high} %. The rest is procedural." in page.read_text()
+    assert f"({low} to {high} %). The rest is procedural." in page.read_text()

@@ -18,6 +18,7 @@ from perilune_shared.dataset.parts import read_part, write_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.dataset.stats import summary
 from perilune_shared.errors import UserError
+from perilune_shared.validation.faults import part_faults
 from perilune_shared.validation.validate import validate
 
 MANIFEST = str(Path(sys.executable).parent / "perilune-manifest")
@@ -111,6 +112,20 @@ def test_a_link_out_of_the_dataset_is_found(tiny_detect):
     frame.rename(outside)
     frame.symlink_to(outside)
     assert any(fault.column == "png_path" for fault in validate(open_dataset(tiny_detect)))
+
+
+@pytest.mark.parametrize(("key", "columns"), [("meaning", set()), ("unit", {"time_s"})])
+def test_a_column_may_have_another_meaning_but_no_other_unit(tiny_detect, key, columns):
+    """Datasets stay valid when a later version words the meaning of a column differently."""
+    path = sorted((tiny_detect / "manifest/frames").glob("*.parquet"))[0]
+    rows = pq.read_table(path)
+    place = rows.schema.get_field_index("time_s")
+    field = rows.schema.field(place)
+    changed = field.with_metadata({**field.metadata, key.encode(): b"other words"})
+    pq.write_table(rows.cast(rows.schema.set(place, changed)), path)
+    dataset = open_dataset(tiny_detect)
+    assert {fault.column for fault in part_faults(dataset, path, "frames")} == columns
+    assert dataset.table("frames").num_rows > rows.num_rows
 
 
 def test_another_schema_version_is_refused(tiny_detect):
