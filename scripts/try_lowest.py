@@ -35,7 +35,7 @@ def main(folder: Path) -> None:
     """Print each completed step; raise if a step fails."""
     print(f"imported {import_all()} modules")
     sys.path.insert(0, str(ROOT))
-    from tests.drawn_dataset import build_dataset
+    from tests.helpers.drawn_dataset import build_dataset
 
     splits = {"train": 1, "val": 1, "test": 1}
     build_dataset(folder / "detect", "detect", splits=splits)
