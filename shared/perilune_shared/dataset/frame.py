@@ -31,9 +31,17 @@ class Frame:
 
     @property
     def image(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Grey levels (height, width), 8 or 16 bits. Raises UserError if the file is not such a PNG."""
+        """Grey levels (height, width), 8 or 16 bits.
+
+        Raises UserError if the file is not such a PNG, or has not as many bytes as the manifest records.
+        """
         from PIL import Image
 
+        # Decoders accept a PNG whose last bytes are missing.
+        size_bytes = self.row["png_bytes"]
+        if pd.notna(size_bytes) and len(self.png) != size_bytes:
+            expected = f"{int(size_bytes)} bytes; see `perilune-manifest validate`, and render the damaged frame again"
+            raise UserError(self.frame_id, "png_bytes", f"{len(self.png)} bytes", expected)
         try:
             header = png_header(self.png)
             if header.width_px * header.height_px > LARGEST_IMAGE_PX:

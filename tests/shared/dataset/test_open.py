@@ -1,5 +1,7 @@
 """Reading a dataset in Python: tables as pandas, frames by row number or frame_id."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -50,9 +52,20 @@ def test_an_invalid_image_error_names_the_frame(victim, damage):
         _ = dataset[0].image
 
 
+def test_a_frame_without_its_last_bytes_is_refused(victim):
+    dataset = ps.open_dataset(victim)
+    path = victim / dataset.frames["png_path"][0]
+    size = path.stat().st_size
+    path.write_bytes(path.read_bytes()[:-12])  # the end mark: all pixels are there
+    with pytest.raises(UserError, match=f"png_bytes: got {size - 12} bytes, expected {size} bytes"):
+        _ = dataset[0].image
+
+
 def test_16_bit_frames_keep_all_bits(victim):
     dataset = ps.open_dataset(victim)
     path = victim / dataset.frames["png_path"][0]
     deep = np.arange(32 * 32, dtype=np.uint16).reshape(32, 32) * 60
     path.write_bytes(cv2.imencode(".png", deep)[1].tobytes())
-    assert np.array_equal(dataset[0].image, deep) and dataset[0].image.dtype == np.uint16
+    frame = dataset[0]
+    frame = replace(frame, row={**frame.row, "png_bytes": len(frame.png)})
+    assert np.array_equal(frame.image, deep) and frame.image.dtype == np.uint16

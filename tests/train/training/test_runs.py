@@ -176,7 +176,7 @@ def test_a_resumed_run_repeats_the_uninterrupted_one(tmp_path):
     assert (best["state_dict"]["weight"] - 2).abs() < 2
 
 
-def test_a_resumed_run_took_the_time_of_all_its_sittings(tmp_path):
+def test_a_resumed_run_took_the_time_of_all_its_parts(tmp_path):
     run = started(tmp_path, "a")
     with pytest.raises(KeyError):
         fit(run, Line(dies_in=2), 3)
