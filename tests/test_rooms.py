@@ -11,11 +11,11 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
-        "errors run_record terminal progress content yaml_text config_errors config config_page storage geometry "
-        "dataset labels validation editing export cli"
+        "errors interrupts run_record terminal progress content yaml_text config_errors config config_page storage "
+        "geometry dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
-        "config_values config_terrain config streams interrupts provenance terrain flight imaging labels "
+        "config_values config_terrain config streams provenance terrain flight imaging labels "
         "frame_source blender dataset cli_options cli"
     ),
     "render/perilune_render/terrain": (

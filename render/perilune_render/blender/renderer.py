@@ -18,11 +18,11 @@ from perilune_render.blender import stage as blender_stage
 from perilune_render.config import DatasetConfig, LightConfig, RenderConfig
 from perilune_render.imaging.exr import read_exr
 from perilune_render.imaging.radiance import Radiance
-from perilune_render.interrupts import interrupts_held
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
+from perilune_shared.interrupts import interrupts_held
 
 _FAR_M = 1e9
 _LEAST_FREE_BYTES = 16_000_000

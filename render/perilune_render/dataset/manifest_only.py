@@ -9,13 +9,13 @@ from perilune_render.dataset import tables
 from perilune_render.dataset.folder import new_info
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
-from perilune_render.interrupts import interrupts_held
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground, grow_scene
 from perilune_shared.dataset.names import ImageKind, Kind, frame_path
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.dataset.writer import new_dataset
+from perilune_shared.interrupts import interrupts_held
 from perilune_shared.progress import Progress
 
 

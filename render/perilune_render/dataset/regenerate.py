@@ -25,7 +25,6 @@ from perilune_render.flight.view import view_envelope
 from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.imaging.exr import read_exr
-from perilune_render.interrupts import interrupts_held
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.provenance.recipe import config_of, same_source
 from perilune_render.terrain.cache import cached_scene
@@ -35,6 +34,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.dataset.names import ImageKind, frame_path
 from perilune_shared.errors import UserError
+from perilune_shared.interrupts import interrupts_held
 from perilune_shared.progress import Progress
 from perilune_shared.storage.files import sha256_of
 from perilune_shared.storage.locks import locked

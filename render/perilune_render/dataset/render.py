@@ -27,7 +27,6 @@ from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, make_pl
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
 from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
-from perilune_render.interrupts import interrupts_held
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.cache import cached_scene
@@ -39,6 +38,7 @@ from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import Kind
 from perilune_shared.dataset.parts import read_part, write_part
 from perilune_shared.errors import UserError
+from perilune_shared.interrupts import interrupts_held
 from perilune_shared.progress import Progress
 
 _GROUND = ("craters", "boulders")

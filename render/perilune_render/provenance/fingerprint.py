@@ -21,7 +21,7 @@ _SETTINGS = "perilune_render.config"
 """Prefix of the modules of settings. Their values are in the recipe, so the hash omits defaults, bounds and checks."""
 _NO_EFFECT = (
     "perilune_render.provenance.caches",
-    "perilune_render.interrupts",
+    "perilune_shared.interrupts",
     "perilune_shared.config",
     "perilune_shared.errors",
     "perilune_shared.progress",

@@ -20,6 +20,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from perilune_shared.errors import UserError
+from perilune_shared.interrupts import interrupts_held
 
 LOCK_NAME = ".perilune.lock"
 """Lock file in a folder that is written in place."""
@@ -56,7 +57,9 @@ def lock(path: Path, folder: Path) -> Iterator[None]:
     held, record, held_elsewhere = FileLock(path), path.with_name(f"{path.name}.json"), False
     try:
         try:
-            held.acquire(timeout=0)
+            # An interrupt within `acquire` would leave the lock file behind.
+            with interrupts_held():
+                held.acquire(timeout=0)
         except Timeout:
             raise _locked_error(folder, _read(record), "a free folder: wait until that process ends") from None
         seconds_left = _seconds_left(record)

@@ -1,7 +1,9 @@
 """Locks of folders against other processes, killed processes and other machines."""
 
+import fcntl
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -97,6 +99,21 @@ def test_threads_exclude_each_other(tmp_path):
         thread.start()
         thread.join()
     assert len(refused) == 1
+
+
+@pytest.mark.parametrize("way", [locked, new_folder])
+def test_ctrl_c_while_the_lock_is_acquired_leaves_nothing(tmp_path, monkeypatch, way):
+    acquire = fcntl.flock
+
+    def acquire_and_interrupt(descriptor, operation):
+        acquire(descriptor, operation)
+        if operation & fcntl.LOCK_EX:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(fcntl, "flock", acquire_and_interrupt)
+    with pytest.raises(KeyboardInterrupt), way(tmp_path / "out"):
+        pytest.fail("not interrupted")
+    assert names(tmp_path) == []
 
 
 def test_a_refused_folder_is_not_left_behind(tmp_path):

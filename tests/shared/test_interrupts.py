@@ -7,11 +7,11 @@ import sys
 
 import pytest
 
-from perilune_render.interrupts import interrupts_held
+from perilune_shared.interrupts import interrupts_held
 
 TWICE = """
 import os, signal, time
-from perilune_render.interrupts import interrupts_held
+from perilune_shared.interrupts import interrupts_held
 with interrupts_held():
     for _ in range(2):
         os.kill(os.getpid(), signal.SIGINT)
