@@ -141,7 +141,7 @@ def main(
         for name, rows in table.groupby("frame_id")
     }
     threshold = json.loads((run / "metrics.json").read_text())["test/threshold"]
-    result = {**measure(opened, detections, threshold), "judged": evaluate(opened, detections, threshold)}
+    result = {**measure(opened, detections, threshold), "metrics": evaluate(opened, detections, threshold)}
     write_figures(out / "contrast.json", result)
     if picture:
         draw(opened, picture, out / "contrast.jpg")

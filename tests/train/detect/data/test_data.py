@@ -56,7 +56,7 @@ def test_craters_that_show_too_little_are_ignored(dataset_detect):
     assert shares[0] == shares[1] == 1 > shares[2] == shares[3] > 0.5 and shares[4] == 0
 
 
-def test_without_a_range_of_radii_that_of_the_whole_dataset_is_judged(dataset_detect):
+def test_the_default_range_of_radii_is_that_of_the_whole_dataset(dataset_detect):
     dataset = open_dataset(dataset_detect)
     radius_px = dataset.table("labels").to_pandas()["radius_px"]
     splits = [load_split(dataset, name, LabelSettings(selection="all")) for name in ("train", "test")]

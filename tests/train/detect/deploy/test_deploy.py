@@ -218,7 +218,7 @@ def quantise_once():
 
 
 @pytest.mark.parametrize("most_loss", [-1.0, 1.0])
-def test_int8_is_judged_and_kept_only_if_worth_it(
+def test_int8_is_evaluated_and_kept_only_if_better(
     run_folder, dataset_detect, tmp_path, monkeypatch, quantise_once, most_loss
 ):
     """Both verdicts: no loss is small enough, and every one is, while int8 is called the faster."""

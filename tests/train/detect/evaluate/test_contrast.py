@@ -42,6 +42,6 @@ def test_a_detector_that_finds_what_shows(dataset_detect, tmp_path):
     assert every["radius_px"] > 0.98 and every["contrast"] == 0.5
     assert result["auc"]["2-3 px"]["found"] < 0.1 and result["auc"]["5-10 px"]["found"] == 1
     assert [row["labels"] for row in result["found_by_contrast"]][-1] == len(chosen)
-    assert result["judged"]["visible"]["precision"] > 0.98
-    assert result["judged"]["paper"]["labels"] > result["judged"]["visible"]["labels"]
+    assert result["metrics"]["visible"]["precision"] > 0.98
+    assert result["metrics"]["paper"]["labels"] > result["metrics"]["visible"]["labels"]
     assert (tmp_path / "out/contrast.jpg").stat().st_size > 5000

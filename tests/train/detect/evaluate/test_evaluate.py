@@ -41,7 +41,7 @@ def figures(folder):
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_a_run_judged_again_has_the_same_figures(run, dataset_detect):
+def test_a_run_evaluated_again_has_the_same_figures(run, dataset_detect):
     before = (run / "metrics.json").read_bytes()
     call("evaluate", "--run", run, "--dataset", dataset_detect)
     assert (run / "metrics.json").read_bytes() == before
@@ -91,9 +91,9 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
     # The threshold is the best on val, by the same detections that --split val finds.
     call(*evaluate_run, "--split", "val", "--threshold", chosen["test/threshold"], "--out", tmp_path / "best")
     assert figures(tmp_path / "best")["val/f1"] >= val["val/f1"]
-    # Another operating point on the same val: the words, the precision wished, and no less recall.
-    wished = ("--set", f"detect.evaluation.min_precision={val['val/precision'] / 2}")
-    call(*evaluate_run, "--choose-threshold", *wished, "--out", tmp_path / "recall")
+    # Another operating point on the same val: the message, the required precision, and no less recall.
+    required = ("--set", f"detect.evaluation.min_precision={val['val/precision'] / 2}")
+    call(*evaluate_run, "--choose-threshold", *required, "--out", tmp_path / "recall")
     assert "of highest recall at a precision of at least" in (tmp_path / "recall/report.md").read_text()
     more = figures(tmp_path / "recall")
     call(*evaluate_run, "--split", "val", "--threshold", more["test/threshold"], "--out", tmp_path / "val-recall")

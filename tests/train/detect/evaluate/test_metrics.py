@@ -56,7 +56,7 @@ def test_wanted_labels_come_before_ignored_ones():
     assert match_frame(detections([square(0, 0), square(-1, 0), square(0, 0)]), truth, 0.5).tolist() == [1, -2, -2]
 
 
-def test_what_no_one_can_judge_is_left_out_unless_strict():
+def test_undecidable_labels_are_ignored_unless_strict():
     truth = labels([square(10, 10), square(40, 40)], [True, False])
     found = detections([square(10, 10), square(40, 40), square(-9, 20), square(70, 70, 3.0), square(70, 20)])
     matches = match_one(found, truth)

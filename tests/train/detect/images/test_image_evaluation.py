@@ -1,4 +1,4 @@
-"""Judging on labelled images: what is expected, what does not count, and what is left in the folder."""
+"""Evaluation on labelled images: expected figures, ignored craters, files written to the folder."""
 
 import json
 from pathlib import Path
@@ -69,7 +69,7 @@ def folder(tmp_path):
     return root
 
 
-def test_a_folder_is_judged(run, folder, tmp_path):
+def test_a_folder_is_evaluated(run, folder, tmp_path):
     out = tmp_path / "out"
     figures = evaluate_images(run, settings_of(run), folder, out, Tiling(tile_px=96, overlap_px=32))
     written = json.loads((out / "metrics.json").read_text())
@@ -137,7 +137,7 @@ def test_compare_shows_images(run, folder, tmp_path):
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_images_are_looked_at_as_the_run_was_judged(folder, tmp_path):
+def test_images_are_prepared_as_in_the_evaluation_of_the_run(folder, tmp_path):
     run = store_run(tmp_path / "runs", "evaluation.scales=[1,2]")
     arguments = ["detect", "evaluate", "--run", str(run), "--images", str(folder), "--out"]
     for name, given, expected in (("own", (), "1.0 2.0"), ("other", ("--scale", "0.5"), "0.5")):

@@ -81,7 +81,7 @@ def test_a_frame_without_labels_beside_one_with(empty):
     assert box.item() == pytest.approx(2 * (1 + 64 / 320) / 3, abs=1e-5)
     assert confidence.item() == pytest.approx(LN2, rel=1e-5)
     (box + confidence).backward()
-    # The empty frame is reported only that it is empty: s(0) / 96 at every predictor.
+    # From the empty frame the network learns only that it is empty: s(0) / 96 at every predictor.
     assert raw.grad[empty, ..., :4].abs().max() == 0
     torch.testing.assert_close(raw.grad[empty, ..., 4], torch.full((3, 4, 4), 0.5 / 96))
     assert raw.grad[1 - empty, 0, 1, 1, 4] < 0

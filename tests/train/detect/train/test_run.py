@@ -148,12 +148,12 @@ def test_a_finished_run_is_left_as_it_is(finished, few, tmp_path, capsys):
 
 
 @pytest.fixture
-def unjudged(monkeypatch):
-    """Runs are trained alone: judging takes most of the time of a small one."""
+def no_evaluation(monkeypatch):
+    """Train without evaluation, which takes most of the time of a small run."""
     monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
 
 
-def test_weights_to_start_from_are_not_needed_to_go_on(finished, few, tmp_path, unjudged):
+def test_resuming_does_not_need_the_initial_weights(finished, few, tmp_path, no_evaluation):
     """The last state of a run that was stopped while it was evaluated: all trained, no figures yet."""
     first = tmp_path / "first.ckpt"
     shutil.copy(finished.best, first)
@@ -204,7 +204,7 @@ def test_a_run_in_bfloat16(few, tmp_path, monkeypatch):
         assert 0 <= metrics[account + "ap50_paper"] <= 1
 
 
-def test_a_packed_dataset_gives_the_same_weights(few, tmp_path, unjudged):
+def test_a_packed_dataset_gives_the_same_weights(few, tmp_path, no_evaluation):
     pack(open_dataset(few), tmp_path / "packed")
     config = settings("detect.epochs=1")
     made = [run_detect(config, root, tmp_path, root.name) for root in (few, tmp_path / "packed")]
