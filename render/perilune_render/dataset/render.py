@@ -4,7 +4,6 @@ A trajectory's part of `frames` is written last, after its images and labels. A 
 one without it is rendered again.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 from perilune_render.blender.renderer import Renderer
@@ -19,14 +18,12 @@ from perilune_render.dataset.folder import (
     open_finished,
     writing,
 )
-from perilune_render.dataset.frame_files import write_frame
-from perilune_render.dataset.real_ground import real_ground_share
-from perilune_render.dataset.shots import planned_shot
-from perilune_render.dataset.trajectory_parts import finish_trajectory, is_finished
+from perilune_render.dataset.trajectory import render_trajectory
+from perilune_render.dataset.trajectory_parts import is_finished
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
 from perilune_render.frame_source import FrameSource
-from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
+from perilune_render.imaging.darkness import warn_of_dark_frames
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.cache import cached_scene
@@ -97,8 +94,8 @@ def _render(
             dark = [
                 frame_id
                 for trajectory in unfinished
-                for frame_id in _render_trajectory(
-                    out, source, trajectory, scene, config.render.exr, lambda: progress.advance(task)
+                for frame_id in render_trajectory(
+                    out, source, trajectory, scene, config, lambda: progress.advance(task)
                 )
             ]
         n_rendered = sum(len(t.splits) for t in unfinished)
@@ -132,24 +129,3 @@ def _write_scene(
     for name, rows in parts.items():
         if not paths[name].exists():
             write_part(out, name, plan.scene_id, rows)
-
-
-def _render_trajectory(
-    out: Path, source: FrameSource, trajectory: TrajectoryPlan, scene: Scene, exr: bool, advance: Callable[[], None]
-) -> list[str]:
-    """Render and write one trajectory, with `exr` also its EXRs; returns the ids of its dark frames."""
-    rows: list[dict] = []
-    labels, dark = [], []
-    for place in range(len(trajectory.splits)):
-        frame_id, frame = trajectory.frame_id(place), source.take(planned_shot(trajectory, place))
-        files = write_frame(out, frame_id, source, frame, exr=exr)
-        share = real_ground_share(scene, source.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
-        found = source.labels(frame)
-        rows.append({**files, "real_ground_share": share, "n_craters_above_max_radius": found.n_above})
-        labels.append(tables.label_table(frame_id, found))
-        if is_dark(frame.radiance):
-            dark.append(frame_id)
-        advance()
-    frames = tables.frame_table(trajectory, source.camera, source.engine.sun, rows)
-    finish_trajectory(out, trajectory.scene_id, trajectory.trajectory_id, labels, frames)
-    return dark
