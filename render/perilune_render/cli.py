@@ -8,11 +8,22 @@ import typer
 from rich.console import Console
 
 import perilune_shared as ps
-from perilune_render.cli_options import Catalogue, Config, Dem, KindChoice, Preset, Setting, first_kind, one_kind
+from perilune_render.cli_dataset import dataset
+from perilune_render.cli_options import (
+    Catalogue,
+    Config,
+    Dem,
+    KindChoice,
+    Preset,
+    Setting,
+    first_kind,
+    one_kind,
+    resolved_config,
+    warn_of_size,
+)
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
-from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import EXIT_USER_ERROR, UserError, run_command_line
 from perilune_shared.terminal import progress_bar
 
@@ -22,30 +33,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-
-
-def _warn_of_size(config: DatasetConfig) -> None:
-    """Warn before rendering if the detector cannot be trained on frames of this size."""
-    sides = {"width_px": config.camera.width_px, "height_px": config.camera.height_px}
-    for name, side in sides.items():
-        if side % 32:
-            line = (
-                f"dataset.camera.{name}: {side} is not a multiple of 32: the detector cannot be trained on such frames"
-            )
-            Console(stderr=True).print(line, soft_wrap=True)
-
-
-def _resolve(
-    preset: str, config: Path | None, setting: list[str] | None, dem: Path | None, catalogue: Path | None
-) -> DatasetConfig:
-    resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
-    paths = {name: str(path) for name, path in (("dem", dem), ("catalogue", catalogue)) if path is not None}
-    terrain = resolved.terrain.model_copy(update=paths)
-    if terrain.catalogue is not None and terrain.dem is None:
-        raise UserError(
-            "--catalogue", "catalogue", terrain.catalogue, "--dem as well, the elevation model of this catalogue"
-        )
-    return resolved.model_copy(update={"terrain": terrain})
 
 
 @app.command()
@@ -62,74 +49,7 @@ def config(
     typer.echo(annotated_yaml("dataset", resolved) if show else to_yaml("dataset", resolved), nl=False)
 
 
-@app.command()
-def dataset(
-    context: typer.Context,
-    preset: Preset = "small",
-    config: Config = None,
-    setting: Setting = None,
-    dem: Dem = None,
-    catalogue: Catalogue = None,
-    kind: Annotated[KindChoice, typer.Option(help="Crater detection, navigation, or both.")] = "both",
-    out: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the datasets `detect` and `nav`; default: data/<preset>."),
-    ] = None,
-    manifest: Annotated[
-        Path | None,
-        typer.Option(help="Manifest or plan to render into --out, in place of a preset."),
-    ] = None,
-) -> None:
-    """Render the datasets of a preset or a manifest. Run the same command again to resume."""
-    if manifest is not None:
-        given = [name for name in ("preset", "config", "setting", "kind") if _was_given(context, name)]
-        _render_manifest(manifest, out, dem, catalogue, given)
-        return
-    resolved = _resolve(preset, config, setting, dem, catalogue)
-    if kind != "nav":
-        _warn_of_size(resolved)
-    folder = out or Path("data") / preset
-    # Importing Blender takes seconds; check the settings first.
-    from perilune_render.dataset.render import make_dataset
-
-    for name in KINDS if kind == "both" else (kind,):
-        with progress_bar() as progress:
-            made = make_dataset(resolved, name, preset, folder / name, progress)
-        counts = made.info.counts
-        Console().print(
-            f"{folder / name}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
-            f"look at {folder / name / 'overview.png'}",
-            soft_wrap=True,
-        )
-
-
-def _was_given(context: typer.Context, name: str) -> bool:
-    source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
-
-
-def _render_manifest(
-    manifest: Path, out: Path | None, dem: Path | None, catalogue: Path | None, others: list[str]
-) -> None:
-    if out is None or others:
-        found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
-        expected = (
-            "--out, and --dem and --catalogue if the recipe names them; all other settings come from the manifest"
-        )
-        raise UserError("--manifest", "options", found, expected)
-    given = ps.open_dataset(manifest)
-    from perilune_render.dataset.from_manifest import compare_hashes, plan_from_manifest
-    from perilune_render.dataset.render import render_plan
-
-    plan, config, info = plan_from_manifest(given, dem, catalogue)
-    with progress_bar() as progress:
-        made = render_plan(plan, config, info, out, progress, manifest)
-    same, known, other_scenes = compare_hashes(given, made)
-    comparison = f"; {same} of {known} frames are byte-identical to the manifest's" if known else ""
-    comparison += f"; terrain hash mismatch in {other_scenes} scenes" if other_scenes else "; terrain hashes match"
-    Console().print(
-        f"{out}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{comparison}", soft_wrap=True
-    )
+app.command()(dataset)
 
 
 @app.command()
@@ -163,9 +83,9 @@ def plan(
     kind: Annotated[KindChoice, typer.Option(help="Crater detection or navigation (detect or nav).")] = "detect",
 ) -> None:
     """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
-    resolved = _resolve(preset, config, setting, dem, catalogue)
+    resolved = resolved_config(preset, config, setting, dem, catalogue)
     if kind != "nav":
-        _warn_of_size(resolved)
+        warn_of_size(resolved)
     from perilune_render.dataset.manifest_only import write_manifest_only
 
     with progress_bar() as progress:
@@ -232,7 +152,7 @@ def preview(
     out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("preview.png"),
 ) -> None:
     """Render a contact sheet of a configuration, with and without labels, in seconds."""
-    resolved = _resolve(preset, config, setting, dem, catalogue)
+    resolved = resolved_config(preset, config, setting, dem, catalogue)
     if out.suffix != ".png":
         raise UserError(out, "format", out.suffix or "none", ".png")
     from perilune_render.dataset.preview import write_preview
@@ -258,7 +178,7 @@ def export(
     ] = Path("scene.glb"),
 ) -> None:
     """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
-    resolved = _resolve(preset, config, setting, dem, catalogue)
+    resolved = resolved_config(preset, config, setting, dem, catalogue)
     from perilune_render.flight.plan import make_plan
     from perilune_render.terrain.cache import cached_scene
     from perilune_render.terrain.export import MESH_SUFFIXES, RASTER_SUFFIXES, export_mesh, export_raster

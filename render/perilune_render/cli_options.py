@@ -5,8 +5,11 @@ from typing import Annotated, Literal
 
 import typer
 
+from perilune_render.config import DatasetConfig
+from perilune_shared.config import resolve
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
+from perilune_shared.terminal import console
 
 KindChoice = Literal[Kind, "both"]
 """One of a preset's two datasets, or both."""
@@ -40,3 +43,28 @@ def one_kind(kind: KindChoice) -> Kind:
     if kind == "both":
         raise UserError("--kind", "kind", "both", "detect or nav (one dataset)")
     return first_kind(kind)
+
+
+def warn_of_size(config: DatasetConfig) -> None:
+    """Warn before rendering if the detector cannot be trained on frames of this size."""
+    sides = {"width_px": config.camera.width_px, "height_px": config.camera.height_px}
+    for name, side in sides.items():
+        if side % 32:
+            line = (
+                f"dataset.camera.{name}: {side} is not a multiple of 32: the detector cannot be trained on such frames"
+            )
+            console.print(line, soft_wrap=True)
+
+
+def resolved_config(
+    preset: str, config: Path | None, setting: list[str] | None, dem: Path | None, catalogue: Path | None
+) -> DatasetConfig:
+    """The settings of a preset with the user's changes. Raises UserError on invalid ones."""
+    resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
+    paths = {name: str(path) for name, path in (("dem", dem), ("catalogue", catalogue)) if path is not None}
+    terrain = resolved.terrain.model_copy(update=paths)
+    if terrain.catalogue is not None and terrain.dem is None:
+        raise UserError(
+            "--catalogue", "catalogue", terrain.catalogue, "--dem as well, the elevation model of this catalogue"
+        )
+    return resolved.model_copy(update={"terrain": terrain})

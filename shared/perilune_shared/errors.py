@@ -29,10 +29,21 @@ class UserError(Exception):
 
     def __init__(self, where: object, field: str, found: object, expected: str):
         # These texts may come from untrusted files and may be of any length.
+        self.where = shortened(where, 4200)
         self.field, self.found, self.expected = shortened(field), shortened(found), shortened(expected, 500)
-        super().__init__(
-            one_line(f"{shortened(where, 4200)}: {self.field}: got {self.found}, expected {self.expected}"),
-        )
+        super().__init__(one_line(f"{self.where}: {self.field}: got {self.found}, expected {self.expected}"))
+
+    def __reduce__(self) -> tuple:
+        """Pickle by the constructor's arguments, so that another process can send it."""
+        return UserError, (self.where, self.field, self.found, self.expected)
+
+
+def ends_run(error: BaseException) -> bool:
+    """Whether an error would repeat with everything that is left to do: one of the user's, or a full or closed disk."""
+    # A file that is missing may have been removed by another process.
+    return isinstance(error, UserError) or (
+        isinstance(error, OSError) and error.errno in _DISK_FAULTS and error.errno != errno.ENOENT
+    )
 
 
 def one_line(text: object) -> str:

@@ -1,1 +1,1 @@
-"""Datasets: render, resume, regenerate, develop, preview."""
+"""Files of a dataset: trajectories, parts, resume, regenerate, develop, preview."""

@@ -8,6 +8,7 @@ import numpy as np
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.overview import write_overview
 from perilune_render.flight.plan import Plan
+from perilune_render.provenance.versions import all_versions
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import Dataset, count_rows, open_dataset
 from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
@@ -81,6 +82,14 @@ def begin_or_resume(out: Path, info: DatasetInfo) -> DatasetInfo:
     return existing
 
 
+def check_code(recipe: Recipe, *, with_dem: bool) -> None:
+    """Raises UserError if code or libraries of this process are not those of a recipe."""
+    recorded, found = (_without_releases(versions) for versions in (recipe.versions, all_versions(with_dem=with_dem)))
+    if recorded != found:
+        expected = "the code that the rendering began with: render with one version from start to end"
+        raise UserError("perilune_render", "versions", first_difference(recorded, found), expected)
+
+
 def check_begun(out: Path, plan: Plan) -> None:
     """Raises UserError if trajectories that the dataset already holds differ from those of the plan to resume.
 
@@ -123,9 +132,13 @@ def open_finished(out: Path) -> Dataset:
 
 
 def _compared(recipe: Recipe, name: str) -> object:
-    """One field of a recipe, without perilune's release numbers, since hashes identify its code."""
-    value = getattr(recipe, name)
-    return {k: v for k, v in value.items() if not k.startswith("perilune")} if name == "versions" else value
+    """One field of a recipe as it is compared on resuming."""
+    return _without_releases(recipe.versions) if name == "versions" else getattr(recipe, name)
+
+
+def _without_releases(versions: dict[str, str]) -> dict[str, str]:
+    """Versions without perilune's release numbers, since hashes identify its code."""
+    return {name: version for name, version in versions.items() if not name.startswith("perilune")}
 
 
 def first_difference(recorded: object, requested: object, path: str = "") -> str:

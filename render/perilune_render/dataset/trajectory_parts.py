@@ -13,6 +13,12 @@ def is_finished(root: Path, scene_id: str, trajectory_id: str) -> bool:
     return _path(root, "frames", f"{scene_id}.{trajectory_id}").exists()
 
 
+def finished_names(root: Path) -> set[tuple[str, str]]:
+    """Scene ids and trajectory ids of all finished trajectories."""
+    parts = (path.stem.partition(".") for path in root.joinpath("manifest", "frames").glob("[A-Za-z0-9]*.parquet"))
+    return {(scene_id, trajectory_id) for scene_id, _, trajectory_id in parts}
+
+
 def finish_trajectory(root: Path, scene_id: str, trajectory_id: str, labels: list[pa.Table], frames: pa.Table) -> None:
     """Write the parts of a trajectory whose files are written; waits until these are on the disk.
 

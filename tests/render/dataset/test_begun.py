@@ -14,8 +14,10 @@ from perilune_render.dataset import tables
 from perilune_render.dataset.develop import develop_dataset
 from perilune_render.dataset.folder import begin_or_resume, check_begun, new_info, open_finished
 from perilune_render.dataset.regenerate import png_outlier_share, regenerate
-from perilune_render.dataset.render import render_plan
 from perilune_render.flight.plan import make_plan
+from perilune_render.jobs.here import Here
+from perilune_render.jobs.job import Job
+from perilune_render.jobs.run import render_job
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
@@ -80,7 +82,7 @@ def test_a_folder_that_another_process_writes_is_left_alone(begun):
     info = new_info(config, plan, recipe_of(config, "detect", "tiny"))
     before = sorted(out.rglob("*"))
     with locked(out), pytest.raises(UserError, match=f"locked by PID {os.getpid()} "):
-        render_plan(plan, config, info, out, Progress(), "configuration")
+        render_job(Job(plan, config, info, "configuration"), out, Progress(), Here)
     assert sorted(out.rglob("*")) == before
 
 

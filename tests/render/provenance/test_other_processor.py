@@ -9,9 +9,9 @@ import pytest
 from numpy.core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 from tests.helpers.scenes import config_with
 
-from perilune_render.dataset.render import _write_scene
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.view import view_envelope
+from perilune_render.jobs.scene_renderer import write_scene
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.dataset.parts import read_part
 from perilune_shared.errors import UserError
@@ -31,17 +31,17 @@ begin(Path(sys.argv[1]))
 def begin(out):
     plan = make_plan(CONFIG, "detect")
     scene = grow_scene(CONFIG, view_envelope(CAMERA, CONFIG.detect.flight), 3)
-    _write_scene(out, plan.scenes[0], scene, CONFIG, "0" * 16, plan.trajectories)
+    write_scene(out, plan.scenes[0], scene, CONFIG, "0" * 16, plan.trajectories)
     return plan, scene
 
 
 def test_a_scene_with_other_last_digits_is_resumed(tmp_path):
     plan, scene = begin(tmp_path)
     rims = replace(scene.rims, z_m=scene.rims.z_m * (1 + 1e-15), depth_m=scene.rims.depth_m * (1 - 1e-15))
-    _write_scene(tmp_path, plan.scenes[0], replace(scene, rims=rims), CONFIG, "0" * 16, plan.trajectories)
+    write_scene(tmp_path, plan.scenes[0], replace(scene, rims=rims), CONFIG, "0" * 16, plan.trajectories)
     other = replace(scene.rims, depth_m=scene.rims.depth_m + 0.01)
     with pytest.raises(UserError, match="other craters"):
-        _write_scene(tmp_path, plan.scenes[0], replace(scene, rims=other), CONFIG, "0" * 16, plan.trajectories)
+        write_scene(tmp_path, plan.scenes[0], replace(scene, rims=other), CONFIG, "0" * 16, plan.trajectories)
 
 
 @pytest.mark.skipif(not AVX512, reason="NumPy uses no AVX-512 here, so that the other processor cannot be had")

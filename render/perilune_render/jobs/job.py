@@ -1,0 +1,49 @@
+"""A job: a dataset to render, as plain data that every process of a run receives."""
+
+from dataclasses import dataclass
+
+from perilune_render.config import DatasetConfig
+from perilune_render.dataset.folder import new_info
+from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, make_plan
+from perilune_render.provenance.recipe import recipe_of
+from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.names import Kind
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A dataset to render. Trajectories are identified by their place, the index in `plan.trajectories`."""
+
+    plan: Plan
+    """Scenes, trajectories and frames."""
+    config: DatasetConfig
+    """Settings."""
+    info: DatasetInfo
+    """The initial dataset.json."""
+    where: str
+    """Origin of the plan (configuration or manifest), named in errors about poses."""
+
+    @classmethod
+    def planned(cls, config: DatasetConfig, kind: Kind, preset: str) -> "Job":
+        """The job of the dataset `detect` or `nav` of a configuration. Raises UserError on impossible settings."""
+        plan = make_plan(config, kind)
+        return cls(
+            plan, config, new_info(config, plan, recipe_of(config, kind, preset)), f"configuration: dataset.{kind}"
+        )
+
+    def scene(self, scene_id: str) -> ScenePlan:
+        """The plan of a scene."""
+        return next(scene for scene in self.plan.scenes if scene.scene_id == scene_id)
+
+    def n_frames(self, place: int) -> int:
+        """Number of frames of a trajectory."""
+        return len(self.plan.trajectories[place].splits)
+
+    def name(self, place: int) -> str:
+        """Name of a trajectory, as scene-0000/trajectory-0000."""
+        return trajectory_name(self.plan.trajectories[place])
+
+
+def trajectory_name(trajectory: TrajectoryPlan) -> str:
+    """Name of a trajectory in messages, as scene-0000/trajectory-0000."""
+    return f"{trajectory.scene_id}/{trajectory.trajectory_id}"

@@ -1,0 +1,120 @@
+"""Render one trajectory of a job: the unit of work, which any process can do that has the job and the folder."""
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+
+from perilune_render.blender.renderer import Renderer
+from perilune_render.config import DatasetConfig
+from perilune_render.dataset import tables
+from perilune_render.dataset.folder import check_code
+from perilune_render.dataset.trajectory import render_trajectory
+from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
+from perilune_render.flight.pose_checks import Poses, check_poses
+from perilune_render.frame_source import FrameSource
+from perilune_render.jobs.job import Job
+from perilune_render.labels.frame_labels import RimCircles
+from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.scene import Scene
+from perilune_shared.content import content_sha256
+from perilune_shared.dataset.parts import read_part, write_part
+from perilune_shared.errors import UserError
+from perilune_shared.interrupts import interrupts_held
+
+_GROUND = ("craters", "boulders")
+
+
+class SceneRenderer:
+    """Renders trajectories of a job, one at a time, and keeps the scene of the last one for the next.
+
+    Use as a context manager, and only one at a time in a process, since Blender holds only one scene. Raises UserError
+    if the code of this process is not that of the job.
+    """
+
+    def __init__(self, job: Job, out: Path):
+        check_code(job.info.recipe(), with_dem=job.config.terrain.dem is not None)
+        self._job, self._out = job, out
+        self._grown: tuple[str, Scene] | None = None
+        self._opened: tuple[str, Scene, FrameSource] | None = None
+        self._closing = contextlib.ExitStack()
+
+    @property
+    def scene_id(self) -> str | None:
+        """The scene that is kept, if any."""
+        kept = self._opened or self._grown
+        return kept[0] if kept is not None else None
+
+    def grow(self, scene_id: str) -> Scene:
+        """Generate the ground of a scene and check that all its poses fit it. Raises UserError if one does not."""
+        if self._grown is None or self._grown[0] != scene_id:
+            self.close()  # frees the ground of the last scene first
+            job = self._job
+            with interrupts_held():
+                scene = cached_scene(job.config, job.plan.view, job.scene(scene_id).seed)
+            trajectories = job.plan.of_scene(scene_id)
+            if trajectories:
+                check_poses(Poses.planned(trajectories), job.plan.exr_camera, scene, job.where)
+            self._grown = scene_id, scene
+        return self._grown[1]
+
+    def render(self, place: int, advance: Callable[[], object], note: Callable[[str], object]) -> list[str]:
+        """Render a trajectory and write its files, labels and frames; returns the ids of its dark frames.
+
+        `advance` is called after each frame, `note` with a text on the current step.
+        """
+        trajectory = self._job.plan.trajectories[place]
+        try:
+            scene, source = self._open(trajectory.scene_id, note)
+            return render_trajectory(self._out, source, trajectory, scene, self._job.config, advance)
+        except BaseException:
+            self.close()  # Blender's scene may be half changed
+            raise
+
+    def _open(self, scene_id: str, note: Callable[[str], object]) -> tuple[Scene, FrameSource]:
+        if self._opened is None or self._opened[0] != scene_id:
+            note(f"{scene_id}: generating ground")
+            scene, plan, config = self.grow(scene_id), self._job.scene(scene_id), self._job.config
+            trajectories = self._job.plan.of_scene(scene_id)
+            write_scene(self._out, plan, scene, config, self._job.info.recipe().key, trajectories)
+            engine = self._closing.enter_context(Renderer(scene, config, self._job.plan.exr_camera, plan.sun))
+            source = FrameSource.of(engine, config, self._job.plan.camera, RimCircles.of_scene(scene))
+            self._opened = scene_id, scene, source
+            note(scene_id)
+        return self._opened[1:]
+
+    def __enter__(self) -> "SceneRenderer":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release Blender and the memory of the scene."""
+        self._opened = self._grown = None
+        self._closing.close()
+
+
+def write_scene(
+    out: Path, plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str, trajectories: list[TrajectoryPlan]
+) -> None:
+    """Write the parts of a scene that are missing; `recipe` is the key of its recipe, `trajectories` holds all of it.
+
+    Raises UserError if the dataset has other craters or boulders in this scene.
+    """
+    parts = {
+        **tables.scene_tables(plan, scene, config, recipe),
+        "trajectories": tables.trajectory_table(trajectories),
+    }
+    paths = {name: out / "manifest" / name / f"{plan.scene_id}.parquet" for name in parts}
+    existing = {name: read_part(paths[name], name) if paths[name].exists() else parts[name] for name in _GROUND}
+    # Compared by content hash, since craters computed on another processor may differ in the last digits.
+    if content_sha256(*existing.values()) != content_sha256(*(parts[name] for name in _GROUND)):
+        expected = "the elevation model and catalogue that the dataset was started with"
+        raise UserError(paths["craters"], "craters", "other craters or boulders", expected)
+    for name, rows in parts.items():
+        # Another process may write the same scene at the same time, with the same content.
+        with contextlib.suppress(FileExistsError):
+            write_part(out, name, plan.scene_id, rows)

@@ -1,0 +1,66 @@
+"""The trajectories of a job that are still to be rendered: which is next, and which have failed."""
+
+from collections import Counter, deque
+from collections.abc import Iterable
+
+from perilune_render.flight.plan import Plan
+
+N_ATTEMPTS = 4
+"""Number of times that a trajectory is tried: once, and again three times."""
+
+
+class WorkList:
+    """Hands out trajectories by their place in the plan, so that each process changes scenes rarely."""
+
+    def __init__(self, plan: Plan, places: Iterable[int]):
+        self._scene = [trajectory.scene_id for trajectory in plan.trajectories]
+        self._waiting: dict[str, deque[int]] = {}
+        for place in places:
+            self._waiting.setdefault(self._scene[place], deque()).append(place)
+        self._untouched = deque(self._waiting)
+        self._running: Counter[str] = Counter()
+        self._attempts: Counter[int] = Counter()
+        self.failures: dict[int, str] = {}
+        """Error of the last attempt of each trajectory that failed N_ATTEMPTS times."""
+
+    @property
+    def n_waiting(self) -> int:
+        """Number of trajectories that nobody renders at the moment."""
+        return sum(map(len, self._waiting.values()))
+
+    def take(self, scene_id: str | None) -> int | None:
+        """The next trajectory for a process that keeps the scene `scene_id`; None if none is waiting.
+
+        The first choice is a trajectory of the same scene, the second a scene that nobody has begun, the third the
+        scene that the fewest processes render.
+        """
+        if scene_id not in self._waiting:
+            while self._untouched and self._untouched[0] not in self._waiting:
+                self._untouched.popleft()
+            if not self._waiting:
+                return None
+            fewest = min(self._waiting, key=self._running.__getitem__) if not self._untouched else None
+            scene_id = fewest or self._untouched.popleft()
+        elif self._untouched and self._untouched[0] == scene_id:
+            self._untouched.popleft()
+        places = self._waiting[scene_id]
+        place = places.popleft()
+        if not places:
+            del self._waiting[scene_id]
+        self._running[scene_id] += 1
+        self._attempts[place] += 1
+        return place
+
+    def done(self, place: int) -> None:
+        """Record that a trajectory is finished."""
+        self._running[self._scene[place]] -= 1
+
+    def failed(self, place: int, error: str) -> int:
+        """Record a failed attempt; returns the number of attempts left. With some left, the trajectory waits again."""
+        self._running[self._scene[place]] -= 1
+        left = N_ATTEMPTS - self._attempts[place]
+        if left > 0:
+            self._waiting.setdefault(self._scene[place], deque()).append(place)
+        else:
+            self.failures[place] = error
+        return left
