@@ -6,11 +6,14 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from filelock import FileLock
 from hypothesis import settings
+
+from tests.helpers.s3_server import new_bucket, s3_server
 
 # Set by pytest-xdist in each of the processes of `make test`.
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
@@ -85,6 +88,22 @@ def tiny(tmp_path_factory) -> Path:
             subprocess.run(command, check=True, capture_output=True, text=True, env=one_thread)
             Path(f"{folder}.made").touch()
     return folder
+
+
+@pytest.fixture(scope="session")
+def s3_environment() -> Iterator[dict[str, str]]:
+    """The variables by which clients find an S3 server on this machine; also set in this process."""
+    pytest.importorskip("s3fs")
+    with s3_server() as environment, pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        yield environment
+
+
+@pytest.fixture
+def s3_bucket(s3_environment) -> str:
+    """The address of an empty bucket, s3://name, on an S3 server on this machine."""
+    return new_bucket()
 
 
 @pytest.fixture

@@ -133,5 +133,5 @@ def test_every_direct_dependency_is_pinned():
         project = tomllib.loads((ROOT / house / "pyproject.toml").read_text())["project"]
         extras = [name for extra in project.get("optional-dependencies", {}).values() for name in extra]
         for requirement in project["dependencies"] + extras:
-            name = re.split(r"[<>=!~ ]", requirement)[0].lower()
+            name = re.split(r"[<>=!~ \[]", requirement)[0].lower()
             assert name in pinned or name == "perilune-shared", name

@@ -1,0 +1,293 @@
+"""Read and write the files of a dataset by relative path, in a local folder or below a prefix of an object store.
+
+Use:
+
+    store = open_store("s3://bucket/moon")           # or a path, gs://bucket/prefix, memory://name
+    store.write("frames/s000/t000/000000.png", png)  # the whole object or nothing
+    store.read("dataset.json")
+
+All paths are relative POSIX paths of plain names. Every fault of an object store is a UserError with its address.
+"""
+
+import abc
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage import files
+from perilune_shared.storage.file_systems import OBJECT_STORES, file_system, open_ranges
+from perilune_shared.storage.store_faults import store_faults
+
+_KINDS = "a path, s3://bucket/prefix, gs://bucket/prefix or memory://name"
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One file of a store, as listed."""
+
+    path: str
+    """Path relative to the store."""
+    size_bytes: int
+    """Size, bytes."""
+
+
+class Store(abc.ABC):
+    """The files below one address. Get one with `open_store`."""
+
+    address: str
+    """Folder or prefix as text, without a slash at the end."""
+    folder: Path | None = None
+    """The local folder; None for an object store."""
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the store is a local folder."""
+        return self.folder is not None
+
+    def at(self, path: str) -> str:
+        """Return the address of one file, for messages."""
+        return f"{self.address}/{path}"
+
+    def __repr__(self) -> str:
+        return f"open_store({self.address!r})"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Store) and self.address == other.address
+
+    def __hash__(self) -> int:
+        return hash(self.address)
+
+    def exists(self, path: str) -> bool:
+        """Whether there is such a file."""
+        return self.size(path) is not None
+
+    def plain_size(self, path: str) -> int:
+        """Return the size of a file, bytes. Raises UserError if it is missing, a link, a folder, a pipe or a device."""
+        size = self.size(path)
+        if size is None:
+            raise _missing(self, path)
+        return size
+
+    @abc.abstractmethod
+    def sub(self, prefix: str) -> "Store":
+        """Return the store of the files below a prefix. Raises UserError if the prefix is not plain."""
+
+    @abc.abstractmethod
+    def list(self, prefix: str = "") -> Iterator[Item]:
+        """Yield all files below a prefix, sorted by path. Links, pipes and devices of a folder are included."""
+
+    @abc.abstractmethod
+    def size(self, path: str) -> int | None:
+        """Return the size of a file, bytes; None if it is missing. Raises UserError if it is no file of the store."""
+
+    @abc.abstractmethod
+    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes:
+        """Return the bytes [start, end) of a file. Raises UserError if it is missing."""
+
+    @abc.abstractmethod
+    def open(self, path: str) -> BinaryIO:
+        """Open a file for reading; only the ranges that are read are fetched. Raises UserError if it is missing."""
+
+    @abc.abstractmethod
+    def write(self, path: str, content: bytes, *, durable: bool = True) -> None:
+        """Write a new file: all of it or nothing. A file with equal content is left as it is.
+
+        With `durable`, a local file is synchronised to disk. Raises FileExistsError if it exists with other content.
+        """
+
+    @abc.abstractmethod
+    def replace(self, path: str, content: bytes) -> None:
+        """Write a file: all of it or nothing; replaces a file of that path."""
+
+    @abc.abstractmethod
+    def delete(self, path: str) -> None:
+        """Delete a file if it exists."""
+
+
+class LocalStore(Store):
+    """A local folder. Links that leave it, pipes and devices are refused."""
+
+    folder: Path
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.address = str(folder)
+
+    def sub(self, prefix: str) -> "LocalStore":
+        return LocalStore(files.inside(self.folder, prefix))
+
+    def list(self, prefix: str = "") -> Iterator[Item]:
+        top = files.inside(self.folder, prefix) if prefix else self.folder
+        if top.is_dir():
+            yield from _entries(top, f"{prefix}/" if prefix else "")
+
+    def size(self, path: str) -> int | None:
+        try:
+            state = files.inside(self.folder, path).stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        if not stat.S_ISREG(state.st_mode):
+            raise UserError(self.at(path), "file", "a folder, a pipe or a device", "a regular file")
+        return state.st_size
+
+    def plain_size(self, path: str) -> int:
+        if not files.is_plain(path):
+            files.inside(self.folder, path)
+        size = files.check_plain_file(self.folder / path)
+        files.inside(self.folder, path)
+        return size
+
+    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes:
+        with self.open(path) as stream:
+            stream.seek(start)
+            return stream.read() if end is None else stream.read(max(end - start, 0))
+
+    def open(self, path: str) -> BinaryIO:
+        if self.size(path) is None:
+            raise _missing(self, path)
+        return (self.folder / path).open("rb")
+
+    def write(self, path: str, content: bytes, *, durable: bool = True) -> None:
+        target = files.inside(self.folder, path)
+        size = self.size(path)
+        if size is None:
+            files.write_bytes(target, content, durable=durable)
+        elif size != len(content) or self.read(path) != content:
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), self.at(path))
+
+    def replace(self, path: str, content: bytes) -> None:
+        files.write_bytes(files.inside(self.folder, path), content)
+
+    def delete(self, path: str) -> None:
+        files.inside(self.folder, path).unlink(missing_ok=True)
+
+
+class ObjectStore(Store):
+    """A prefix of an object store, by fsspec. Usable in processes started by fork and in several threads."""
+
+    def __init__(self, address: str):
+        self.address = address
+        self._kind, _, self._prefix = address.partition("://")
+        self._opened: Any = None
+        self._pid = -1
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": None, "_pid": -1}
+
+    @property
+    def _system(self) -> Any:
+        """The file system of fsspec; opened again in a new process, since connections do not survive a fork."""
+        if self._pid != os.getpid():
+            self._opened, self._pid = file_system(self._kind, self.address), os.getpid()
+        return self._opened
+
+    def _key(self, path: str) -> str:
+        if not files.is_plain(path):
+            raise UserError(self.address, "path", repr(path), "a relative POSIX path of plain names inside the dataset")
+        return f"{self._prefix}/{path}"
+
+    def sub(self, prefix: str) -> "ObjectStore":
+        self._key(prefix)
+        return ObjectStore(self.at(prefix))
+
+    def list(self, prefix: str = "") -> Iterator[Item]:
+        top = self._key(prefix) if prefix else self._prefix
+        found: dict[str, Any] = {}
+        with store_faults(self.address):
+            try:
+                found = self._system.find(top, detail=True)
+            except FileNotFoundError as error:
+                if "bucket" in str(error).lower():
+                    raise
+        start = len(self._prefix) + 1
+        for key in sorted(found):
+            path = key.lstrip("/")[start:]
+            # A console may have made an empty object for a folder.
+            if path and not path.endswith("/"):
+                yield Item(path, int(found[key]["size"]))
+
+    def size(self, path: str) -> int | None:
+        with store_faults(self.at(path)):
+            try:
+                found = self._system.info(self._key(path))
+            except FileNotFoundError:
+                return None
+        return int(found["size"]) if found["type"] == "file" else None
+
+    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes:
+        if end is not None and end <= start:
+            return b""
+        with store_faults(self.at(path)):
+            try:
+                return cast(bytes, self._system.cat_file(self._key(path), start=start or None, end=end))
+            except FileNotFoundError:
+                raise _missing(self, path) from None
+
+    def open(self, path: str) -> BinaryIO:
+        with store_faults(self.at(path)):
+            try:
+                return open_ranges(self._system, self._key(path), self.at(path))
+            except FileNotFoundError:
+                raise _missing(self, path) from None
+
+    def write(self, path: str, content: bytes, *, durable: bool = True) -> None:
+        with store_faults(self.at(path)):
+            try:
+                self._system.pipe_file(self._key(path), content, mode="create")
+            except Exception:
+                # A repeated request may find what the first one wrote, though its answer was lost.
+                found = self.size(path)
+                if found is None:
+                    raise
+                if found != len(content) or self.read(path) != content:
+                    raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), self.at(path)) from None
+
+    def replace(self, path: str, content: bytes) -> None:
+        with store_faults(self.at(path)):
+            self._system.pipe_file(self._key(path), content)
+
+    def delete(self, path: str) -> None:
+        with store_faults(self.at(path)):
+            try:
+                self._system.rm_file(self._key(path))
+            except FileNotFoundError:
+                return
+
+
+def open_store(address: str | os.PathLike[str]) -> Store:
+    """Open the store at a path, s3://bucket/prefix, gs://bucket/prefix or memory://name; nothing is read or written.
+
+    Raises UserError if the address is of another kind, or the library for it is not installed.
+    """
+    text = os.fspath(address)
+    kind, found, prefix = text.partition("://")
+    if not found or kind == "file":
+        return LocalStore(Path(prefix if found else text))
+    prefix = prefix.strip("/")
+    if kind not in OBJECT_STORES:
+        raise UserError(text, "address", f"{kind}://", _KINDS)
+    if not files.is_plain(prefix):
+        raise UserError(text, "address", repr(prefix), f"{_KINDS}, of plain names")
+    file_system(kind, text)
+    return ObjectStore(f"{kind}://{prefix}")
+
+
+def _entries(folder: Path, prefix: str) -> Iterator[Item]:
+    """Yield the files below a folder in the order of their paths; links are not followed."""
+    with os.scandir(folder) as scanned:
+        # "a-b" comes before "a/b", as in the listing of an object store.
+        found = sorted(scanned, key=lambda entry: entry.name + ("/" if entry.is_dir(follow_symlinks=False) else ""))
+    for entry in found:
+        if entry.is_dir(follow_symlinks=False):
+            yield from _entries(Path(entry.path), f"{prefix}{entry.name}/")
+        else:
+            yield Item(prefix + entry.name, entry.stat(follow_symlinks=False).st_size)
+
+
+def _missing(store: Store, path: str) -> UserError:
+    return UserError(store.at(path), "file", "no such file", "a regular file")
