@@ -10,10 +10,11 @@ Six tables, schema version {SCHEMA_VERSION}. Every Parquet file also stores unit
 metadata `unit` and `meaning`). O_L and O_S are [frames of reference](frames.md). Columns in px use the frame's image
 coordinates: origin at the outer corner of the top-left pixel, x right, y down.
 """
-PACKED = """## images
+PACKED = """## shards
 
-Only in packed datasets, in `images/`: `frame_id`, and `image`, a struct of `bytes` (the PNG file) and `path` (the
-frame's `png_path`).
+Only in packed datasets: one row per frame, in `shards/<split>-00000-of-00012.parquet`. The columns of `frames`, then
+`image`, a struct of `bytes` (the PNG file) and `path` (the frame's `png_path`), and `labels`, a list of structs: the
+columns of `labels` that are not in `frames`.
 """
 
 

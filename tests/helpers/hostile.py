@@ -15,7 +15,8 @@ import pytest
 
 from perilune_shared.cli import main as cli
 from perilune_shared.dataset.manifest import Dataset, open_dataset
-from perilune_shared.dataset.schema import IMAGES, TABLES
+from perilune_shared.dataset.packed import SHARDS, packed_rows, shard_name
+from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError, run_command_line
 from perilune_shared.storage import checksums
 from perilune_shared.validation.validate import validate
@@ -56,20 +57,18 @@ def edit(change: Callable[[dict], object]) -> Callable[[Path], None]:
     return damage
 
 
-def pack(root: Path, change: Callable[[list[dict]], object] = lambda rows: None, schema=IMAGES, **options) -> None:
-    """Pack the frames in one shard, with `change` applied to its rows."""
-    frames = pq.read_table(part_of(root, "frames")).to_pylist()
-    rows = [
-        {
-            "frame_id": row["frame_id"],
-            "image": {"bytes": (root / row["png_path"]).read_bytes(), "path": row["png_path"]},
-        }
-        for row in frames
-    ]
+def pack(root: Path, change: Callable[[list[dict]], object] = lambda rows: None, schema=SHARDS, **options) -> None:
+    """Pack the frames in one shard for each split, with `change` applied to all rows."""
+    frames, labels = pq.read_table(part_of(root, "frames")), pq.read_table(part_of(root, "labels"))
+    pngs = [(root / path).read_bytes() for path in frames["png_path"].to_pylist()]
+    rows = packed_rows(frames, labels, pngs).to_pylist()
+    splits = {row["frame_id"]: row["split"] for row in rows}
     change(rows)
-    (root / "images").mkdir()
-    table = pa.Table.from_pylist(rows, schema=schema)
-    pq.write_table(table, root / "images/00000.parquet", **{"use_dictionary": ["frame_id"], **options})
+    (root / "shards").mkdir()
+    for split in sorted(set(splits.values())):
+        own = [row for row in rows if splits.get(row["frame_id"], "train") == split]
+        table = pa.Table.from_pylist(own, schema=schema)
+        pq.write_table(table, root / shard_name(split, 0, 1), **{"use_dictionary": ["frame_id"], **options})
     edit(lambda content: content.update(images="packed"))(root)
 
 

@@ -6,10 +6,8 @@ from pathlib import Path
 import pytest
 from tests.helpers.drawn_dataset import build_dataset
 
-from perilune_shared.dataset.info_file import read_info
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.packed import write_packed
-from perilune_shared.dataset.writer import new_dataset
+from perilune_shared.editing.pack import pack
 
 
 @pytest.fixture(scope="session")
@@ -33,15 +31,9 @@ def crowded(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def crowded_packed(crowded, tmp_path_factory) -> Path:
-    """The dataset `crowded`, packed: each table in one part, frames in Parquet."""
-    source, out = open_dataset(crowded), tmp_path_factory.mktemp("packed") / "set"
-    info = read_info(crowded).model_copy(update={"images": "packed"})
-    with new_dataset(out, info, whole_tables=True) as writer:
-        for scene_id in source.scene_ids():
-            writer.add_scene(source.scene(scene_id))
-        frames = source.table("frames")
-        paths = dict(zip(frames["frame_id"].to_pylist(), frames["png_path"].to_pylist(), strict=True))
-        write_packed(writer.root, ((name, paths[name], png) for name, png in source.pngs(frames)), shard_bytes=100_000)
+    """The dataset `crowded`, packed: each table in one part, frames in shards."""
+    out = tmp_path_factory.mktemp("packed") / "set"
+    pack(open_dataset(crowded), out, shard_mb=0.1)
     return out
 
 

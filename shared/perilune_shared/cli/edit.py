@@ -135,9 +135,9 @@ def migrate(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) 
 def pack(
     dataset: DatasetArgument,
     out: OutOption,
-    shard_mb: Annotated[float, typer.Option(help="Size of an image shard, megabytes.")] = 1000,
+    shard_mb: Annotated[float, typer.Option(help="Size of a shard of frames, megabytes.")] = 128,
 ) -> None:
-    """Pack all frames into a few large Parquet files and each table into one, for transfer or streaming."""
+    """Pack frames with poses and labels into Parquet shards by split, and each table into one file, for streaming."""
     from perilune_shared.editing.pack import pack as pack_dataset
 
     with progress_bar() as progress:

@@ -55,9 +55,12 @@ def read_info(root: Path) -> DatasetInfo:
     """Read a folder's dataset.json. Raises UserError if it is missing, damaged or of another schema version."""
     path = root / INFO_NAME
     content = read_object(path)
-    for folder in (root / "manifest", root / "images", *(root / "manifest" / table for table in TABLES)):
+    for folder in (root / "manifest", root / "shards", *(root / "manifest" / table for table in TABLES)):
         if folder.is_symlink():
             raise UserError(folder, "folder", "a link", "a folder")
+    if content.get("images") == "packed" and (root / "images").exists():
+        expected = "frames in shards/; unpack the dataset with the version of perilune that packed it"
+        raise UserError(path, "images", "frames in images/*.parquet", expected)
     version = content.get("schema_version")
     if version != SCHEMA_VERSION:
         raise UserError(path, "schema_version", version, f"{SCHEMA_VERSION}; see `perilune-manifest migrate`")

@@ -1,4 +1,4 @@
-"""Read a dataset: dataset.json, Parquet parts under manifest/, frames under frames/ or packed in images/.
+"""Read a dataset: dataset.json, Parquet parts under manifest/, frames under frames/ or packed in shards/.
 
 Parts are written atomically and never rewritten. Use:
 
@@ -204,9 +204,9 @@ class Dataset:
                 raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {LARGEST_FRAME_BYTES}")
             yield frame_id, path.read_bytes()
 
-    def shards(self) -> list[Path]:
-        """Return the Parquet files that contain packed frames."""
-        return shards_of(self.root)
+    def shards(self, split: str | None = None) -> list[Path]:
+        """Return the Parquet files that contain packed frames, of all splits or of one, sorted by name."""
+        return shards_of(self.root, split)
 
 
 def open_dataset(root: str | Path) -> Dataset:

@@ -141,7 +141,7 @@ class DatasetInfo(_Info):
     complete: bool
     """False while rendering is in progress or was interrupted."""
     images: ImageState
-    """Where the frames are: files (under frames/), packed (images/*.parquet), absent, or planned (no labels either)."""
+    """Where the frames are: files (under frames/), packed (shards/*.parquet), absent, or planned (no labels either)."""
     split_by: SplitUnit
     """Unit of the split; no unit is in two splits. If it is not scene, splits may share terrain."""
     camera: CameraRecord

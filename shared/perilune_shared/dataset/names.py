@@ -12,7 +12,7 @@ Split = Literal["train", "val", "test"]
 SplitUnit = Literal["scene", "trajectory", "frame"]
 """Rows that belong to one split as a whole."""
 ImageState = Literal["files", "packed", "absent", "planned"]
-"""Where the frames are: under frames/, in images/*.parquet, left out, or not rendered yet (then without labels)."""
+"""Where the frames are: under frames/, in shards/*.parquet, left out, or not rendered yet (then without labels)."""
 ImageKind = Literal["png", "exr"]
 """The two files of a frame: the image of the sensor, and radiance with depth and crater index."""
 ImageChoice = Literal["copy", "none", "plan"]

@@ -1,23 +1,84 @@
-"""Read and write packed frames: PNGs in images/*.parquet."""
+"""Packed frames: shards/<split>-00000-of-00012.parquet, one row per frame with its pose, its image and its labels."""
 
-from collections.abc import Iterable, Iterator
+import json
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
+import pyarrow.compute as pc
 
+from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.parts import Part
-from perilune_shared.dataset.schema import IMAGES
+from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.errors import UserError
 
-MOST_IMAGES_WRITTEN = 1_000_000
-"""Maximum number of frames of a shard; it gives 7,813 row groups, and readers accept 10,000."""
-_IMAGES_PER_GROUP, _BYTES_PER_GROUP = 128, 2**28
+FOLDER = "shards"
+_NAME = re.compile(rf"({'|'.join(SPLITS)})-([0-9]{{5}})-of-([0-9]{{5}})\.parquet")
+_DTYPES = {
+    pa.string(): "string",
+    pa.int64(): "int64",
+    pa.float32(): "float32",
+    pa.float64(): "float64",
+    pa.bool_(): "bool",
+}
+IMAGE = pa.field(
+    "image",
+    pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())]),
+    metadata={"unit": "", "meaning": "the PNG file's bytes, and the png_path of the frame"},
+)
+LABEL = pa.struct([field for field in TABLES["labels"] if field.name not in TABLES["frames"].names])
+"""One label of a frame: the columns of `labels` that are not columns of `frames`."""
 
 
-def shards_of(root: Path) -> list[Path]:
-    """Return the Parquet files of a dataset that contain packed frames."""
-    return sorted(root.joinpath("images").glob("[A-Za-z0-9]*.parquet"))
+def features_of(columns: list[pa.Field]) -> bytes:
+    """Return the metadata `huggingface` of a Parquet file: it makes `datasets` decode the column `image`."""
+    features = {field.name: {"_type": "Image"} if field.name == "image" else _feature(field.type) for field in columns}
+    return json.dumps({"info": {"features": features}}).encode()
+
+
+def _feature(kind: pa.DataType) -> dict[str, Any]:
+    """Describe a type in the notation of `datasets`."""
+    if pa.types.is_fixed_size_list(kind):
+        return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
+    if pa.types.is_list(kind):
+        return {"feature": {field.name: _feature(field.type) for field in kind.value_type}, "_type": "List"}
+    return {"dtype": _DTYPES[kind], "_type": "Value"}
+
+
+def _shard_schema() -> pa.Schema:
+    labels = pa.list_(pa.field("element", LABEL, nullable=False))
+    meaning = {"unit": "", "meaning": "the frame's labels: the columns of the table labels"}
+    columns = [*TABLES["frames"], IMAGE, pa.field("labels", labels, nullable=False, metadata=meaning)]
+    about = {"perilune.table": FOLDER, "perilune.schema_version": SCHEMA_VERSION, "huggingface": features_of(columns)}
+    return pa.schema(columns, metadata=about)
+
+
+SHARDS = _shard_schema()
+"""Schema of a shard: the columns of `frames`, the image and the labels."""
+
+
+def shard_name(split: str, number: int, count: int) -> str:
+    """Return the path of a shard, relative to the dataset."""
+    return f"{FOLDER}/{split}-{number:05d}-of-{count:05d}.parquet"
+
+
+def split_of(shard: Path) -> str:
+    """Return the split that the name of a shard states."""
+    return shard.name.partition("-")[0]
+
+
+def shards_of(root: Path, split: str | None = None) -> list[Path]:
+    """Return the shards of a dataset, or of one split, sorted by name. Other files are not shards."""
+    found = sorted(path for path in root.joinpath(FOLDER).glob("*.parquet") if _NAME.fullmatch(path.name))
+    return [path for path in found if split in (None, split_of(path))]
+
+
+def open_shard(path: Path) -> Part:
+    """Open a shard and check its footer. Raises UserError as `Part` does."""
+    return Part(path, FOLDER, SHARDS)
 
 
 def read_packed(root: Path, frame_ids: set[str]) -> Iterator[tuple[str, bytes]]:
@@ -26,69 +87,36 @@ def read_packed(root: Path, frame_ids: set[str]) -> Iterator[tuple[str, bytes]]:
     Raises UserError if a frame is missing.
     """
     missing = set(frame_ids)
-    for shard in shards_of(root):
+    for path in shards_of(root):
         if not missing:
             return
-        part = Part(shard, "images", IMAGES)
-        for group in part.groups_within("frame_id", min(missing), max(missing) + "\x00"):
-            keys = part.read(["frame_id"], [group])["frame_id"].to_pylist()
+        shard = open_shard(path)
+        for group in shard.groups_within("frame_id", min(missing), max(missing) + "\x00"):
+            keys = shard.read(["frame_id"], [group])["frame_id"].to_pylist()
             if missing.isdisjoint(keys):
                 continue
-            images = part.read(["image"], [group])["image"]
+            images = shard.read(["image"], [group])["image"]
             for frame_id, image in zip(keys, images, strict=True):
                 if frame_id in missing:
                     missing.remove(frame_id)
                     yield frame_id, image["bytes"].as_py() or b""
     if missing:
-        raise UserError(root / "images", "frame_id", f"no {min(missing)}", "every frame of the manifest")
+        raise UserError(root / FOLDER, "frame_id", f"no {min(missing)}", "every frame of the manifest")
 
 
-def write_packed(
-    root: Path, images: Iterable[tuple[str, str, bytes]], shard_bytes: int, most_images: int = MOST_IMAGES_WRITTEN
-) -> None:
-    """Write frames (frame_id, png_path, PNG bytes) into images/*.parquet, of up to about `shard_bytes` each."""
-    root.joinpath("images").mkdir(parents=True, exist_ok=True)
-    shard = _ShardWriter(root / "images", 0)
-    try:
-        for name, path, png in images:
-            if shard.n_images and (shard.n_bytes + len(png) > shard_bytes or shard.n_images == most_images):
-                shard.close()
-                shard = _ShardWriter(root / "images", shard.number + 1)
-            shard.add(name, path, png)
-    finally:
-        shard.close()
+def packed_rows(frames: pa.Table, labels: pa.Table, pngs: list[bytes | None]) -> pa.Table:
+    """Return rows of a shard from rows of `frames` (N), rows of `labels` and PNG bytes (N).
 
-
-class _ShardWriter:
-    """Writer of one shard; the file is created with the first row group."""
-
-    def __init__(self, folder: Path, number: int):
-        self.number, self.n_images, self.n_bytes = number, 0, 0
-        self._path = folder / f"{number:05d}.parquet"
-        self._buffer: list[dict] = []
-        self._buffer_bytes = 0
-        self._writer: pq.ParquetWriter | None = None
-
-    def add(self, frame_id: str, path: str, png: bytes) -> None:
-        """Add a frame; write a row group whenever it is full."""
-        self._buffer.append({"frame_id": frame_id, "image": {"bytes": png, "path": path}})
-        self.n_images += 1
-        self.n_bytes += len(png)
-        self._buffer_bytes += len(png)
-        if len(self._buffer) == _IMAGES_PER_GROUP or self._buffer_bytes > _BYTES_PER_GROUP:
-            self._flush()
-
-    def close(self) -> None:
-        """Write the last row group and close the file."""
-        self._flush()
-        if self._writer is not None:
-            self._writer.close()
-
-    def _flush(self) -> None:
-        if not self._buffer:
-            return
-        if self._writer is None:
-            # PNG is already compressed, and all frames differ.
-            self._writer = pq.ParquetWriter(self._path, IMAGES, compression="none", use_dictionary=["frame_id"])
-        self._writer.write_table(pa.Table.from_pylist(self._buffer, schema=IMAGES))
-        self._buffer, self._buffer_bytes = [], 0
+    Labels of other frames are left out; those of one frame keep their order.
+    """
+    row_of = pc.index_in(labels["frame_id"], frames["frame_id"].combine_chunks())
+    frame_of = pc.fill_null(row_of, len(frames)).to_numpy()
+    counts = np.bincount(frame_of, minlength=len(frames) + 1)[: len(frames)]
+    own = np.argsort(frame_of, kind="stable")[: counts.sum()]
+    columns = [labels[field.name].combine_chunks().take(pa.array(own)) for field in LABEL]
+    offsets = pa.array(np.concatenate([[0], np.cumsum(counts)]), pa.int32())
+    nested = pa.ListArray.from_arrays(offsets, pa.StructArray.from_arrays(columns, fields=list(LABEL)))
+    images = [pa.array(pngs, pa.binary()), frames["png_path"].combine_chunks()]
+    image = pa.StructArray.from_arrays(images, fields=list(IMAGE.type))
+    rows = [frames[name] for name in SHARDS.names[:-2]]
+    return pa.table([*rows, image, nested.cast(SHARDS.field("labels").type)], schema=SHARDS)

@@ -38,6 +38,8 @@ _MAX_FOOTER_TEXT_BYTES = 10_000_000
 _SPARE_ROWS, _BYTES_PER_ROW = 10_000, 4
 _SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
+_NESTED_ROWS = "labels."
+"""Start of the columns of a shard that contain rows of another table, any number for each frame."""
 _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
 """Pattern of scene_id and trajectory_id, which become file names."""
@@ -57,11 +59,11 @@ class Part:
     def __init__(self, path: Path, table: str, schema: pa.Schema | None = None, version: str = SCHEMA_VERSION):
         """Open a part. Raises UserError if it is no Parquet file, of another table or schema version, or too large.
 
-        `schema` replaces the table's schema in TABLES, for older versions. Unknown columns are ignored. Missing columns
-        of `MAY_BE_ABSENT` are read as null.
+        `schema` replaces the table's schema in TABLES, for older versions and for shards. Unknown columns are ignored.
+        Missing columns of `MAY_BE_ABSENT` are read as null.
         """
         self.path, self.schema = path, schema or TABLES[table]
-        self._may_be_absent = MAY_BE_ABSENT.get(table, ()) if schema is None else ()
+        self._may_be_absent = MAY_BE_ABSENT.get(table, ()) if version == SCHEMA_VERSION else ()
         self._n_bytes = files.check_plain_file(path)
         self._checked: set[tuple[int, str]] = set()
         try:
@@ -111,6 +113,7 @@ class Part:
         footer = self.file.metadata
         most_rows = min(_MAX_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_PER_ROW)
         n_bytes, n_rows = 0, 0
+        n_nested: dict[str, int] = {}
         for group in range(footer.num_row_groups):
             rows = footer.row_group(group)
             n_rows += rows.num_rows
@@ -122,8 +125,14 @@ class Part:
                 if column.path_in_schema.split(".")[0] not in self.schema.names:
                     continue  # never read
                 n_bytes += max(column.total_uncompressed_size, 0)
-                # The longest list is a quaternion.
-                if column.num_values > 4 * rows.num_rows:
+                if column.path_in_schema.startswith(_NESTED_ROWS):
+                    # Each is a row of a table, so the limit is that of rows.
+                    n_nested[column.path_in_schema] = n_nested.get(column.path_in_schema, 0) + column.num_values
+                    if column.num_values > _MAX_GROUP_ROWS or n_nested[column.path_in_schema] > most_rows:
+                        expected = f"at most {most_rows} for {self._n_bytes} bytes"
+                        raise UserError(self.path, column.path_in_schema, f"{column.num_values} values", expected)
+                # The longest other list is a quaternion.
+                elif column.num_values > 4 * rows.num_rows:
                     raise UserError(
                         self.path, column.path_in_schema, f"{column.num_values} values", "at most 4 per row"
                     )

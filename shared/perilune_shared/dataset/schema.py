@@ -160,7 +160,8 @@ TABLES: dict[str, pa.Schema] = {
         ),
     ),
 }
-MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {"frames": ("real_ground_share", "n_craters_above_max_radius")}
+_ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius")
+MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {"frames": _ABSENT_IN_FRAMES, "shards": _ABSENT_IN_FRAMES}
 """Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
 writers always write them. To add one, append a column with `nullable=True` to its table and add its name here."""
 KEYS: dict[str, list[str]] = {
@@ -172,22 +173,3 @@ KEYS: dict[str, list[str]] = {
     "labels": ["frame_id", "crater_id"],
 }
 """Columns that identify a row, by table."""
-
-IMAGES = pa.schema(
-    [
-        _column("frame_id", _TEXT, "", "the frame"),
-        pa.field(
-            "image",
-            pa.struct([pa.field("bytes", pa.binary()), pa.field("path", _TEXT)]),
-            metadata={"unit": "", "meaning": "the PNG file's bytes, and the png_path of the frame"},
-        ),
-    ],
-    metadata={
-        "perilune.table": "images",
-        "perilune.schema_version": SCHEMA_VERSION,
-        # Makes the library `datasets` of Hugging Face decode the column as an image.
-        "huggingface": '{"info": {"features": {"frame_id": {"dtype": "string", "_type": "Value"}, '
-        '"image": {"_type": "Image"}}}}',
-    },
-)
-"""Schema of the packed frames, images/*.parquet."""

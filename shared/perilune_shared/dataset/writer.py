@@ -53,7 +53,7 @@ class DatasetWriter:
         trajectory.
         """
         check_scene("new dataset", tables)
-        frames = _with_new_paths(tables["frames"])
+        frames = with_new_paths(tables["frames"])
         splits = frames["split"].to_numpy(zero_copy_only=False)
         scene = tables["scenes"].to_pylist()[0]
         terrain = terrain_of(scene["dem_source"], scene["content_sha256"])
@@ -173,7 +173,7 @@ def with_column(table: pa.Table, name: str, values: object) -> pa.Table:
     return table.set_column(place, field, array)
 
 
-def _with_new_paths(frames: pa.Table) -> pa.Table:
+def with_new_paths(frames: pa.Table) -> pa.Table:
     """Return frames with the file paths of the new dataset; the source dataset may use other paths."""
     ids = frames["frame_id"].to_pylist()
     for kind in IMAGE_KINDS:

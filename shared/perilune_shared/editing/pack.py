@@ -1,40 +1,48 @@
-"""Pack a dataset into few large files, and unpack it: PNGs in images/*.parquet, each table as one part."""
+"""Pack a dataset into shards that can be streamed, and unpack it. A shard has frames with pose, image and labels."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.dataset.names import frame_path
-from perilune_shared.dataset.packed import MOST_IMAGES_WRITTEN, write_packed
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.packed import LABEL, SHARDS, packed_rows, shard_name
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
-from perilune_shared.dataset.writer import new_dataset, with_column
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.writer import new_dataset, with_column, with_new_paths
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
+from perilune_shared.storage import files
 
+MOST_FRAMES_WRITTEN = 100_000
+"""Maximum number of frames of a shard; it gives at most 1,563 row groups, and readers accept 10,000."""
+_MAX_SHARD_MB = 2000
+_FRAMES_PER_GROUP, _BYTES_PER_GROUP = 64, 2**23
+"""Maximum of a row group, the unit that a stream reads and shuffles."""
 _EXR_COLUMNS = ("exr_path", "exr_sha256", "exr_bytes")
-_MAX_SHARD_MB = 8000
-"""Maximum shard size, 10^6 bytes: larger files are refused on reading (perilune_shared.dataset.parts)."""
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
 
 
 def pack(
     source: Dataset,
     out: Path,
-    shard_mb: float = 1000,
+    shard_mb: float = 128,
     progress: Progress = NO_PROGRESS,
     *,
     most_rows: int = MOST_ROWS_WRITTEN,
-    most_images: int = MOST_IMAGES_WRITTEN,
+    most_frames: int = MOST_FRAMES_WRITTEN,
 ) -> None:
     """Write a packed dataset: frames in shards of about `shard_mb` megabytes, readable by Hugging Face `datasets`.
 
-    A table of more than `most_rows` rows becomes several parts, and a shard contains at most `most_images` frames, to
-    stay within the limits of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are
-    packed. EXRs are not packed: their columns become null.
+    Shards contain the frames of one split, in the order scene, trajectory, frame index. A table of more than
+    `most_rows` rows becomes several parts, and a shard contains at most `most_frames` frames, to stay within the limits
+    of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are packed. EXRs are not
+    packed: their columns become null.
     """
     check_source(source, out, progress)
     if not 0 < shard_mb <= _MAX_SHARD_MB:
@@ -43,20 +51,74 @@ def pack(
     info = source.info
     if packed:
         info = info.changed("packed", images="packed", exr_camera=None)
-    frames = source.table("frames").sort_by(_ORDER)
     with new_dataset(out, info, whole_tables=True, most_rows=most_rows, progress=progress) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
             writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
         if packed:
-            write_packed(writer.root, _images(source, frames, progress), round(shard_mb * 1e6), most_images)
+            task = progress.add_task("packing", total=source.info.counts.frames, unit="frames")
+            for split in SPLITS:
+                sizes = _sizes(source, split, shard_mb * 1e6, most_frames)
+                for n_frames in _write_shards(source, writer.root, split, sizes):
+                    progress.advance(task, n_frames)
 
 
-def _images(source: Dataset, frames: pa.Table, progress: Progress) -> Iterator[tuple[str, str, bytes]]:
-    task = progress.add_task("packing", total=len(frames), unit="frames")
-    for frame_id, png in source.pngs(frames):
-        yield frame_id, frame_path(frame_id, "png"), png
-        progress.advance(task)
+def _write_shards(source: Dataset, root: Path, split: str, shards: list[list[int]]) -> Iterator[int]:
+    """Write the shards of one split, with row groups of given sizes; yield the size of each when it is written."""
+    groups = _groups(source, split, [size for shard in shards for size in shard])
+    for number, shard in enumerate(shards):
+        with files.written_aside(root / shard_name(split, number, len(shards)), durable=False) as path:
+            text = [field.name for field in SHARDS if pa.types.is_string(field.type)]
+            with pq.ParquetWriter(path, SHARDS, compression="zstd", use_dictionary=text) as writer:
+                for n_frames, rows in zip(shard, groups, strict=False):
+                    writer.write_table(rows)
+                    yield n_frames
+
+
+def _sizes(source: Dataset, split: str, shard_bytes: float, most_frames: int) -> list[list[int]]:
+    """Return the number of frames of each row group of each shard of a split."""
+    frames = source.table("frames", ["scene_id", "trajectory_id", "frame_index", "png_bytes"], split=split)
+    counts = source.info.counts
+    label_bytes = sum(field.type.bit_width // 8 for field in LABEL) * counts.labels / max(counts.frames, 1)
+    shards: list[list[int]] = []
+    in_group = in_shard = group_bytes = bytes_so_far = 0.0
+    for png_bytes in frames.sort_by(_ORDER)["png_bytes"].to_pylist():
+        n_bytes = (png_bytes or 0) + label_bytes
+        if not shards or bytes_so_far + n_bytes > shard_bytes or in_shard == most_frames:
+            shards.append([0])
+            in_group = in_shard = group_bytes = bytes_so_far = 0
+        elif in_group == _FRAMES_PER_GROUP or group_bytes + n_bytes > _BYTES_PER_GROUP:
+            shards[-1].append(0)
+            in_group = group_bytes = 0
+        shards[-1][-1] += 1
+        in_group, in_shard = in_group + 1, in_shard + 1
+        group_bytes, bytes_so_far = group_bytes + n_bytes, bytes_so_far + n_bytes
+    return shards
+
+
+def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Table]:
+    """Yield the row groups of a split, of `sizes` frames each. The tables of a few trajectories are in memory."""
+    trajectories = _trajectories(source, split)
+    frames, labels = TABLES["frames"].empty_table(), TABLES["labels"].empty_table()
+    for size in sizes:
+        while len(frames) < size:
+            more, more_labels = next(trajectories)
+            frames, labels = pa.concat_tables([frames, more]), pa.concat_tables([labels, more_labels])
+        chosen, frames = frames[:size], frames[size:]
+        pngs = dict(source.pngs(chosen))
+        yield packed_rows(with_new_paths(chosen), labels, [pngs[name] for name in chosen["frame_id"].to_pylist()])
+        labels = labels.filter(pc.is_in(labels["frame_id"], frames["frame_id"].combine_chunks()))
+
+
+def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Table]]:
+    """Yield the frames, in order and without EXRs, and the labels of each trajectory of a split."""
+    columns = ["scene_id", "trajectory_id", "split"]
+    for row in source.table("trajectories", columns).sort_by(_ORDER[:2]).to_pylist():
+        if row["split"] in (split, None):
+            keys = row["scene_id"], row["trajectory_id"], split
+            frames = source.table("frames", None, *keys).replace_schema_metadata(TABLES["frames"].metadata)
+            labels = source.table("labels", None, *keys).replace_schema_metadata(TABLES["labels"].metadata)
+            yield _without_exr(frames.sort_by(_ORDER)), labels
 
 
 def unpack(source: Dataset, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:

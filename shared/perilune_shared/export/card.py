@@ -34,7 +34,7 @@ _SAFE = frozenset(string.ascii_letters + string.digits + " ._+,:()/%=?-")
 _PURPOSE = {"detect": "Crater detection", "nav": "Navigation"}
 _IMAGES = {
     "files": "8- or 16-bit grey PNGs under frames/",
-    "packed": "grey PNGs packed in images/*.parquet",
+    "packed": "grey PNGs packed in shards/*.parquet",
     "absent": "not included (only the manifest)",
     "planned": "not rendered yet",
 }

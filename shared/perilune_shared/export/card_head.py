@@ -8,6 +8,8 @@ installation; the tests read the head with it.
 from typing import Any
 
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.packed import FOLDER, shards_of
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.yaml_text import to_yaml_text
 
@@ -42,20 +44,20 @@ def head_of(dataset: Dataset, configs: list[dict[str, Any]]) -> str:
 
 
 def table_configs(dataset: Dataset) -> list[dict[str, Any]]:
-    """Return a configuration for each table that has rows, and for packed images.
+    """Return the configurations: of packed frames, the default with the dataset's splits, and of tables that have rows.
 
-    Without configurations `datasets` treats every image in the folder as training data. A part may contain rows of all
-    splits, so each table has the single split `mixed`; see the column `split` of frames. The Hugging Face export writes
-    separate files per split.
+    Without configurations `datasets` treats every image in the folder as training data. A part of a table may contain
+    rows of all splits, so each table has the single split `mixed`; see the column `split` of frames. The Hugging Face
+    export writes frames that are not packed in separate files per split.
     """
     counts = dataset.info.counts.model_dump()
     names = ["frames", *(name for name in TABLES if name != "frames")]
-    configs = [_config(name, f"manifest/{name}/*.parquet") for name in names if counts[name]]
+    configs = [_config(name, {"mixed": f"manifest/{name}/*.parquet"}) for name in names if counts[name]]
     if dataset.info.images == "packed":
-        configs.append(_config("images", "images/*.parquet"))
-    return configs
+        splits = [split for split in SPLITS if shards_of(dataset.root, split)]
+        configs.insert(0, _config("packed", {split: f"{FOLDER}/{split}-*.parquet" for split in splits}))
+    return [{**configs[0], "default": True}, *configs[1:]] if configs else []
 
 
-def _config(name: str, path: str) -> dict[str, Any]:
-    config: dict[str, Any] = {"config_name": name, "data_files": [{"split": "mixed", "path": path}]}
-    return {**config, "default": True} if name == "frames" else config
+def _config(name: str, files: dict[str, str]) -> dict[str, Any]:
+    return {"config_name": name, "data_files": [{"split": split, "path": path} for split, path in files.items()]}

@@ -225,7 +225,7 @@ def _images(*, packed: bool) -> dict[str, Any]:
         "name": "image-files",
         "description": "packed frames" if packed else "frames; the table frames has their hashes",
         "encodingFormat": _PARQUET if packed else "image/png",
-        "includes": "images/*.parquet" if packed else "frames/*.png",
+        "includes": "shards/*.parquet" if packed else "frames/*.png",
     }
 
 

@@ -5,10 +5,8 @@ all of them as training data. With this export, `datasets.load_dataset(folder)` 
 `load_dataset(folder, split="test")` loads one. Format: https://huggingface.co/docs/hub/datasets-manual-configuration.
 """
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,21 +15,16 @@ import pyarrow.parquet as pq
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import SPLITS
-from perilune_shared.dataset.schema import IMAGES, TABLES
+from perilune_shared.dataset.packed import IMAGE, LABEL, features_of
+from perilune_shared.dataset.schema import TABLES
 from perilune_shared.export.card_head import head_of
 from perilune_shared.export.rows import Choice, SceneRows, scenes_of
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
 
 _OMITTED = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
-_LABEL = pa.struct(
-    [
-        *(pa.field(field.name, field.type) for field in TABLES["labels"] if field.name != "frame_id"),
-        pa.field("chosen", pa.bool_()),
-    ]
-)
+_LABEL = pa.struct([*(pa.field(field.name, field.type) for field in LABEL), pa.field("chosen", pa.bool_())])
 _FRAMES_PER_GROUP = 128
-_DTYPES = {pa.string(): "string", pa.int64(): "int64", pa.float64(): "float64", pa.bool_(): "bool"}
 
 
 def export_hugging_face(
@@ -83,20 +76,10 @@ test = load_dataset("FOLDER", split="test")
 
 def schema_of() -> pa.Schema:
     """Return the schema of the files: columns of frames, the image, and the labels as a list of structs."""
-    columns = [IMAGES.field("frame_id"), IMAGES.field("image")]
+    columns = [TABLES["frames"].field("frame_id"), IMAGE]
     columns += [field for field in TABLES["frames"] if field.name not in ("frame_id", *_OMITTED)]
     columns.append(pa.field("labels", pa.list_(_LABEL), metadata={"unit": "", "meaning": "craters in the frame"}))
-    features = {field.name: {"_type": "Image"} if field.name == "image" else _feature(field.type) for field in columns}
-    return pa.schema(columns, metadata={"huggingface": json.dumps({"info": {"features": features}})})
-
-
-def _feature(kind: pa.DataType) -> dict[str, Any]:
-    """Describe a type in the notation of `datasets`."""
-    if pa.types.is_fixed_size_list(kind):
-        return {"feature": _feature(kind.value_type), "length": kind.list_size, "_type": "List"}
-    if pa.types.is_list(kind):
-        return {"feature": {field.name: _feature(field.type) for field in kind.value_type}, "_type": "List"}
-    return {"dtype": _DTYPES[kind], "_type": "Value"}
+    return pa.schema(columns, metadata={"huggingface": features_of(columns)})
 
 
 def _tables(dataset: Dataset, scene: SceneRows) -> Iterator[tuple[str, pa.Table]]:

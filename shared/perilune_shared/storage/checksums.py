@@ -16,7 +16,7 @@ SUMS_NAME = "SHA256SUMS"
 _LARGEST_BYTES = 20_000_000
 _LARGEST_FILE = 2**36
 _LINE = re.compile(r"([0-9a-f]{64})  (\S+)")
-_OWN_FOLDERS = ("manifest", "images")
+_OWN_FOLDERS = ("manifest", "shards")
 
 
 def seal(root: Path, progress: Progress = NO_PROGRESS, known: Mapping[str, str] | None = None) -> None:
@@ -84,7 +84,7 @@ def _hashing(root: Path, names: list[str], progress: Progress) -> Iterator[Calla
 
 
 def _covered(root: Path) -> list[str]:
-    """List the files directly in the dataset's folder and below manifest/ and images/, sorted, without hidden files."""
+    """List the files directly in the dataset's folder and below manifest/ and shards/, sorted, without hidden files."""
     found = [path for path in root.iterdir() if path.is_file() and path.name != SUMS_NAME]
     for folder in _OWN_FOLDERS:
         found += [path for path in root.joinpath(folder).rglob("*") if path.is_file() or path.is_symlink()]

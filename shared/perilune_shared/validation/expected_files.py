@@ -41,14 +41,14 @@ def unexpected(dataset: Dataset) -> Iterator[str]:
     own_files = {INFO_NAME, SUMS_NAME, *EXTRA_NAMES, *_LOCKS}
     own_files |= {path.relative_to(dataset.root).as_posix() for table in TABLES for path in dataset.parts(table)}
     if dataset.info.images == "packed":
-        own_folders.add("images")
+        own_folders.add("shards")
         own_files |= {path.relative_to(dataset.root).as_posix() for path in dataset.shards()}
     if dataset.info.images == "files":
         frames = dataset.table("frames", ["png_path", "exr_path"])
         for kind in ("png", "exr"):
             # Files of other types stay unexpected, even if a row of `frames` lists them.
             paths = [path for path in frames[f"{kind}_path"].to_pylist() if path and path.endswith(f".{kind}")]
-            own_files |= {path for path in paths if path.split("/")[0] not in ("manifest", "images")}
+            own_files |= {path for path in paths if path.split("/")[0] not in ("manifest", "shards")}
         own_folders |= {str(parent) for path in own_files for parent in Path(path).parents if str(parent) != "."}
     n_found = 0
     for root, folders, names in os.walk(dataset.root):

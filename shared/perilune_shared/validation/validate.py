@@ -22,6 +22,7 @@ from perilune_shared.storage import checksums
 from perilune_shared.validation.expected_files import unexpected
 from perilune_shared.validation.faults import Fault, part_faults
 from perilune_shared.validation.images import image_faults
+from perilune_shared.validation.shards import shard_faults
 from perilune_shared.validation.trajectory import trajectory_faults
 
 _TOLERANCE_DEG = 1e-9
@@ -63,7 +64,10 @@ def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
         if not faults:
             faults.append(Fault.from_error("manifest", None, error))
     try:
-        faults += image_faults(dataset, progress)
+        if dataset.info.images == "files":
+            faults += image_faults(dataset, progress)
+        elif dataset.info.images == "packed":
+            faults += shard_faults(dataset, progress)
     except UserError as error:
         if not faults:
             faults.append(Fault.from_error("images", None, error))

@@ -47,14 +47,14 @@ def test_unpacking_restores_the_dataset(drawn, packed, tmp_path):
 def test_large_tables_become_several_readable_parts(little, tmp_path, monkeypatch):
     source = open_dataset(little)
     assert source.info.counts.craters == 600
-    pack(source, tmp_path / "p", most_rows=100, most_images=2)
+    pack(source, tmp_path / "p", most_rows=100, most_frames=2)
     original = parts._MAX_ROWS
     monkeypatch.setattr(parts, "_MAX_ROWS", 100)
     with pytest.raises(UserError, match="rows"):
         source.table("craters")
     made = open_dataset(tmp_path / "p")
     assert validate(made) == []
-    assert len(made.parts("craters")) == 6 and len(made.parts("labels")) == 1 and len(made.shards()) == 3
+    assert len(made.parts("craters")) == 6 and len(made.parts("labels")) == 1 and len(made.shards()) == 4
     assert [part.stem for part in made.parts("craters")][:2] == ["all", "all.0001"]
     monkeypatch.setattr(parts, "_MAX_ROWS", original)
     assert made.table("craters").equals(source.table("craters"))
@@ -107,7 +107,15 @@ def test_a_subset_of_a_packed_dataset(packed, tmp_path):
 def test_the_metadata_of_a_shard_declares_an_image_column(packed):
     schema = pq.read_schema(open_dataset(packed).shards()[0])
     features = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
-    assert features["image"] == {"_type": "Image"} and schema.names == ["frame_id", "image"]
+    assert features["image"] == {"_type": "Image"} and schema.names == [*TABLES["frames"].names, "image", "labels"]
+
+
+def test_images_without_poses_and_labels_are_refused(packed, tmp_path):
+    """The packed form of earlier versions."""
+    root = shutil.copytree(packed, tmp_path / "p")
+    (root / "shards").rename(root / "images")
+    with pytest.raises(UserError, match=r"dataset.json: images: got frames in images/\*.parquet, expected .*unpack"):
+        open_dataset(root)
 
 
 @pytest.mark.parametrize("version", ["1", "2"])

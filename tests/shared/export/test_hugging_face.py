@@ -1,9 +1,10 @@
-"""Hugging Face `datasets` loads the splits of an export and does not mix them."""
+"""Hugging Face `datasets` loads the splits of an export and of shards, and does not mix them."""
 
 import io
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 from rich.progress import Progress
@@ -24,14 +25,54 @@ def offline(monkeypatch, tmp_path):
     return pytest.importorskip("datasets")
 
 
-def test_shards_are_images(crowded_packed, offline, tmp_path):
+def check_rows(dataset, split, rows):
+    """Check that rows are all frames of a split, with their images, poses and labels."""
+    frames = dataset.table("frames", split=split).to_pandas().set_index("frame_id")
+    pngs = dict(dataset.pngs(dataset.table("frames", split=split)))
+    labels = dataset.table("labels", split=split).to_pandas().groupby("frame_id")
+    found = {row["frame_id"]: row for row in rows}
+    assert sorted(found) == sorted(frames.index) == sorted(pngs)
+    for frame_id, row in found.items():
+        assert np.array_equal(np.array(row["image"]), np.array(Image.open(io.BytesIO(pngs[frame_id]))))
+        assert row["position_m"] == frames.loc[frame_id, "position_m"].tolist()
+        own = labels.get_group(frame_id).set_index("crater_id")["ellipse_a_px"].to_dict()
+        assert {each["crater_id"]: each["ellipse_a_px"] for each in row["labels"]} == own
+
+
+def test_shards_are_loaded_and_streamed_by_split(crowded_packed, offline, tmp_path):
+    dataset, cache = open_dataset(crowded_packed), str(tmp_path / "cache")
+    files = {split: [str(path) for path in dataset.shards(split)] for split in ("train", "val", "test")}
+    assert len(files["train"]) > 1
+    loaded = offline.load_dataset("parquet", data_files=files, cache_dir=cache)
+    for split, rows in loaded.items():
+        check_rows(dataset, split, rows)
+    # Without a card `datasets` finds the splits by the names of the shards.
+    named = offline.load_dataset(str(crowded_packed), cache_dir=cache)
+    assert set(named) == {"train", "validation", "test"}
+    check_rows(dataset, "val", named["validation"])
+    root = shutil.copytree(crowded_packed, tmp_path / "set")
+    with Progress(disable=True) as progress:
+        write_card(open_dataset(root), None, progress)
+    for split in ("train", "val", "test"):
+        check_rows(dataset, split, offline.load_dataset(str(root), split=split, cache_dir=cache, streaming=True))
+    labels = offline.load_dataset(str(root), "labels", split="mixed", cache_dir=cache)
+    assert len(labels) == dataset.info.counts.labels
+
+
+def test_shards_are_read_by_pandas_polars_and_duckdb(crowded_packed):
+    duckdb, polars = pytest.importorskip("duckdb"), pytest.importorskip("polars")
     dataset = open_dataset(crowded_packed)
-    shards = [str(shard) for shard in dataset.shards()]
-    rows = offline.load_dataset("parquet", data_files=shards, split="train", cache_dir=str(tmp_path / "cache"))
-    assert len(rows) == dataset.info.counts.frames and type(rows.features["image"]).__name__ == "Image"
-    pngs = dict(dataset.pngs(dataset.table("frames")))
-    for row in rows:
-        assert np.array_equal(np.array(row["image"]), np.array(Image.open(io.BytesIO(pngs[row["frame_id"]]))))
+    pattern = str(dataset.root / "shards/train-*.parquet")
+    frames, labels = (dataset.table(name, split="train").to_pandas() for name in ("frames", "labels"))
+    area = (np.pi * labels["radius_px"] ** 2).sum()
+    rows = pd.concat([pd.read_parquet(path) for path in dataset.shards("train")])
+    assert rows["frame_id"].tolist() == frames["frame_id"].tolist()
+    assert sum(np.pi * each["radius_px"] ** 2 for own in rows["labels"] for each in own) == pytest.approx(area)
+    found = polars.scan_parquet(pattern).select("frame_id", "labels").explode("labels").unnest("labels").collect()
+    assert len(found) == len(labels) and np.pi * (found["radius_px"] ** 2).sum() == pytest.approx(area)
+    query = f"select sum(pi() * l.radius_px ** 2) from (select unnest(labels) as l from '{pattern}')"
+    assert duckdb.sql(query).fetchall()[0][0] == pytest.approx(area)
+    assert duckdb.sql(f"select octet_length(image.bytes) = png_bytes from '{pattern}'").fetchall() == [(True,)] * 10
 
 
 @pytest.fixture(params=["files", "packed", "split by frame"])
@@ -69,14 +110,14 @@ def test_an_export_has_splits_with_images_poses_and_labels(source, offline, tmp_
     assert test["frame_id"] == loaded["test"]["frame_id"]
 
 
-def test_the_card_of_a_dataset_declares_no_split_train(source, offline, tmp_path):
-    root = shutil.copytree(source.root, tmp_path / "set")
+def test_the_card_of_frames_in_files_declares_no_split_train(crowded, offline, tmp_path):
+    root = shutil.copytree(crowded, tmp_path / "set")
     with Progress(disable=True) as progress:
         write_card(open_dataset(root), None, progress)
     loaded = offline.load_dataset(str(root), cache_dir=str(tmp_path / "cache"))
     assert set(loaded) == {"mixed"} and set(loaded["mixed"]["split"]) == {"train", "val", "test"}
     labels = offline.load_dataset(str(root), "labels", split="mixed", cache_dir=str(tmp_path / "cache"))
-    assert len(labels) == source.info.counts.labels
+    assert len(labels) == open_dataset(crowded).info.counts.labels
     for split in ("train", "test"):
         with pytest.raises(ValueError, match="Unknown split"):
             offline.load_dataset(str(root), split=split, cache_dir=str(tmp_path / "cache"))

@@ -25,7 +25,7 @@ UNEXPECTED = {
     "a table of another name": ("manifest/extra/all.parquet", "manifest/extra"),
     "a file among the tables": ("manifest/README.md", None),
     "a part of another suffix": ("manifest/frames/all.csv", None),
-    "images of a dataset that is not packed": ("images/00000.parquet", "images"),
+    "shards of a dataset that is not packed": ("shards/train-00000-of-00001.parquet", "shards"),
     "a Parquet file beside dataset.json": ("train.parquet", None),
     "a program": ("perilune.py", None),
     "a hidden file": (".hidden", None),

@@ -221,7 +221,7 @@ FILES = {
     "a part of one byte": (sealed(added("manifest/frames/b.parquet")), "manifest/frames/b.parquet", "content"),
     "the manifest by a link": (moved("manifest"), "manifest", "link"),
     "a table by a link": (moved("manifest/labels"), "labels", "link"),
-    "images by a link": (linked("images", "canary"), "images", "link"),
+    "shards by a link": (linked("shards", "canary"), "shards", "link"),
     "a part named by a command": (sealed(added("manifest/frames/a$(id).parquet")), "a$(id).parquet", "part"),
     "a part named with a blank": (sealed(added("manifest/frames/a b.parquet")), "a b.parquet", "part"),
     "a part named with a line break": (sealed(added("manifest/frames/a\nb.parquet")), "a b.parquet", "part"),

@@ -5,10 +5,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from tests.helpers import hostile_parquet as forged
-from tests.helpers.hostile import edit, faults_within_limits, part_of, sealed
+from tests.helpers.hostile import faults_within_limits, pack, part_of, sealed
 
+from perilune_shared.dataset.packed import SHARDS
 from perilune_shared.dataset.parts import Part
-from perilune_shared.dataset.schema import IMAGES, TABLES
+from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 
 
@@ -68,14 +69,39 @@ def long_list(root):
 
 
 def one_image_repeated(root):
-    rows = pq.read_table(part_of(root, "frames"), columns=["frame_id"])
-    image = pa.array([b"\x89PNG" + bytes(40_000_000)])
-    images = pa.StructArray.from_arrays([image, pa.array(["a"])], fields=list(IMAGES.field("image").type))
-    (root / "images").mkdir()
-    with pq.ParquetWriter(root / "images/00000.parquet", IMAGES, compression="zstd") as writer:
-        for k in range(6):
-            writer.write_table(pa.table([rows["frame_id"].combine_chunks()[k : k + 1], images], schema=IMAGES))
-    edit(lambda found: found.update(images="packed"))(root)
+    pack(root, lambda rows: rows.__delitem__(slice(1, None)), compression="zstd")
+    path = root / "shards/train-00000-of-00001.parquet"
+    rows = pq.read_table(path)
+    image = pa.array([{"bytes": b"\x89PNG" + bytes(40_000_000), "path": "a"}], SHARDS.field("image").type)
+    rows = rows.set_column(rows.schema.get_field_index("image"), SHARDS.field("image"), image)
+    with pq.ParquetWriter(path, SHARDS, compression="zstd") as writer:
+        for _ in range(6):
+            writer.write_table(rows)
+
+
+def one_label_repeated(change=None):
+    """Give one frame 3 x 10^6 equal labels, which take few bytes by a dictionary or in run lengths."""
+
+    def damage(root):
+        pack(root, lambda rows: rows.__delitem__(slice(1, None)))
+        path = root / "shards/train-00000-of-00001.parquet"
+        rows = pq.read_table(path)
+        label = rows["labels"].combine_chunks().values.slice(0, 1)
+        many = label.take(pa.array(np.zeros(3_000_000, np.int32)))
+        lists = pa.ListArray.from_arrays(pa.array([0, len(many)], pa.int32()), many).cast(SHARDS.field("labels").type)
+        rows = rows.set_column(rows.schema.get_field_index("labels"), SHARDS.field("labels"), lists)
+        pq.write_table(rows, path, compression="zstd")
+        if change is not None:
+            forged.forge(path, change)
+
+    return damage
+
+
+def few_values(found):
+    """Change a footer so that it states few labels."""
+    for group in forged.groups(found):
+        for each in forged.columns(group)[-13:]:
+            forged.put(each, 5, 100)
 
 
 BOMBS = {
@@ -94,6 +120,8 @@ BOMBS = {
     ),
     "2 x 10^7 numbers in a row": (long_list, "nominal_position_m"),
     "images of 240 MB in 60 kB": (one_image_repeated, "size"),
+    "3 x 10^6 labels of one frame": (one_label_repeated(), "labels.list.element"),
+    "the same with a footer that hides it, by its values": (one_label_repeated(few_values), "labels.list.element"),
 }
 
 

@@ -12,7 +12,7 @@ from tests.helpers.hostile import assert_refused, digest, edit, pack, part_of, p
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import Counts
-from perilune_shared.dataset.schema import IMAGES
+from perilune_shared.dataset.packed import SHARDS as SHARD_SCHEMA
 from perilune_shared.dataset.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
@@ -219,7 +219,8 @@ def image_of(rows, **change):
     rows[0]["image"] = {**rows[0]["image"], **change}
 
 
-TEXT_IMAGE = pa.schema([IMAGES.field(0), pa.field("image", pa.string())], metadata=IMAGES.metadata)
+TRAIN = "shards/train-00000-of-00001.parquet"
+TEXT_IMAGE = SHARD_SCHEMA.set(SHARD_SCHEMA.get_field_index("image"), pa.field("image", pa.string()))
 SHARDS = {
     "a frame twice": (lambda root: pack(root, lambda rows: rows.append(rows[0])), "frame_id"),
     "a frame less": (lambda root: pack(root, lambda rows: rows.pop()), "frame_id"),
@@ -236,10 +237,25 @@ SHARDS = {
         lambda root: pack(root, lambda rows: [row.update(image="a") for row in rows], schema=TEXT_IMAGE),
         "image",
     ),
-    "no shard": (lambda root: [pack(root), (root / "images/00000.parquet").unlink()], "frame_id"),
-    "a shard that is none": (lambda root: [pack(root), (root / "images/00000.parquet").write_bytes(b"x")], "content"),
+    "a label of another frame": (
+        lambda root: pack(root, lambda rows: rows[0]["labels"].append(rows[1]["labels"][0])),
+        "labels",
+    ),
+    "a label less": (lambda root: pack(root, lambda rows: rows[0]["labels"].pop()), "labels"),
+    "another pose": (lambda root: pack(root, lambda rows: rows[0].update(position_m=[0.0, 0.0, 9.0])), "position_m"),
+    "a path outside": (lambda root: pack(root, lambda rows: image_of(rows, path="/etc/passwd")), "image.path"),
+    "frames of another split": (
+        lambda root: [pack(root), (root / TRAIN).rename(root / "shards/test-00000-of-00001.parquet")],
+        "split",
+    ),
+    "one of two shards": (
+        lambda root: [pack(root), (root / TRAIN).rename(root / "shards/train-00001-of-00002.parquet")],
+        "name",
+    ),
+    "no shard": (lambda root: [pack(root), (root / TRAIN).unlink()], "frame_id"),
+    "a shard that is none": (lambda root: [pack(root), (root / TRAIN).write_bytes(b"x")], "content"),
     "a shard of another table": (
-        lambda root: [pack(root), (root / "images/00001.parquet").write_bytes(part_of(root, "frames").read_bytes())],
+        lambda root: [pack(root), (root / TRAIN).write_bytes(part_of(root, "frames").read_bytes())],
         "perilune.table",
     ),
     "packed, and frames that cannot be read": (

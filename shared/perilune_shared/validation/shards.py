@@ -1,0 +1,85 @@
+"""Check a dataset's shards against the manifest: names, rows, labels and images."""
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterator
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.packed import FOLDER, open_shard, packed_rows, shard_name, split_of
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.errors import UserError
+from perilune_shared.progress import Progress
+from perilune_shared.validation.faults import Fault
+from perilune_shared.validation.images import png_faults
+
+
+def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
+    """Yield faults of packed frames: every frame occurs once, in its split's shards, with its rows of the manifest.
+
+    Reads one row group at a time, and the tables of its trajectories.
+    """
+    task = progress.add_task("hashing", total=dataset.info.counts.frames, unit="frames")
+    missing = set(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())
+    shards = dataset.shards()
+    for path in shards:
+        where = path.relative_to(dataset.root).as_posix()
+        try:
+            shard = open_shard(path)
+            first_row = 0
+            for group in range(shard.n_groups):
+                rows = shard.read(groups=[group])
+                for row, frame_id in enumerate(rows["frame_id"].to_pylist(), first_row):
+                    if frame_id not in missing:
+                        yield Fault.of(where, row, "frame_id", frame_id, "frames of the manifest, each once")
+                    missing.discard(frame_id)
+                yield from _row_faults(dataset, rows, where, split_of(path), first_row)
+                first_row += len(rows)
+                progress.advance(task, len(rows))
+        except UserError as error:
+            yield Fault.from_error(where, None, error)
+    if missing:
+        yield Fault.of(FOLDER, None, "frame_id", f"no {min(missing)}", "every frame of the manifest")
+    names = defaultdict(list)
+    for path in shards:
+        names[split_of(path)].append(path.relative_to(dataset.root).as_posix())
+    for split, found in names.items():
+        expected = [shard_name(split, number, len(found)) for number in range(len(found))]
+        if found != expected:
+            odd = next(name for name in found if name not in expected)
+            yield Fault.of(odd, None, "name", f"one of {len(found)} shards of {split}", expected[0])
+
+
+def _row_faults(dataset: Dataset, rows: pa.Table, where: str, split: str, first_row: int) -> Iterator[Fault]:
+    """Compare a row group with the manifest; rows of unknown frames are reported by the caller."""
+    frames, labels = _manifest_rows(dataset, rows)
+    known = rows.filter(pc.is_in(rows["frame_id"], frames["frame_id"].combine_chunks()))
+    frames = frames.take(pc.index_in(known["frame_id"], frames["frame_id"].combine_chunks()))
+    expected = packed_rows(frames, labels, [None] * len(frames))
+    for name in expected.column_names:
+        found = known[name] if name != "image" else pc.struct_field(known[name], "path")
+        right = expected[name] if name != "image" else frames["png_path"]
+        if not found.equals(right.cast(found.type)):
+            pairs = enumerate(zip(found.to_pylist(), right.to_pylist(), strict=True), first_row)
+            row, (value, other) = next((row, pair) for row, pair in pairs if pair[0] != pair[1])
+            column = "image.path" if name == "image" else name
+            table = "labels" if name == "labels" else "frames"
+            yield Fault.of(where, row, column, value, f"{other}, as in the table {table}")
+    for row, frame in enumerate(frames.to_pylist(), first_row):
+        if frame["split"] != split:
+            yield Fault.of(where, row, "split", frame["split"], f"{split}, as in the name of the shard")
+        png = known["image"][row - first_row]["bytes"].as_py() or b""
+        yield from png_faults(dataset, png, len(png), hashlib.sha256(png).hexdigest(), frame, row, where)
+
+
+def _manifest_rows(dataset: Dataset, rows: pa.Table) -> tuple[pa.Table, pa.Table]:
+    """Return the rows of frames and labels of the trajectories in a row group."""
+    keys = rows.group_by(["scene_id", "trajectory_id"]).aggregate([]).to_pylist()
+    tables = []
+    for name in ("frames", "labels"):
+        found = [dataset.table(name, scene_id=key["scene_id"], trajectory_id=key["trajectory_id"]) for key in keys]
+        empty = TABLES[name].empty_table().replace_schema_metadata()
+        tables.append(pa.concat_tables([empty, *found]))
+    return tables[0], tables[1]
