@@ -142,9 +142,9 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     render.pixel_aspect_x, render.pixel_aspect_y = _pixel_aspect(camera)
     render.use_persistent_data = True
     render.use_file_extension = False
-    render.threads_mode = "FIXED" if settings.threads else "AUTO"
-    if settings.threads:
-        render.threads = settings.threads
+    # Blender itself would count the cores that it could use when it started, which is one.
+    render.threads_mode = "FIXED"
+    render.threads = settings.threads or _n_cores()
     render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
     render.image_settings.color_depth = "32"
     render.image_settings.exr_codec = "NONE"
@@ -165,6 +165,11 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     layer.use_pass_z = True
     layer.use_pass_normal = True
     layer.use_pass_diffuse_direct = light.bounce or light.earthshine
+
+
+def _n_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _pixel_aspect(camera: Camera) -> tuple[float, float]:

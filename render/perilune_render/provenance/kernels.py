@@ -13,12 +13,12 @@ from perilune_render.provenance.caches import machine_code_folder
 
 
 def njit(**options: Any) -> Callable[[Callable], Any]:
-    """`numba.njit(cache=True)` with the machine code in `machine_code_folder()`."""
+    """`numba.njit(cache=True)` with the machine code in `machine_code_folder()`; other threads may run meanwhile."""
 
     def decorate(function: Callable) -> Any:
         before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(machine_code_folder())
         try:
-            return numba.njit(cache=True, **options)(function)
+            return numba.njit(cache=True, nogil=True, **options)(function)
         finally:
             numba.config.CACHE_DIR = before
 

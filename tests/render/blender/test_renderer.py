@@ -4,6 +4,8 @@ import dataclasses
 import os
 import signal
 import threading
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -249,3 +251,37 @@ def test_one_renderer_at_a_time_in_a_process():
         Renderer(None, config_with(), CAMERA, sun)
     with Renderer(ground, config_with(), CAMERA, sun) as second:
         assert (second.render(np.array([0, 0, 100.0]), np.diag([1.0, -1.0, -1.0])).radiance_factor > 0).all()
+
+
+def test_one_thread_renders_on_one_core_and_lets_python_run():
+    """Blender's pool of threads must not spin while one thread renders; Python's other threads must not wait for it."""
+    config, gap_s = config_with(render=RenderConfig(samples=200, threads=1)), []
+
+    def cpu_s(thread):
+        fields = (thread / "stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def measure_gaps():
+        last = time.monotonic()
+        while not stopped.wait(0.01):
+            gap_s.append(time.monotonic() - last)
+            last += gap_s[-1]
+
+    with Renderer(flat_scene(400, 41), config, CAMERA, sun_direction(0, 40)) as renderer:
+        renderer.render(POSITION, TILTED)
+        threads = list(Path("/proc/self/task").iterdir())
+        before, stopped = [cpu_s(thread) for thread in threads], threading.Event()
+        measuring = threading.Thread(target=measure_gaps)
+        measuring.start()
+        renderer.render(POSITION, TILTED)
+        stopped.set()
+        measuring.join()
+    used_s = sorted(cpu_s(thread) - start for thread, start in zip(threads, before, strict=True))
+    assert used_s[-1] > 0.5
+    assert sum(used_s[:-1]) < 0.2 * used_s[-1]
+    assert max(gap_s) < 0.5 * used_s[-1]
+
+
+def test_all_cores_render_by_default():
+    with Renderer(flat_scene(400, 41), config_with(), CAMERA, sun_direction(0, 40)) as renderer:
+        assert renderer.stage.render.threads == len(os.sched_getaffinity(0))
