@@ -17,7 +17,7 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig, KindConfig, RenderConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.flight.view import view_envelope
-from perilune_render.imaging.exr import read_radiance, write_exr
+from perilune_render.imaging.exr import exr_bytes, read_radiance
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.export import vertices
@@ -130,7 +130,7 @@ def rendered_frames() -> list[Frame]:
         for seed, place in enumerate(POSES):
             position, rotation = pose(scene, *place)
             radiance = renderer.render(position, rotation, seed)
-            write_exr(path, radiance, np.zeros_like(radiance.depth_m))
+            path.write_bytes(exr_bytes(radiance, np.zeros_like(radiance.depth_m)))
             found.append(Frame(position, rotation, read_radiance(path), caster.cast(position, RAYS @ rotation)))
     return found
 

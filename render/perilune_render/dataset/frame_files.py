@@ -1,12 +1,13 @@
 """Write a frame's files: PNG, and EXR on request."""
 
+import hashlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from perilune_render.frame_source import Frame, FrameSource
-from perilune_render.imaging.exr import write_exr
+from perilune_render.imaging.exr import exr_bytes
 from perilune_shared.dataset.names import ImageKind, frame_path
 from perilune_shared.storage import files
 
@@ -16,29 +17,24 @@ def write_frame(root: Path, frame_id: str, source: FrameSource, frame: Frame, *,
 
     Does not wait until the files are on the disk.
     """
-    write_png(files.inside(root, frame_path(frame_id, "png")), frame.image, source.sensor.bits)
-    columns = _columns(root, frame_id, "png")
+    columns = _write(root, frame_id, "png", png_bytes(frame.image, source.sensor.bits))
     if exr:
-        write_exr(root / frame_path(frame_id, "exr"), frame.radiance, source.crater_index(frame))
-        columns |= _columns(root, frame_id, "exr")
+        columns |= _write(root, frame_id, "exr", exr_bytes(frame.radiance, source.crater_index(frame)))
     return columns
 
 
-def write_png(path: Path, image: np.ndarray, bits: int) -> None:
-    """Write an image (h, w), DN. Above 8 bits the PNG has 16: a grey value fills the upper bits, the lower ones are 0.
-
-    Does not wait until the file is on the disk.
-    """
+def png_bytes(image: np.ndarray, bits: int) -> bytes:
+    """An image (h, w), DN, as PNG. Above 8 bits the PNG has 16: a grey value fills the upper bits, the lower are 0."""
     stored = image if bits == 8 else image << (16 - bits)
-    files.write_bytes(path, cv2.imencode(".png", stored)[1].tobytes(), durable=False)
+    return cv2.imencode(".png", stored)[1].tobytes()
 
 
-def _columns(root: Path, frame_id: str, kind: ImageKind) -> dict[str, str | int]:
-    """The columns png_* or exr_* (by `kind`) of a written file."""
+def _write(root: Path, frame_id: str, kind: ImageKind, content: bytes) -> dict[str, str | int]:
+    """Write a file of a frame; returns its columns png_* or exr_* (by `kind`)."""
     path = frame_path(frame_id, kind)
-    whole = root / path
+    files.write_bytes(files.inside(root, path), content, durable=False)
     return {
         f"{kind}_path": path,
-        f"{kind}_bytes": whole.stat().st_size,
-        f"{kind}_sha256": files.sha256_of(whole),
+        f"{kind}_bytes": len(content),
+        f"{kind}_sha256": hashlib.sha256(content).hexdigest(),
     }

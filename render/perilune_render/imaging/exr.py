@@ -1,6 +1,6 @@
-"""Read the EXR files that Blender writes; read and write the EXR files of datasets."""
+"""Read the EXR files that Blender writes; make and read the EXR files of datasets."""
 
-import errno
+import io
 from pathlib import Path
 
 import numpy as np
@@ -9,25 +9,19 @@ import OpenEXR
 from perilune_render.imaging.radiance import Radiance
 from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
 from perilune_shared.errors import UserError
-from perilune_shared.storage.files import written_aside
 
 _MOST_CHANNELS = 64
 CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 
-def write_exr(path: Path, radiance: Radiance, crater: np.ndarray) -> None:
-    """Write a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), compressed without loss.
-
-    Does not wait until the file is on the disk.
-    """
+def exr_bytes(radiance: Radiance, crater: np.ndarray) -> bytes:
+    """An EXR file of a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), without loss."""
     values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), radiance.sunlit, crater)
     channels = {name: np.ascontiguousarray(value, np.float32) for name, value in zip(CHANNELS, values, strict=True)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with written_aside(path, durable=False) as aside:
-        try:
-            OpenEXR.File(header, channels).write(str(aside))
-        except RuntimeError as error:
-            raise OSError(errno.ENOSPC, f"cannot write ({error})", str(path)) from None
+    stream = io.BytesIO()
+    OpenEXR.File(header, channels).write(stream)
+    return stream.getvalue()
 
 
 def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:
