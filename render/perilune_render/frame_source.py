@@ -108,7 +108,14 @@ class FrameSource:
 
     def take(self, shot: Shot) -> Frame:
         """Render and develop one frame. Raises what the engine raises: OSError if Blender wrote no readable frame."""
-        radiance = self.engine.render(*shot.pose, seed=shot.render_seed)
+        return self.develop(shot, self.render(shot))
+
+    def render(self, shot: Shot) -> Radiance:
+        """The engine's rendering of a shot, in the pixels of its camera. Raises what the engine raises."""
+        return self.engine.render(*shot.pose, seed=shot.render_seed)
+
+    def develop(self, shot: Shot, radiance: Radiance) -> Frame:
+        """Develop the rendering of a shot. Another thread may do this while the engine renders the next shot."""
         velocity = shot.rotation_camera_from_site @ shot.velocity_mps
         exposure = expose(radiance, self.sensor, self.camera, self.engine.camera, velocity)
         noise = stream(shot.seed, "sensor", shot.index)

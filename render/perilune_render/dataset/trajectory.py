@@ -1,7 +1,11 @@
 """Render one trajectory: its images, labels and rows of `frames`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+
+import pyarrow as pa
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
@@ -10,9 +14,22 @@ from perilune_render.dataset.real_ground import real_ground_share
 from perilune_render.dataset.shots import planned_shot
 from perilune_render.dataset.trajectory_parts import finish_trajectory
 from perilune_render.flight.plan import TrajectoryPlan
-from perilune_render.frame_source import FrameSource
+from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.imaging.darkness import is_dark
+from perilune_render.imaging.radiance import Radiance
 from perilune_render.terrain.scene import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """What remains of a frame once its files are written."""
+
+    row: dict[str, str | int | float | None]
+    """Columns of its files and measurements in the table `frames`."""
+    labels: pa.Table
+    """Its rows of the table `labels`."""
+    is_dark: bool
+    """Whether almost none of its pixels are sunlit."""
 
 
 def render_trajectory(
@@ -25,21 +42,45 @@ def render_trajectory(
 ) -> list[str]:
     """Render and write one trajectory of `scene` into the dataset's folder `out`; returns the ids of its dark frames.
 
-    `source` renders the scene. `advance` is called after each frame. The same arguments give the same bytes; a
-    trajectory whose rendering was interrupted is rendered from its start.
+    `source` renders the scene. A second thread develops, labels and writes each frame while the next one is rendered.
+    `advance` is called after each frame, in order. The same arguments give the same bytes; a trajectory whose rendering
+    was interrupted is rendered from its start.
     """
-    rows: list[dict] = []
-    labels, dark = [], []
-    for place in range(len(trajectory.splits)):
-        frame_id, frame = trajectory.frame_id(place), source.take(planned_shot(trajectory, place))
-        files = write_frame(out, frame_id, source, frame, exr=config.render.exr)
-        share = real_ground_share(scene, source.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
-        found = source.labels(frame)
-        rows.append({**files, "real_ground_share": share, "n_craters_above_max_radius": found.n_above})
-        labels.append(tables.label_table(frame_id, found))
-        if is_dark(frame.radiance):
-            dark.append(frame_id)
+    frames: list[_Written] = []
+    for frame in _frames(out, source, trajectory, scene, config):
+        frames.append(frame)
         advance()
-    frames = tables.frame_table(trajectory, source.camera, source.engine.sun, rows)
-    finish_trajectory(out, trajectory.scene_id, trajectory.trajectory_id, labels, frames)
-    return dark
+    rows = tables.frame_table(trajectory, source.camera, source.engine.sun, [frame.row for frame in frames])
+    labels = [frame.labels for frame in frames]
+    finish_trajectory(out, trajectory.scene_id, trajectory.trajectory_id, labels, rows)
+    return [trajectory.frame_id(place) for place, frame in enumerate(frames) if frame.is_dark]
+
+
+def _frames(
+    out: Path, source: FrameSource, trajectory: TrajectoryPlan, scene: Scene, config: DatasetConfig
+) -> Iterator[_Written]:
+    """Render and write the frames of a trajectory, in order; rendering is one frame ahead of writing."""
+
+    def written(place: int, shot: Shot, radiance: Radiance) -> _Written:
+        frame = source.develop(shot, radiance)
+        return _write(out, trajectory.frame_id(place), source, frame, scene, exr=config.render.exr)
+
+    with ThreadPoolExecutor(1, "develop") as developer:
+        last: Future[_Written] | None = None
+        for place in range(len(trajectory.splits)):
+            shot = planned_shot(trajectory, place)
+            radiance = source.render(shot)
+            if last is not None:
+                yield last.result()
+            last = developer.submit(written, place, shot, radiance)
+        if last is not None:
+            yield last.result()
+
+
+def _write(out: Path, frame_id: str, source: FrameSource, frame: Frame, scene: Scene, *, exr: bool) -> _Written:
+    """Write the files of a frame and label it."""
+    files = write_frame(out, frame_id, source, frame, exr=exr)
+    share = real_ground_share(scene, source.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
+    found = source.labels(frame)
+    row = {**files, "real_ground_share": share, "n_craters_above_max_radius": found.n_above}
+    return _Written(row, tables.label_table(frame_id, found), is_dark(frame.radiance))
