@@ -7,7 +7,7 @@ import numpy as np
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.overview import write_overview
-from perilune_render.flight.plan import Plan
+from perilune_render.flight.plan import Plan, TrajectoryPlan
 from perilune_render.provenance.versions import all_versions
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import Dataset, count_rows, open_dataset
@@ -95,8 +95,12 @@ def check_begun(out: Path, plan: Plan) -> None:
 
     Two manifests with the same settings may still differ in trajectories, frames and splits.
     """
-    planned = {f"{t.scene_id}.{t.trajectory_id}": t for t in plan.trajectories}
+    planned: dict[str, TrajectoryPlan] = {}
+    of_scene = None
     for part in sorted(out.joinpath("manifest", "frames").glob("[A-Za-z0-9]*.parquet")):
+        scene_id = part.stem.partition(".")[0]
+        if scene_id != of_scene:
+            of_scene, planned = scene_id, {f"{scene_id}.{t.trajectory_id}": t for t in plan.of_scene(scene_id)}
         own = planned.get(part.stem)
         rows = read_part(part, "frames", ["frame_index", "split", "position_m"])
         if (

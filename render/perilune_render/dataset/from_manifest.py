@@ -1,8 +1,15 @@
 """The plan of a manifest, so that a published dataset can be rendered again with its labels."""
 
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.folder import new_info
@@ -15,6 +22,8 @@ from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_shared.storage.files import sha256_of
+
+_OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "rotation_wxyz")
 
 
 def plan_from_manifest(
@@ -43,10 +52,15 @@ def plan_from_manifest(
         ScenePlan(row["scene_id"], row["seed"], row["sun_azimuth_deg"], row["sun_elevation_deg"])
         for row in manifest.table("scenes").sort_by("scene_id").to_pylist()
     ]
-    trajectories = [trajectory for scene in scenes for trajectory in _trajectories(manifest, scene.scene_id)]
+    recorded = _Recorded.of(manifest, [scene.scene_id for scene in scenes])
+    of_scene = [row["scene_id"] for row in recorded.rows]
+    places = {
+        scene.scene_id: range(bisect_left(of_scene, scene.scene_id), bisect_right(of_scene, scene.scene_id))
+        for scene in scenes
+    }
     exr_camera = camera.covering_pinhole()
     view = view_envelope(exr_camera, config.ground_flight(recipe.kind))
-    plan = Plan(camera, exr_camera, view, tuple(scenes), tuple(trajectories))
+    plan = Plan(camera, exr_camera, view, tuple(scenes), recorded, places)
     begun = new_info(config, plan, recipe_of(config, recipe.kind, recipe.preset))
     kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     return plan, config, begun.model_copy(update=kept)
@@ -62,21 +76,62 @@ def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
             raise UserError("--dem", "elevation model", found, expected)
 
 
-def _trajectories(manifest: Dataset, scene_id: str) -> list[TrajectoryPlan]:
-    found = []
-    for row in manifest.table("trajectories", scene_id=scene_id).sort_by("trajectory_id").to_pylist():
-        frames = manifest.table("frames", scene_id=scene_id, trajectory_id=row["trajectory_id"])
-        columns = frames.sort_by("frame_index").to_pydict()
-        position, velocity, acceleration = (
-            tuple(row[f"nominal_{name}"]) for name in ("position_m", "velocity_mps", "acceleration_mps2")
+@dataclass(frozen=True, slots=True)
+class _Recorded(Sequence[TrajectoryPlan]):
+    """The trajectories of a manifest, ordered by scene and name."""
+
+    rows: list[dict[str, Any]]
+    """Rows of the table `trajectories`."""
+    first: np.ndarray
+    """Index of the first frame of each trajectory, and the number of frames (n_trajectories + 1,)."""
+    columns: dict[str, np.ndarray]
+    """Columns of the table `frames`, in the order of trajectories and of `frame_index`, each (n_frames, ...)."""
+
+    @classmethod
+    def of(cls, manifest: Dataset, scene_ids: list[str]) -> "_Recorded":
+        """Read the trajectories and poses of some scenes of a manifest."""
+        keys = ["scene_id", "trajectory_id"]
+        trajectories = manifest.table("trajectories").sort_by([(key, "ascending") for key in keys])
+        trajectories = trajectories.filter(pc.is_in(trajectories["scene_id"], pa.array(scene_ids, pa.string())))
+        frames = manifest.table("frames", [*keys, *_OF_FRAMES])
+        names, of_frames = (
+            pc.binary_join_element_wise(*(table[key] for key in keys), "/") for table in (trajectories, frames)
         )
-        flight = Flight(
-            NominalTrajectory(position, velocity, acceleration, row["duration_s"]),
-            *(np.array(columns[name]) for name in ("time_s", "position_m", "velocity_mps", "rotation_wxyz")),
-        )
-        places, splits = tuple(columns["frame_index"]), tuple(columns["split"])
-        found.append(TrajectoryPlan(scene_id, row["trajectory_id"], row["seed"], places, splits, flight))
-    return found
+        place = pc.fill_null(pc.index_in(of_frames, names), -1).to_numpy()
+        order = np.lexsort((frames["frame_index"].to_numpy(), place))[np.count_nonzero(place < 0) :]
+        first = np.concatenate([[0], np.cumsum(np.bincount(place[order], minlength=len(names)))])
+        columns = {name: _values(frames[name])[order] for name in _OF_FRAMES}
+        return cls(trajectories.to_pylist(), first, columns)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, place: Any) -> Any:
+        """The trajectory at an index, or a tuple of those in a slice."""
+        if isinstance(place, slice):
+            return tuple(self[k] for k in range(*place.indices(len(self))))
+        place = range(len(self))[place]
+        row, own = self.rows[place], slice(self.first[place], self.first[place + 1])
+        columns = {name: values[own] for name, values in self.columns.items()}
+        flight = partial(_flight, row, columns)
+        index, splits = tuple(columns["frame_index"].tolist()), tuple(columns["split"].tolist())
+        return TrajectoryPlan(row["scene_id"], row["trajectory_id"], row["seed"], index, splits, flight)
+
+
+def _values(column: pa.ChunkedArray) -> np.ndarray:
+    """A column without nulls as an array (N,), or (N, k) if it holds lists of k numbers."""
+    if pa.types.is_fixed_size_list(column.type):
+        return column.combine_chunks().flatten().to_numpy().reshape(-1, column.type.list_size)
+    return column.to_numpy()
+
+
+def _flight(row: dict[str, Any], columns: dict[str, np.ndarray]) -> Flight:
+    """The flight of a row of the table `trajectories` and the columns of its frames."""
+    position, velocity, acceleration = (
+        tuple(row[f"nominal_{name}"]) for name in ("position_m", "velocity_mps", "acceleration_mps2")
+    )
+    nominal = NominalTrajectory(position, velocity, acceleration, row["duration_s"])
+    return Flight(nominal, *(columns[name] for name in ("time_s", "position_m", "velocity_mps", "rotation_wxyz")))
 
 
 def compare_hashes(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:

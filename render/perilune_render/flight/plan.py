@@ -1,10 +1,14 @@
 """The plan: every scene, trajectory and frame of a dataset, fixed before rendering.
 
-The plan is plain data and depends on the configuration alone. A scene is planned as a seed, which determines its
-craters and boulders (`perilune_render.terrain.scene.grow_scene`).
+The plan depends on the configuration alone. A scene is planned as a seed, which determines its craters and boulders
+(`perilune_render.terrain.scene.grow_scene`). The trajectories of a scene are derived from its seed when they are asked
+for, and a flight is drawn when it is first used, so that the plan of many millions of frames is made in seconds.
 """
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +17,7 @@ from perilune_render.flight.trajectories import Flight, fly
 from perilune_render.flight.view import view_envelope
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.envelope import ViewEnvelope
-from perilune_shared.dataset.names import frame_id_of
+from perilune_shared.dataset.names import SPLITS, frame_id_of
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, sun_direction
@@ -41,7 +45,7 @@ class ScenePlan:
         return sun_direction(self.sun_azimuth_deg, self.sun_elevation_deg)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TrajectoryPlan:
     """One trajectory."""
 
@@ -51,12 +55,17 @@ class TrajectoryPlan:
     """Unique in its scene."""
     seed: int
     """Random seed of the trajectory."""
-    frame_index: tuple[int, ...]
+    frame_index: Sequence[int]
     """Index of each frame in the trajectory, from 0; with gaps if only some of its frames are selected."""
     splits: tuple[str, ...]
     """Split of each frame."""
-    flight: Flight
-    """True motion of the camera."""
+    draw_flight: Callable[[], Flight]
+    """Returns the flight."""
+
+    @cached_property
+    def flight(self) -> Flight:
+        """True motion of the camera, drawn when it is first used."""
+        return self.draw_flight()
 
     def frame_id(self, place: int) -> str:
         """Id, unique in the dataset, of the frame at index `place` of `frame_index`."""
@@ -80,12 +89,42 @@ class Plan:
     """The views that the mesh of every scene is made for."""
     scenes: tuple[ScenePlan, ...]
     """All scenes."""
-    trajectories: tuple[TrajectoryPlan, ...]
-    """All trajectories, in the order of their scenes."""
+    trajectories: Sequence[TrajectoryPlan]
+    """All trajectories, in the order of their scenes. A drawn plan makes a trajectory anew at each access."""
+    places: Mapping[str, range]
+    """Indices in `trajectories` of the trajectories of each scene, by its id."""
 
     def of_scene(self, scene_id: str) -> list[TrajectoryPlan]:
-        """The trajectories of one scene."""
-        return [trajectory for trajectory in self.trajectories if trajectory.scene_id == scene_id]
+        """The trajectories of one scene; none if the plan has no such scene."""
+        return [self.trajectories[place] for place in self.places.get(scene_id, ())]
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawn(Sequence[TrajectoryPlan]):
+    """The trajectories of a configuration."""
+
+    settings: KindConfig
+    """Settings of the dataset."""
+    kind: str
+    """`detect` or `nav`."""
+    scenes: tuple[ScenePlan, ...]
+    """All scenes."""
+    splits: np.ndarray
+    """Index in SPLITS of each frame's split (n_scenes, trajectories_per_scene, n_frames) int8."""
+
+    def __len__(self) -> int:
+        return len(self.scenes) * self.settings.trajectories_per_scene
+
+    def __getitem__(self, place: Any) -> Any:
+        """The trajectory at an index, or a tuple of those in a slice."""
+        if isinstance(place, slice):
+            return tuple(self[k] for k in range(*place.indices(len(self))))
+        s, t = divmod(range(len(self))[place], self.settings.trajectories_per_scene)
+        scene, n_frames = self.scenes[s], self.settings.n_frames
+        seed = derived_seed(scene.seed, self.kind, "trajectory", t)
+        splits = tuple(SPLITS[code] for code in self.splits[s, t])
+        draw_flight = partial(fly, self.settings.flight, n_frames, seed)
+        return TrajectoryPlan(scene.scene_id, f"trajectory-{t:04d}", seed, range(n_frames), splits, draw_flight)
 
 
 def camera_of(config: CameraConfig) -> Camera:
@@ -133,30 +172,30 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
     camera = camera_of(config.camera)
     splits = _splits(settings, stream(config.seed, config.name, kind, "splits"))
     ground = "shared" if config.shared_terrain else kind
-    scenes, trajectories = [], []
+    scenes = []
     for s in range(settings.n_scenes):
         seed = derived_seed(config.seed, config.name, ground, "scene", s)
         sun = stream(seed, "sun")
         azimuth = sun.uniform(settings.sun.azimuth_deg.low, settings.sun.azimuth_deg.high)
         elevation = sun.uniform(settings.sun.elevation_deg.low, settings.sun.elevation_deg.high)
         scenes.append(ScenePlan(f"scene-{s:04d}", seed, float(azimuth), float(elevation)))
-        for t in range(settings.trajectories_per_scene):
-            own = derived_seed(seed, kind, "trajectory", t)
-            flight = fly(settings.flight, settings.n_frames, own)
-            name, places = f"trajectory-{t:04d}", tuple(range(settings.n_frames))
-            trajectories.append(TrajectoryPlan(scenes[-1].scene_id, name, own, places, tuple(splits[s, t]), flight))
+    n = settings.trajectories_per_scene
+    places = {scene.scene_id: range(s * n, (s + 1) * n) for s, scene in enumerate(scenes)}
     exr_camera = camera.covering_pinhole()
     view = view_envelope(exr_camera, config.ground_flight(kind))
-    return Plan(camera, exr_camera, view, tuple(scenes), tuple(trajectories))
+    return Plan(camera, exr_camera, view, tuple(scenes), _Drawn(settings, kind, tuple(scenes), splits), places)
 
 
 def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:
-    """Split names (n_scenes, trajectories_per_scene, n_frames); a unit of `split_by` is never divided."""
+    """Splits as indices in SPLITS (n_scenes, trajectories_per_scene, n_frames) int8.
+
+    A unit of `split_by` is never divided.
+    """
     shape = (settings.n_scenes, settings.trajectories_per_scene, settings.n_frames)
     n_axes = ("scene", "trajectory", "frame").index(settings.split_by) + 1
     n_units = int(np.prod(shape[:n_axes]))
     n_test = min(int(np.ceil(settings.test_share * n_units)), max(n_units - 2, 0))
     n_val = min(int(np.ceil(settings.val_share * n_units)), max(n_units - n_test - 1, 0))
-    names = np.array(["train"] * (n_units - n_val - n_test) + ["val"] * n_val + ["test"] * n_test)
-    units = rng.permutation(names).reshape(shape[:n_axes] + (1,) * (3 - n_axes))
-    return np.broadcast_to(units, shape)
+    counts = {"train": n_units - n_val - n_test, "val": n_val, "test": n_test}
+    codes = np.repeat(np.array([SPLITS.index(name) for name in counts], np.int8), list(counts.values()))
+    return np.broadcast_to(rng.permutation(codes).reshape(shape[:n_axes] + (1,) * (3 - n_axes)), shape)

@@ -15,6 +15,8 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 LEAST_CLEARANCE_M = 1.0
 """Smallest height of the camera above the ground below it, metres."""
+_CHECKED_FRAMES = 100_000
+"""Number of frames that `check_plan` checks, about: a few seconds' work."""
 _POINTS_PER_SIDE = 8
 _UNIT_TOLERANCE = 1e-6
 
@@ -43,15 +45,20 @@ class Poses:
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
     """Make the checks that need no terrain heights: the Sun is up, poses are over the mesh, no horizon is in view.
 
-    Raises UserError with `where` (the configuration or the manifest) and the first scene or frame that fails.
+    Poses are checked in the first scenes, up to about _CHECKED_FRAMES; `check_poses` checks those of each other scene
+    when its ground is known. Raises UserError with `where` (the configuration or the manifest) and the first scene or
+    frame that fails.
     """
     for scene in plan.scenes:
         if not 0 < scene.sun_elevation_deg <= 90:
             found = f"{scene.sun_elevation_deg:g} degrees"
             raise UserError(where, f"{scene.scene_id}: sun_elevation_deg", found, "above 0 (the horizon), at most 90")
-        trajectories = plan.of_scene(scene.scene_id)
-        if trajectories:
-            _check_mesh(Poses.planned(trajectories), plan.exr_camera, grid, where)
+    n_checked = 0
+    for trajectory in plan.trajectories:
+        _check_mesh(Poses.planned([trajectory]), plan.exr_camera, grid, where)
+        n_checked += len(trajectory.splits)
+        if n_checked >= _CHECKED_FRAMES:
+            break
 
 
 def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:

@@ -53,7 +53,7 @@ def test_a_rendering_goes_on_with_its_own_plan_alone(begun):
     (descent,) = plan.trajectories
     moved = replace(descent.flight, position_m=descent.flight.position_m + 1.0)
     for other in (
-        replace(descent, flight=moved),
+        replace(descent, draw_flight=lambda: moved),
         replace(descent, splits=("test",) * len(descent.splits)),
         replace(descent, frame_index=tuple(i + 1 for i in descent.frame_index)),
         replace(descent, trajectory_id="trajectory-0009"),

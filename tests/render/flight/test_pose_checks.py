@@ -84,7 +84,7 @@ def test_a_plan_is_checked_before_its_ground_is_grown(scene):
     (trajectory,) = plan.trajectories
     far = replace(trajectory.flight, position_m=trajectory.flight.position_m + np.array([5000.0, 0, 0]))
     with pytest.raises(UserError, match=f"plan: frame {trajectory.frame_id(0)}: got a camera at x"):
-        check_plan(replace(plan, trajectories=(replace(trajectory, flight=far),)), scene.grid, "plan")
+        check_plan(replace(plan, trajectories=(replace(trajectory, draw_flight=lambda: far),)), scene.grid, "plan")
     night = replace(plan.scenes[0], sun_elevation_deg=-2.0)
     with pytest.raises(UserError, match="plan: scene-0000: sun_elevation_deg: got -2 degrees"):
         check_plan(replace(plan, scenes=(night,)), scene.grid, "plan")
