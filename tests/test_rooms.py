@@ -15,7 +15,7 @@ ROOMS = {
         "geometry dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
-        "config_values config_terrain config streams provenance terrain flight imaging labels "
+        "processor config_values config_terrain config streams provenance terrain flight imaging labels "
         "frame_source blender dataset jobs cli_options cli_dataset cli"
     ),
     "render/perilune_render/terrain": (

@@ -1,6 +1,6 @@
 """Regenerate frames from a manifest alone: seeds, poses and the recorded recipe.
 
-On the same kind of machine a frame is identical byte for byte. On another kind, rounding may change where a ray hits
+On every processor with AVX2 and FMA a frame is identical byte for byte. On others, rounding may change where a ray hits
 the ground and so change single pixels: frames are then compared within a tolerance.
 """
 

@@ -5,13 +5,16 @@ from importlib import metadata
 
 import perilune_render
 import perilune_shared
+from perilune_render import processor
 from perilune_render.provenance.fingerprint import fingerprint
 
-GROUND = ("perilune_render.flight.view:view_envelope", "perilune_render.terrain.scene:grow_scene")
+_SETTINGS = "perilune_render.processor:SETTINGS"
+GROUND = (_SETTINGS, "perilune_render.flight.view:view_envelope", "perilune_render.terrain.scene:grow_scene")
 """Code that generates ground, craters and boulders."""
-RENDERING = ("perilune_render.flight.plan:make_plan", "perilune_render.blender.renderer:Renderer")
+RENDERING = (_SETTINGS, "perilune_render.flight.plan:make_plan", "perilune_render.blender.renderer:Renderer")
 """Code that plans trajectories and renders radiance."""
 IMAGING = (
+    _SETTINGS,
     "perilune_render.frame_source:",
     "perilune_render.dataset.shots:",
     "perilune_render.dataset.frame_files:write_frame",
@@ -67,4 +70,6 @@ def _versions(names: tuple[str, ...], with_dem: bool) -> dict[str, str]:
     found = dict(_found(names))
     if not with_dem:
         found.pop("rasterio", None)
+    if not processor.IN_FORCE:
+        found["arithmetic"] = "of the processor"
     return found

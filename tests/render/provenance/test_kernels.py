@@ -37,7 +37,8 @@ def test_a_change_in_another_file_is_compiled_into_its_callers(tmp_path):
     package = tmp_path / "perilune_render"
     source = Path(perilune_render.__path__[0])
     shutil.copytree(source / "provenance", package / "provenance", ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(source / "__init__.py", package)
+    for name in ("__init__.py", "processor.py"):
+        shutil.copy(source / name, package)
     (package / "caller.py").write_text(CALLER)
     (package / "callee.py").write_text(CALLEE.format(step=2))
     assert run(tmp_path) == [302, 0]

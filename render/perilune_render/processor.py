@@ -1,0 +1,30 @@
+"""Settings of the numerical libraries, with which x86-64 processors with AVX2 and FMA compute the same digits.
+
+NumPy, OpenBLAS, OpenCV and numba select their code by the processor, and OpenBLAS also by the number of threads; both
+change last digits. The libraries read these environment variables when they are loaded, so `perilune_render` imports
+this module first. Processors without AVX2 and FMA still differ: the C library (sin, exp, log, power), OpenCV and Cycles
+have other code for them.
+"""
+
+import os
+import sys
+
+SETTINGS = {
+    # NumPy's least common code. Its code for AVX-512 has other last digits in log, power and others.
+    "NPY_DISABLE_CPU_FEATURES": "SSSE3 SSE41 POPCNT SSE42 AVX F16C FMA3 AVX2 AVX512F AVX512CD AVX512_KNL AVX512_KNM"
+    " AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL",
+    # These need SSE 4.2, as Blender does.
+    "OPENBLAS_CORETYPE": "Nehalem",
+    "OPENBLAS_NUM_THREADS": "1",
+    "NUMBA_CPU_NAME": "x86-64-v2",
+    "NUMBA_CPU_FEATURES": "",
+    "NUMBA_DISABLE_INTEL_SVML": "1",
+    # OpenCV uses AVX2 and FMA, if the processor has them, as Cycles does.
+    "OPENCV_CPU_DISABLE": "AVX512-SKX",
+    "OPENCV_IPP": "sse42",
+}
+"""Environment variables and their values."""
+IN_FORCE = "numpy" not in sys.modules or all(os.environ.get(name) == value for name, value in SETTINGS.items())
+"""Whether the settings came before NumPy. If not, results are those of this processor, and recipes say so."""
+
+os.environ.update(SETTINGS)
