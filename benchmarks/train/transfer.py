@@ -15,9 +15,9 @@ mode. Writes runs/bench/transfer.json.
 """
 
 import argparse
+import itertools
 import statistics
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -28,10 +28,10 @@ from benchmarks.figures import write_figures
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.config import Attention
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.batches import Batch, EvaluationFrames, TrainingFrames, loader
+from perilune_train.detect.data.batches import Batch, evaluation_loader, network_input, training_loader
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.network import build_network, label_sizes
+from perilune_train.detect.train.network import build_network
 from perilune_train.detect.train.task import learning_rate_factor
 from perilune_train.models.yolo import YOLOv3
 
@@ -44,20 +44,19 @@ CHOICES: dict[str, Attention] = {
 _LAST = 20
 
 
-def batches(split: DetectSplit, config: DetectConfig) -> Iterator[Batch]:
-    """Training batches of one epoch after another, without end."""
-    epoch = 0
-    while True:
-        yield from loader(TrainingFrames(split, config.augment, config.seed, epoch), config)
-        epoch += 1
+def batches(split: DetectSplit, config: DetectConfig, anchors: Tensor) -> Iterator[Batch]:
+    """Network input and assignments of one epoch after another, without end."""
+    loaded = training_loader(split, config, anchors)
+    for epoch in itertools.count():
+        loaded.batch_sampler.set_epoch(epoch)
+        for grey, targets in loaded:
+            yield network_input(grey, config.in_channels), targets
 
 
 def loss_of(network: YOLOv3, batch: Batch, config: DetectConfig) -> Tensor:
     """The detector's training loss."""
     images, targets = batch
-    box, confidence = detection_loss(
-        network(images), targets, network.anchors, network.strides, config.anchor_ratio, config.loss
-    )
+    box, confidence = detection_loss(network(images), targets, network.anchors, network.strides, config.loss)
     return config.loss.lambda_iou * box + config.loss.lambda_obj * confidence
 
 
@@ -67,7 +66,7 @@ def train(network: YOLOv3, split: DetectSplit, config: DetectConfig, steps: int)
     optimizer = torch.optim.AdamW(learnt, lr=config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda s: learning_rate_factor(s, 20, steps))
     losses = []
-    for batch in islice(batches(split, config), steps):
+    for batch in itertools.islice(batches(split, config, network.anchors), steps):
         loss = loss_of(network, batch, config)
         optimizer.zero_grad()
         loss.backward()
@@ -86,8 +85,8 @@ def recalibrate(network: YOLOv3, split: DetectSplit, config: DetectConfig) -> No
         norm.reset_running_stats()
         norm.momentum = None
     network.backbone.train()
-    for images, _ in loader(TrainingFrames(split, config.augment, config.seed, 0), config):
-        network.backbone(images)
+    for grey, _ in training_loader(split, config, network.anchors):
+        network.backbone(network_input(grey, config.in_channels))
     for norm in norms:
         norm.momentum = 0.1
 
@@ -108,12 +107,15 @@ def similarity(network: YOLOv3, plain: YOLOv3, images: Tensor) -> dict[str, list
 
 def compare(train_split: DetectSplit, val_split: DetectSplit, config: DetectConfig, steps: int, before: int) -> dict:
     """Features and losses of every choice; all start from the same plain detector."""
-    sizes = label_sizes(train_split)
+    sizes = train_split.label_sizes_px
     plain = build_network(config.model_copy(update={"attention": "none"}), sizes, Path())
     train(plain.train(), train_split, config, before)
     plain.eval()
     backbone = {key: value for key, value in plain.state_dict().items() if key.startswith("backbone.")}
-    val = list(loader(EvaluationFrames(val_split), config))
+    val = [
+        (network_input(grey, config.in_channels), targets)
+        for grey, targets in evaluation_loader(val_split, config, plain.anchors)
+    ]
     results = {}
     for choice, attention in CHOICES.items():
         network = build_network(config.model_copy(update={"attention": attention}), sizes, Path())

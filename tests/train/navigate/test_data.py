@@ -11,11 +11,16 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
+from perilune_train.data import frames
+from perilune_train.data.shares import ALONE, Share
 from perilune_train.navigate.data import sequences
-from perilune_train.navigate.data.epochs import EpochBatches
+from perilune_train.navigate.data.epochs import TrainingSequences
 from perilune_train.navigate.data.sequences import Jitter, mirrored, pair_sequence
 from perilune_train.navigate.data.trajectories import load_trajectories
 from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography
+
+PINNED_SEQUENCES = [(3, 0), (1, 2), (0, 4), (2, 3), (3, 2), (0, 1), (1, 2), (2, 1)]
+"""Trajectory and first pair of the sequences of epoch 1 with seed 3."""
 
 
 @pytest.fixture(scope="module")
@@ -188,17 +193,54 @@ def test_flow_labels_of_a_mirrored_pair_are_the_mirrored_labels(trajectories):
     assert len(seen) == 8
 
 
-def test_epoch_follows_from_the_key_alone(trajectories):
+def sequences_of(trajectories, n_pairs=3, seed=3, share=ALONE):
     training = [d for d in trajectories if d.split == "train"]
+    return TrainingSequences(training, n_pairs, warp=True, augmented=True, jitter=None, seed=seed, share=share)
 
-    def epoch(key):
-        return list(EpochBatches(training, 3, 2, warp=True, augmented=True, jitter=None, key=key))
 
-    one, again, other = epoch((3, 0)), epoch((3, 0)), epoch((3, 1))
-    assert [len(batch) for batch in one] == [2, 2, 2, 2]  # 4 trajectories of 7 pairs: 2 runs of 3 each
-    np.testing.assert_array_equal(one[1][0].second, again[1][0].second)
-    assert not np.array_equal(one[0][0].first, other[0][0].first)
-    assert len(EpochBatches(training, 3, 3, warp=True, augmented=True, jitter=None, key=(0, 0))) == 3
+def test_an_epoch_follows_from_seed_and_number_alone(trajectories):
+    one, again, other = sequences_of(trajectories), sequences_of(trajectories), sequences_of(trajectories, seed=4)
+    assert len(one.keys(0)) == one.fewest == 8  # 4 trajectories of 7 pairs: 2 sequences of 3 each
+    assert one.keys(0) == again.keys(0)
+    assert one.keys(0) != other.keys(0) and [key[1:] for key in one.keys(0)] != [key[1:] for key in one.keys(1)]
+    key = one.keys(0)[2]
+    one[one.keys(0)[1]]
+    np.testing.assert_array_equal(one[key].second, again[key].second)
+    # A run resumed with a later version sees the same sequences.
+    assert one.keys(1) == [(1, place, *sequence) for place, sequence in enumerate(PINNED_SEQUENCES)]
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+def test_processes_share_the_sequences_of_an_epoch(dataset_nav, trajectories, processes):
+    whole = sequences_of(trajectories)
+    shares = [Share(process, processes) for process in range(processes)]
+    own = [sequences_of(load_trajectories(open_dataset(dataset_nav), share), share=share) for share in shares]
+    assert sorted(key for one in own for key in one.keys(5)) == sorted(whole.keys(5))
+    assert {one.fewest for one in own} == {min(len(one.keys(5)) for one in own)}
+    for one in own:
+        key = one.keys(5)[0]
+        np.testing.assert_array_equal(one[key].second, whole[key].second)
+
+
+def test_each_process_loads_the_frames_that_it_needs(dataset_nav, trajectories, monkeypatch):
+    decoded, decode = [], frames.decode
+    monkeypatch.setattr(frames, "decode", lambda *more: decoded.append(0) or decode(*more))
+    loaded = [load_trajectories(open_dataset(dataset_nav), Share(process, 3)) for process in range(3)]
+    # Training trajectories 0 and 3, 1, 2; each the one of val; the first process the one of test.
+    assert [[len(d.images) for d in own] for own in loaded] == [
+        [8, 0, 0, 8, 8, 8],
+        [0, 8, 0, 0, 8, 0],
+        [0, 0, 8, 0, 8, 0],
+    ]
+    assert len(decoded) == 8 * 8
+    for own in loaded:
+        for one, expected in zip(own, trajectories, strict=True):
+            np.testing.assert_array_equal(one.position_m, expected.position_m)
+            assert one.n_pairs == expected.n_pairs and one.shrunk(32).images.shape[1:] == (32, 32)
+            if len(one.images):
+                np.testing.assert_array_equal(one.images, expected.images)
+    with pytest.raises(UserError, match="train trajectories: got 4, expected at least 5, one for each process"):
+        load_trajectories(open_dataset(dataset_nav), Share(0, 5))
 
 
 def test_a_detection_dataset_is_refused(dataset_detect):

@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
@@ -11,7 +12,7 @@ from perilune_train.models.yolo import YOLOv3
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data.sequences import pair_sequence
 from perilune_train.navigate.data.trajectories import load_trajectories
-from perilune_train.navigate.network import Scales, load_navigator, predict, translation_units
+from perilune_train.navigate.network import Collate, Scales, load_navigator, predict, translation_units
 from perilune_train.navigate.train.run import navigate_run
 from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.training.runs import save_weights
@@ -160,13 +161,6 @@ def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
         load_navigator(run.best, "warp")
 
 
-def test_several_processes_are_refused_before_anything_is_written(dataset_nav, tmp_path, monkeypatch):
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(UserError, match="torchrun: processes: got 2, expected 1"):
-        navigate_run(_settings(), dataset_nav, tmp_path / "runs", "a", None)
-    assert not (tmp_path / "runs").exists()
-
-
 def test_scales_by_hand(trajectories):
     training = [d for d in trajectories if d.split == "train"]
     translation = np.concatenate([d.motion[0] for d in training])
@@ -206,8 +200,21 @@ def test_outputs_made_from_the_truth_have_no_loss(trajectories, monkeypatch):
 
     def loss(output):
         task.network = Gives(output)
-        return float(task.training_step([sequence], 0))
+        return float(task.training_step(Collate(task.scales, "stack")([sequence]), 0))
 
     assert loss(truth) == pytest.approx(0, abs=1e-6)
     # One unit too far in x at one of four pairs: a quarter.
     assert loss(truth + np.eye(4, 9) * np.array([1, 0, 0, 0])[:, None]) == pytest.approx(0.25, abs=1e-5)
+
+
+@pytest.mark.parametrize("fusion", ["warp", "stack"])
+def test_no_training_step_needs_a_value(trajectories, monkeypatch, fusion):
+    """A GPU would have to be waited for. Fake tensors have no values: an operation that needs one raises an error."""
+    task = NavigationTask(_settings(), fusion, trajectories)
+    for name in ("log", "log_dict"):
+        monkeypatch.setattr(task, name, lambda *_, **__: None)
+    sequences = [pair_sequence(trajectories[i].shrunk(64), 0, 4, warp=fusion == "warp") for i in (0, 1)]
+    batch = Collate(task.scales, fusion)(sequences)
+    assert (batch.flow_px is not None) == (fusion == "warp")
+    with FakeTensorMode(allow_non_fake_inputs=True) as fake:
+        task.training_step(batch.each(fake.from_tensor), 0).backward()

@@ -14,6 +14,7 @@ from torch import nn
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
+from perilune_train.data.epochs import EpochBatches, batch_loader
 from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.training import fit as fitting
 from perilune_train.training import runs
@@ -115,11 +116,19 @@ def test_damaged_weights_are_refused_in_one_line(tmp_path, recwarn):
     assert refused > 50 and not recwarn.list
 
 
+class Points(torch.utils.data.Dataset):
+    """A number that follows from epoch and place."""
+
+    def __getitem__(self, key):
+        return torch.randn(1, generator=torch.Generator().manual_seed(100 * key[0] + key[1]))
+
+
 class Line(lightning.LightningModule):
     """Fits y = 2 x; data follow from the epoch. Stops dead in `dies_in`, as a killed process would."""
 
-    def __init__(self, dies_in: int | None = None):
+    def __init__(self, dies_in: int | None = None, workers: int = 0):
         super().__init__()
+        self.workers = workers
         self.architecture = {"kind": "line"}
         self.network = nn.Linear(1, 1)
         nn.init.zeros_(self.network.weight)
@@ -128,8 +137,9 @@ class Line(lightning.LightningModule):
         self.dies_in = dies_in
 
     def train_dataloader(self):
-        x = torch.randn(12, 1, generator=torch.Generator().manual_seed(self.current_epoch))
-        return torch.utils.data.DataLoader(torch.utils.data.TensorDataset(x), batch_size=4)
+        epoch = self.trainer.fit_loop.epoch_progress.current.processed
+        batches = EpochBatches(lambda epoch: [(epoch, place) for place in range(12)], 12, 4, epoch)
+        return batch_loader(Points(), batches, torch.stack, self.workers, pinned=False)
 
     def val_dataloader(self):
         return torch.utils.data.DataLoader(torch.utils.data.TensorDataset(torch.ones(1, 1)))
@@ -137,7 +147,7 @@ class Line(lightning.LightningModule):
     def training_step(self, batch, batch_idx):
         if self.current_epoch == self.dies_in and batch_idx == 1:
             raise KeyError("killed")
-        return (self.network(batch[0]) - 2 * batch[0]).square().mean()
+        return (self.network(batch) - 2 * batch).square().mean()
 
     def validation_step(self, batch, batch_idx):
         self.log("val/error", (self.network(batch[0]) - 2).abs().mean())
@@ -167,7 +177,8 @@ def test_a_resumed_run_repeats_the_uninterrupted_one(tmp_path):
     with pytest.raises(KeyError):
         fit(killed, Line(dies_in=2), 4)
     assert killed.last.is_file()
-    rest = Line()
+    # Workers load ahead, in the right epoch too.
+    rest = Line(workers=1)
     fit(killed, rest, 4, resume=True)
     assert rest.trainer.global_step == whole.trainer.global_step == 12
     assert torch.equal(rest.network.weight, whole.network.weight)

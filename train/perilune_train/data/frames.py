@@ -9,23 +9,28 @@ from itertools import islice
 import cv2
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.png import png_header
 from perilune_shared.terminal import progress_bar
+from perilune_train.data.shares import ALONE, Share
 
 _PORTION = 256
 """Number of compressed frames in memory at a time."""
+_ORDER = ["scene_id", "trajectory_id", "frame_index"]
+_POSE = ["time_s", "position_m", "rotation_wxyz", "sun_direction"]
+_FILE = ["png_path", "png_bytes"]
 
 
 @dataclass(frozen=True)
 class FrameStore:
-    """Frames of one split, in the order scene, trajectory, frame index."""
+    """Frames of one split or of a share of it, in the order scene, trajectory, frame index."""
 
     table: pd.DataFrame
-    """Rows of the manifest's table `frames`, index 0..N-1."""
+    """Rows of `frame_table`, index 0..N-1."""
     images: NDArray[np.uint8]
     """Pixels (N, height, width), 8-bit grey."""
 
@@ -55,36 +60,53 @@ def decode(png: bytes, name: str, height_px: int, width_px: int, size_bytes: int
     return (image >> 8 if image.dtype == np.uint16 else image).astype(np.uint8, copy=False)
 
 
-def load_frames(dataset: Dataset, split: str) -> FrameStore:
-    """Load all frames of a split, 64 kB each at 256 x 256 px.
+def frame_table(dataset: Dataset, split: str) -> pd.DataFrame:
+    """Ids, times, poses and files of the frames of a split, sorted by scene, trajectory and frame index.
 
-    Raises UserError if there are none, if they do not fit into memory, or if one is invalid.
+    Raises UserError if there are none.
     """
-    rows = dataset.table("frames", split=split)
-    table = rows.to_pandas()
+    table = dataset.table("frames", ["frame_id", *_ORDER, *_POSE, *_FILE], split=split).to_pandas()
     if table.empty:
         raise UserError(dataset.root, "split", f"no {split} frames", "a dataset with frames in train, val and test")
-    table = table.sort_values(["scene_id", "trajectory_id", "frame_index"], ignore_index=True)
+    return table.sort_values(_ORDER, ignore_index=True)
+
+
+def load_frames(dataset: Dataset, split: str, share: Share = ALONE) -> FrameStore:
+    """Load the frames of a split, or only those of a share of it; a frame of 256 x 256 px takes 64 kB.
+
+    Raises UserError if the split is empty, if its frames do not fit into memory, or if one is invalid.
+    """
+    table = frame_table(dataset, split)
+    own = table.iloc[list(share.of(len(table)))].reset_index(drop=True)
+    return FrameStore(own, load_images(dataset, own, split))
+
+
+def load_images(dataset: Dataset, table: pd.DataFrame, name: str) -> NDArray[np.uint8]:
+    """Load the pixels (N, height, width) of N rows of `frame_table`; `name` is for the progress bar and messages.
+
+    Raises UserError if they do not fit into memory or if one is invalid.
+    """
     camera = dataset.info.camera
     n_bytes = len(table) * camera.height_px * camera.width_px
     if n_bytes > os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"):
         found = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
-        raise UserError(dataset.root, "frames", found, f"{split} frames that fit into this machine's memory")
+        raise UserError(dataset.root, "frames", found, f"{name} frames that fit into this machine's memory")
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
-    row_of = {frame_id: i for i, frame_id in enumerate(table["frame_id"])}
+    place_of = {frame_id: place for place, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()
+    rows = pa.table({column: table[column].tolist() for column in ("frame_id", "png_path")})
 
     def unpack(frame: tuple[str, bytes]) -> None:
-        i = row_of[frame[0]]
+        i = place_of[frame[0]]
         images[i] = decode(frame[1], f"{dataset.root}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
 
     # OpenCV releases Python's global interpreter lock while it decodes.
     with progress_bar() as progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as threads:
-        task = progress.add_task(f"load {split}", total=len(table), unit="frames", note="")
+        task = progress.add_task(f"load {name}", total=len(table), unit="frames", note="")
         for portion in _portions(dataset.pngs(rows), _PORTION):
             for _ in threads.map(unpack, portion):
                 progress.advance(task)
-    return FrameStore(table, images)
+    return images
 
 
 def _portions(frames: Iterable[tuple[str, bytes]], size: int) -> Iterator[list[tuple[str, bytes]]]:

@@ -133,7 +133,8 @@ class WarpNavigator(nn.Module):
         jacobian = self.plane_flow(flow_px.shape[1], flow_px.shape[2], width_px) * unit[:, None, None, None]
         weighted = jacobian * weight[..., None, None]
         normal = torch.einsum("nhwij,nhwik->njk", weighted, jacobian) + torch.diag(self.log_prior.exp())
-        return torch.linalg.solve(normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px))
+        # `solve` would make the process wait for the GPU, to find singular matrices, which the prior excludes.
+        return torch.linalg.solve_ex(normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px))[0]
 
     def plane_flow(self, rows: int, columns: int, width_px: int) -> Tensor:
         """Derivatives (rows, columns, 2, 6) of flow / focal length by translation / altitude and by rotation vector."""

@@ -56,6 +56,8 @@ class NavigateConfig(Section):
     """Arithmetic: auto (bfloat16 if the hardware supports it), bf16 or float32."""
     device: Device = "auto"
     """Where to compute: auto (the GPU if there is one), cpu or cuda."""
+    workers: Annotated[int, Field(ge=0, le=64)] = 0
+    """Worker processes that prepare sequences; 0 prepares them in the training process, which is best on few cores."""
     warp: FusionConfig
     """Network with the second frame warped by the nominal motion and stacked in channels; the default navigator."""
     stack: FusionConfig

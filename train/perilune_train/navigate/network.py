@@ -1,6 +1,7 @@
-"""The navigation networks: build, load, and convert their nine outputs to motions."""
+"""The navigation networks: build, load, batches of their input, and motions from their nine outputs."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +13,7 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.models.navigator import StackNavigator, WarpNavigator
 from perilune_train.navigate.data.sequences import Sequence, pair_sequence
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
-from perilune_train.navigate.geometry import rotation_from_sixd, rotation_vectors
+from perilune_train.navigate.geometry import euler_from_rotation, rotation_from_sixd, rotation_vectors
 from perilune_train.training.runs import check_architecture, load_state, load_weights
 
 Fusion = Literal["warp", "stack"]
@@ -68,26 +69,78 @@ def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:
     return network.eval(), content["architecture"]
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Sequences of equal length as tensors, with what the network should output for them."""
+
+    first: Tensor
+    """Earlier frames, normalised (batch, pairs, height, width)."""
+    second: Tensor
+    """Later frames, for warp resampled onto the earlier ones (batch, pairs, height, width)."""
+    altitude_m: Tensor
+    """Nominal altitudes, metres (batch, pairs)."""
+    translation: Tensor
+    """True translations in the network's units, see Scales (batch, pairs, 3)."""
+    angles: Tensor
+    """True rotations as Euler angles, divided by `rotation_rad` of Scales (batch, pairs, 3)."""
+    flow_px: Tensor | None
+    """For warp: true flow, pixels (batch, pairs, height / 8, width / 8, 2)."""
+
+    def pin_memory(self) -> "Batch":
+        """The same in page-locked memory; a DataLoader calls it."""
+        return self.each(Tensor.pin_memory)
+
+    def to(self, device: torch.device) -> "Batch":
+        """The same on another device; from page-locked memory without waiting."""
+        return self.each(lambda part: part.to(device, non_blocking=True))
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Batch":
+        """The same with each tensor changed."""
+        return replace(self, **{name: change(part) for name, part in vars(self).items() if part is not None})
+
+
+@dataclass(frozen=True)
+class Collate:
+    """Makes a batch of sequences. A class, so that `spawn` can pickle it."""
+
+    scales: Scales
+    """Scales of the network."""
+    fusion: Fusion
+    """Which network."""
+
+    def __call__(self, sequences: list[Sequence]) -> Batch:
+        reference, unit = translation_units(sequences, self.scales, self.fusion)
+        rotation = stacked([sequence.rotation_c2_from_c1 for sequence in sequences])
+        flows = [sequence.flow_px for sequence in sequences if sequence.flow_px is not None]
+        return Batch(
+            torch.from_numpy(np.stack([sequence.first for sequence in sequences])),
+            torch.from_numpy(np.stack([sequence.second for sequence in sequences])),
+            stacked([sequence.altitude_m for sequence in sequences]),
+            (stacked([sequence.translation_m for sequence in sequences]) - reference) / unit,
+            euler_from_rotation(rotation) / self.scales.rotation_rad,
+            stacked(flows) if flows else None,
+        )
+
+
 def predict(network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory) -> Motion:
     """Motions of a whole trajectory, in one pass of the network in evaluation mode."""
     shrunk = trajectory.shrunk(architecture["size_px"])
     sequence = pair_sequence(shrunk, 0, shrunk.n_pairs, warp=architecture["fusion"] == "warp")
     device = next(network.parameters()).device
     scales = Scales(**architecture["scales"])
+    batch = Collate(scales, architecture["fusion"])([sequence]).to(device)
     with torch.no_grad():
-        output, _ = network_output(network, [sequence], device)
+        output, _ = network_output(network, batch)
     output = output[0].cpu()
     reference, unit = translation_units([sequence], scales, architecture["fusion"])
     return (reference[0] + unit * output[:, :3]).double().numpy(), decoded_rotation(output, scales).double().numpy()
 
 
-def network_output(network: nn.Module, batch: list[Sequence], device: torch.device) -> tuple[Tensor, Tensor | None]:
+def network_output(network: nn.Module, batch: Batch) -> tuple[Tensor, Tensor | None]:
     """Outputs (batch, pairs, 9), and of a warp network the flow (batch, pairs, height / 8, width / 8, 2), pixels."""
-    first = torch.from_numpy(np.stack([sequence.first for sequence in batch])).to(device)
-    second = torch.from_numpy(np.stack([sequence.second for sequence in batch])).to(device)
     if isinstance(network, WarpNavigator):
-        return network(first, second, stacked([sequence.altitude_m for sequence in batch]).to(device))
-    return network(first, second), None
+        return network(batch.first, batch.second, batch.altitude_m)
+    return network(batch.first, batch.second), None
 
 
 def translation_units(sequences: list[Sequence], scales: Scales, fusion: Fusion) -> tuple[Tensor, Tensor]:
@@ -99,7 +152,8 @@ def translation_units(sequences: list[Sequence], scales: Scales, fusion: Fusion)
 
 def decoded_rotation(output: Tensor, scales: Scales) -> Tensor:
     """Rotations (..., 3, 3) of outputs (..., 9)."""
-    identity = torch.tensor([1.0, 0, 0, 0, 1, 0], device=output.device)
+    # The first two columns. `torch.tensor` would make the process wait for the GPU.
+    identity = torch.eye(2, 3, device=output.device).flatten()
     return rotation_from_sixd(identity + scales.rotation_rad * output[..., 3:].float())
 
 

@@ -21,7 +21,7 @@ State = Literal["new", "resume", "finished"]
 Hashes = Mapping[str, str | None]
 """SHA-256 of each input of a run; None if it is missing."""
 
-_NO_EFFECT_ON_RESULT = {"detect.workers", "detect.checkpoint_minutes"}
+_NO_EFFECT_ON_RESULT = {"detect.workers", "detect.checkpoint_minutes", "navigate.workers"}
 """Settings that change how a run proceeds, but not its result."""
 _REPLACE = "; --overwrite replaces the run"
 _STATE_KEY = "perilune/run"
@@ -45,9 +45,9 @@ def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwri
     if is_first_process():
         state = _decide(run, task, config, inputs, overwrite)
         if torch.distributed.is_torchelastic_launched():
-            _store().set(_STATE_KEY, state)
+            _store().set(f"{_STATE_KEY}/{run.root.name}", state)
     elif torch.distributed.is_torchelastic_launched():
-        state = _store().get(_STATE_KEY).decode()
+        state = _store().get(f"{_STATE_KEY}/{run.root.name}").decode()
     else:
         # Lightning starts these processes on the first process's machine, after the first has prepared the folder.
         state = "resume" if run.last.is_file() else "new"

@@ -11,10 +11,12 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import progress_bar
 from perilune_train.config import Precision
+from perilune_train.data.shares import Share
 from perilune_train.training.runs import (
     RunFolder,
     check_tensors,
@@ -144,6 +146,11 @@ def machines(devices: int, num_nodes: int) -> tuple[int, int]:
     return devices, num_nodes
 
 
+def own_share(devices: int, num_nodes: int) -> Share:
+    """The share of this process; also valid before training (see `is_first_process`)."""
+    return Share(int(rank_zero_only.rank), math.prod(machines(devices, num_nodes)))
+
+
 def fit(
     run: RunFolder,
     task: lightning.LightningModule,
@@ -165,15 +172,17 @@ def fit(
 
     Returns the training time in seconds, including the time before a resume.
 
-    The task provides its own loaders, which are requested again before every epoch, so that order and augmentation can
-    depend on seed and epoch only. With several processes, each loader provides the batches of its own process. The task
-    logs `monitor` in validation, and has `architecture` and `evaluated` (see KeepBest).
+    The task provides its own loaders, once; a batch sampler with an attribute `sampler` is told each epoch by
+    `set_epoch` (see data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several
+    processes, each loader provides the batches of its own process. The task logs `monitor` in validation, and has
+    `architecture` and `evaluated` (see KeepBest).
 
     With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
     uninterrupted run. The state is saved after every epoch, and with `checkpoint_minutes` within epochs too; then the
     task's training batches must continue at the position of the checkpoint. Raises UserError if last.ckpt is damaged,
-    of another network or of another number of processes.
+    of another network or of another number of processes, or if the rank of this process was unknown before.
     """
+    share = own_share(devices, num_nodes)
     devices, num_nodes = machines(devices, num_nodes)
     resume_from = run.last if resume and run.last.is_file() else None
     if resume_from is not None:
@@ -201,7 +210,6 @@ def fit(
             precision="bf16-mixed" if choose_bf16(precision, device) else "32-true",
             deterministic="warn",
             gradient_clip_val=gradient_clip,
-            reload_dataloaders_every_n_epochs=1,
             num_sanity_val_steps=0,
             logger=TensorBoardLogger(run.root, name="", version=""),
             log_every_n_steps=10,
@@ -215,6 +223,9 @@ def fit(
                 keep_last,
             ],
         )
+        if trainer.global_rank != share.process:
+            expected = f"{share.process}, which the environment states; start several machines with torchrun or Slurm"
+            raise UserError("machines", "rank", trainer.global_rank, expected)
         try:
             trainer.fit(task, ckpt_path=resume_from, weights_only=True)
         except SystemExit:

@@ -2,15 +2,15 @@
 
 import torch
 
-from perilune_train.detect.data.assign import Targets, assign, matching_anchors
+from perilune_train.detect.data.assign import BatchLabels, assign, matching_anchors
 
 ANCHORS = torch.tensor([[[4.0, 4.0], [8.0, 8.0], [16.0, 16.0]], [[32.0, 32.0], [64.0, 64.0], [100.0, 100.0]]])
 SHAPES = [(2, 16, 16), (2, 8, 8)]
 
 
-def targets(*boxes, frame=None, selected=None):
+def labels(*boxes, frame=None, selected=None):
     count = len(boxes)
-    return Targets(
+    return BatchLabels(
         torch.tensor(boxes).view(-1, 4),
         torch.tensor(frame or [0] * count, dtype=torch.long),
         torch.tensor(selected or [True] * count, dtype=torch.bool),
@@ -27,26 +27,27 @@ def test_anchors_within_the_ratio_take_part():
 
 def test_centre_cell_and_two_neighbours():
     # Centre (13, 22) px, stride 8: cell column 1, row 2 at (0.625, 0.75): neighbours right and below.
-    made = assign(targets([9.0, 18.0, 17.0, 26.0]), ANCHORS, (8, 16), SHAPES, 1.5)
+    made = assign(labels([9.0, 18.0, 17.0, 26.0]), ANCHORS, (8, 16), SHAPES, 1.5)
     first = made[0]
-    assert sorted(zip(first.column.tolist(), first.row.tolist(), strict=True)) == [(1, 2), (1, 3), (2, 2)]
-    assert first.anchor.tolist() == [1, 1, 1]
-    assert first.label.tolist() == [0, 0, 0]
-    assert first.frame.tolist() == [0, 0, 0]
-    assert len(made[1].row) == 0
+    frame, anchor, row, column = first.places.tolist()
+    assert sorted(zip(column, row, strict=True)) == [(1, 2), (1, 3), (2, 2)]
+    assert anchor == [1, 1, 1]
+    assert frame == [0, 0, 0]
+    assert first.boxes.tolist() == [[9.0, 18.0, 17.0, 26.0]] * 3
+    assert made[1].places.shape == (4, 0)
     assert first.positive.sum() == 3
     assert not (first.positive & first.ignored).any()
 
 
 def test_neighbours_off_the_grid_are_left_out():
     # Centre (1, 1) px: the nearest neighbours of cell (0, 0) are left of and above the image.
-    made = assign(targets([-2.0, -2.0, 4.0, 4.0]), ANCHORS, (8, 16), SHAPES, 1.4)
-    assert (made[0].column.tolist(), made[0].row.tolist()) == ([0], [0])
+    made = assign(labels([-2.0, -2.0, 4.0, 4.0]), ANCHORS, (8, 16), SHAPES, 1.4)
+    assert made[0].places[2:].tolist() == [[0], [0]]
 
 
 def test_ignored_labels_are_neither_positive_nor_negative():
-    made = assign(targets([56.0, 56.0, 72.0, 72.0], frame=[1], selected=[False]), ANCHORS, (8, 16), SHAPES, 1.5)
-    assert len(made[0].row) == 0
+    made = assign(labels([56.0, 56.0, 72.0, 72.0], frame=[1], selected=[False]), ANCHORS, (8, 16), SHAPES, 1.5)
+    assert made[0].places.shape == (4, 0)
     ignored = made[0].ignored.nonzero()
     # 16 px box about (64, 64): cell centres nearer than 16 / 4 + 8 / 2 = 8 px, in the anchor that fits.
     assert ignored.tolist() == [[1, 2, r, c] for r in (7, 8) for c in (7, 8)]
@@ -54,12 +55,12 @@ def test_ignored_labels_are_neither_positive_nor_negative():
 
 
 def test_empty_batch_and_crowded_batch():
-    for part in assign(targets(), ANCHORS, (8, 16), SHAPES, 2.0):
-        assert len(part.label) == 0
+    for part in assign(labels(), ANCHORS, (8, 16), SHAPES, 2.0):
+        assert part.places.shape == (4, 0) and part.boxes.shape == (0, 4)
         assert not part.ignored.any()
     corner = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 120
     boxes = torch.cat([corner, corner + 6], 1)
-    crowd = Targets(boxes, torch.zeros(500, dtype=torch.long), torch.ones(500, dtype=torch.bool))
+    crowd = BatchLabels(boxes, torch.zeros(500, dtype=torch.long), torch.ones(500, dtype=torch.bool))
     made = assign(crowd, ANCHORS, (8, 16), SHAPES, 1.6)[0]
-    assert set(made.label.tolist()) == set(range(500))
-    assert made.row.max() < 16 and made.column.max() < 16
+    assert {tuple(box) for box in made.boxes.tolist()} == {tuple(box) for box in boxes.tolist()}
+    assert made.places[2:].max() < 16

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from hypothesis import given
@@ -13,12 +12,22 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import quaternion_from_matrix
+from perilune_train.data import frames
+from perilune_train.data.shares import Share
 from perilune_train.detect.config import AugmentSettings, DetectConfig, LabelSettings
 from perilune_train.detect.data.augment import augment, grey_levels, rescale, turn
-from perilune_train.detect.data.batches import EvaluationFrames, TrainingFrames, loader
-from perilune_train.detect.data.split import load_split, unlabelled_craters
+from perilune_train.detect.data.batches import (
+    TrainingFrames,
+    evaluation_loader,
+    network_input,
+    training_loader,
+)
+from perilune_train.detect.data.ignored import Craters, unlabelled_craters
+from perilune_train.detect.data.split import load_split
 
 PLAIN = AugmentSettings(flips_and_turns=False, gain=0.0, gamma=0.0, blur_px=0.0, noise=0.0)
+ANCHORS = torch.tensor([[[8.0, 8.0], [12.0, 12.0], [16.0, 16.0]], [[20.0, 20.0]] * 3, [[32.0, 32.0]] * 3])
+PINNED_ORDER = [19, 20, 11, 0, 10, 14, 17, 22, 1, 5, 6, 2, 9, 8, 7, 15, 16, 3, 4, 18, 23, 12, 21, 13]
 
 
 @pytest.fixture(scope="module")
@@ -64,33 +73,36 @@ def test_the_default_range_of_radii_is_that_of_the_whole_dataset(dataset_detect)
     assert all(part.selected[part.labelled].all() for part in splits[0].labels)
 
 
+def flat_craters(*places):
+    """Craters at (x, y) in the plane z = 0 with a diameter, metres."""
+    x, y, diameter = np.array(places, float).T
+    zero = np.zeros(len(x))
+    centre, normal = np.column_stack([x, y, zero]), np.column_stack([zero, zero, zero + 1])
+    return Craters(np.arange(len(x)), centre, normal, diameter, diameter / 5)
+
+
 def test_craters_just_outside_the_labelled_range_are_ignored():
     camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
     # Straight down from 100 m: a pixel is a metre, O_L's x is the image's x, its y runs up.
     frame = {"position_m": [0.0, 0.0, 100.0], "rotation_wxyz": quaternion_from_matrix(np.diag([1.0, -1.0, -1.0]))}
-    places = [(0, 10, 2.0), (20, 0, 3.6), (-20, 0, 130.0), (0, 0, 160.0), (52, 0, 20.0), (80, 0, 20.0)]
-    craters = pd.DataFrame(
-        [
-            {"x_m": x, "y_m": y, "z_m": 0.0, "normal_x": 0.0, "normal_y": 0.0, "normal_z": 1.0, "diameter_m": diameter}
-            for x, y, diameter in places
-        ]
-    )
-    rows = unlabelled_craters(craters, camera, frame, (2.0, 50.0))
+    craters = flat_craters((0, 10, 2.0), (20, 0, 3.6), (-20, 0, 130.0), (0, 0, 160.0), (52, 0, 20.0), (80, 0, 20.0))
+    shapes = unlabelled_craters(craters, camera, frame, (2.0, 50.0))
     # Radius 1 px: too small; 1.8 px; 65 px; 80 px: too large; off the image but reaching in; altogether off.
-    np.testing.assert_allclose(rows["radius_px"], [1.8, 65.0, 10.0], rtol=1e-6)
-    np.testing.assert_allclose(rows[["ellipse_cx_px", "ellipse_cy_px"]], [[70, 50], [30, 50], [102, 50]], atol=1e-6)
-    np.testing.assert_allclose(rows["bbox_x0_px"], [68.2, -35, 92], atol=1e-6)
-    assert not rows["selected"].any() and not rows["labelled"].any()
+    np.testing.assert_allclose(shapes[:, 4], [1.8, 65.0, 10.0], rtol=1e-6)
+    np.testing.assert_allclose(shapes[:, 5:7], [[70, 50], [30, 50], [102, 50]], atol=1e-6)
+    np.testing.assert_allclose(shapes[:, 0], [68.2, -35, 92], atol=1e-6)
+    # A crater that has a label is not ignored.
+    others = unlabelled_craters(craters, camera, frame, (2.0, 50.0), labelled=np.array([1, 4]))
+    np.testing.assert_array_equal(others, shapes[1:2])
 
 
 def test_what_is_ignored_reaches_as_far_as_frames_are_resized():
     camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
     frame = {"position_m": [0.0, 0.0, 100.0], "rotation_wxyz": quaternion_from_matrix(np.diag([1.0, -1.0, -1.0]))}
-    row = {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "normal_x": 0.0, "normal_y": 0.0, "normal_z": 1.0}
-    craters = pd.DataFrame([{**row, "diameter_m": 2 * radius} for radius in (0.6, 1.1, 1.8, 65.0, 110.0, 150.0)])
+    craters = flat_craters(*((0, 0, 2 * radius) for radius in (0.6, 1.1, 1.8, 65.0, 110.0, 150.0)))
 
     def ignored(*scale):
-        return unlabelled_craters(craters, camera, frame, (2.0, 50.0), scale)["radius_px"].round(6).tolist()
+        return unlabelled_craters(craters, camera, frame, (2.0, 50.0), scale)[:, 4].round(6).tolist()
 
     # Of the radii times the factors, those from 2 sqrt(1/2) to 50 sqrt(2) pixels.
     assert ignored(1.0, 1.0) == [1.8, 65.0]
@@ -104,11 +116,10 @@ def test_a_distorted_camera_ignores_craters_where_it_sees_them():
     plain = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)
     barrel = replace(plain, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0))
     frame = {"position_m": [0.0, 0.0, 100.0], "rotation_wxyz": quaternion_from_matrix(np.diag([1.0, -1.0, -1.0]))}
-    row = {"y_m": 0.0, "z_m": 0.0, "normal_x": 0.0, "normal_y": 0.0, "normal_z": 1.0}
-    craters = pd.DataFrame([{"x_m": 53.0, "diameter_m": 3.6, **row}, {"x_m": 300.0, "diameter_m": 3.6, **row}])
+    craters = flat_craters((53.0, 0.0, 3.6), (300.0, 0.0, 3.6))
     assert len(unlabelled_craters(craters, plain, frame, (2.0, 50.0))) == 0
-    rows = unlabelled_craters(craters, barrel, frame, (2.0, 50.0))
-    np.testing.assert_allclose(rows["ellipse_cx_px"], [50 + 53 * (1 - 0.3 * 0.53**2)], atol=0.02)
+    shapes = unlabelled_craters(craters, barrel, frame, (2.0, 50.0))
+    np.testing.assert_allclose(shapes[:, 5], [50 + 53 * (1 - 0.3 * 0.53**2)], atol=0.02)
 
 
 def test_frames_that_do_not_divide_by_32_are_refused(tmp_path, make_dataset):
@@ -212,42 +223,75 @@ def test_scales_are_least_and_largest():
 
 
 def test_an_epoch_follows_from_seed_and_number_alone(split):
-    first, again = (TrainingFrames(split, AugmentSettings(), 5, 2) for _ in range(2))
-    other = TrainingFrames(split, AugmentSettings(), 5, 3)
-    assert sorted(first.order) == list(range(len(split)))
-    assert first.order.tolist() == again.order.tolist() != other.order.tolist()
+    first, again = (TrainingFrames(split, DetectConfig(seed=5)) for _ in range(2))
+    order = [number for _, number in first.keys(2)]
+    assert sorted(order) == list(range(len(split)))
+    assert first.keys(2) == again.keys(2) and order != [number for _, number in first.keys(3)]
     # The sample does not depend on what was drawn before it.
-    again[0]
-    np.testing.assert_array_equal(first[3][0], again[3][0])
-    same_frame = int(np.flatnonzero(other.order == first.order[3])[0])
-    assert not np.array_equal(first[3][0], other[same_frame][0])
+    again[2, 0]
+    np.testing.assert_array_equal(first[2, 3][0], again[2, 3][0])
+    assert not np.array_equal(first[2, 3][0], first[3, 3][0])
+
+
+def test_the_order_of_an_epoch_is_pinned(split):
+    """A run resumed with a later version sees the same frames."""
+    assert [number for _, number in TrainingFrames(split, DetectConfig(seed=7)).keys(1)] == PINNED_ORDER
+
+
+def test_each_process_loads_its_own_frames_and_labels(dataset_detect, split, monkeypatch):
+    dataset, decoded = open_dataset(dataset_detect), []
+    decode = frames.decode
+    monkeypatch.setattr(frames, "decode", lambda *more: decoded.append(0) or decode(*more))
+    shares = [load_split(dataset, "train", LabelSettings(), share=Share(process, 3)) for process in range(3)]
+    assert len(decoded) == len(split) == sum(map(len, shares))
+    for process, own in enumerate(shares):
+        np.testing.assert_array_equal(own.frames.images, split.frames.images[process::3])
+        np.testing.assert_array_equal(own.label_sizes_px, split.label_sizes_px)
+        for part, expected in zip(own.labels, split.labels[process::3], strict=True):
+            for name, values in vars(expected).items():
+                np.testing.assert_array_equal(getattr(part, name), values)
+    with pytest.raises(UserError, match="train frames: got 24, expected at least 25, one for each process"):
+        load_split(dataset, "train", LabelSettings(), share=Share(0, 25))
+
+
+def test_processes_augment_a_frame_as_one_process_does(split, dataset_detect):
+    config = DetectConfig(seed=3)
+    whole = TrainingFrames(split, config)
+    own = TrainingFrames(load_split(open_dataset(dataset_detect), "train", config.labels, share=Share(1, 2)), config)
+    epoch, number = own.keys(4)[0]
+    np.testing.assert_array_equal(own[epoch, number][0], whole[epoch, 2 * number + 1][0])
 
 
 def test_batches(split):
     config = DetectConfig(batch_size=5, in_channels=3)
-    batches = list(loader(EvaluationFrames(split), config))
+    batches = list(evaluation_loader(split, config, ANCHORS))
     assert [len(images) for images, _ in batches] == [5, 5, 5, 5, 4]
-    images, targets = batches[1]
+    grey, targets = batches[1]
+    assert grey.shape == (5, 96, 96)
+    torch.testing.assert_close(grey.mean((1, 2)), torch.zeros(5), atol=1e-4, rtol=0)
+    torch.testing.assert_close(grey.std((1, 2)), torch.ones(5), atol=1e-2, rtol=0)
+    images = network_input(grey, config.in_channels)
     assert images.shape == (5, 3, 96, 96)
     assert images.is_contiguous(memory_format=torch.channels_last)
-    torch.testing.assert_close(images.mean((2, 3)), torch.zeros(5, 3), atol=1e-4, rtol=0)
-    torch.testing.assert_close(images.std((2, 3)), torch.ones(5, 3), atol=1e-2, rtol=0)
-    assert torch.equal(images[:, 0], images[:, 2])
-    assert torch.bincount(targets.frame, minlength=5).tolist() == [len(part.boxes) for part in split.labels[5:10]]
-    np.testing.assert_allclose(targets.boxes[targets.frame == 2], split.labels[7].boxes, rtol=1e-6)
-    assert targets.selected[targets.frame == 2].tolist() == split.labels[7].selected.tolist()
+    assert torch.equal(images[:, 0], grey) and torch.equal(images[:, 2], grey)
+    assert [part.ignored.shape for part in targets] == [(5, 3, side, side) for side in (12, 6, 3)]
+    for frame, labels in enumerate(split.labels[5:10]):
+        # Each selected label has a predictor at some scale, and no other box has one.
+        assigned = torch.cat([part.boxes[part.places[0] == frame] for part in targets])
+        assert {tuple(box) for box in assigned.tolist()} == {
+            tuple(box) for box in labels.boxes[labels.selected].astype(np.float32).tolist()
+        }
 
 
 def test_workers_under_spawn_give_the_same_batches(split):
     """`spawn` pickles the frames and the function that makes batches of them."""
-    few = replace(split, frames=replace(split.frames, images=split.frames.images[:4]), labels=split.labels[:4])
-    config = DetectConfig(batch_size=2, in_channels=1, workers=1)
-    batches = loader(TrainingFrames(few, config.augment, 3, 0), config)
+    config = DetectConfig(batch_size=2, in_channels=1, workers=1, seed=3)
+    batches = training_loader(split.first(4), config, ANCHORS)
     batches.multiprocessing_context = "spawn"
     beside = list(batches)
-    alone = list(loader(TrainingFrames(few, config.augment, 3, 0), config.model_copy(update={"workers": 0})))
+    alone = list(training_loader(split.first(4), config.model_copy(update={"workers": 0}), ANCHORS))
     assert len(beside) == len(alone) == 2
     for (images, targets), (own_images, own_targets) in zip(beside, alone, strict=True):
         assert torch.equal(images, own_images)
-        own = vars(own_targets)
-        assert own and all(torch.equal(value, own[name]) for name, value in vars(targets).items())
+        for part, own in zip(targets, own_targets, strict=True):
+            assert vars(own) and all(torch.equal(value, vars(own)[name]) for name, value in vars(part).items())

@@ -6,7 +6,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from tests.helpers.coco_reference import coco_evaluation
 
-from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.matching import COCO_IOUS, Detections, find_overlaps
 from perilune_train.detect.evaluate.metrics import curve, figures_over_ious
 

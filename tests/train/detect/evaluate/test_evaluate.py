@@ -16,7 +16,8 @@ from perilune_shared.errors import UserError
 from perilune_train.cli import app
 from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data.frame_facts import facts_of
-from perilune_train.detect.data.split import FrameLabels, load_split
+from perilune_train.detect.data.labels import FrameLabels
+from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import COCO_IOUS, Detections, find_overlaps
 from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.train.run import run_detect

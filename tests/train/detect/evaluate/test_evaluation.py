@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from perilune_train.detect.data.frame_facts import FrameFacts, unknown_facts
-from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.bootstrap import average_precisions
 from perilune_train.detect.evaluate.evaluation import evaluate_detections
 from perilune_train.detect.evaluate.figures import choose_frames

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.matching import (
     FALSE,
     FOUND,

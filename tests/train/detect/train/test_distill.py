@@ -10,11 +10,11 @@ from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.batches import EvaluationFrames, loader
+from perilune_train.detect.data.batches import evaluation_loader, network_input
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.train.distill import Teacher, distill_loss
-from perilune_train.detect.train.network import build_network, label_sizes, load_teacher
+from perilune_train.detect.train.network import build_network, load_teacher
 from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.models.size import multiply_adds
@@ -128,8 +128,9 @@ def test_the_teacher_adds_to_the_loss(teacher_path, dataset_detect):
     config = settings("detect.loss.lambda_teacher=3")
     split = load_split(open_dataset(dataset_detect), "val", config.labels)
     teacher = load_teacher(teacher_path, config)
-    network = build_network(config, label_sizes(split), dataset_detect).eval()
-    batch = next(iter(loader(EvaluationFrames(split), config)))
+    network = build_network(config, split.label_sizes_px, dataset_detect).eval()
+    grey, targets = next(iter(evaluation_loader(split, config, network.anchors)))
+    batch = network_input(grey, config.in_channels), targets
     costs = []
     for reported in (None, teacher):
         task = DetectTask(network, config, split, split, 0, reported)

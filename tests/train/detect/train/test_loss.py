@@ -4,9 +4,10 @@ import math
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import DynamicOutputShapeException, FakeTensorMode
 
 from perilune_train.detect.config import LossSettings
-from perilune_train.detect.data.assign import Targets
+from perilune_train.detect.data.assign import Assignment, BatchLabels, assign
 from perilune_train.detect.train.loss import ciou_loss, detection_loss
 
 
@@ -60,10 +61,15 @@ def anchors_and_output():
     return torch.tensor([[[8.0, 8.0], [16.0, 16.0], [30.0, 30.0]]]), torch.zeros(1, 3, 4, 4, 5)
 
 
+def loss(raw, labels, anchors, ratio, settings):
+    targets = assign(labels, anchors, (8,), [(1, 4, 4)], ratio)
+    return detection_loss([raw], targets, anchors, (8,), settings)
+
+
 def test_loss_by_hand():
     anchors, raw = anchors_and_output()
-    label = Targets(torch.tensor([[8.0, 8.0, 16.0, 16.0]]), torch.tensor([0]), torch.tensor([True]))
-    box, confidence = detection_loss([raw], label, anchors, (8,), 1.5, LossSettings(lambda_noobj=0.5))
+    label = BatchLabels(torch.tensor([[8.0, 8.0, 16.0, 16.0]]), torch.tensor([0]), torch.tensor([True]))
+    box, confidence = loss(raw, label, anchors, 1.5, LossSettings(lambda_noobj=0.5))
     # Centre (12, 12): cell (1, 1) exactly, its neighbours right and below 8 px off; 3 of 48 predictors positive.
     # Shifted boxes: IoU 0, distance 64 / (256 + 64). Reach of the ignored ones: 8 / 4 + 4 = 6 px, only cell (1, 1).
     assert box.item() == pytest.approx((0 + 2 * (1 + 64 / 320)) / 3, abs=1e-5)
@@ -73,10 +79,10 @@ def test_loss_by_hand():
 def test_ignored_label_takes_its_predictors_out_of_the_loss():
     anchors, raw = anchors_and_output()
     boxes = torch.tensor([[8.0, 8.0, 16.0, 16.0]])
-    none = Targets(boxes[:0], torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.bool))
-    ignored = Targets(boxes, torch.tensor([0]), torch.tensor([False]))
-    full = detection_loss([raw], none, anchors, (8,), 1.5, LossSettings())[1]
-    less = detection_loss([raw], ignored, anchors, (8,), 1.5, LossSettings())[1]
+    none = BatchLabels(boxes[:0], torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.bool))
+    ignored = BatchLabels(boxes, torch.tensor([0]), torch.tensor([False]))
+    full = loss(raw, none, anchors, 1.5, LossSettings())[1]
+    less = loss(raw, ignored, anchors, 1.5, LossSettings())[1]
     assert full.item() == pytest.approx(math.log(2), rel=1e-5)
     assert less.item() == pytest.approx(47 / 48 * math.log(2), rel=1e-5)
 
@@ -84,8 +90,43 @@ def test_ignored_label_takes_its_predictors_out_of_the_loss():
 def test_empty_frame_has_a_gradient():
     anchors, raw = anchors_and_output()
     raw.requires_grad_()
-    none = Targets(torch.zeros(0, 4), torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.bool))
-    box, confidence = detection_loss([raw], none, anchors, (8,), 2.0, LossSettings())
+    none = BatchLabels(torch.zeros(0, 4), torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.bool))
+    box, confidence = loss(raw, none, anchors, 2.0, LossSettings())
     (box + confidence).backward()
     assert box.item() == 0
     assert raw.grad[..., 4].min() > 0 and raw.grad[..., :4].abs().max() == 0
+
+
+@pytest.mark.parametrize("objectness", ["hard", "iou"])
+def test_no_step_of_the_loss_needs_a_value(objectness):
+    """A GPU would have to be waited for. Fake tensors have no values: an operation that needs one raises an error."""
+    anchors = torch.tensor([[[8.0, 8.0], [16.0, 16.0], [30.0, 30.0]]])
+    boxes = torch.tensor([[8.0, 8.0, 16.0, 16.0], [4.0, 4.0, 20.0, 20.0], [0.0, 0.0, 30.0, 30.0]])
+    labels = BatchLabels(boxes, torch.tensor([0, 0, 1]), torch.tensor([True, True, False]))
+    targets = assign(labels, anchors, (8,), [(2, 4, 4)], 1.5)
+    assert targets[0].places.shape[1] > 3 and targets[0].ignored.any()
+    with FakeTensorMode() as fake:
+        raw = torch.zeros(2, 3, 4, 4, 5, requires_grad=True)
+        given = [Assignment(*(fake.from_tensor(part) for part in vars(targets[0]).values()))]
+        loss = sum(detection_loss([raw], given, fake.from_tensor(anchors), (8,), LossSettings(objectness=objectness)))
+        loss.backward()
+        assert raw.grad.shape == raw.shape
+        # The assignment itself depends on values, so the loader does it.
+        fake_labels = BatchLabels(*(fake.from_tensor(part) for part in vars(labels).values()))
+        with pytest.raises(DynamicOutputShapeException):
+            assign(fake_labels, fake.from_tensor(anchors), (8,), [(2, 4, 4)], 1.5)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_gpu_is_not_waited_for():
+    anchors, raw = anchors_and_output()
+    label = BatchLabels(torch.tensor([[8.0, 8.0, 16.0, 16.0]]), torch.tensor([0]), torch.tensor([True]))
+    targets, device = assign(label, anchors, (8,), [(1, 4, 4)], 1.5), torch.device("cuda")
+    pinned = [part.pin_memory() for part in targets]
+    raw, anchors = raw.to(device).requires_grad_(), anchors.to(device)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        box, confidence = detection_loss([raw], [part.to(device) for part in pinned], anchors, (8,), LossSettings())
+        (box + confidence).backward()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from perilune_train.detect.config import LossSettings
-from perilune_train.detect.data.assign import Targets, assign
+from perilune_train.detect.data.assign import BatchLabels, assign
 from perilune_train.detect.train.loss import ciou_loss, detection_loss
 
 ANCHORS = torch.tensor([[[8.0, 8.0], [16.0, 16.0], [30.0, 30.0]]])
@@ -16,16 +16,18 @@ LN2 = math.log(2)
 
 def labels(*boxes, frame=None, selected=None):
     count = len(boxes)
-    return Targets(
+    return BatchLabels(
         torch.tensor(boxes, dtype=torch.float32).view(-1, 4),
         torch.tensor(frame or [0] * count, dtype=torch.long),
         torch.tensor(selected or [True] * count, dtype=torch.bool),
     )
 
 
-def losses(raw, targets, ratio=1.5, stride=8, **settings):
+def losses(raw, given, ratio=1.5, stride=8, **settings):
     chosen = LossSettings(**{"aspect": "circular", "lambda_noobj": 1.0, **settings})
-    return detection_loss([raw], targets, ANCHORS, (stride,), ratio, chosen)
+    frames, _, rows, columns, _ = raw.shape
+    targets = assign(given, ANCHORS, (stride,), [(frames, rows, columns)], ratio)
+    return detection_loss([raw], targets, ANCHORS, (stride,), chosen)
 
 
 def raw_zero(frames=1, rows=4, columns=4):
@@ -100,12 +102,12 @@ def test_a_batch_without_any_label():
 def test_500_craters_in_one_frame_by_hand():
     # 25 x 20 craters of 8 px, centres in the middle of every third cell of 4 px.
     boxes = [[12 * k + 2, 12 * j + 2, 12 * k + 10, 12 * j + 10] for k in range(25) for j in range(20)]
-    targets = labels(*boxes)
+    given = labels(*boxes)
     raw = raw_zero(rows=64, columns=80)
-    made = assign(targets, ANCHORS, (4,), [(1, 64, 80)], 1.5)[0]
-    assert len(made.label) == int(made.positive.sum()) == 1500
-    assert torch.bincount(made.label).tolist() == [3] * 500
-    box, confidence = losses(raw, targets, stride=4)
+    made = assign(given, ANCHORS, (4,), [(1, 64, 80)], 1.5)[0]
+    assert len(made.boxes) == int(made.positive.sum()) == 1500
+    assert torch.unique(made.boxes, dim=0, return_counts=True)[1].tolist() == [3] * 500
+    box, confidence = losses(raw, given, stride=4)
     # The own cell's box fits. Those of the cells beside it are 4 px off: IoU 32 / 96, distance 16 / (12^2 + 8^2).
     assert box.item() == pytest.approx(2 * (1 - 1 / 3 + 16 / 208) / 3, abs=1e-5)
     assert confidence.item() == pytest.approx(LN2, rel=1e-5)

@@ -15,7 +15,6 @@ from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
 from perilune_train.cli import main
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.batches import ProcessBatches
 from perilune_train.detect.train.run import run_detect
 
 SETTINGS = ("detect.precision=float32", "detect.device=cpu", "detect.checkpoint_minutes=0")
@@ -101,16 +100,3 @@ def test_two_processes_share_the_frames_and_end_with_equal_weights(few, tmp_path
 
 def is_weight(key: str) -> bool:
     return not key.endswith(("running_mean", "running_var"))
-
-
-@pytest.mark.parametrize(("count", "size", "processes"), [(24, 4, 2), (25, 4, 2), (27, 4, 2), (10, 4, 1), (7, 2, 3)])
-def test_shares_are_disjoint_and_of_equal_number(count, size, processes):
-    shares = [list(ProcessBatches(count, size, process, processes)) for process in range(processes)]
-    assert {len(share) for share in shares} == {len(ProcessBatches(count, size, 0, processes))}
-    taken = sorted(place for share in shares for batch in share for place in batch)
-    left = count - len(taken)
-    assert taken == list(range(count - left)) and left < processes
-    assert all(1 <= len(batch) <= size for share in shares for batch in share)
-    for process, share in enumerate(shares):
-        again = ProcessBatches(count, size, process, processes, start=2)
-        assert list(again) == share[2:] and len(again) == len(share)

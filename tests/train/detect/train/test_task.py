@@ -1,7 +1,5 @@
 """Schedule, moving average, freezing; that the loss learns."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -9,13 +7,13 @@ from torch import nn
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.detect.config import AugmentSettings, DetectConfig, EvaluationSettings, LabelSettings
-from perilune_train.detect.data.batches import EvaluationFrames, loader
+from perilune_train.detect.data.batches import evaluation_loader, network_input
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.split_evaluation import match_detections
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.train.loss import detection_loss
-from perilune_train.detect.train.network import build_network, label_sizes
+from perilune_train.detect.train.network import build_network
 from perilune_train.detect.train.task import DetectTask, learning_rate_factor, paired_tensors, update_average
 
 
@@ -51,7 +49,7 @@ def split(dataset_detect):
 
 def test_while_frozen_only_gates_and_head_may_learn(split, tmp_path):
     config = DetectConfig(width=0.125, in_channels=1, epochs=3, strides=(4, 8, 16))
-    task = DetectTask(build_network(config, label_sizes(split), tmp_path), config, split, split, frozen_epochs=1)
+    task = DetectTask(build_network(config, split.label_sizes_px, tmp_path), config, split, split, frozen_epochs=1)
     task.train()
     task.on_train_epoch_start()
     learning = {name for name, p in task.network.named_parameters() if p.requires_grad}
@@ -67,7 +65,7 @@ def test_while_frozen_only_gates_and_head_may_learn(split, tmp_path):
 
 def test_long_gradients_are_shortened_and_short_ones_left_alone(split, tmp_path):
     config = DetectConfig(width=0.125, in_channels=1, gradient_clip=2.0)
-    task = DetectTask(build_network(config, label_sizes(split), tmp_path), config, split, split, 0)
+    task = DetectTask(build_network(config, split.label_sizes_px, tmp_path), config, split, split, 0)
     parameters = list(task.network.parameters())
     random = torch.Generator().manual_seed(0)
     # A frozen weight has none.
@@ -86,13 +84,13 @@ def test_long_gradients_are_shortened_and_short_ones_left_alone(split, tmp_path)
 def test_a_few_frames_can_be_learned_by_heart(split, tmp_path):
     """The whole chain (assignment, loss, decoding, suppression, matching) agrees: else this cannot work."""
     config = DetectConfig(width=0.125, in_channels=1, strides=(4, 8, 16), attention="cbam_identity", batch_size=4)
-    frames = type(split.frames)(split.frames.table[:4], split.frames.images[:4])
-    few = replace(split, frames=frames, labels=split.labels[:4])
-    network = build_network(config, label_sizes(few), tmp_path).train()
-    images, targets = next(iter(loader(EvaluationFrames(few), config)))
+    few = split.first(4)
+    network = build_network(config, few.label_sizes_px, tmp_path).train()
+    grey, targets = next(iter(evaluation_loader(few, config, network.anchors)))
+    images = network_input(grey, config.in_channels)
     optimizer = torch.optim.AdamW(network.parameters(), 5e-3)
     for _ in range(60):
-        box, confidence = detection_loss(network(images), targets, network.anchors, network.strides, 2.0, config.loss)
+        box, confidence = detection_loss(network(images), targets, network.anchors, network.strides, config.loss)
         optimizer.zero_grad()
         (0.05 * box + confidence).backward()
         optimizer.step()
@@ -104,5 +102,5 @@ def test_a_few_frames_can_be_learned_by_heart(split, tmp_path):
 
 def test_augmentation_settings_reach_the_task(split, tmp_path):
     config = DetectConfig(width=0.125, in_channels=1, augment=AugmentSettings(noise=0.0))
-    task = DetectTask(build_network(config, label_sizes(split), tmp_path), config, split, split, 0)
+    task = DetectTask(build_network(config, split.label_sizes_px, tmp_path), config, split, split, 0)
     assert task.train_dataloader().dataset.settings.noise == 0.0

@@ -15,7 +15,7 @@ from perilune_shared.errors import UserError
 from perilune_train.cli import app
 from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data.split import load_split
-from perilune_train.detect.train.network import build_network, label_sizes
+from perilune_train.detect.train.network import build_network
 from perilune_train.detect.train.run import run_detect
 from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.transfer import darknet_content, rescale_input, start_from
@@ -256,7 +256,7 @@ def test_a_run_leaves_the_backbone_alone_in_its_frozen_epochs_only(few, tmp_path
 def test_the_frozen_forward_keeps_no_graph_that_nobody_needs(dataset_detect, tmp_path, attention):
     split = load_split(open_dataset(dataset_detect), "train", LabelSettings())
     config = DetectConfig(width=0.125, in_channels=1, epochs=2, strides=(4, 8, 16), attention=attention)
-    task = DetectTask(build_network(config, label_sizes(split), tmp_path), config, split, split, frozen_epochs=1)
+    task = DetectTask(build_network(config, split.label_sizes_px, tmp_path), config, split, split, frozen_epochs=1)
     task.on_train_epoch_start()
     images = torch.randn(1, 1, 64, 64)
     # Without gates nothing in the backbone learns, so that autograd records nothing of it.

@@ -7,6 +7,7 @@ import torch
 
 from perilune_shared.config import resolve
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data import batches
 from perilune_train.detect.evaluate import report
 from perilune_train.detect.train import task
 from perilune_train.detect.train.run import run_detect
@@ -17,12 +18,12 @@ def main(dataset: Path, out: Path, *settings: str) -> None:
     seen: list[tuple[int, int]] = []
     last: list[task.DetectTask] = []
 
-    class Recorded(task.TrainingFrames):
-        def __getitem__(self, place):
-            seen.append((self.key[1], int(self.order[place])))
-            return super().__getitem__(place)
+    class Recorded(batches.TrainingFrames):
+        def __getitem__(self, key):
+            seen.append((key[0], self.split.share.of(self.split.n_frames)[key[1]]))
+            return super().__getitem__(key)
 
-    task.TrainingFrames = Recorded  # type: ignore[misc]
+    batches.TrainingFrames = Recorded  # type: ignore[misc]
     for name in ("draw_bins", "draw_curves", "draw_frames"):
         setattr(report, name, lambda *_, **__: None)
     task.DetectTask.on_train_end = lambda self: last.append(self)  # type: ignore[method-assign]

@@ -1,6 +1,10 @@
-"""Assignment of predictors to labels."""
+"""Assignment of predictors to labels.
 
-from dataclasses import dataclass
+The number of positive predictors depends on the labels. A GPU would make the process wait for that number, so that the
+loader assigns on the CPU, and the loss only gathers.
+"""
+
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -9,7 +13,7 @@ from perilune_train.models.boxes import iou
 
 
 @dataclass(frozen=True)
-class Targets:
+class BatchLabels:
     """Labels of a batch, one row each."""
 
     boxes: Tensor
@@ -19,25 +23,15 @@ class Targets:
     selected: Tensor
     """False for a label to ignore, such as a hardly visible crater (T,)."""
 
-    def to(self, device: torch.device) -> "Targets":
-        """The same on another device."""
-        return Targets(self.boxes.to(device), self.frame.to(device), self.selected.to(device))
-
 
 @dataclass(frozen=True)
 class Assignment:
     """Positive predictors of one scale with their labels, and ignored predictors."""
 
-    frame: Tensor
-    """Frame of each positive predictor (P,)."""
-    anchor: Tensor
-    """Anchor of each positive predictor (P,)."""
-    row: Tensor
-    """Row of its cell (P,)."""
-    column: Tensor
-    """Column of its cell (P,)."""
-    label: Tensor
-    """Its label, a row of Targets (P,)."""
+    places: Tensor
+    """Frame, anchor, row and column of each positive predictor (4, P)."""
+    boxes: Tensor
+    """Box of its label: x0, y0, x1, y1 in pixels (P, 4)."""
     ignored: Tensor
     """Predictors that are neither positive nor negative (N, 3, h, w), bool."""
 
@@ -45,8 +39,21 @@ class Assignment:
     def positive(self) -> Tensor:
         """The positive predictors (N, 3, h, w), bool."""
         mask = torch.zeros_like(self.ignored)
-        mask[self.frame, self.anchor, self.row, self.column] = True
+        mask[tuple(self.places)] = True
         return mask
+
+    def pin_memory(self) -> "Assignment":
+        """The same in page-locked memory; a DataLoader calls it."""
+        return Assignment(self.places.pin_memory(), self.boxes.pin_memory(), self.ignored.pin_memory())
+
+    def to(self, device: torch.device) -> "Assignment":
+        """The same on another device; from page-locked memory without waiting."""
+        moved = (part.to(device, non_blocking=True) for part in (self.places, self.boxes, self.ignored))
+        return Assignment(*moved)
+
+
+Targets = list[Assignment]
+"""The assignments of a batch, one per scale."""
 
 
 def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float) -> Tensor:
@@ -66,8 +73,8 @@ def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float) -> Tensor:
 
 
 def assign(
-    targets: Targets, anchors: Tensor, strides: tuple[int, ...], shapes: list[tuple[int, int, int]], ratio: float
-) -> list[Assignment]:
+    labels: BatchLabels, anchors: Tensor, strides: tuple[int, ...], shapes: list[tuple[int, int, int]], ratio: float
+) -> Targets:
     """Positive and ignored predictors of every scale, for anchors (scales, 3, 2) and grids (N, h, w).
 
     A predictor is positive if its anchor is within the factor `ratio` of a selected label and its cell contains the
@@ -79,9 +86,9 @@ def assign(
     others are negative, including those around a selected label. YOLOv3 ignores those if their boxes overlap the label
     by more than 0.5; then the loss does not lower their scores below the scores of better boxes.
     """
-    matches = matching_anchors(targets.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
-    centre = (targets.boxes[:, :2] + targets.boxes[:, 2:]) / 2
-    size = targets.boxes[:, 2:] - targets.boxes[:, :2]
+    matches = matching_anchors(labels.boxes, anchors.flatten(0, 1), ratio).unflatten(1, anchors.shape[:2])
+    centre = (labels.boxes[:, :2] + labels.boxes[:, 2:]) / 2
+    size = labels.boxes[:, 2:] - labels.boxes[:, :2]
     result = []
     for scale, stride in enumerate(strides):
         frames, height, width = shapes[scale]
@@ -89,10 +96,10 @@ def assign(
         at = centre[label] / stride
         limit = at.new_tensor([width, height])
         grid = (frames, anchors.shape[1], height, width)
-        selected = targets.selected[label]
+        selected = labels.selected[label]
         unselected = label[~selected]
         ignored = _cells_touched(
-            targets.frame[unselected], anchor[~selected], at[~selected], size[unselected] / stride, grid
+            labels.frame[unselected], anchor[~selected], at[~selected], size[unselected] / stride, grid
         )
         label, anchor, at = label[selected], anchor[selected], at[selected]
         cell = at.floor()
@@ -105,8 +112,9 @@ def assign(
         label, anchor = label.repeat(3), anchor.repeat(3)
         inside = ((cells >= 0) & (cells < limit)).all(1)
         cells, label, anchor = cells[inside].long(), label[inside], anchor[inside]
-        made = Assignment(targets.frame[label], anchor, cells[:, 1], cells[:, 0], label, ignored)
-        result.append(Assignment(made.frame, made.anchor, made.row, made.column, label, ignored & ~made.positive))
+        places = torch.stack([labels.frame[label], anchor, cells[:, 1], cells[:, 0]])
+        made = Assignment(places, labels.boxes[label], ignored)
+        result.append(replace(made, ignored=ignored & ~made.positive))
     return result
 
 
@@ -121,11 +129,11 @@ def _cells_touched(frame: Tensor, anchor: Tensor, at: Tensor, size: Tensor, shap
     reach = size / 4 + 0.5
     span = int(reach.max().ceil()) + 1
     offsets = torch.arange(-span, span + 1, device=at.device)
-    step = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), dim=-1).flatten(0, 1)
-    cells = at.floor()[:, None] + step
-    limit = at.new_tensor([shape[3], shape[2]])
-    hit = ((cells + 0.5 - at[:, None]).abs() < reach[:, None]).all(2) & ((cells >= 0) & (cells < limit)).all(2)
-    which, place = hit.nonzero(as_tuple=True)
-    chosen = cells[which, place].long()
-    touched[frame[which], anchor[which], chosen[:, 1], chosen[:, 0]] = True
+    # Columns and rows (P, 2, S) around each centre; a cell is touched if both its column and its row are.
+    cells = at.floor()[..., None] + offsets
+    limit = at.new_tensor([shape[3], shape[2]])[:, None]
+    near = ((cells + 0.5 - at[..., None]).abs() < reach[..., None]) & (cells >= 0) & (cells < limit)
+    which, row, column = (near[:, 1, :, None] & near[:, 0, None, :]).nonzero(as_tuple=True)
+    cells = cells.long()
+    touched[frame[which], anchor[which], cells[which, 1, row], cells[which, 0, column]] = True
     return touched

@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_train.detect.config import AugmentSettings
-from perilune_train.detect.data.split import MARGIN
+from perilune_train.detect.data.ignored import MARGIN
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,5 @@
-"""Batches of frames and labels: order of an epoch, shares of several processes, the network's input."""
+"""Batches of frames and labels: order of an epoch, augmentation, assignment, the network's input."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,50 +8,57 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils import data as torch_data
 
+from perilune_train.data.epochs import EpochBatches, batch_loader
 from perilune_train.data.frames import normalised
-from perilune_train.detect.config import AugmentSettings, DetectConfig
-from perilune_train.detect.data.assign import Targets
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.assign import BatchLabels, Targets, assign
 from perilune_train.detect.data.augment import augment
 from perilune_train.detect.data.split import DetectSplit
+from perilune_train.training.runs import choose_device
 
 Array = NDArray[np.float64]
 Sample = tuple[NDArray[np.float32], Array, NDArray[np.bool_]]
 """A normalised frame (H, W), its boxes (M, 4) in pixels, and which of them are selected (M,)."""
 Batch = tuple[Tensor, Targets]
+"""Normalised frames (N, H, W) and the assignments of their labels; none without training."""
+Key = tuple[int, int]
+"""Epoch and number of a frame within a share."""
 
 
 class TrainingFrames(torch_data.Dataset):
-    """A split in the order and with the augmentation of one epoch; both depend on seed and epoch only."""
+    """The frames of a share, indexed by epoch and number; the augmentation depends on seed, epoch and frame only."""
 
-    def __init__(self, split: DetectSplit, settings: AugmentSettings, seed: int, epoch: int):
-        self.split, self.settings, self.key = split, settings, [seed, epoch]
-        self.order = np.random.default_rng(self.key).permutation(len(split))
+    def __init__(self, split: DetectSplit, config: DetectConfig):
+        self.split, self.settings, self.seed = split, config.augment, config.seed
 
-    def __len__(self) -> int:
-        return len(self.order)
+    def keys(self, epoch: int) -> list[Key]:
+        """Keys of the share's frames in the order of an epoch, which depends on seed and epoch only."""
+        order = np.random.default_rng([self.seed, epoch]).permutation(self.split.n_frames)
+        own = order[self.split.share.owns(order)] // self.split.share.processes
+        return [(epoch, int(number)) for number in own]
 
-    def __getitem__(self, place: int) -> Sample:
-        index = int(self.order[place])
-        labels = self.split.labels[index]
-        rng = np.random.default_rng([*self.key, index])
-        image, split = self.split.frames.images[index], self.split
+    def __getitem__(self, key: Key) -> Sample:
+        epoch, number = key
+        split, labels = self.split, self.split.labels[number]
+        in_split = split.share.of(split.n_frames)[number]
+        rng = np.random.default_rng([self.seed, epoch, in_split])
+        image = split.frames.images[number]
         pixels, boxes, selected = augment(image, labels.boxes, labels.selected, split.radius_px, self.settings, rng)
         return normalised(pixels), boxes, selected
 
 
 class EvaluationFrames(torch_data.Dataset):
-    """A split in order, not augmented; each of several `processes` takes every n-th frame."""
+    """The frames of a share in order, not augmented."""
 
-    def __init__(self, split: DetectSplit, process: int = 0, processes: int = 1):
-        self.split, self.own = split, range(process, len(split), processes)
+    def __init__(self, split: DetectSplit):
+        self.split = split
 
     def __len__(self) -> int:
-        return len(self.own)
+        return len(self.split)
 
-    def __getitem__(self, place: int) -> Sample:
-        index = self.own[place]
-        labels = self.split.labels[index]
-        return normalised(self.split.frames.images[index]), labels.boxes, labels.selected
+    def __getitem__(self, number: int) -> Sample:
+        labels = self.split.labels[number]
+        return normalised(self.split.frames.images[number]), labels.boxes, labels.selected
 
 
 def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Tensor:
@@ -61,53 +67,56 @@ def network_input(images: NDArray[np.float32] | Tensor, in_channels: int) -> Ten
     return stacked.contiguous(memory_format=torch.channels_last)
 
 
-class ProcessBatches(torch_data.Sampler[list[int]]):
-    """Batches of one of several processes, as positions in an epoch's order of frames.
-
-    In every step the processes together take the next `size * processes` positions, each an equal part, so that all
-    have the same number of batches and each position is taken once. If the last step has fewer positions than
-    processes, they are skipped (at most processes - 1 frames of an epoch, different ones in each epoch).
-
-    Iterates from batch `start` on; the length is that of the whole epoch.
-    """
-
-    def __init__(self, count: int, size: int, process: int = 0, processes: int = 1, start: int = 0):
-        self.count, self.size, self.process, self.processes, self.start = count, size, process, processes, start
-
-    def __len__(self) -> int:
-        whole, rest = divmod(self.count, self.size * self.processes)
-        return whole + (rest >= self.processes)
-
-    def __iter__(self) -> Iterator[list[int]]:
-        step = self.size * self.processes
-        for first in range(self.start * step, len(self) * step, step):
-            yield list(range(first, min(first + step, self.count)))[self.process :: self.processes]
-
-
 @dataclass(frozen=True)
 class Collate:
-    """Makes a batch (images (N, in_channels, H, W), Targets) from frames. A class, so that `spawn` can pickle it."""
+    """Makes a batch of frames. A class, so that `spawn` can pickle it."""
 
-    in_channels: int
-    """Input channels of the network."""
+    anchors: Tensor | None
+    """Widths and heights of the anchors in pixels (scales, 3, 2), on the CPU; None without assignment."""
+    strides: tuple[int, ...]
+    """Strides of the scales, pixels."""
+    ratio: float
+    """Factor within which an anchor fits a label."""
 
     def __call__(self, samples: list[Sample]) -> Batch:
         images, boxes, selected = zip(*samples, strict=True)
-        counts = torch.tensor([len(part) for part in boxes])
-        return network_input(np.stack(images), self.in_channels), Targets(
+        frames = torch.as_tensor(np.stack(images))
+        if self.anchors is None:
+            return frames, []
+        labels = BatchLabels(
             torch.as_tensor(np.concatenate(boxes), dtype=torch.float32),
-            torch.repeat_interleave(torch.arange(len(samples)), counts),
+            torch.repeat_interleave(torch.arange(len(samples)), torch.tensor([len(part) for part in boxes])),
             torch.as_tensor(np.concatenate(selected)),
         )
+        count, height, width = frames.shape
+        shapes = [(count, height // stride, width // stride) for stride in self.strides]
+        return frames, assign(labels, self.anchors, self.strides, shapes, self.ratio)
 
 
-def loader(
-    frames: TrainingFrames | EvaluationFrames, config: DetectConfig, share: ProcessBatches | None = None
+def training_loader(
+    split: DetectSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
 ) -> torch_data.DataLoader:
-    """Batches (images (N, in_channels, H, W), Targets) in the given order; with `share` only its frames."""
-    return torch_data.DataLoader(
-        frames,
-        batch_sampler=share or ProcessBatches(len(frames), config.batch_size),
-        num_workers=config.workers,
-        collate_fn=Collate(config.in_channels),
-    )
+    """Training batches of a share, in every epoch in its order; the first one, `epoch`, from batch `start` on.
+
+    `anchors` (scales, 3, 2) are those of the network. All processes have the same number of batches: each frame is seen
+    once in an epoch, except at most processes - 1 frames, different ones in each epoch.
+    """
+    frames = TrainingFrames(split, config)
+    fewest = split.n_frames // split.share.processes
+    batches = EpochBatches(frames.keys, fewest, config.batch_size, epoch, start)
+    return batch_loader(frames, batches, _collate(config, anchors), config.workers, _pinned(config))
+
+
+def evaluation_loader(split: DetectSplit, config: DetectConfig, anchors: Tensor | None = None) -> torch_data.DataLoader:
+    """Batches of a share in order, not augmented; with `anchors` as in training, else without assignments."""
+    frames = EvaluationFrames(split)
+    batches = torch_data.BatchSampler(range(len(frames)), config.batch_size, drop_last=False)
+    return batch_loader(frames, batches, _collate(config, anchors), config.workers, _pinned(config))
+
+
+def _collate(config: DetectConfig, anchors: Tensor | None) -> Collate:
+    return Collate(None if anchors is None else anchors.cpu(), config.strides, config.anchor_ratio)
+
+
+def _pinned(config: DetectConfig) -> bool:
+    return choose_device(config.device) == "cuda"

@@ -11,6 +11,7 @@ ellipses inscribed in the boxes) and `facts` a FrameFacts (`unknown_facts` if no
 frame.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_train.detect.data.frame_facts import FrameFacts
-from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.bins import BinFigures, figures_by_bin
 from perilune_train.detect.evaluate.bootstrap import at_threshold_resampled, average_precisions
 from perilune_train.detect.evaluate.matching import (
@@ -44,7 +45,7 @@ class Evaluation:
 
     found: list[Detections]
     """Detections, one entry per frame."""
-    labels: list[FrameLabels]
+    labels: Sequence[FrameLabels]
     """Labels, one entry per frame."""
     facts: FrameFacts
     """Metadata of the frames."""
@@ -119,7 +120,7 @@ class Evaluation:
 
 def evaluate_detections(
     found: list[Detections],
-    labels: list[FrameLabels],
+    labels: Sequence[FrameLabels],
     facts: FrameFacts,
     threshold: float,
     *,

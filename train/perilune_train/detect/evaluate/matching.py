@@ -2,7 +2,7 @@
 
 Evaluate detections against labels of rendered or real images with:
 
-    overlaps = find_overlaps(found, labels, sizes_px)          # list[Detections], list[FrameLabels], (N, 2)
+    overlaps = find_overlaps(found, labels, sizes_px)          # list[Detections], FrameLabels, (N, 2)
     matches = overlaps.match(0.5, (2.0, 50.0))                 # at one IoU
     curve(matches).ap_paper()                                  # metrics.py
 
@@ -24,12 +24,13 @@ ignored label is repeated once for every detection (a test does that). COCO coun
 image as a false positive, because its labels have no such centres.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.boxes import iou_matrix
 
 Array = NDArray[np.float64]
@@ -148,7 +149,7 @@ class Overlaps:
 
 
 def find_overlaps(
-    found: list[Detections], labels: list[FrameLabels], sizes_px: NDArray, min_iou: float = 0.5
+    found: list[Detections], labels: Sequence[FrameLabels], sizes_px: NDArray, min_iou: float = 0.5
 ) -> Overlaps:
     """All pairs with an IoU of at least `min_iou`, for frames of the widths and heights `sizes_px` (N, 2)."""
     boxes, scores, detections, others, values, n_found, n_labels = [], [], [], [], [], 0, 0
@@ -186,7 +187,7 @@ def find_overlaps(
 
 def match_split(
     found: list[Detections],
-    labels: list[FrameLabels],
+    labels: Sequence[FrameLabels],
     image_size_px: tuple[int, int],
     match_iou: float,
     radius_px: tuple[float, float],
@@ -194,6 +195,23 @@ def match_split(
     """Match the detections of frames of one size (width, height) at one IoU."""
     sizes = np.tile(image_size_px, (len(found), 1))
     return find_overlaps(found, labels, sizes, match_iou).match(match_iou, radius_px)
+
+
+def joined(parts: Sequence[Matches]) -> Matches:
+    """The matches in the frames of several processes, which each took every n-th frame; sorted by frame.
+
+    Rows of labels (`label`) are not unique in the result.
+    """
+
+    def numbered(name: str) -> NDArray:
+        return _joined([getattr(part, name) * len(parts) + i for i, part in enumerate(parts)]).astype(np.intp)
+
+    frame = numbered("frame")
+    order = np.argsort(frame, kind="stable")
+    scores, outcome, label = (
+        _joined([getattr(part, name) for part in parts])[order] for name in ("scores", "outcome", "label")
+    )
+    return Matches(scores, outcome, label, frame[order], np.sort(numbered("selected_frame")))
 
 
 def _joined(parts: list) -> NDArray:

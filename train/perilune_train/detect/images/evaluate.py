@@ -18,7 +18,7 @@ from perilune_shared.storage.files import written_aside
 from perilune_shared.terminal import progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.frame_facts import unknown_facts
-from perilune_train.detect.data.split import FrameLabels
+from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections
 from perilune_train.detect.evaluate.metrics import at_threshold, curve

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from perilune_train.detect.config import LossSettings
-from perilune_train.detect.data.assign import Targets, assign
+from perilune_train.detect.data.assign import Targets
 from perilune_train.models.boxes import iou
 from perilune_train.models.yolo import decode
 
@@ -41,12 +41,7 @@ def ciou_loss(predicted: Tensor, label: Tensor, aspect: Literal["circular", "sta
 
 
 def detection_loss(
-    outputs: list[Tensor],
-    targets: Targets,
-    anchors: Tensor,
-    strides: tuple[int, ...],
-    ratio: float,
-    settings: LossSettings,
+    outputs: list[Tensor], targets: Targets, anchors: Tensor, strides: tuple[int, ...], settings: LossSettings
 ) -> tuple[Tensor, Tensor]:
     """L_ciou and L_obj of raw outputs (N, 3, h, w, 5) per scale; the loss is their weighted sum.
 
@@ -56,19 +51,17 @@ def detection_loss(
     over all scales. With means, both parts train with the paper's weights 0.05 and 1. The weights 1 / stride raise the
     coarse scales relative to a plain sum, because their craters are a hundred times rarer.
 
+    No shape depends on values, so that a GPU never makes the process wait.
+
     The objectness target of a positive predictor is 1 (`hard`, YOLOv3) or the IoU of its box with its label (`iou`).
     With `iou` the score measures how well a box fits, and suppression keeps the best box on a crater.
     """
-    shapes = [(raw.shape[0], raw.shape[2], raw.shape[3]) for raw in outputs]
     box, confidence = outputs[0].new_zeros(()), outputs[0].new_zeros(())
     total = sum(1 / stride for stride in strides)
-    for raw, own_anchors, stride, found in zip(
-        outputs, anchors, strides, assign(targets, anchors, strides, shapes, ratio), strict=True
-    ):
-        place = (found.frame, found.anchor, found.row, found.column)
-        chosen = raw[place].float()
-        cells = torch.stack([found.column, found.row], 1)
-        boxes, labels = decode(chosen, cells, own_anchors[found.anchor], stride), targets.boxes[found.label]
+    for raw, own_anchors, stride, found in zip(outputs, anchors, strides, targets, strict=True):
+        frame, anchor, row, column = found.places
+        chosen, cells = raw[frame, anchor, row, column].float(), torch.stack([column, row], 1)
+        boxes, labels = decode(chosen, cells, own_anchors[anchor], stride), found.boxes
         share = 1 / stride / total
         # An empty sum keeps the graph, so that a batch of empty frames remains differentiable.
         box = box + share * ciou_loss(boxes, labels, settings.aspect).sum() / max(len(labels), 1)
@@ -78,7 +71,7 @@ def detection_loss(
         if settings.objectness == "iou":
             # If two labels share a predictor, use the larger IoU.
             _, anchors_here, height, width = target.shape
-            flat = ((found.frame * anchors_here + found.anchor) * height + found.row) * width + found.column
+            flat = ((frame * anchors_here + anchor) * height + row) * width + column
             target = (
                 torch.zeros_like(target)
                 .view(-1)

@@ -8,7 +8,6 @@ import torch
 
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.train.anchors import best_possible_recall, kmeans_anchors
 from perilune_train.detect.train.distill import Teacher
@@ -16,12 +15,6 @@ from perilune_train.models.yolo import ANCHORS_PER_SCALE, YOLOv3
 from perilune_train.training import runs
 
 _ANCHOR_STREAM = 1
-
-
-def label_sizes(split: DetectSplit) -> np.ndarray:
-    """Widths and heights (N, 2) in pixels of all selected labels of a split."""
-    boxes = np.concatenate([part.boxes[part.selected] for part in split.labels])
-    return boxes[:, 2:] - boxes[:, :2]
 
 
 def build_network(config: DetectConfig, sizes_px: np.ndarray, where: Path) -> YOLOv3:

@@ -1,11 +1,10 @@
 """One training run of the detector: load, train, evaluate, write."""
 
-import math
 from pathlib import Path
 
 from perilune_shared.dataset.manifest import Dataset, open_dataset
-from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
+from perilune_train.data.shares import ALONE
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.matching import EDGE
@@ -27,7 +26,6 @@ from perilune_train.detect.train.network import (
     anchor_report,
     anchor_sizes,
     build_network,
-    label_sizes,
     load_teacher,
 )
 from perilune_train.detect.train.task import DetectTask
@@ -37,7 +35,7 @@ from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, training_provenance
 from perilune_train.training import runs
 from perilune_train.training.begin import hashes_of, start_run, state_of
-from perilune_train.training.fit import fit, machines
+from perilune_train.training.fit import fit, own_share
 
 
 def run_detect(
@@ -69,13 +67,11 @@ def run_detect(
     terrain_check = check_terrain(terrain, dataset, "test", allow_overlap)
     device = runs.choose_device(config.device)
     scale = {"train": config.augment.scale, "val": (1.0, 1.0), "test": (1.0, 1 / EDGE)}
-    splits = {split: load_split(dataset, split, config.labels, scale[split]) for split in ("train", "val", "test")}
-    processes = math.prod(machines(config.devices, config.num_nodes))
-    for split in ("train", "val"):
-        if len(splits[split]) < processes:
-            expected = f"at least {processes}, one for each process"
-            raise UserError(dataset.root, f"{split} frames", len(splits[split]), expected)
-    sizes = label_sizes(splits["train"])
+    share = own_share(config.devices, config.num_nodes)
+    splits = {name: load_split(dataset, name, config.labels, scale[name], share) for name in ("train", "val")}
+    if runs.is_first_process():
+        splits["test"] = load_split(dataset, "test", config.labels, scale["test"])
+    sizes = splits["train"].label_sizes_px
     network = build_network(config, sizes, dataset.root)
     if config.init_from is not None and not resume:
         start_from(network, Path(config.init_from), config)
@@ -111,6 +107,8 @@ def run_detect(
     )
     if not runs.is_first_process():
         return run
+    if share != ALONE:
+        splits["val"] = load_split(dataset, "val", config.labels, scale["val"])
     anchors = anchor_sizes(network)
     metrics: Metrics = {
         "train/seconds": round(seconds, 1),
@@ -145,7 +143,7 @@ def evaluate(
     evaluation = evaluate_split(splits["test"], found, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found)
     about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{rule} on val")
-    about.append(anchor_report(detector.network, label_sizes(splits["train"]), config.anchor_ratio))
+    about.append(anchor_report(detector.network, splits["train"].label_sizes_px, config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), about)
     metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}
     metrics |= {f"test/{key}": value for key, value in evaluation.figures().items()}

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.batches import Batch, EvaluationFrames, ProcessBatches, TrainingFrames, loader
+from perilune_train.detect.data.batches import Batch, evaluation_loader, network_input, training_loader
 from perilune_train.detect.data.split import DetectSplit
-from perilune_train.detect.evaluate.matching import Detections, match_split
+from perilune_train.detect.evaluate.matching import Detections, joined, match_split
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.train.distill import Teacher, distill_loss
@@ -66,6 +66,8 @@ class DetectTask(lightning.LightningModule):
     """Training with AdamW, warm-up and cosine; a moving average of the weights is evaluated in their place.
 
     A frozen backbone keeps its weights and batch statistics, except the weights of its attention gates.
+
+    `train` and `val` are the shares of this process.
     """
 
     def __init__(
@@ -99,13 +101,14 @@ class DetectTask(lightning.LightningModule):
         return (self._trainer.global_rank, self._trainer.world_size) if self._trainer else (0, 1)
 
     def train_dataloader(self) -> Any:
-        frames = TrainingFrames(self.splits["train"], self.config.augment, self.config.seed, self.current_epoch)
-        epoch, batches = self.resumed
-        start = batches if epoch == self.current_epoch else 0
-        return loader(frames, self.config, ProcessBatches(len(frames), self.config.batch_size, *self.process, start))
+        # The current epoch is one too low here if the run is resumed after a whole epoch.
+        epoch = self._trainer.fit_loop.epoch_progress.current.processed if self._trainer else 0
+        resumed_epoch, batches = self.resumed
+        start = batches if epoch == resumed_epoch else 0
+        return training_loader(self.splits["train"], self.config, self.network.anchors, epoch, start)
 
     def val_dataloader(self) -> Any:
-        return loader(EvaluationFrames(self.splits["val"], *self.process), self.config)
+        return evaluation_loader(self.splits["val"], self.config)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["epoch_and_batches"] = [
@@ -130,9 +133,7 @@ class DetectTask(lightning.LightningModule):
             fused=True,
         )
         # Lightning's own count would load the batches of an epoch before it knows the position of a resumed run.
-        total = self.config.epochs * len(
-            ProcessBatches(len(self.splits["train"]), self.config.batch_size, *self.process)
-        )
+        total = self.config.epochs * len(self.train_dataloader())
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda step: learning_rate_factor(step, self.config.warmup_steps, total)
         )
@@ -151,9 +152,7 @@ class DetectTask(lightning.LightningModule):
         self.images_seen += len(images) * self.process[1]
         outputs = self.network(images)
         settings = self.config.loss
-        box, confidence = detection_loss(
-            outputs, targets, self.network.anchors, self.network.strides, self.config.anchor_ratio, settings
-        )
+        box, confidence = detection_loss(outputs, targets, self.network.anchors, self.network.strides, settings)
         self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(images))
         loss = settings.lambda_iou * box + settings.lambda_obj * confidence
         if self.teacher is not None:
@@ -185,7 +184,10 @@ class DetectTask(lightning.LightningModule):
             update_average(self.tensors, min(self.config.ema_decay, (1 + steps) / (10 + steps)) ** every)
 
     def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        return batch[0].to(device), batch[1].to(device)
+        images, targets = batch
+        # The channels of a grey frame are equal, so copy one.
+        moved = network_input(images.to(device, non_blocking=True), self.config.in_channels)
+        return moved, [part.to(device) for part in targets]
 
     def on_validation_epoch_start(self) -> None:
         self.detections = []
@@ -199,15 +201,14 @@ class DetectTask(lightning.LightningModule):
         self.detections += detections_of(boxes, scores, self.config.evaluation)
 
     def on_validation_epoch_end(self) -> None:
-        split, detections = self.splits["val"], self.detections
-        processes = self.process[1]
-        if processes > 1:
-            parts: list[Any] = [None] * processes
-            torch.distributed.all_gather_object(parts, detections)
-            detections = [parts[i % processes][i // processes] for i in range(len(split))]
+        split, processes = self.splits["val"], self.process[1]
         height, width = split.frames.images.shape[1:]
         match_iou = self.config.evaluation.match_iou
-        matches = match_split(detections, split.labels, (width, height), match_iou, split.radius_px)
+        matches = match_split(self.detections, split.labels, (width, height), match_iou, split.radius_px)
+        if processes > 1:
+            parts: list[Any] = [None] * processes
+            torch.distributed.all_gather_object(parts, matches)
+            matches = joined(parts)
         points = curve(matches)
         _, recall, f1 = at_threshold(matches, points.best_threshold())
         self.log_dict({"val/ap50_paper": points.ap_paper(), "val/f1": f1, "val/recall": recall})

@@ -1,55 +1,61 @@
-"""Batches of one epoch of navigation training."""
-
-from collections.abc import Iterator
+"""Order and augmentation of the sequences of every epoch of navigation training."""
 
 import numpy as np
+from torch.utils import data as torch_data
 
+from perilune_train.data.shares import Share
 from perilune_train.navigate.data.sequences import Jitter, Sequence, pair_sequence
 from perilune_train.navigate.data.trajectories import Trajectory
 
+Key = tuple[int, int, int, int]
+"""Epoch, place in its order, number of a trajectory and first pair of a sequence."""
 
-class EpochBatches:
-    """One epoch of batches of sequences; depends on trajectories and key (seed, epoch) only.
+
+class TrainingSequences(torch_data.Dataset):
+    """The training sequences of a share; they depend on trajectories, seed and epoch only.
 
     A trajectory gives about as many sequences of `n_pairs` (at most the length of the shortest trajectory) as fit into
-    it, each with its own random start. Iterates over lists of `batch` sequences; `augmented` sequences are mirrored
-    and, with `jitter`, moved (see `pair_sequence`).
+    it, each with its own random start. A sequence belongs to the process of its trajectory. `augmented` sequences are
+    mirrored and, with `jitter`, moved (see `pair_sequence`).
     """
 
     def __init__(
         self,
         trajectories: list[Trajectory],
         n_pairs: int,
-        batch: int,
         *,
         warp: bool,
         augmented: bool,
         jitter: Jitter | None,
-        key: tuple[int, ...],
+        seed: int,
+        share: Share,
     ):
-        self.trajectories, self.batch, self.warp, self.augmented = trajectories, batch, warp, augmented
-        self.jitter, self.key = jitter, key
+        self.trajectories, self.warp, self.augmented = trajectories, warp, augmented
+        self.jitter, self.seed, self.share = jitter, seed, share
         self.n_pairs = min(n_pairs, *(trajectory.n_pairs for trajectory in trajectories))
-        rng = np.random.default_rng(key)
-        self.places = [
+        self.counts = [round(trajectory.n_pairs / self.n_pairs) for trajectory in trajectories]
+
+    @property
+    def fewest(self) -> int:
+        """Number of sequences of the process that has fewest."""
+        processes = self.share.processes
+        return min(sum(self.counts[process::processes]) for process in range(processes))
+
+    def keys(self, epoch: int) -> list[Key]:
+        """Keys of the share's sequences in the order of an epoch."""
+        rng = np.random.default_rng([self.seed, epoch])
+        places = [
             (number, int(start))
-            for number, trajectory in enumerate(trajectories)
-            for start in rng.integers(
-                0, trajectory.n_pairs - self.n_pairs + 1, round(trajectory.n_pairs / self.n_pairs)
-            )
+            for number, (trajectory, count) in enumerate(zip(self.trajectories, self.counts, strict=True))
+            for start in rng.integers(0, trajectory.n_pairs - self.n_pairs + 1, count)
         ]
-        rng.shuffle(self.places)
+        rng.shuffle(places)
+        own = set(self.share.of(len(self.trajectories)))
+        return [(epoch, place, *sequence) for place, sequence in enumerate(places) if sequence[0] in own]
 
-    def __len__(self) -> int:
-        return -(-len(self.places) // self.batch)
-
-    def __iter__(self) -> Iterator[list[Sequence]]:
-        for begin in range(0, len(self.places), self.batch):
-            yield [self._sequence(i) for i in range(begin, min(begin + self.batch, len(self.places)))]
-
-    def _sequence(self, i: int) -> Sequence:
-        number, start = self.places[i]
-        rng = np.random.default_rng([*self.key, i]) if self.augmented else None
+    def __getitem__(self, key: Key) -> Sequence:
+        epoch, place, number, start = key
+        rng = np.random.default_rng([self.seed, epoch, place]) if self.augmented else None
         return pair_sequence(
             self.trajectories[number], start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter
         )

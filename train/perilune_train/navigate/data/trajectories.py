@@ -11,7 +11,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
-from perilune_train.data.frames import load_frames
+from perilune_train.data.frames import frame_table, load_images
+from perilune_train.data.shares import ALONE, Share
 from perilune_train.navigate.geometry import relative_poses
 
 Motion = tuple[Array, Array]
@@ -27,7 +28,7 @@ class Trajectory:
     split: str
     """train, val or test."""
     images: np.ndarray
-    """8-bit grey frames (n, height, width)."""
+    """8-bit grey frames (n, height, width); (0, height, width) if another process loads them."""
     camera: Camera
     """Intrinsics of `images`."""
     position_m: Array
@@ -42,7 +43,7 @@ class Trajectory:
     @property
     def n_pairs(self) -> int:
         """Number of pairs of consecutive frames."""
-        return len(self.images) - 1
+        return len(self.position_m) - 1
 
     @property
     def motion(self) -> Motion:
@@ -52,7 +53,7 @@ class Trajectory:
     @property
     def nominal_motion(self) -> Motion:
         """Nominal motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3), which is the identity."""
-        attitudes = np.broadcast_to(self.nominal_rotation_camera_from_site, (len(self.images), 3, 3))
+        attitudes = np.broadcast_to(self.nominal_rotation_camera_from_site, (len(self.position_m), 3, 3))
         return relative_poses(self.nominal_position_m, attitudes)
 
     @property
@@ -73,16 +74,31 @@ class Trajectory:
         scale = size_px / width
         new_height = round(height * scale)
         size = (size_px, new_height)
-        images = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self.images])
+        images = np.empty((len(self.images), new_height, size_px), np.uint8)
+        for image, small in zip(self.images, images, strict=True):
+            cv2.resize(image, size, small, interpolation=cv2.INTER_AREA)
         c, down = self.camera, new_height / height
         camera = Camera(size_px, new_height, c.fx_px * scale, c.fy_px * down, c.cx_px * scale, c.cy_px * down)
         return replace(self, images=images, camera=camera)
 
 
-def load_trajectories(dataset: Dataset) -> list[Trajectory]:
+def own_trajectories(split: str, count: int, share: Share) -> list[int]:
+    """Numbers of the trajectories of a split, among 0 .. count - 1, whose frames a process needs.
+
+    Those of train and val are divided among the processes; with fewer in val than processes, some validate the same
+    one. Only the first process evaluates test.
+    """
+    if split == "test":
+        return list(range(count)) if share.process == 0 else []
+    return list(share.of(count)) or ([share.process % count] if split == "val" else [])
+
+
+def load_trajectories(dataset: Dataset, share: Share = ALONE) -> list[Trajectory]:
     """Load all trajectories of a navigation dataset: train, then val, then test, each in the order of their ids.
 
-    Raises UserError if the dataset is of another kind, its images are distorted or a frame is missing.
+    One of several processes loads only the frames that it needs (`own_trajectories`). Raises UserError if the dataset
+    is of another kind, its images are distorted, a frame is missing or there are fewer training trajectories than
+    processes.
     """
     if dataset.info.kind != "nav":
         raise UserError(dataset.root, "kind", dataset.info.kind, "nav, a dataset of trajectories")
@@ -90,16 +106,26 @@ def load_trajectories(dataset: Dataset) -> list[Trajectory]:
         raise UserError(dataset.root, "camera.distortion", dataset.info.camera.distortion, "zeros")
     rows = dataset.table("trajectories").to_pylist()
     curves = {(row["scene_id"], row["trajectory_id"]): row for row in rows}
-    trajectories = [trajectory for split in SPLITS for trajectory in _split_trajectories(dataset, split, curves)]
+    trajectories = [trajectory for split in SPLITS for trajectory in _split_trajectories(dataset, split, curves, share)]
     if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):
         raise UserError(dataset.root, "split", "a trajectory in two splits", "one split for each trajectory")
     return trajectories
 
 
-def _split_trajectories(dataset: Dataset, split: str, curves: dict[tuple[str, str], dict]) -> list[Trajectory]:
-    store = load_frames(dataset, split)
+def _split_trajectories(
+    dataset: Dataset, split: str, curves: dict[tuple[str, str], dict], share: Share
+) -> list[Trajectory]:
+    table = frame_table(dataset, split)
+    groups = list(table.groupby(["scene_id", "trajectory_id"]))
+    if split == "train" and len(groups) < share.processes:
+        expected = f"at least {share.processes}, one for each process"
+        raise UserError(dataset.root, "train trajectories", len(groups), expected)
+    own = set(own_trajectories(split, len(groups), share))
+    loaded = table.iloc[np.concatenate([[], *(groups[number][1].index for number in sorted(own))]).astype(int)]
+    images, start = load_images(dataset, loaded, split), 0
     trajectories = []
-    for key, rows in store.table.groupby(["scene_id", "trajectory_id"]):
+    for number, (key, rows) in enumerate(groups):
+        stop = start + (len(rows) if number in own else 0)
         scene_id, trajectory_id = (str(part) for part in key)
         curve = curves[scene_id, trajectory_id]
         nominal = NominalTrajectory(
@@ -116,7 +142,7 @@ def _split_trajectories(dataset: Dataset, split: str, curves: dict[tuple[str, st
             Trajectory(
                 (scene_id, trajectory_id),
                 split,
-                store.images[rows.index],
+                images[start:stop],
                 dataset.camera,
                 np.array(rows["position_m"].tolist()),
                 matrix_from_quaternion(rows["rotation_wxyz"].tolist()),
@@ -124,4 +150,5 @@ def _split_trajectories(dataset: Dataset, split: str, curves: dict[tuple[str, st
                 np.array(dataset.info.camera.rotation_camera_from_body),
             )
         )
+        start = stop
     return trajectories

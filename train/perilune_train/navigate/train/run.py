@@ -1,6 +1,5 @@
 """One navigation run: train and evaluate the selected networks, evaluate the baselines, write tables and pictures."""
 
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,9 @@ import pandas as pd
 from torch import Tensor
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.errors import UserError
 from perilune_shared.storage.files import written_aside
 from perilune_shared.terminal import console, progress_bar
+from perilune_train.data.shares import Share
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import (
@@ -31,11 +30,12 @@ from perilune_train.navigate.evaluate.metrics import motion_errors, summary, sum
 from perilune_train.navigate.network import Fusion, load_navigator, predict
 from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.training.begin import hashes_of, start_run, state_of
-from perilune_train.training.fit import fit
+from perilune_train.training.fit import fit, own_share
 from perilune_train.training.runs import (
     RunFolder,
     check_architecture,
     choose_device,
+    is_first_process,
     load_weights,
 )
 
@@ -59,12 +59,11 @@ def navigate_run(
 
     `detector` is the default checkpoint for the stack network's backbone, used if it exists and has the same
     architecture; `settings.detector` must have it. Raises UserError on bad data, a checkpoint of another architecture,
-    a detector that was fitted to terrain of the test split (unless `allow_overlap`), or under torchrun with several
-    processes.
+    or a detector that was fitted to terrain of the test split (unless `allow_overlap`).
+
+    Under torchrun all processes train, and the first one evaluates and writes.
     """
-    processes = os.environ.get("WORLD_SIZE", "1")
-    if processes != "1":
-        raise UserError("torchrun", "processes", processes, "1: navigation is trained in one process")
+    console.quiet = not is_first_process()
     fusions: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
     backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in fusions else (None, "", [])
     inputs: dict[Fusion, dict[str, str | None]] = {"warp": hashes_of({"dataset": dataset})}
@@ -80,24 +79,29 @@ def navigate_run(
     terrain = {"warp": own, "stack": own.joined(inherited)}
     # One check for both, because the table of the warp run includes the metrics of stack.
     terrain_check = check_terrain(terrain["stack"], opened, "test", allow_overlap)
-    trajectories = load_trajectories(opened)
+    share = own_share(1, 1)
+    trajectories = load_trajectories(opened, share)
+    seconds: dict[Fusion, float] = {}
+    # Train all before any is evaluated, so that the other processes do not wait for the first.
+    for fusion, run in folders.items():
+        if states[fusion] != "finished":
+            start_run(run, "navigate", settings, inputs[fusion], states[fusion])
+            start, resume = backbone if fusion == "stack" else None, states[fusion] == "resume"
+            seconds[fusion] = _train(run, settings, fusion, trajectories, start, resume, terrain[fusion], share)
+    if not is_first_process():
+        return list(folders.values())
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     motions = _baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
     # stack comes first, so that the table of the warp run, which finishes last, has both.
     for fusion, run in folders.items():
-        seconds = None
-        if states[fusion] != "finished":
-            start_run(run, "navigate", settings, inputs[fusion], states[fusion])
-            start, resume = backbone if fusion == "stack" else None, states[fusion] == "resume"
-            seconds = _train(run, settings, fusion, trajectories, start, resume, terrain[fusion])
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
         motions = {fusion: [predict(network, architecture, trajectory) for trajectory in test], **motions}
-        if seconds is None:
+        if fusion not in seconds:
             continue
         pairs = sum(trajectory.n_pairs for trajectory in test)
         details = {
-            "train/seconds": round(seconds, 1),
+            "train/seconds": round(seconds[fusion], 1),
             "test/pairs": pairs,
             "test/ms_per_pair": round(1e3 * (time.monotonic() - started) / pairs, 2),
             "network/parameters": sum(p.numel() for p in network.parameters()),
@@ -117,10 +121,11 @@ def _train(
     backbone: dict[str, Tensor] | None,
     resume: bool,
     terrain: Provenance,
+    share: Share,
 ) -> float:
     """Train one network; returns the training time in seconds."""
     lightning.seed_everything(settings.seed, verbose=False)
-    task = NavigationTask(settings, fusion, trajectories, backbone)
+    task = NavigationTask(settings, fusion, trajectories, backbone, share)
     task.terrain = terrain.plain()
     own = task.own
     return fit(
@@ -133,6 +138,8 @@ def _train(
         resume=resume,
         precision=settings.precision,
         device=choose_device(settings.device),
+        # In coarse epochs some weights have no gradient.
+        strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
     )
 
 

@@ -9,23 +9,26 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+from perilune_train.data.epochs import EpochBatches, batch_loader
+from perilune_train.data.shares import ALONE, Share
 from perilune_train.models.navigator import WarpNavigator
 from perilune_train.navigate.config import FusionConfig, NavigateConfig
-from perilune_train.navigate.data.epochs import EpochBatches
-from perilune_train.navigate.data.sequences import Jitter, Sequence
-from perilune_train.navigate.data.trajectories import Motion, Trajectory
+from perilune_train.navigate.data.epochs import TrainingSequences
+from perilune_train.navigate.data.sequences import Jitter
+from perilune_train.navigate.data.trajectories import Motion, Trajectory, own_trajectories
 from perilune_train.navigate.evaluate.metrics import motion_errors, summary
 from perilune_train.navigate.geometry import euler_from_rotation
 from perilune_train.navigate.network import (
+    Batch,
+    Collate,
     Fusion,
     Scales,
     build,
     decoded_rotation,
     network_output,
     predict,
-    stacked,
-    translation_units,
 )
+from perilune_train.training.runs import choose_device
 
 
 class NavigationTask(lightning.LightningModule):
@@ -43,6 +46,7 @@ class NavigationTask(lightning.LightningModule):
         fusion: Fusion,
         trajectories: list[Trajectory],
         pretrained: dict[str, Tensor] | None = None,
+        share: Share = ALONE,
     ):
         super().__init__()
         self.settings, self.fusion = settings, fusion
@@ -69,8 +73,10 @@ class NavigationTask(lightning.LightningModule):
             self.network.backbone.load_state_dict(pretrained, strict=False)
         self.terrain: dict[str, Any] | None = None
         self.log_weights = nn.Parameter(torch.zeros(2))
+        self.share = share
         self.training_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "train"]
         self.validation_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "val"]
+        self.validated = own_trajectories("val", len(self.validation_trajectories), share)
         jitter, scales = self.own.jitter, self.scales
         self.jitter = Jitter(jitter * np.array(scales.spread_m), jitter * scales.rotation_rad) if jitter else None
 
@@ -84,22 +90,29 @@ class NavigationTask(lightning.LightningModule):
         """Whether this epoch belongs to the coarse stage."""
         return self.current_epoch < self.own.coarse_epochs
 
-    def train_dataloader(self) -> EpochBatches:
-        return EpochBatches(
+    def train_dataloader(self) -> DataLoader:
+        sequences = TrainingSequences(
             self.training_trajectories,
             self.own.sequence_pairs,
-            self.own.batch_sequences,
             warp=self.fusion == "warp",
             augmented=self.fusion == "warp",
             jitter=self.jitter,
-            key=(self.settings.seed, self.current_epoch),
+            seed=self.settings.seed,
+            share=self.share,
         )
+        # The current epoch is one too low here if the run is resumed.
+        epoch = self._trainer.fit_loop.epoch_progress.current.processed if self._trainer else 0
+        batches = EpochBatches(sequences.keys, sequences.fewest, self.own.batch_sequences, epoch)
+        pinned = choose_device(self.settings.device) == "cuda"
+        return batch_loader(sequences, batches, Collate(self.scales, self.fusion), self.settings.workers, pinned)
 
     def val_dataloader(self) -> DataLoader:
-        return DataLoader(self.validation_trajectories, batch_size=None)  # type: ignore[arg-type]
+        own = [self.validation_trajectories[number] for number in self.validated]
+        return DataLoader(own, batch_size=None)  # type: ignore[arg-type]
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
-        return batch  # Sequences are NumPy arrays; `network_output` moves them.
+        # In validation a batch is a trajectory; `predict` moves it.
+        return batch.to(device) if isinstance(batch, Batch) else batch
 
     def on_train_epoch_start(self) -> None:
         for name, parameter in self.network.backbone.named_parameters():
@@ -108,37 +121,43 @@ class NavigationTask(lightning.LightningModule):
             if isinstance(module, nn.BatchNorm2d):
                 module.train(not (self.coarse and f"{name}.weight" in self.pretrained))
 
-    def training_step(self, batch: list[Sequence], batch_idx: int) -> Tensor:
-        output, flow_px = network_output(self.network, batch, self.device)
-        reference, unit = translation_units(batch, self.scales, self.fusion)
-        expected = (stacked([s.translation_m for s in batch]) - reference) / unit
-        angles = euler_from_rotation(stacked([s.rotation_c2_from_c1 for s in batch])) / self.scales.rotation_rad
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        output, flow_px = network_output(self.network, batch)
         found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
-        position = (output[..., :3] - expected.to(self.device)).square().sum(-1).mean()
-        orientation = (found - angles.to(self.device)).square().sum(-1).mean()
+        position = (output[..., :3] - batch.translation).square().sum(-1).mean()
+        orientation = (found - batch.angles).square().sum(-1).mean()
         if self.coarse:
             loss = position + self.settings.kappa * orientation
         else:
             weighted = torch.stack([position, orientation]) * torch.exp(-self.log_weights)
             loss = (weighted + self.log_weights).sum()
-        if flow_px is not None:
-            true_px = stacked([s.flow_px for s in batch if s.flow_px is not None]).to(self.device)
-            flow_error = (flow_px - true_px).square().sum(-1).add(1e-4).sqrt().mean()
-            self.log("train/flow_px", flow_error, batch_size=len(batch))
+        if flow_px is not None and batch.flow_px is not None:
+            flow_error = (flow_px - batch.flow_px).square().sum(-1).add(1e-4).sqrt().mean()
+            self.log("train/flow_px", flow_error, batch_size=len(batch.first))
             loss = loss + self.settings.flow_weight * flow_error
         self.log_dict(
-            {"train/loss": loss, "train/position": position, "train/orientation": orientation}, batch_size=len(batch)
+            {"train/loss": loss, "train/position": position, "train/orientation": orientation},
+            batch_size=len(batch.first),
         )
         return loss
 
     def on_validation_epoch_start(self) -> None:
         self.validation_motions: list[Motion] = []
+        if self.share.processes > 1:
+            # Weights are equal in all processes; batch statistics differ, and those of the first process are used.
+            for value in self.network.buffers():
+                torch.distributed.broadcast(value, 0)
 
     def validation_step(self, batch: Trajectory, batch_idx: int) -> None:
         self.validation_motions.append(predict(self.network, self.architecture, batch))
 
     def on_validation_epoch_end(self) -> None:
-        errors = motion_errors(self.validation_trajectories, self.validation_motions)
+        motions, processes, count = self.validation_motions, self.share.processes, len(self.validation_trajectories)
+        if processes > 1:
+            parts: list[Any] = [None] * processes
+            torch.distributed.all_gather_object(parts, motions)
+            motions = [parts[i % processes][i // processes] for i in range(count)]
+        errors = motion_errors(self.validation_trajectories, motions)
         figures = summary(errors)
         for key in ("position_rmse_vector_m", "orientation_rmse_angle_deg"):
             self.log(f"val/{key}", figures[key], batch_size=1)

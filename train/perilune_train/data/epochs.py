@@ -1,0 +1,72 @@
+"""Batches of one process in every epoch, from one loader for the whole training."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import cv2
+from torch.utils import data as torch_data
+
+
+class EpochBatches(torch_data.Sampler[list[Any]]):
+    """Batches of the keys with which a dataset is indexed: `size` keys each, in the order of the current epoch.
+
+    `keys(epoch)` has the keys of this process in their order. `fewest` is the number of keys of the process that has
+    fewest. All processes take as many batches as that one needs, so that each step has one batch of each process. The
+    last keys of the others may be left out.
+
+    The first epoch that is iterated over starts at batch `start`, for a run that is resumed within an epoch; the length
+    is always that of a whole epoch. Lightning sets the epoch before each epoch but the first.
+    """
+
+    def __init__(
+        self, keys: Callable[[int], Sequence[Any]], fewest: int, size: int, epoch: int = 0, start: int = 0
+    ) -> None:
+        self.keys, self.fewest, self.size, self.epoch = keys, fewest, size, epoch
+        self.resumed = (epoch, start)
+        # Lightning calls `set_epoch` of a batch sampler's attribute `sampler`.
+        self.sampler = self
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch of the next iteration."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return -(-self.fewest // self.size)
+
+    def __iter__(self) -> Iterator[list[Any]]:
+        keys, (resumed_epoch, start) = self.keys(self.epoch), self.resumed
+        for batch in range(start if self.epoch == resumed_epoch else 0, len(self)):
+            yield list(keys[batch * self.size : (batch + 1) * self.size])
+
+
+def batch_loader(
+    dataset: torch_data.Dataset,
+    batches: torch_data.Sampler[list[Any]],
+    collate: Callable[[list[Any]], Any],
+    workers: int,
+    pinned: bool,
+) -> torch_data.DataLoader:
+    """Load batches in `workers` processes, which live as long as the loader; with 0 in the calling process.
+
+    With workers, OpenCV uses one thread from now on, here and in the workers, which together use all cores anyway. It
+    is set before the workers are forked: a worker that stops inherited threads would wait for ever.
+
+    `pinned` puts the batches into page-locked memory, from which a GPU copies them without making the process wait.
+    """
+    if workers:
+        cv2.setNumThreads(1)
+    return torch_data.DataLoader(
+        dataset,
+        batch_sampler=batches,
+        collate_fn=collate,
+        num_workers=workers,
+        pin_memory=pinned,
+        persistent_workers=workers > 0,
+        worker_init_fn=_one_thread,
+    )
+
+
+def _one_thread(_: int) -> None:
+    # A forked worker has inherited it; a spawned one has not.
+    if cv2.getNumThreads() != 1:
+        cv2.setNumThreads(1)

@@ -1,0 +1,28 @@
+"""Shares of the data of several processes that train together."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Share:
+    """The part of one process: every n-th frame or trajectory, the same in every epoch."""
+
+    process: int = 0
+    """Rank of the process, from 0."""
+    processes: int = 1
+    """Number of processes that train together."""
+
+    def of(self, count: int) -> range:
+        """Own numbers among 0 .. count - 1."""
+        return range(self.process, count, self.processes)
+
+    def owns(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which of the numbers (N,) are own ones (N,)."""
+        return numbers % self.processes == self.process
+
+
+ALONE = Share()
+"""The share of the only process: everything."""

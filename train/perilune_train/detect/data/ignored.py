@@ -1,0 +1,107 @@
+"""Craters that a frame shows just outside the labelled range; the detector ignores them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.ellipse import project_circles
+from perilune_shared.geometry.frames import matrix_from_quaternion
+
+Array = NDArray[np.float64]
+MARGIN = np.sqrt(0.5)
+"""Craters below the smallest evaluated radius are ignored down to this fraction of it. Smaller ones cannot reach an IoU
+of 0.5 with a box in the range."""
+_CENTRE, _NORMAL = ["x_m", "y_m", "z_m"], ["normal_x", "normal_y", "normal_z"]
+_SIZE = ["diameter_m", "depth_m"]
+
+
+@dataclass(frozen=True)
+class Craters:
+    """Craters of one scene, in the order of the table craters."""
+
+    crater_id: NDArray[np.int64]
+    """Ids within the scene (N,)."""
+    centre_m: Array
+    """Centres, metres, O_L (N, 3)."""
+    normal: Array
+    """Unit normals of the rims' planes, O_L (N, 3)."""
+    diameter_m: Array
+    """Diameters, metres (N,)."""
+    depth_m: Array
+    """Depths, metres (N,)."""
+
+    def chosen(self, rows: NDArray) -> "Craters":
+        """Those of some rows, given by number or by a mask (N,)."""
+        return Craters(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def read_craters(dataset: Dataset, scene_id: str) -> Craters:
+    """Read the craters of one scene."""
+    table = dataset.table("craters", ["crater_id", *_CENTRE, *_NORMAL, *_SIZE], scene_id=scene_id)
+    sizes = (_real(table[name]) for name in _SIZE)
+    return Craters(table["crater_id"].to_numpy(), _vectors(table, _CENTRE), _vectors(table, _NORMAL), *sizes)
+
+
+def unlabelled_craters(
+    craters: Craters,
+    camera: Camera,
+    frame: Mapping[Any, Any],
+    radius_px: tuple[float, float],
+    scale: tuple[float, float] = (1.0, 1.0),
+    labelled: NDArray[np.int64] | None = None,
+) -> Array:
+    """Shapes (M, 10) of the craters that a frame shows just outside the labelled range, and that are to be ignored.
+
+    The columns are box (x0, y0, x1, y1), radius and ellipse (centre x and y, semi-axes, all in pixels, and direction in
+    radians).
+
+    A crater of 1.9 px looks like one of 2.1 px. If the first were background, training would lower the scores of both,
+    and a detection of the first would be a false positive. So two kinds of crater are ignored, as COCO ignores objects
+    outside its area range: craters within a factor of sqrt(2) of the range (others cannot reach an IoU of 0.5 with a
+    box in the range) and craters with their centre off the image. If frames will be enlarged or shrunk (`scale`, see
+    load_split), smaller and larger ones are ignored too. `frame` is a row of the table, `labelled` the ids of the
+    craters that have a label in it.
+    """
+    low, high = radius_px[0] * MARGIN / max(scale[1], 1.0), radius_px[1] / MARGIN / min(scale[0], 1.0)
+    rotation = matrix_from_quaternion(frame["rotation_wxyz"])
+    # First select by size: a scene has a hundred thousand craters, and the other checks cost more.
+    craters = craters.chosen(_right_size(craters, camera, rotation[2], frame["position_m"], (low, high)))
+    if labelled is not None:
+        craters = craters.chosen(~np.isin(craters.crater_id, labelled))
+    centre, radius_m = camera_from_site(craters.centre_m, frame["position_m"], rotation), craters.diameter_m / 2
+    middle, rough_px = camera.project(centre), camera.fx_px * radius_m / centre[:, 2]
+    near = (middle > -2 * rough_px[:, None]).all(1)
+    near &= (middle < np.array([camera.width_px, camera.height_px]) + 2 * rough_px[:, None]).all(1)
+    shapes = project_circles(camera, centre[near], craters.normal[near] @ rotation.T, radius_m[near])
+    box, radius = shapes.bounding_boxes(), shapes.radius_px()
+    seen = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
+    seen &= (radius >= low) & (radius <= high)
+    ellipse = [shapes.cx_px, shapes.cy_px, shapes.a_px, shapes.b_px, shapes.theta_rad]
+    return np.column_stack([box, radius, *ellipse])[seen]
+
+
+def _right_size(
+    craters: Craters, camera: Camera, forward: Array, position_m: Any, range_px: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Select craters (N,) in front of the camera whose radius in the frame may be in a range, from their depth only.
+
+    Exact for level ground and a level camera; the effect of a tilt is well within the margins. `forward` is the
+    camera's z axis in O_L.
+    """
+    depth_m = craters.centre_m @ forward - np.asarray(position_m, np.float64) @ forward
+    scaled = camera.fx_px * (craters.diameter_m / 2)
+    return (depth_m > 0) & (scaled > 0.8 * range_px[0] * depth_m) & (scaled < 2 * range_px[1] * depth_m)
+
+
+def _real(column: pa.ChunkedArray) -> Array:
+    return column.to_numpy().astype(np.float64, copy=False)
+
+
+def _vectors(table: pa.Table, names: list[str]) -> Array:
+    return np.column_stack([_real(table[name]) for name in names])

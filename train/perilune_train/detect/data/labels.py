@@ -1,0 +1,180 @@
+"""Labels of the frames of a split, read scene by scene into one array per column."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.keys import FRAME_COLUMNS, KeyCheck
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_shared.labels.selection import selected
+from perilune_shared.labels.thresholds import Selection
+from perilune_train.data.shares import Share
+from perilune_train.detect.data.ignored import Craters, read_craters, unlabelled_craters
+
+Array = NDArray[np.float64]
+_BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
+_ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
+_SHAPE = [*_BOX, "radius_px", *_ELLIPSE]
+_KEYS = ["frame_id", "crater_id"]
+_THRESHOLDED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
+
+
+@dataclass(frozen=True)
+class FrameLabels:
+    """Labels of one frame."""
+
+    boxes: Array
+    """Box around the whole ellipse: x0, y0, x1, y1 in pixels (M, 4)."""
+    radius_px: Array
+    """Radius of the circle of equal area, pixels (M,)."""
+    ellipses: Array
+    """Centre x and y, semi-axes a and b in pixels, direction of a in radians (M, 5), for drawing."""
+    selected: NDArray[np.bool_]
+    """False for a crater to ignore: hardly visible, or not labelled (M,)."""
+    labelled: NDArray[np.bool_]
+    """False for a crater that is not in the manifest's labels: slightly too small, too large, or off the image (M,)."""
+    depth_ratio: Array | None = None
+    """Depth over diameter (M,), the freshness of a crater; NaN or None if unknown."""
+
+
+@dataclass(frozen=True)
+class SplitLabels(Sequence[FrameLabels]):
+    """Labels of N frames; an item is a view of the arrays. Worker processes share the few arrays without copies."""
+
+    shape: Array
+    """Box (4), radius and ellipse (5) of all labels, frame after frame (L, 10)."""
+    selected: NDArray[np.bool_]
+    """See FrameLabels (L,)."""
+    labelled: NDArray[np.bool_]
+    """See FrameLabels (L,)."""
+    depth_ratio: Array
+    """See FrameLabels (L,)."""
+    bounds: NDArray[np.int64]
+    """The labels of frame i are those from bounds[i] to bounds[i + 1] (N + 1,)."""
+
+    def __len__(self) -> int:
+        return len(self.bounds) - 1
+
+    @overload
+    def __getitem__(self, place: int) -> FrameLabels: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[FrameLabels]: ...
+    def __getitem__(self, place: int | slice) -> FrameLabels | list[FrameLabels]:
+        if isinstance(place, slice):
+            return [self[i] for i in range(*place.indices(len(self)))]
+        place = range(len(self))[place]
+        own = slice(self.bounds[place], self.bounds[place + 1])
+        shape = self.shape[own]
+        return FrameLabels(
+            shape[:, :4], shape[:, 4], shape[:, 5:], self.selected[own], self.labelled[own], self.depth_ratio[own]
+        )
+
+
+def read_split_labels(
+    dataset: Dataset,
+    table: pd.DataFrame,
+    share: Share,
+    selection: Selection,
+    radius_px: tuple[float, float],
+    scale: tuple[float, float],
+) -> tuple[SplitLabels, Array]:
+    """Labels and ignored craters of the share's frames, and sizes (S, 2) of the selected labels of all frames.
+
+    `table` has all frames of the split (`frame_table`). Only the craters and labels of one scene are in memory at a
+    time, beside the result. Raises UserError if a part cannot be read or keys are broken.
+    """
+    rows = dataset.table("frames", FRAME_COLUMNS)
+    check = KeyCheck(dataset, rows)
+    place_of_row = (
+        pc.index_in(rows["frame_id"], pa.array(table["frame_id"].tolist(), rows["frame_id"].type))
+        .fill_null(-1)
+        .to_numpy()
+    )
+    names = list(dict.fromkeys([*_KEYS, *_THRESHOLDED, *_SHAPE]))
+    frames, sizes, own_places = _Joined(), [], share.of(len(table))
+    with dataset.parts_kept_open():
+        for scene_id, places in table.groupby("scene_id").indices.items():
+            labels = dataset.table("labels", names, scene_id=str(scene_id))
+            frame = place_of_row[check.add_labels(labels)]
+            wrong = (frame >= 0) & ~np.isin(frame, places)
+            if wrong.any():
+                found = labels["frame_id"][int(wrong.argmax())].as_py()
+                expected = f"only frames of scene {scene_id} in its part; see `perilune-manifest validate`"
+                raise UserError(dataset.root, "labels: frame_id", found, expected)
+            craters = read_craters(dataset, str(scene_id))
+            # Labels of another split have the place -1.
+            order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]
+            labels, bounds = labels.take(order), np.searchsorted(frame[order], [*places, places[-1] + 1])
+            own = _SceneLabels.of(labels, craters, selection)
+            sizes.append((own.shape[:, 2:4] - own.shape[:, :2])[own.selected])
+            for place, start, stop in zip(places, bounds, bounds[1:], strict=False):
+                if place in own_places:
+                    part, row = slice(start, stop), table.iloc[place].to_dict()
+                    ids = own.crater_id[part]
+                    ignored = unlabelled_craters(craters, dataset.camera, row, radius_px, scale, ids)
+                    frames.add(own.shape[part], own.selected[part], own.depth_ratio[part], ignored)
+    check.finish()
+    return frames.joined(), np.concatenate(sizes)
+
+
+@dataclass(frozen=True)
+class _SceneLabels:
+    """Labels of one scene, sorted by frame."""
+
+    crater_id: NDArray[np.int64]
+    """Ids within the scene (L,)."""
+    shape: Array
+    """See SplitLabels (L, 10)."""
+    selected: NDArray[np.bool_]
+    """See FrameLabels (L,)."""
+    depth_ratio: Array
+    """See FrameLabels (L,)."""
+
+    @classmethod
+    def of(cls, labels: pa.Table, craters: Craters, selection: Selection) -> "_SceneLabels":
+        """From rows of the table labels, whose craters all exist."""
+        ids = labels["crater_id"].to_numpy()
+        by_id = np.argsort(craters.crater_id)
+        row = by_id[np.searchsorted(craters.crater_id, ids, sorter=by_id)]
+        depth_m, diameter_m = craters.depth_m[row], craters.diameter_m[row]
+        columns = {name: labels[name].to_numpy() for name in _THRESHOLDED}
+        chosen = selected(pd.DataFrame({**columns, "depth_m": depth_m, "diameter_m": diameter_m}), selection)
+        shape = np.column_stack([labels[name].to_numpy().astype(np.float64, copy=False) for name in _SHAPE])
+        return cls(ids, shape, chosen, depth_m / diameter_m)
+
+
+class _Joined:
+    """Collects the labels and the ignored craters of one frame after the other."""
+
+    def __init__(self) -> None:
+        self.shape: list[Array] = []
+        self.selected: list[NDArray[np.bool_]] = []
+        self.labelled: list[NDArray[np.bool_]] = []
+        self.depth_ratio: list[Array] = []
+        self.counts: list[int] = []
+
+    def add(self, shape: Array, chosen: NDArray[np.bool_], depth_ratio: Array, ignored: Array) -> None:
+        """Add a frame with M labels and K ignored craters, whose shapes are (M, 10) and (K, 10)."""
+        nothing = np.zeros(len(ignored), np.bool_)
+        self.shape += [shape, ignored]
+        self.selected += [chosen, nothing]
+        self.labelled += [np.ones(len(shape), np.bool_), nothing]
+        self.depth_ratio += [depth_ratio, np.full(len(ignored), np.nan)]
+        self.counts.append(len(shape) + len(ignored))
+
+    def joined(self) -> SplitLabels:
+        """The labels of all frames."""
+        return SplitLabels(
+            np.concatenate(self.shape),
+            np.concatenate(self.selected),
+            np.concatenate(self.labelled),
+            np.concatenate(self.depth_ratio),
+            np.cumsum([0, *self.counts]),
+        )
