@@ -36,7 +36,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint docs docs-build bench-render bench-scale compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint docs docs-build bench-render bench-scale compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -134,6 +134,12 @@ bench-photometry: setup ## rendered radiance, compared with the formulas; writes
 
 bench-manifest: setup ## time and memory of reading 100,000 frames and 5 million labels; writes runs/bench/manifest.json
 	@$(BIN)/python -m benchmarks.dataset.manifest
+
+bench-plan: setup ## time and memory of planning 10 million frames; writes runs/bench/plan.json
+	@$(BIN)/python -m benchmarks.dataset.plan
+
+bench-memory: setup ## resident memory of a process that renders 5000 frames; writes runs/bench/memory.json
+	@$(BIN)/python -m benchmarks.dataset.memory
 
 bench-develop: setup ## frames developed per second on one core; writes runs/bench/develop.json
 	@$(BIN)/python -m benchmarks.dataset.develop

@@ -15,7 +15,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 LEAST_CLEARANCE_M = 1.0
 """Smallest height of the camera above the ground below it, metres."""
-_CHECKED_FRAMES = 100_000
+_CHECKED_FRAMES = 20_000
 """Number of frames that `check_plan` checks, about: a few seconds' work."""
 _POINTS_PER_SIDE = 8
 _UNIT_TOLERANCE = 1e-6

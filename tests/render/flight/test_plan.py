@@ -1,3 +1,5 @@
+import pickle
+
 import numpy as np
 import pytest
 from tests.helpers import in_process
@@ -51,6 +53,19 @@ def test_adding_scenes_leaves_the_first_ones_as_they_were():
     few = config_with(detect=KindConfig(n_scenes=2, trajectories_per_scene=1, n_frames=4, split_by="scene"))
     more = config_with(detect=KindConfig(n_scenes=5, trajectories_per_scene=1, n_frames=4, split_by="scene"))
     assert make_plan(few, "detect").scenes == make_plan(more, "detect").scenes[:2]
+
+
+def test_a_plan_of_ten_million_frames_draws_a_flight_when_it_is_used():
+    kind = KindConfig(n_scenes=1000, trajectories_per_scene=100, n_frames=100, split_by="frame")
+    many = make_plan(config_with(detect=kind), "detect")
+    assert len(many.trajectories) == 100_000
+    last = many.of_scene("scene-0999")[-1]
+    assert (last.scene_id, last.trajectory_id) == ("scene-0999", "trajectory-0099")
+    assert "flight" not in vars(last) and last.flight is last.flight
+    same = pickle.loads(pickle.dumps(many)).trajectories[-1]  # noqa: S301
+    assert (same.seed, same.splits) == (last.seed, last.splits)
+    assert np.array_equal(same.flight.position_m, last.flight.position_m)
+    assert many.of_scene("scene-1000") == [] and [t.seed for t in many.trajectories[-1:]] == [last.seed]
 
 
 def test_the_papers_protocol_has_its_numbers():

@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from tests.helpers.scenes import config_with, flat_scene
 
 from perilune_render.cli import main
+from perilune_render.config import KindConfig
+from perilune_render.flight import pose_checks
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
 from perilune_render.flight.trajectories import fly
@@ -88,6 +90,18 @@ def test_a_plan_is_checked_before_its_ground_is_grown(scene):
     night = replace(plan.scenes[0], sun_elevation_deg=-2.0)
     with pytest.raises(UserError, match="plan: scene-0000: sun_elevation_deg: got -2 degrees"):
         check_plan(replace(plan, scenes=(night,)), scene.grid, "plan")
+
+
+def test_the_first_scenes_of_a_large_plan_are_checked(scene, monkeypatch):
+    kind = KindConfig(n_scenes=3, trajectories_per_scene=1, n_frames=4, split_by="scene")
+    plan = make_plan(config_with(detect=kind), "detect")
+    far = replace(plan.trajectories[0].flight, position_m=np.full((4, 3), 5000.0))
+    trajectories = (*plan.trajectories[:2], replace(plan.trajectories[2], draw_flight=lambda: far))
+    monkeypatch.setattr(pose_checks, "_CHECKED_FRAMES", 8)
+    check_plan(replace(plan, trajectories=trajectories), scene.grid, "plan")
+    monkeypatch.setattr(pose_checks, "_CHECKED_FRAMES", 9)
+    with pytest.raises(UserError, match="plan: frame scene-0002/trajectory-0000/000000"):
+        check_plan(replace(plan, trajectories=trajectories), scene.grid, "plan")
 
 
 @pytest.mark.parametrize("command", ["dataset", "plan"])
