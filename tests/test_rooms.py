@@ -16,12 +16,14 @@ ROOMS = {
     ),
     "render/perilune_render": (
         "processor config_values config_terrain config streams provenance terrain flight imaging labels "
-        "frame_source blender dataset jobs cli_options cli_dataset cli"
+        "frame_source blender dataset jobs cli_options cli_dataset cli_status cli"
     ),
     "render/perilune_render/terrain": (
         "envelope grid interpolation noise relief size_frequency craters albedo boulders elevation scene cache export"
     ),
-    "render/perilune_render/jobs": "job steps work_list report scene_renderer here run",
+    "render/perilune_render/jobs": (
+        "job records steps work_list report scene_renderer worker local here run status estimate"
+    ),
     "train/perilune_train": "config cli_options data evaluation models training detect navigate explain cli",
     "train/perilune_train/detect": (
         "config finished_run data evaluate inference train evaluate_run compare_runs images deploy cli"

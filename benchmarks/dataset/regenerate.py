@@ -13,7 +13,8 @@ from benchmarks.figures import write_figures
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.regenerate import State, regenerate, spread
 from perilune_render.jobs.here import Here
-from perilune_render.jobs.run import make_dataset
+from perilune_render.jobs.job import Job
+from perilune_render.jobs.run import render_job
 from perilune_shared.config import resolve
 from perilune_shared.terminal import progress_bar
 
@@ -26,7 +27,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, progress_bar() as bar:
         root = Path(folder)
         os.environ["PERILUNE_CACHE"] = str(root / "cache")
-        dataset = make_dataset(config, "detect", "small", root / "made", bar, Here)
+        dataset = render_job(Job.planned(config, "detect", "small"), root / "made", bar, Here)
         n = dataset.info.counts.frames
         os.environ["PERILUNE_CACHE"] = str(root / "other cache")
         outcomes = regenerate(dataset, spread(dataset, n), root / "again", bar)

@@ -21,6 +21,7 @@ from perilune_render.cli_options import (
     resolved_config,
     warn_of_size,
 )
+from perilune_render.cli_status import status
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
@@ -50,6 +51,7 @@ def config(
 
 
 app.command()(dataset)
+app.command()(status)
 
 
 @app.command()

@@ -1,7 +1,10 @@
 """The command `perilune-render dataset`."""
 
+import re
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -21,6 +24,42 @@ from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import console, progress_bar
 
+if TYPE_CHECKING:
+    from perilune_render.jobs.job import Job
+    from perilune_render.jobs.run import MakeExecutor, RenderingFailed
+    from perilune_shared.dataset.manifest import Dataset
+
+
+_UNITS = ((12, "TB"), (9, "GB"), (6, "MB"), (3, "kB"), (0, "bytes"))
+
+
+@dataclass(frozen=True, slots=True)
+class _How:
+    """How a job is rendered, and which part of it."""
+
+    workers: int
+    """Number of worker processes; 0 renders in this process."""
+    threads: int | None
+    """Number of threads of each process; None divides the cores among the workers."""
+    shard: tuple[int, int] | None
+    """Number, from 1, and count of shards; None renders all trajectories."""
+    finish: bool
+    """Whether only to finish a dataset whose shards are rendered."""
+    dry_run: bool
+    """Whether only to estimate."""
+
+    @classmethod
+    def of(cls, workers: int, threads: int | None, shard: str | None, finish: bool, dry_run: bool) -> "_How":
+        """From the options of the command. Raises UserError on a shard that is none, and on options that exclude."""
+        given = [name for name, is_set in (("--shard", shard), ("--finish", finish), ("--dry-run", dry_run)) if is_set]
+        if len(given) > 1:
+            raise UserError("dataset", "options", " and ".join(given), "one of them")
+        matched = re.fullmatch(r"([1-9]\d{0,6})/([1-9]\d{0,6})", shard) if shard is not None else None
+        numbers = (int(matched[1]), int(matched[2])) if matched is not None else None
+        if shard is not None and (numbers is None or numbers[0] > numbers[1]):
+            raise UserError("--shard", "shard", shard, "its number and the count of shards, from 1/64 to 64/64")
+        return cls(workers, threads, numbers, finish, dry_run)
+
 
 def dataset(
     context: typer.Context,
@@ -38,43 +77,98 @@ def dataset(
         Path | None,
         typer.Option(help="Manifest or plan to render into --out, in place of a preset."),
     ] = None,
+    workers: Annotated[
+        int, typer.Option(min=0, max=1024, help="Worker processes; 0 renders in the command's own process.")
+    ] = 1,
+    threads: Annotated[
+        int | None,
+        typer.Option(min=1, max=1024, help="Threads of each process. [default: the cores, divided by the workers]"),
+    ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(help="Render one share of the trajectories, as 3/64, without a lock; then --finish once."),
+    ] = None,
+    finish: Annotated[bool, typer.Option("--finish", help="Finish the datasets whose shards are rendered.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print frames, hours and bytes, measured on a few frames; write nothing.")
+    ] = False,
 ) -> None:
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
+    how = _How.of(workers, threads, shard, finish, dry_run)
     if manifest is not None:
         given = [name for name in ("preset", "config", "setting", "kind") if _was_given(context, name)]
-        _render_manifest(manifest, out, dem, catalogue, given)
+        _render_manifest(manifest, out, dem, catalogue, given, how)
         return
     resolved = resolved_config(preset, config, setting, dem, catalogue)
     if kind != "nav":
         warn_of_size(resolved)
-    folder = out or Path("data") / preset
-    # Importing Blender takes seconds; check the settings first.
-    from perilune_render.jobs.here import Here
-    from perilune_render.jobs.run import RenderingFailed, make_dataset
+    folder, failed = out or Path("data") / preset, False
+    # Importing pyarrow and Numba takes seconds; check the settings first.
+    from perilune_render.jobs.job import Job
+    from perilune_render.jobs.run import RenderingFailed
 
-    failed = False
     for name in KINDS if kind == "both" else (kind,):
         try:
-            with progress_bar() as progress:
-                made = make_dataset(resolved, name, preset, folder / name, progress, Here)
+            made = _made(Job.planned(resolved, name, preset), folder / name, how)
         except RenderingFailed as error:
+            _print_failures(error)
             failed = True
-            _print_failures(error.out, error.errors)
             continue
-        counts = made.info.counts
-        Console().print(
-            f"{folder / name}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
-            f"look at {folder / name / 'overview.png'}",
-            soft_wrap=True,
-        )
+        if made is not None:
+            counts = made.info.counts
+            Console().print(
+                f"{folder / name}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
+                f"look at {folder / name / 'overview.png'}",
+                soft_wrap=True,
+            )
     if failed:
         raise typer.Exit(1)
 
 
-def _print_failures(out: Path, errors: dict[str, str]) -> None:
-    for name, error in errors.items():
-        console.print(f"error: {out}: {name}: {error}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"{len(errors)} trajectories failed; run the same command again to try them again", soft_wrap=True)
+def _made(job: "Job", out: Path, how: _How) -> "Dataset | None":
+    """Do what the options ask for; the dataset if it is finished. Raises RenderingFailed if trajectories failed."""
+    from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
+
+    job = job.with_threads(how.threads, how.workers)
+    if how.finish:
+        return finish_job(job, out)
+    if how.dry_run:
+        _print_estimate(job, out, how)
+        return None
+    with progress_bar() as progress:
+        if how.shard is None:
+            return render_job(job, out, progress, _executor(how))
+        n_rendered = render_shard(job, out, Shard(*how.shard), progress, _executor(how))
+    Console().print(f"{out}: {n_rendered} trajectories rendered; after all shards, --finish", soft_wrap=True)
+    return None
+
+
+def _print_estimate(job: "Job", out: Path, how: _How) -> None:
+    from perilune_render.jobs.estimate import estimate
+
+    with progress_bar() as progress:
+        found = estimate(job, out, progress, _executor(how), how.workers)
+    hours = f"{found.seconds / 3600:.2f} hours" if found.seconds > 360 else f"{found.seconds:.0f} seconds"
+    size = next(f"{found.n_bytes / 10**n:.3g} {unit}" for n, unit in _UNITS if found.n_bytes >= 10**n or n == 0)
+    Console().print(f"{out}: {found.n_frames} frames left, {hours}, {size}", soft_wrap=True)
+
+
+def _print_failures(error: "RenderingFailed") -> None:
+    for name, text in error.errors.items():
+        console.print(f"error: {error.out}: {name}: {text}", markup=False, highlight=False, soft_wrap=True)
+    again = "run the same command again to try them again"
+    console.print(f"error: {error.out}: {len(error.errors)} trajectories failed; {again}", soft_wrap=True)
+
+
+def _executor(how: _How) -> "MakeExecutor":
+    if how.workers == 0:
+        # Imports Blender, which takes seconds.
+        from perilune_render.jobs.here import Here
+
+        return Here
+    from perilune_render.jobs.local import LocalWorkers
+
+    return partial(LocalWorkers, n_workers=how.workers)
 
 
 def _was_given(context: typer.Context, name: str) -> bool:
@@ -83,7 +177,7 @@ def _was_given(context: typer.Context, name: str) -> bool:
 
 
 def _render_manifest(
-    manifest: Path, out: Path | None, dem: Path | None, catalogue: Path | None, others: list[str]
+    manifest: Path, out: Path | None, dem: Path | None, catalogue: Path | None, others: list[str], how: _How
 ) -> None:
     if out is None or others:
         found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
@@ -93,17 +187,16 @@ def _render_manifest(
         raise UserError("--manifest", "options", found, expected)
     given = ps.open_dataset(manifest)
     from perilune_render.dataset.from_manifest import compare_hashes, plan_from_manifest
-    from perilune_render.jobs.here import Here
     from perilune_render.jobs.job import Job
-    from perilune_render.jobs.run import RenderingFailed, render_job
+    from perilune_render.jobs.run import RenderingFailed
 
-    job = Job(*plan_from_manifest(given, dem, catalogue), str(manifest))
     try:
-        with progress_bar() as progress:
-            made = render_job(job, out, progress, Here)
+        made = _made(Job(*plan_from_manifest(given, dem, catalogue), str(manifest)), out, how)
     except RenderingFailed as error:
-        _print_failures(error.out, error.errors)
+        _print_failures(error)
         raise typer.Exit(1) from None
+    if made is None:
+        return
     same, known, other_scenes = compare_hashes(given, made)
     comparison = f"; {same} of {known} frames are byte-identical to the manifest's" if known else ""
     comparison += f"; terrain hash mismatch in {other_scenes} scenes" if other_scenes else "; terrain hashes match"

@@ -16,7 +16,7 @@ from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION
 from perilune_shared.errors import UserError
 from perilune_shared.storage.checksums import SUMS_NAME, seal
-from perilune_shared.storage.locks import LOCK_NAME, locked
+from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE, locked
 
 LICENCE = "CC-BY-4.0"
 _SAME_PLACE_M = 1e-6
@@ -50,11 +50,17 @@ def writing(out: Path) -> contextlib.AbstractContextManager[None]:
 
 def is_begun(out: Path) -> bool:
     """Whether a folder holds a dataset. Raises UserError if it holds something else."""
+    others = [path for path in (out.iterdir() if out.exists() else ()) if not _is_temporary(path.name)]
+    # Checked last, since another process may be beginning the same dataset; it writes dataset.json first.
     begun = (out / "dataset.json").exists()
-    if not begun and out.exists() and any(not path.name.startswith(LOCK_NAME) for path in out.iterdir()):
+    if others and not begun:
         expected = "an empty or new folder, or a dataset to resume"
         raise UserError(out, "--out", "a folder with other content", expected)
     return begun
+
+
+def _is_temporary(name: str) -> bool:
+    return name.startswith(LOCK_NAME) or TEMPORARY_FILE.fullmatch(name) is not None
 
 
 def begin_or_resume(out: Path, info: DatasetInfo) -> DatasetInfo:
@@ -64,7 +70,6 @@ def begin_or_resume(out: Path, info: DatasetInfo) -> DatasetInfo:
     """
     if not is_begun(out):
         write_info(out, info)
-        return info
     existing = open_dataset(out).info
     if len(existing.recipes) != 1 or existing.history != info.history:
         raise UserError(out, "--out", f"a dataset with other recipes or history: {existing.name}", "another folder")

@@ -23,7 +23,7 @@ class Here:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._renderer.close()
+        self._renderer.__exit__(kind, error, trace)
 
     def check_scene(self, scene_id: str) -> None:
         """Generate a scene and check that its poses fit it. Raises UserError."""
@@ -32,6 +32,7 @@ class Here:
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
         while (place := work.take(self._renderer.scene_id)) is not None:
+            report.started(place)
             try:
                 dark = self._renderer.render(place, partial(report.frame, place), report.note)
             except Exception as error:

@@ -1,6 +1,7 @@
 """A job: a dataset to render, as plain data that every process of a run receives."""
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.folder import new_info
@@ -30,6 +31,17 @@ class Job:
         return cls(
             plan, config, new_info(config, plan, recipe_of(config, kind, preset)), f"configuration: dataset.{kind}"
         )
+
+    def with_threads(self, n_threads: int | None, n_workers: int) -> "Job":
+        """The job with this number of threads in each process.
+
+        None keeps the configured number. If that is 0, all cores, it divides the cores among several workers.
+        """
+        if n_threads is None and (self.config.render.threads or n_workers <= 1):
+            return self
+        n_threads = n_threads or max(len(os.sched_getaffinity(0)) // n_workers, 1)
+        render = self.config.render.model_copy(update={"threads": n_threads})
+        return replace(self, config=self.config.model_copy(update={"render": render}))
 
     def scene(self, scene_id: str) -> ScenePlan:
         """The plan of a scene."""

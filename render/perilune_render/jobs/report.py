@@ -24,6 +24,9 @@ class Report:
         self._dark: defaultdict[str, list[str]] = defaultdict(list)
         self._frames: Counter[int] = Counter()
 
+    def started(self, place: int) -> None:
+        """Note that a process begins a trajectory."""
+
     def frame(self, place: int) -> None:
         """Count a rendered frame of a trajectory."""
         self._frames[place] += 1

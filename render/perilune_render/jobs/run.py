@@ -2,18 +2,20 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from perilune_render.config import DatasetConfig
-from perilune_render.dataset.folder import open_finished, writing
-from perilune_render.jobs import steps
+from perilune_render.dataset.folder import is_begun, open_finished, writing
+from perilune_render.jobs import records, steps
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.names import Kind
+from perilune_shared.errors import UserError
 from perilune_shared.progress import Progress
+from perilune_shared.storage.locks import remove_temporary_files
+from perilune_shared.storage.store import open_store
 
 
 class Executor(Protocol):
@@ -26,6 +28,21 @@ class Executor(Protocol):
         """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
 
 
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """One of several equal shares of a job's trajectories."""
+
+    number: int
+    """Number of the shard, from 1."""
+    count: int
+    """Number of shards."""
+
+    def places(self, n_trajectories: int) -> range:
+        """Places of its trajectories. Consecutive, so that few scenes are in several shards."""
+        first, after = ((k * n_trajectories) // self.count for k in (self.number - 1, self.number))
+        return range(first, after)
+
+
 MakeExecutor = Callable[[Job, Path], AbstractContextManager[Executor]]
 """Makes the executor of a job and its folder."""
 
@@ -36,13 +53,6 @@ class RenderingFailed(Exception):
     def __init__(self, out: Path, errors: dict[str, str]):
         self.out, self.errors = out, errors
         super().__init__(f"{out}: {len(errors)} trajectories failed {N_ATTEMPTS} times each")
-
-
-def make_dataset(
-    config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress, executor: MakeExecutor
-) -> Dataset:
-    """Render the dataset `detect` or `nav` into `out`, or resume it. See `render_job` for the errors."""
-    return render_job(Job.planned(config, kind, preset), out, progress, executor)
 
 
 def render_job(job: Job, out: Path, progress: Progress, executor: MakeExecutor) -> Dataset:
@@ -58,13 +68,43 @@ def render_job(job: Job, out: Path, progress: Progress, executor: MakeExecutor) 
             info = steps.prepare(job, out, own.check_scene)
             if info.complete:
                 return open_finished(out)
+            records.remove_running(open_store(out))
             _render(job, out, steps.unfinished(job, out), own, progress)
+        remove_temporary_files(out)  # of workers that were killed
         return steps.finish(job, out, info)
+
+
+def render_shard(job: Job, out: Path, shard: Shard, progress: Progress, executor: MakeExecutor) -> int:
+    """Render the unfinished trajectories of one shard of a job into `out`; returns their number.
+
+    Processes on many machines may render different shards into one folder at the same time, so the folder is not
+    locked. Raises the errors of `render_job`.
+    """
+    steps.check(job)
+    with executor(job, out) as own:
+        info = steps.prepare(job, out, own.check_scene)
+        chosen = set(shard.places(len(job.plan.trajectories)))
+        places = [place for place in steps.unfinished(job, out) if place in chosen and not info.complete]
+        _render(job, out, places, own, progress)
+    return len(places)
+
+
+def finish_job(job: Job, out: Path) -> Dataset:
+    """Finish a dataset whose shards are all rendered. Raises UserError if trajectories are still to be rendered."""
+    if not is_begun(out):
+        raise UserError(out, "--finish", "no dataset", "the folder of the rendered shards")
+    with writing(out):
+        info = steps.prepare(job, out, lambda scene_id: None)
+        return open_finished(out) if info.complete else steps.finish(job, out, info)
 
 
 def _render(job: Job, out: Path, places: list[int], executor: Executor, progress: Progress) -> None:
     """Render some trajectories, given by their places. Raises RenderingFailed at the end if some failed."""
-    work = WorkList(job.plan, places)
+    work, store = WorkList(job.plan, places), open_store(out)
+    records.remove_failures(store, map(job.name, places))
     executor.render(work, Report(job, places, progress))
     if work.failures:
-        raise RenderingFailed(out, {job.name(place): error for place, error in sorted(work.failures.items())})
+        errors = {job.name(place): error for place, error in sorted(work.failures.items())}
+        for name, error in errors.items():
+            records.write_failure(store, name, error)
+        raise RenderingFailed(out, errors)

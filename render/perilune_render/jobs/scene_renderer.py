@@ -14,6 +14,7 @@ from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.frame_source import FrameSource
 from perilune_render.jobs.job import Job
+from perilune_render.jobs.records import RunningRecord
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene
@@ -21,6 +22,7 @@ from perilune_shared.content import content_sha256
 from perilune_shared.dataset.parts import read_part, write_part
 from perilune_shared.errors import UserError
 from perilune_shared.interrupts import interrupts_held
+from perilune_shared.storage.store import open_store
 
 _GROUND = ("craters", "boulders")
 
@@ -35,6 +37,7 @@ class SceneRenderer:
     def __init__(self, job: Job, out: Path):
         check_code(job.info.recipe(), with_dem=job.config.terrain.dem is not None)
         self._job, self._out = job, out
+        self._record = RunningRecord(open_store(out))
         self._grown: tuple[str, Scene] | None = None
         self._opened: tuple[str, Scene, FrameSource] | None = None
         self._closing = contextlib.ExitStack()
@@ -64,9 +67,15 @@ class SceneRenderer:
         `advance` is called after each frame, `note` with a text on the current step.
         """
         trajectory = self._job.plan.trajectories[place]
+
+        def counted() -> None:
+            self._record.frame()
+            advance()
+
         try:
+            self._record.begin(self._job.name(place))
             scene, source = self._open(trajectory.scene_id, note)
-            return render_trajectory(self._out, source, trajectory, scene, self._job.config, advance)
+            return render_trajectory(self._out, source, trajectory, scene, self._job.config, counted)
         except BaseException:
             self.close()  # Blender's scene may be half changed
             raise
@@ -90,6 +99,7 @@ class SceneRenderer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+        self._record.remove()
 
     def close(self) -> None:
         """Release Blender and the memory of the scene."""

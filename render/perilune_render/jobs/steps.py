@@ -10,12 +10,14 @@ from perilune_render.dataset.folder import begin_or_resume, check_begun, is_begu
 from perilune_render.dataset.folder import finish as finish_folder
 from perilune_render.dataset.trajectory_parts import finished_names
 from perilune_render.flight.pose_checks import check_plan
+from perilune_render.jobs import records
 from perilune_render.jobs.job import Job
 from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.errors import UserError
+from perilune_shared.storage.store import open_store
 
 
 def check(job: Job) -> None:
@@ -34,6 +36,8 @@ def prepare(job: Job, out: Path, check_scene: Callable[[str], object]) -> Datase
         check_scene(job.plan.scenes[0].scene_id)
     info = begin_or_resume(out, job.info)
     check_begun(out, job.plan)
+    if not info.complete:
+        records.write_plan(open_store(out), job)
     return info
 
 
@@ -53,4 +57,6 @@ def finish(job: Job, out: Path, info: DatasetInfo) -> Dataset:
     if left:
         found = f"{len(left)} of {len(job.plan.trajectories)} trajectories not rendered, first {job.name(left[0])}"
         raise UserError(out, "trajectories", found, "all rendered: run the shards that hold them again")
+    # First, since nothing would remove them from a dataset that was complete when the process was killed.
+    records.remove_all(open_store(out))
     return finish_folder(out, info)

@@ -19,6 +19,7 @@ IMAGING = (
     "perilune_render.dataset.shots:",
     "perilune_render.dataset.frame_files:write_frame",
     "perilune_render.dataset.tables:",
+    "perilune_render.dataset.real_ground:real_ground_share",
 )
 """Code that makes images, labels and manifest rows from radiance."""
 LIBRARIES = {

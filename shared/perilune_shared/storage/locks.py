@@ -41,14 +41,19 @@ def locked(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with lock(folder / LOCK_NAME, folder):
-            for root, _, names in os.walk(folder):
-                for name in filter(TEMPORARY_FILE.fullmatch, names):
-                    Path(root, name).unlink(missing_ok=True)
+            remove_temporary_files(folder)
             yield
     finally:
         with contextlib.suppress(OSError):
             for each in created:
                 each.rmdir()
+
+
+def remove_temporary_files(folder: Path) -> None:
+    """Remove temporary files of killed writers at any depth. No other process may be writing in the folder."""
+    for root, _, names in os.walk(folder):
+        for name in filter(TEMPORARY_FILE.fullmatch, names):
+            Path(root, name).unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

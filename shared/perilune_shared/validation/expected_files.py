@@ -27,6 +27,8 @@ EXTRA_NAMES = frozenset(
     }
 )
 """Files that tools or users may add directly in the dataset's folder; like dataset.json they are in SHA256SUMS."""
+_RECORDS = "work"
+"""Folder of the records of a rendering in progress."""
 _LOCKS = (LOCK_NAME, f"{LOCK_NAME}.json")
 _MAX_REPORTED = 1000
 
@@ -35,7 +37,7 @@ def unexpected(dataset: Dataset) -> Iterator[str]:
     """Yield relative paths of files and folders that do not belong to the dataset, at most 1000.
 
     An unexpected folder is reported without its content, and only if it is not empty. The lock of a writer is accepted;
-    its temporary files are accepted while the dataset is not complete.
+    its temporary files and records are accepted while the dataset is not complete.
     """
     own_folders = {"manifest", *(f"manifest/{table}" for table in TABLES)}
     own_files = {INFO_NAME, SUMS_NAME, *EXTRA_NAMES, *_LOCKS}
@@ -53,6 +55,8 @@ def unexpected(dataset: Dataset) -> Iterator[str]:
     n_found = 0
     for root, folders, names in os.walk(dataset.root):
         place = Path(root).relative_to(dataset.root)
+        if not dataset.info.complete and root == str(dataset.root) and _RECORDS in folders:
+            folders.remove(_RECORDS)
         inner = [(place / name).as_posix() for name in folders]
         folders[:] = [name for name, path in zip(folders, inner, strict=True) if path in own_folders]
         found = [path for path in inner if path not in own_folders and _contains_files(dataset.root / path)]

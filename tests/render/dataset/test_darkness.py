@@ -27,7 +27,7 @@ DARK = [
 def rendered(tmp_path_factory):
     """The finished command and the folder of a dataset under a Sun that hardly rises."""
     out = tmp_path_factory.mktemp("dark")
-    done = in_process.call(main, "dataset", *DARK, "--out", out)
+    done = in_process.call(main, "dataset", "--workers", 0, *DARK, "--out", out)
     assert done.returncode == 0, done.stderr
     return done, out / "detect"
 

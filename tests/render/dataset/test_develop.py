@@ -196,8 +196,9 @@ def test_blender_is_not_loaded(developed):
 def test_a_distorted_dataset_is_rendered_labelled_and_developed(tmp_path):
     """From the lens to the label: an EXR of the wider pinhole, frames and ellipses of the distorted camera."""
     lens = settings("camera.distortion.k1=-0.2", "camera.distortion.p2=0.003", "camera.principal_y_px=60")
-    quick = settings("terrain.spacing_px=2", "detect.n_scenes=1", "detect.val_share=0", "detect.test_share=0")
-    made = in_process.call(main, "dataset", "--preset", "tiny", "--kind", "detect", "--out", tmp_path, *lens, *quick)
+    quick = ["--preset", "tiny", "--kind", "detect"]
+    quick += settings("terrain.spacing_px=2", "detect.n_scenes=1", "detect.val_share=0", "detect.test_share=0")
+    made = in_process.call(main, "dataset", "--workers", 0, *quick, *lens, "--out", tmp_path)
     assert made.returncode == 0, made.stderr
     dataset = open_dataset(tmp_path / "detect")
     assert validate(dataset) == []

@@ -46,7 +46,7 @@ def test_the_manifest_and_the_card_say_how_much_ground_is_real(tmp_path):
     # The second frame sees less ground than the first, and so a larger share of the model.
     height = np.random.default_rng(1).normal(0, 0.3, (101, 101)).cumsum(axis=0)
     dem = model(tmp_path / "small.tif", height, 4.0)
-    done = in_process.call(main, "dataset", *SMALL, "--dem", dem, "--out", tmp_path / "out")
+    done = in_process.call(main, "dataset", "--workers", 0, *SMALL, "--dem", dem, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     dataset = open_dataset(tmp_path / "out/detect")
     shares = dataset.table("frames", ["real_ground_share"])["real_ground_share"].to_pylist()

@@ -92,7 +92,7 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
     cut = ["frame_index % 3 == 1", "split != 'val'"]
     subset(open_dataset(tiny / "detect"), tmp_path / "hashed", cut, images="plan")
     split_dataset(open_dataset(tmp_path / "hashed"), tmp_path / "s", by="trajectory", val_share=0, test_share=0.5)
-    made = run("dataset", "--manifest", tmp_path / "s", "--out", tmp_path / "out")
+    made = run("dataset", "--workers", 0, "--manifest", tmp_path / "s", "--out", tmp_path / "out")
     assert made.returncode == 0, made.stderr
     n = len(open_dataset(tmp_path / "s").table("frames"))
     assert f"{n} of {n} frames are byte-identical to the manifest's; terrain hashes match" in made.stdout
@@ -102,7 +102,7 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
     labels = old.table("labels").filter(pc.is_in(old.table("labels")["frame_id"], ids.combine_chunks()))
     assert new.table("labels").equals(labels)
     assert set(new.table("frames")["split"].to_pylist()) == {"train", "test"}
-    again = run("dataset", "--manifest", tmp_path / "s", "--out", tmp_path / "out")
+    again = run("dataset", "--workers", 0, "--manifest", tmp_path / "s", "--out", tmp_path / "out")
     assert again.returncode == 0 and f"{n} of {n}" in again.stdout
     for arguments, message in (
         (["--manifest", tmp_path / "s", "--set", "dataset.seed=3", "--out", tmp_path / "o"], "--set"),

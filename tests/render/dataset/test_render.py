@@ -23,6 +23,9 @@ from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.validation.validate import validate
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
+DETECT = ["dataset", "--preset", "tiny", "--kind", "detect"]
+IN_PROCESS = ["--workers", "0"]
+"""Renders in the process of the test, where Blender is loaded once."""
 QUICK = [
     "--set",
     "dataset.camera.width_px=32",
@@ -40,6 +43,17 @@ QUICK = [
 def run(*arguments):
     """In this process, where Blender is loaded once."""
     return in_process.call(main, *arguments)
+
+
+def children_of(pid):
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def eventually(condition, seconds=5.0):
+    deadline = time.monotonic() + seconds
+    while not (fulfilled := condition()) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return fulfilled
 
 
 def hashes(dataset):
@@ -90,7 +104,7 @@ def test_the_camera_looks_down_at_the_site(tiny):
 
 def test_stopped_and_resumed_is_the_same_dataset(tmp_path):
     command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", *QUICK]
-    assert run(*command[1:], "--out", tmp_path / "whole").returncode == 0
+    assert run(*command[1:], *IN_PROCESS, "--out", tmp_path / "whole").returncode == 0
     process = subprocess.Popen(
         [*command, "--out", str(tmp_path / "cut")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -98,12 +112,14 @@ def test_stopped_and_resumed_is_the_same_dataset(tmp_path):
     deadline = time.monotonic() + 60
     while not any(parts.glob("[!.]*")) and time.monotonic() < deadline:
         time.sleep(0.005)
+    workers = children_of(process.pid)
     process.send_signal(signal.SIGKILL)
     process.wait()
+    assert workers and eventually(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
     cut = open_dataset(tmp_path / "cut/detect")
     assert not cut.info.complete and 0 < len(hashes(cut)) < 36
     before = {p: p.stat().st_mtime_ns for p in parts.iterdir()}
-    assert run(*command[1:], "--out", tmp_path / "cut").returncode == 0
+    assert run(*command[1:], *IN_PROCESS, "--out", tmp_path / "cut").returncode == 0
     assert all(p.stat().st_mtime_ns == t for p, t in before.items())
     whole, again = open_dataset(tmp_path / "whole/detect"), open_dataset(tmp_path / "cut/detect")
     assert hashes(whole) == hashes(again) and validate(again) == []
@@ -117,15 +133,17 @@ def test_ctrl_c_is_answered_in_one_line(tmp_path):
     deadline = time.monotonic() + 60
     while not any(tmp_path.rglob("*.png")) and time.monotonic() < deadline:
         time.sleep(0.01)
+    workers, asked = children_of(process.pid), time.monotonic()
     process.send_signal(signal.SIGINT)
     stderr = process.communicate(timeout=60)[1]
+    assert time.monotonic() - asked < 3 and workers and not any(Path(f"/proc/{pid}").exists() for pid in workers)
     assert process.returncode == 130 and "Traceback" not in stderr and "again to resume" in stderr
 
 
 def test_a_finished_dataset_is_reused_and_other_settings_are_refused(tmp_path):
-    assert run("dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", tmp_path).returncode == 0
+    assert run(*DETECT, *QUICK, *IN_PROCESS, "--out", tmp_path).returncode == 0
     stamp = (tmp_path / "detect/dataset.json").stat().st_mtime_ns
-    assert run("dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", tmp_path).returncode == 0
+    assert run(*DETECT, *QUICK, *IN_PROCESS, "--out", tmp_path).returncode == 0
     assert (tmp_path / "detect/dataset.json").stat().st_mtime_ns == stamp
     other = run("dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--set", "dataset.seed=5", "--out", tmp_path)
     assert other.returncode == 2 and "seed" in other.stderr and len(other.stderr.strip().splitlines()) == 1
@@ -144,7 +162,7 @@ def test_a_finished_dataset_is_reused_and_other_settings_are_refused(tmp_path):
     ],
 )
 def test_faults_of_the_user_end_with_one_line_and_code_2(tmp_path, arguments, parts):
-    result = run("dataset", "--preset", "tiny", "--kind", "detect", *arguments, "--out", tmp_path / "out")
+    result = run("dataset", "--preset", "tiny", "--kind", "detect", *IN_PROCESS, *arguments, "--out", tmp_path / "out")
     assert result.returncode == 2 and "Traceback" not in result.stderr
     lines = [line for line in result.stderr.strip().splitlines() if line.startswith("error")]
     assert len(lines) == 1 and all(part in lines[0] for part in parts)
@@ -175,7 +193,7 @@ def test_a_full_disk_leaves_what_was_finished(tmp_path):
     for fault in validate(dataset):
         assert "readable part" not in fault.expected, fault
     assert not [p for p in tmp_path.rglob("*") if ".part" in p.name]
-    assert run("dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", tmp_path).returncode == 0
+    assert run(*DETECT, *QUICK, *IN_PROCESS, "--out", tmp_path).returncode == 0
     assert validate(open_dataset(tmp_path / "detect")) == []
 
 

@@ -78,6 +78,7 @@ def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, expec
         ("perilune_render.imaging.resampling", "INTER_LANCZOS4", "INTER_CUBIC", {"imaging"}),
         ("perilune_render.imaging.exr", "ZIP_COMPRESSION", "NO_COMPRESSION", {"imaging"}),
         ("perilune_render.dataset.frame_files", '".png", stored', '".png", stored + 1', {"imaging"}),
+        ("perilune_render.dataset.real_ground", "> 0\\.5", "> 0.6", {"imaging"}),
         ("perilune_render.blender.nodes", "MULTIPLY", "ADD", {"renderer"}),
         ("perilune_render.terrain.noise", r"njit\(\)", "njit(fastmath=True)", {"generator"}),
     ],

@@ -1,0 +1,31 @@
+"""The command `perilune-render status`."""
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from perilune_shared.storage.store import open_store
+
+
+def status(
+    address: Annotated[str, typer.Argument(help="Address of a dataset, or of the folder of `detect` and `nav`.")],
+) -> None:
+    """Print what is rendered, running and failed, from the dataset's files alone, on any machine."""
+    from perilune_render.jobs.status import SILENT_S, datasets_below, status_of
+
+    for store in datasets_below(open_store(address)):
+        found = status_of(store)
+        lines = [
+            f"{store.address}: {'complete' if found.complete else 'in progress'}",
+            f"  trajectories  {found.n_done} of {found.n_trajectories} done, {len(found.running)} running, "
+            f"{len(found.failed)} failed",
+            f"  frames        {found.frames_done} of {found.n_frames}",
+        ]
+        if found.left_s is not None:
+            lines.append(f"  speed         {found.frames_per_s:.1f} frames/s, {found.left_s / 3600:.2f} hours left")
+        lines += [f"  running       {name}" for name in found.running]
+        if found.n_silent:
+            lines.append(f"  silent        {found.n_silent} processes, for {SILENT_S:.0f} s or more")
+        lines += [f"  failed        {name}: {error}" for name, error in found.failed.items()]
+        Console().print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,167 @@
+"""Estimate time and bytes of a job from a few frames, rendered into a temporary folder."""
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from perilune_render.flight.plan import TrajectoryPlan
+from perilune_render.flight.trajectories import Flight
+from perilune_render.jobs import steps
+from perilune_render.jobs.job import Job
+from perilune_render.jobs.report import Report
+from perilune_render.jobs.run import MakeExecutor, RenderingFailed
+from perilune_render.jobs.work_list import WorkList
+from perilune_shared.dataset.parts import read_part
+from perilune_shared.progress import Progress
+
+_N_FRAMES = 10
+"""Number of frames rendered of each trajectory of the sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What is left to render, and what it will take."""
+
+    n_frames: int
+    """Number of frames that are still to be rendered."""
+    seconds: float
+    """Time to render them, with start and finish."""
+    n_bytes: float
+    """Bytes of their files and rows."""
+
+
+class _Times(Report):
+    """Records when trajectories begin and end and when their frames are rendered, seconds."""
+
+    def __init__(self, job: Job, places: list[int], progress: Progress):
+        super().__init__(job, places, progress)
+        self.begin: dict[int, float] = {}
+        self.frames: dict[int, list[float]] = {}
+        self.end: dict[int, float] = {}
+
+    def started(self, place: int) -> None:
+        self.begin[place], self.frames[place] = time.perf_counter(), []
+
+    def frame(self, place: int) -> None:
+        super().frame(place)
+        self.frames[place].append(time.perf_counter())
+
+    def done(self, place: int, dark: Sequence[str]) -> None:
+        super().done(place, dark)
+        self.end[place] = time.perf_counter()
+
+
+def estimate(job: Job, out: Path, progress: Progress, executor: MakeExecutor, n_workers: int) -> Estimate:
+    """Estimate a job in `out`, where some trajectories may be finished, with an executor of `n_workers` processes.
+
+    Renders ten frames for each process at the same time, from its own scene if there are as many. Writes nothing to
+    `out`. Raises UserError as `steps.check` and if a pose does not fit the ground, RenderingFailed if frames cannot be
+    rendered.
+    """
+    steps.check(job)
+    left = steps.unfinished(job, out)
+    if not left:
+        return Estimate(0, 0.0, 0.0)
+    sample = _sample(job, left, max(n_workers, 1))
+    places = list(range(len(sample.plan.trajectories)))
+    with tempfile.TemporaryDirectory(prefix="perilune-") as folder:
+        begin = time.perf_counter()
+        with executor(sample, Path(folder)) as own:
+            info = steps.prepare(sample, Path(folder), lambda scene_id: None)
+            work, times = WorkList(sample.plan, places), _Times(sample, places, progress)
+            own.render(work, times)
+        if work.failures:
+            raise RenderingFailed(out, {sample.name(place): error for place, error in work.failures.items()})
+        finish_begin = time.perf_counter()
+        steps.finish(sample, Path(folder), info)
+        finish_s = time.perf_counter() - finish_begin
+        bytes_of = _Bytes.of(Path(folder), sample)
+    frame_s = fmean((times.frames[p][-1] - times.frames[p][0]) / max(len(times.frames[p]) - 1, 1) for p in places)
+    scene_s = max(fmean(times.frames[p][0] - times.begin[p] for p in places) - frame_s, 0.0)
+    parts_s = fmean(times.end[p] - times.frames[p][-1] for p in places)
+    n_frames, n_scenes = sum(map(job.n_frames, left)), len({job.plan.trajectories[p].scene_id for p in left})
+    n_parallel = min(max(n_workers, 1), len(left))
+    work_s = n_frames * frame_s + len(left) * parts_s + max(n_scenes, n_parallel) * scene_s
+    start_s = min(times.begin.values()) - begin
+    n_bytes = n_frames * bytes_of.frame + len(left) * bytes_of.trajectory + n_scenes * bytes_of.scene
+    return Estimate(n_frames, start_s + work_s / n_parallel + finish_s, n_bytes)
+
+
+def _sample(job: Job, left: list[int], n_trajectories: int) -> Job:
+    """A job of `n_trajectories` unfinished trajectories with few frames, of different scenes if possible."""
+    first_of: dict[str, int] = {}
+    for place in left:
+        first_of.setdefault(job.plan.trajectories[place].scene_id, place)
+    others = [place for place in left if place not in first_of.values()]
+    chosen = [job.plan.trajectories[place] for place in sorted([*first_of.values(), *others][:n_trajectories])]
+    of_scene: dict[str, list[int]] = {trajectory.scene_id: [] for trajectory in chosen}
+    for index, trajectory in enumerate(chosen):
+        of_scene[trajectory.scene_id].append(index)
+    scenes = tuple(scene for scene in job.plan.scenes if scene.scene_id in of_scene)
+    places = {scene_id: range(found[0], found[-1] + 1) for scene_id, found in of_scene.items()}
+    trajectories = tuple(map(_thinned, chosen))
+    return replace(job, plan=replace(job.plan, scenes=scenes, trajectories=trajectories, places=places))
+
+
+def _thinned(trajectory: TrajectoryPlan) -> TrajectoryPlan:
+    """A trajectory with few frames, evenly spread from the first to the last."""
+    n, flight = len(trajectory.splits), trajectory.flight
+    kept = np.unique(np.linspace(0, n - 1, min(_N_FRAMES, n)).round().astype(int))
+    arrays = (flight.time_s, flight.position_m, flight.velocity_mps, flight.rotation_wxyz)
+    thinned = Flight(flight.nominal, *(array[kept] for array in arrays))
+    return replace(
+        trajectory,
+        frame_index=tuple(trajectory.frame_index[i] for i in kept),
+        splits=tuple(trajectory.splits[i] for i in kept),
+        draw_flight=partial(_same, thinned),
+    )
+
+
+def _same(flight: Flight) -> Flight:
+    return flight
+
+
+@dataclass(frozen=True, slots=True)
+class _Bytes:
+    """Mean bytes of a sample."""
+
+    frame: float
+    """Of a frame's files and rows."""
+    trajectory: float
+    """Of a trajectory's parts, whatever the number of their rows."""
+    scene: float
+    """Of a scene's parts."""
+
+    @classmethod
+    def of(cls, root: Path, sample: Job) -> "_Bytes":
+        """Those of a finished sample in the folder `root`."""
+        n_frames = sum(map(sample.n_frames, range(len(sample.plan.trajectories))))
+        n_trajectories, n_scenes = len(sample.plan.trajectories), len(sample.plan.scenes)
+        images = sum(path.stat().st_size for path in root.joinpath("frames").rglob("*") if path.is_file())
+        rows = fixed = 0.0
+        for name in ("frames", "labels"):
+            for path in root.joinpath("manifest", name).glob("*.parquet"):
+                part = read_part(path, name)
+                whole, half = (_parquet_bytes(part.slice(0, n)) for n in (len(part), len(part) // 2))
+                rows += 2 * (whole - half)
+                fixed += max(2 * half - whole, 0)
+        ground = sum(
+            path.stat().st_size
+            for name in ("scenes", "craters", "boulders", "trajectories")
+            for path in root.joinpath("manifest", name).glob("*.parquet")
+        )
+        return cls((images + rows) / n_frames, fixed / n_trajectories, ground / n_scenes)
+
+
+def _parquet_bytes(rows: pa.Table) -> int:
+    sink = pa.BufferOutputStream()
+    pq.write_table(rows, sink, compression="zstd")
+    return sink.getvalue().size

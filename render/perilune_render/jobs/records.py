@@ -1,0 +1,131 @@
+"""Records of a rendering in progress, below work/ in the dataset, for `perilune-render status`.
+
+    work/plan.json                 number of trajectories and frames
+    work/running/<process>.json    one process: what it renders, and how many frames it has rendered
+    work/failed/<trajectory>.json  the error of a trajectory that failed repeatedly
+
+No record affects what is rendered. They are removed when the dataset is finished.
+"""
+
+import contextlib
+import json
+import os
+import platform
+import secrets
+import shutil
+import time
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from perilune_render.jobs.job import Job
+from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Store
+
+FOLDER = "work"
+_INTERVAL_S = 10.0
+_LARGEST_BYTES = 100_000
+_RUNNING = frozenset({"trajectory", "frames", "since", "updated"})
+_FAILURE = frozenset({"trajectory", "error"})
+
+
+def write_plan(store: Store, job: Job) -> None:
+    """Record the size of a job, unless it is recorded."""
+    places = range(len(job.plan.trajectories))
+    if not store.exists(f"{FOLDER}/plan.json"):
+        _write(store, "plan", {"trajectories": len(places), "frames": sum(map(job.n_frames, places))})
+
+
+def read_plan(store: Store) -> dict[str, Any] | None:
+    """The recorded size of a job: `trajectories` and `frames`; None if there is no record."""
+    return _read(store, f"{FOLDER}/plan.json") if store.exists(f"{FOLDER}/plan.json") else None
+
+
+class RunningRecord:
+    """The record of this process, written when a trajectory begins and at most every ten seconds after a frame."""
+
+    def __init__(self, store: Store):
+        self._store = store
+        self._name = f"running/{secrets.token_hex(8)}"  # process ids are not unique across machines
+        self._process = {"host": platform.node(), "pid": os.getpid(), "since": time.time()}
+        self._trajectory, self._n_frames, self._updated = "", 0, 0.0
+
+    def begin(self, trajectory: str) -> None:
+        """Record that this process begins a trajectory."""
+        self._trajectory = trajectory
+        self._write()
+
+    def frame(self) -> None:
+        """Count a frame."""
+        self._n_frames += 1
+        if time.time() - self._updated > _INTERVAL_S:
+            self._write()
+
+    def remove(self) -> None:
+        """Remove the record, if it was written."""
+        if self._updated:
+            self._store.delete(f"{FOLDER}/{self._name}.json")
+
+    def _write(self) -> None:
+        self._updated = time.time()
+        state = {"trajectory": self._trajectory, "frames": self._n_frames, "updated": self._updated}
+        _write(self._store, self._name, {**self._process, **state})
+
+
+def write_failure(store: Store, trajectory: str, error: str) -> None:
+    """Record a trajectory (scene-0000/trajectory-0000) that failed repeatedly."""
+    _write(store, f"failed/{trajectory.replace('/', '.')}", {"trajectory": trajectory, "error": error[:2000]})
+
+
+def remove_failures(store: Store, trajectories: Iterable[str]) -> None:
+    """Remove the failures of trajectories that are tried again."""
+    recorded = {content["trajectory"]: path for path, content in _listed(store, "failed", _FAILURE)}
+    for trajectory in trajectories:
+        if trajectory in recorded:
+            store.delete(recorded[trajectory])
+
+
+def running(store: Store) -> list[dict[str, Any]]:
+    """The records of all processes: `trajectory`, `frames`, and the times `since` and `updated`, seconds since 1970."""
+    return [content for _, content in _listed(store, "running", _RUNNING)]
+
+
+def remove_running(store: Store) -> None:
+    """Remove the records of processes that were killed."""
+    for path, _ in list(_listed(store, "running", _RUNNING)):
+        store.delete(path)
+
+
+def failures(store: Store) -> dict[str, str]:
+    """The error of each trajectory that failed repeatedly."""
+    return {content["trajectory"]: content["error"] for _, content in _listed(store, "failed", _FAILURE)}
+
+
+def remove_all(store: Store) -> None:
+    """Remove all records."""
+    for item in list(store.list(FOLDER)):
+        store.delete(item.path)
+    if store.folder is not None:
+        shutil.rmtree(store.folder / FOLDER, ignore_errors=True)
+
+
+def _write(store: Store, name: str, content: dict[str, Any]) -> None:
+    # A record that cannot be written is no reason to stop: the dataset's own files will say why.
+    with contextlib.suppress(OSError, UserError):
+        store.replace(f"{FOLDER}/{name}.json", json.dumps(content).encode())
+
+
+def _listed(store: Store, folder: str, fields: frozenset[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for item in store.list(f"{FOLDER}/{folder}"):
+        if item.path.endswith(".json") and item.size_bytes <= _LARGEST_BYTES:
+            content = _read(store, item.path)
+            if content is not None and content.keys() >= fields:
+                yield item.path, content
+
+
+def _read(store: Store, path: str) -> dict[str, Any] | None:
+    """The record in a file; None if it has just been removed, or is damaged."""
+    try:
+        content = json.loads(store.read(path))
+    except (OSError, UserError, ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) else None

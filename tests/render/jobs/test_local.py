@@ -1,0 +1,69 @@
+"""Rendering in worker processes: the same bytes as in one process, also when workers are killed."""
+
+import os
+import signal
+from dataclasses import replace
+
+import pytest
+from rich.progress import Progress
+
+from perilune_render.jobs import local
+from perilune_render.jobs.here import Here
+from perilune_render.jobs.local import LocalWorkers
+from perilune_render.jobs.run import RenderingFailed, render_job
+from perilune_render.jobs.scene_renderer import SceneRenderer
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.errors import UserError
+from perilune_shared.validation.validate import validate
+
+
+class KilledWorkers(LocalWorkers):
+    """Kills the worker of trajectory `killed` after its second frame, `n_kills` times."""
+
+    killed = 1
+    n_kills = 1
+
+    def __init__(self, job, out):
+        super().__init__(job, out, 2)
+        self.frames = 0
+
+    def _handle(self, worker, message, work, report):
+        if message == ("frame",) and worker.place == self.killed and self.n_kills:
+            self.frames += 1
+            if self.frames % 2 == 0:
+                self.n_kills -= 1
+                os.kill(worker.process.pid, signal.SIGKILL)
+                worker.process.wait()
+        super()._handle(worker, message, work, report)
+
+
+class AlwaysKilledWorkers(KilledWorkers):
+    n_kills = 99
+
+
+def test_two_workers_one_killed_and_all_recycled_give_the_same_bytes(
+    job, whole, files_of, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(local, "RECYCLED_AFTER", 1)
+    render_job(job, tmp_path, Progress(disable=True), KilledWorkers)
+    assert files_of(tmp_path) == whole and len(whole) > 20
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "warning: scene-0000/trajectory-0001: worker killed by SIGKILL; trying again (3 left)"
+
+
+def test_a_trajectory_that_always_fails_is_named_and_all_others_are_rendered(job, whole, files_of, tmp_path):
+    with pytest.raises(RenderingFailed) as failed:
+        render_job(job, tmp_path, Progress(disable=True), AlwaysKilledWorkers)
+    assert failed.value.errors == {"scene-0000/trajectory-0001": "worker killed by SIGKILL"}
+    dataset = open_dataset(tmp_path)
+    assert not dataset.info.complete and dataset.table("frames").num_rows == 36
+    render_job(job, tmp_path, Progress(disable=True), Here)
+    assert files_of(tmp_path) == whole and validate(open_dataset(tmp_path)) == []
+
+
+def test_code_that_changed_since_the_beginning_is_refused(job, tmp_path):
+    recipe = job.info.recipe()
+    other = recipe.model_copy(update={"versions": {**recipe.versions, "imaging": "0" * 16}})
+    changed = replace(job, info=job.info.model_copy(update={"recipes": {other.key: other}}))
+    with pytest.raises(UserError, match=r"perilune_render: versions: got imaging .* expected the code that"):
+        SceneRenderer(changed, tmp_path)
