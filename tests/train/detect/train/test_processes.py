@@ -100,3 +100,16 @@ def test_two_processes_share_the_frames_and_end_with_equal_weights(few, tmp_path
 
 def is_weight(key: str) -> bool:
     return not key.endswith(("running_mean", "running_var"))
+
+
+def test_lightning_starts_the_processes_without_torchrun(few, tmp_path):
+    command = ["detect", "train", "--preset", "tiny", "--name", "two", "--dataset", str(few), "--out", str(tmp_path)]
+    settings = (*SETTINGS[:2], "detect.devices=2", "detect.epochs=1", "detect.batch_size=2")
+    command += [part for setting in settings for part in ("--set", setting)]
+    program = [sys.executable, "-m", "perilune_train.cli"]
+    done = subprocess.run([*program, *command], env=ALONE, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    saved = state(tmp_path / "detect" / "two" / "checkpoints" / "last.ckpt")
+    # Six frames, two in each of two processes in a step.
+    assert (saved["processes"], saved["global_step"], saved["images_seen"]) == (2, 2, 6)
+    assert (tmp_path / "detect" / "two" / "metrics.json").is_file()
