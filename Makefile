@@ -37,7 +37,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint docs docs-build bench-render bench-scale compare-nac bench-terrain bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint docs docs-build bench-render bench-scale compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -129,6 +129,9 @@ compare-nac: setup ## compare rendered frames with real NAC crops (NAC=folder); 
 
 bench-terrain: setup ## time and memory of generating terrain on one core; writes runs/bench/terrain.json
 	@$(BIN)/python -m benchmarks.scene.terrain
+
+bench-megapixel: setup ## memory and time of a descent in 1024 x 1024 pixels, and KLT residuals on changes of level; writes runs/bench/megapixel.json
+	@$(BIN)/python -m benchmarks.scene.megapixel
 
 bench-photometry: setup ## rendered radiance, compared with the formulas; writes runs/bench/photometry.json
 	@$(BIN)/python -m benchmarks.scene.photometry

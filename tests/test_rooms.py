@@ -19,7 +19,8 @@ ROOMS = {
         "frame_source blender dataset jobs cli_options cli_dataset cli_status cli"
     ),
     "render/perilune_render/terrain": (
-        "envelope grid interpolation noise relief size_frequency craters albedo boulders elevation scene cache export"
+        "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
+        "cache export"
     ),
     "render/perilune_render/jobs": (
         "job records steps work_list report scene_renderer worker local here run status estimate"

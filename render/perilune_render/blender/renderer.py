@@ -37,6 +37,9 @@ _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
 class Renderer:
     """Renders frames of one scene. Use as a context manager: it holds a temporary folder and Blender's only scene.
 
+    A frame shows the level of the scene for the height of its camera. Blender holds the mesh of one level at a time, so
+    render frames in an order with few changes of level: a change takes as long as building the scene.
+
     It is an `Engine` of `perilune_render.frame_source`: `camera` has no distortion, `sun` (3,) is the unit vector
     towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only one scene.
     """
@@ -55,10 +58,19 @@ class Renderer:
             raise
 
     def _build(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> None:
-        self.stage = blender_stage.build(scene, config, camera, sun)
-        configure(self.stage, camera, config.render, config.light)
+        self._scene, self._config = scene, config
         self._exact = config.render.exr
+        # Descents begin with the coarsest level.
+        self._show(len(scene.finer))
         self._folder = tempfile.TemporaryDirectory(prefix="perilune-")
+
+    def _show(self, level: int) -> None:
+        """Build the stage with a level of the scene; Blender frees the previous one first."""
+        self._level: int | None = None
+        scene = self._scene.at_level(level, self._config.terrain.boulders)
+        self.stage = blender_stage.build(scene, self._config, self.camera, self.sun)
+        configure(self.stage, self.camera, self._config.render, self._config.light)
+        self._level = level
 
     def __enter__(self) -> "Renderer":
         return self
@@ -81,6 +93,9 @@ class Renderer:
         """
         if self not in _open:
             raise RuntimeError("this Renderer is closed")
+        level = self._scene.level_index(float(position_m[2]))
+        if level != self._level:
+            self._show(level)
         blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
         path = Path(self._folder.name) / "frame.exr"
         try:

@@ -3,12 +3,13 @@
 import numpy as np
 
 from perilune_render.config import FlightConfig
-from perilune_render.terrain.envelope import ViewEnvelope
+from perilune_render.terrain.envelope import SeenGround, ViewEnvelope
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 _N_ALTITUDES = 400
+_N_HEIGHTS = 100
 _WIDEST_RAD = np.radians(80)
 
 
@@ -25,7 +26,7 @@ def view_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
     # The ground may rise towards the camera by a twentieth of the altitude.
     lowest = np.maximum(0.95 * altitude - 3 * flight.position_sigma_m, 0.2 * altitude)
     reach = np.maximum.accumulate(reach_m(camera, flight, altitude))
-    return ViewEnvelope(lowest, reach, max(camera.fx_px, camera.fy_px))
+    return ViewEnvelope(lowest, reach, max(camera.fx_px, camera.fy_px), seen_ground(camera, flight))
 
 
 def view_angle(camera: Camera, flight: FlightConfig) -> float:
@@ -40,11 +41,40 @@ def view_angle(camera: Camera, flight: FlightConfig) -> float:
 def reach_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
     """Largest |x| or |y| from the site that a frame at this nominal altitude can show, metres.
 
+    Includes three standard deviations of tilt, rotation and position, and a margin of a twentieth for relief.
+    """
+    view = half_view_m(camera, flight, altitude_m + 3 * flight.position_sigma_m)
+    return nominal_distance_m(flight, altitude_m) + 3 * flight.position_sigma_m + 1.05 * view
+
+
+def nominal_distance_m(flight: FlightConfig, altitude_m: Array) -> Array:
+    """Horizontal distance from the site at a nominal altitude, metres."""
+    share = (altitude_m - flight.end_altitude_m) / (flight.start_altitude_m - flight.end_altitude_m)
+    return flight.downrange_m * share**2
+
+
+def half_view_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Array:
+    """Largest distance |dx| or |dy| from below the camera that a frame at this altitude shows of level ground, metres.
+
     The camera's axes are parallel to those of O_L except for small rotations, so a frame covers a square along the
-    axes. Includes three standard deviations of tilt, rotation and position, and a margin of a twentieth for relief.
+    axes. Includes three standard deviations of tilt and rotation.
     """
     turn = min(3 * np.radians(flight.attitude_sigma_deg), np.pi / 4)
-    share = (altitude_m - flight.end_altitude_m) / (flight.start_altitude_m - flight.end_altitude_m)
     slope = np.tan(view_angle(camera, flight)) * (np.cos(turn) + np.sin(turn))
-    view = (altitude_m + 3 * flight.position_sigma_m) * slope
-    return flight.downrange_m * share**2 + 3 * flight.position_sigma_m + 1.05 * view
+    return altitude_m * slope
+
+
+def seen_ground(camera: Camera, flight: FlightConfig) -> SeenGround:
+    """The ground in view by the camera's height, with the margins of `view_envelope` and `reach_m`."""
+    spread = 3 * flight.position_sigma_m
+    lowest, highest = flight.end_altitude_m, flight.start_altitude_m
+    z = np.geomspace(max(lowest - spread, 0.2 * lowest), highest + spread, _N_HEIGHTS)
+    nearest, farthest = (
+        nominal_distance_m(flight, np.clip(z + sign * spread, lowest, highest))[:, None, None] for sign in (-1, 1)
+    )
+    span = flight.azimuth_deg
+    azimuth = np.radians(np.append(np.arange(span.low, span.high, 1.0), span.high))
+    towards = -np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
+    places = np.concatenate([nearest * towards, farthest * towards], axis=1)
+    margin = (spread + 1.05 * half_view_m(camera, flight, z))[:, None]
+    return SeenGround(z, 0.95 * z, places.min(axis=1) - margin, places.max(axis=1) + margin)

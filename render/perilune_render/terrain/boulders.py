@@ -6,6 +6,7 @@ some are cut by planes, like fractured rocks. Deviation: near fresh craters, obs
 the crater's diameter.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,10 @@ class Boulders:
 
     def __len__(self) -> int:
         return len(self.x_m)
+
+    def chosen(self, selection: np.ndarray) -> "Boulders":
+        """The boulders selected by indices or by a mask."""
+        return Boulders(*(getattr(self, field.name)[selection] for field in dataclasses.fields(self)))
 
     def centre_height_m(self, ground_m: Array) -> Array:
         """Height (N,) of the centres above O_L's plane, metres, from the ground's height (N,) below each."""
@@ -83,7 +88,7 @@ def _fields(
     age = np.nan_to_num(craters.age_myr, nan=4000.0)
     young = np.clip(1 - age / 4000, 0, 1) ** 3 * np.exp(-craters.wear_m2 / (0.05 * radius**2))
     young = np.where((craters.diameter_m >= 10) & (craters.origin == 0), young, 0.0)
-    local = config.min_diameter_spacings * grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
+    local = config.min_diameter_spacings * grid.spacing_under(craters.x_m, craters.y_m)
     # The boulders of a field are at most a twentieth as large as its crater.
     largest = np.minimum(config.max_diameter_m, craters.diameter_m / 20)
     per_area = np.where(largest > local, law.csfd(local) - law.csfd(np.maximum(largest, local)), 0.0)
@@ -99,8 +104,8 @@ def _fields(
     distance = radius[host] * (1 + _FIELD_DECAY * rng.gamma(order))
     angle = rng.uniform(0, 2 * np.pi, len(host))
     x, y = craters.x_m[host] + distance * np.cos(angle), craters.y_m[host] + distance * np.sin(angle)
-    outermost = np.maximum(np.abs(x), np.abs(y))
-    inside = (diameter >= config.min_diameter_spacings * grid.spacing_at(outermost)) & (outermost < grid.extent_m / 2)
+    on_grid = np.maximum(np.abs(x), np.abs(y)) < grid.extent_m / 2
+    inside = (diameter >= config.min_diameter_spacings * grid.spacing_under(x, y)) & on_grid
     return x[inside], y[inside], diameter[inside]
 
 
@@ -135,7 +140,7 @@ def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple
     Every boulder is a copy of one of the seed's rocks; boulders below _FULL_SPACINGS local vertex spacings use the rock
     with fewer faces. All are one mesh, since each object adds to the time of every frame in Cycles.
     """
-    local = grid.spacing_at(np.maximum(np.abs(boulders.x_m), np.abs(boulders.y_m)))
+    local = grid.spacing_under(boulders.x_m, boulders.y_m)
     full = boulders.diameter_m >= _FULL_SPACINGS * local
     rotations = matrix_from_quaternion(boulders.rotation_wxyz.reshape(-1, 4))
     centres = np.stack([boulders.x_m, boulders.y_m, z_m], axis=-1)

@@ -8,6 +8,20 @@ from perilune_shared.geometry.frames import Array
 
 
 @dataclass(frozen=True, slots=True)
+class SeenGround:
+    """The ground that frames show, by the camera's height above the site; see `perilune_render.terrain.levels`."""
+
+    z_m: Array
+    """Height of the camera above O_L's plane, ascending, metres (N,)."""
+    height_m: Array
+    """Lowest height of that camera above the ground in view, metres (N,)."""
+    low_m: Array
+    """Smallest x and y of the ground in view, metres (N, 2)."""
+    high_m: Array
+    """Largest x and y of the ground in view, metres (N, 2)."""
+
+
+@dataclass(frozen=True, slots=True)
 class ViewEnvelope:
     """The views that a scene's mesh is made for: they determine its extent and vertex spacing.
 
@@ -22,6 +36,8 @@ class ViewEnvelope:
     """Distance max(|x|, |y|) of that ground from the site, not descending, metres (N,)."""
     focal_px: float
     """Largest focal length of the camera, pixels: a pixel shows at least height / focal_px metres of ground."""
+    seen: SeenGround | None = None
+    """The ground in view by the camera's height, which allows several levels; None allows one mesh only."""
 
     def __post_init__(self) -> None:
         columns = np.array([self.height_m, self.reach_m])

@@ -13,11 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perilune_render.config_terrain import LARGEST_SPACING_PX, TerrainConfig
+from perilune_render.config_terrain import TerrainConfig
 from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.envelope import ViewEnvelope
-from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
+
+FAR_GROWTH = 0.05
+"""Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: the shadow
+of ground at a distance d enters the view only if it is about d tan(elevation of the Sun) high, and so many spacings
+wide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +32,10 @@ class Grid:
     """Number of vertex spacings from the centre of the inner square to its border."""
     half_widths_m: Array
     """Half-widths of the inner square and of the rings, ascending, metres (n_rings + 1,)."""
+    centre_x_m: float = 0.0
+    """x of the centre, O_L, metres."""
+    centre_y_m: float = 0.0
+    """y of the centre, O_L, metres."""
 
     @classmethod
     def even(cls, half_width_m: float, n_half: int) -> "Grid":
@@ -35,9 +43,14 @@ class Grid:
         return cls(n_half, np.array([half_width_m]))
 
     @property
+    def off_site_m(self) -> float:
+        """Distance max(|x|, |y|) of the centre from the site, metres."""
+        return max(abs(self.centre_x_m), abs(self.centre_y_m))
+
+    @property
     def extent_m(self) -> float:
-        """Side of the square, metres."""
-        return 2 * float(self.half_widths_m[-1])
+        """Side of the largest square around the site that the grid covers, metres."""
+        return 2 * (float(self.half_widths_m[-1]) - self.off_site_m)
 
     @property
     def n_vertices(self) -> int:
@@ -50,10 +63,21 @@ class Grid:
         across = np.diff(self.half_widths_m, prepend=self.half_widths_m[0] * (1 - 1 / self.n_half))
         return np.maximum(self.half_widths_m / self.n_half, across)
 
+    @property
+    def cell_areas_m2(self) -> Array:
+        """Area of ground per vertex of the inner square and of each ring, square metres (n_rings + 1,)."""
+        around = self.half_widths_m / self.n_half
+        across = np.gradient(self.half_widths_m) if len(self.half_widths_m) > 1 else around
+        return around * np.append(around[0], across[1:])
+
     def spacing_at(self, distance_m: Array | float) -> Array:
-        """Vertex spacing, metres, at distances max(|x|, |y|) from the site, metres."""
+        """Vertex spacing, metres, at distances max(|x|, |y|) from the centre, metres."""
         ring = np.searchsorted(self.half_widths_m, distance_m)
         return self.spacings_m[np.minimum(ring, len(self.half_widths_m) - 1)]
+
+    def spacing_under(self, x_m: Array, y_m: Array) -> Array:
+        """Vertex spacing, metres, at places of O_L (...), metres."""
+        return self.spacing_at(np.maximum(np.abs(x_m - self.centre_x_m), np.abs(y_m - self.centre_y_m)))
 
     def half_width_for(self, spacing_m: float) -> float:
         """Half side, metres, of the square in which the spacing is at most `spacing_m`; 0 if there is none."""
@@ -70,7 +94,7 @@ class Grid:
         rings = self.half_widths_m[1:, None]
         x = np.concatenate([np.tile(even, len(even)), (rings * round_x).ravel()])
         y = np.concatenate([np.repeat(even, len(even)), (rings * round_y).ravel()])
-        return x, y
+        return x + self.centre_x_m, y + self.centre_y_m
 
     def quads(self) -> np.ndarray:
         """Vertex indices of the faces (n_faces, 4) int32, counter-clockwise from above."""
@@ -87,46 +111,30 @@ class Grid:
 
 
 def graded_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
-    """The grid for the views of a camera: spacing at most `terrain.spacing_px` times the smallest ground pixel.
+    """The grid for all views of a camera: spacing at most `terrain.spacing_px` times the smallest ground pixel.
 
-    Raises UserError if that needs more than `terrain.max_vertices`.
+    It may have more vertices than `terrain.max_vertices` (`perilune_render.terrain.levels.cut_levels`).
     """
-    spacing_px, most = terrain.spacing_px, terrain.max_vertices
-    grid = _grid_of(spacing_px, view)
-    if grid.n_vertices > most:
-        raise UserError(
-            "configuration",
-            "dataset.terrain.spacing_px",
-            f"{spacing_px} needs {grid.n_vertices:,} vertices",
-            f"{_wider(spacing_px, grid.n_vertices, most, view)} (dataset.terrain.max_vertices is {most:,})",
-        )
-    return grid
+    return grid_of(view.reach_m, terrain.spacing_px * view.height_m / view.focal_px)
 
 
-def _wider(spacing_px: float, n_vertices: int, most: int, view: ViewEnvelope) -> str:
-    """Advice if a spacing needs more than `most` vertices: the smallest allowed spacing, rounded up to 0.01."""
-    hundredths = int(np.ceil(100 * spacing_px * np.sqrt(n_vertices / most)))
-    # The number of vertices is only roughly proportional to 1 / spacing^2.
-    while hundredths > 1 and _grid_of((hundredths - 1) / 100, view).n_vertices <= most:
-        hundredths -= 1
-    while hundredths <= 100 * LARGEST_SPACING_PX:
-        if _grid_of(hundredths / 100, view).n_vertices <= most:
-            return f"at least {hundredths / 100:g}, or a larger dataset.terrain.max_vertices"
-        hundredths += 1
-    return "a larger dataset.terrain.max_vertices, fewer or wider pixels of dataset.camera, or a higher end_altitude_m"
+def grid_of(reach_m: Array, spacing_m: Array, centre_m: tuple[float, float] = (0.0, 0.0), edge_m: float = 0.0) -> Grid:
+    """The grid whose spacing, metres, is at most `spacing_m` (N,) up to the distances `reach_m` (N,) from its centre.
 
-
-def _grid_of(spacing_px: float, view: ViewEnvelope) -> Grid:
-    """The grid of a spacing in pixels, without a limit on the number of vertices."""
-    reach = view.reach_m
-    spacing = spacing_px * view.height_m / view.focal_px
-    n_half = int(np.ceil((reach / spacing).max()))
-    inner = min(n_half * spacing[0], reach[-1])
-    distance = np.linspace(inner, max(reach[-1], inner + spacing[0]), 20_000)
-    allowed = np.interp(distance, reach, spacing)
+    Both are ascending. Beyond the last reach the spacing grows by FAR_GROWTH per metre up to `edge_m`.
+    """
+    n_half = int(np.ceil((reach_m / spacing_m).max()))
+    inner = min(n_half * spacing_m[0], reach_m[-1])
+    distance = np.linspace(inner, max(reach_m[-1], inner + spacing_m[0]), 20_000)
+    allowed = np.interp(distance, reach_m, spacing_m)
+    if edge_m > distance[-1]:
+        n_spacings = (edge_m - distance[-1]) / allowed[-1]
+        far = allowed[-1] * np.expm1(np.linspace(0, np.log1p(FAR_GROWTH * n_spacings), 2000)[1:]) / FAR_GROWTH
+        distance = np.concatenate([distance, distance[-1] + far])
+        allowed = np.concatenate([allowed, allowed[-1] + FAR_GROWTH * far])
     steps = np.concatenate([[0], np.cumsum(np.diff(distance) / allowed[:-1])])
     n_rings = int(np.ceil(steps[-1]))
-    return Grid(n_half, np.interp(np.linspace(0, steps[-1], n_rings + 1), steps, distance))
+    return Grid(n_half, np.interp(np.linspace(0, steps[-1], n_rings + 1), steps, distance), *centre_m)
 
 
 @njit(inline="always")
@@ -139,8 +147,8 @@ def _put(lines, row, x, y, dx, dy, first, number, ring):
 def lines_in(x_low, x_high, y_low, y_high, n_half, half_widths, lines):
     """Write the vertices in a window as lines into `lines` (2 n_half + 1 + 4 n_rings, 7); returns the number of lines.
 
-    A line is: x and y of its first vertex, steps in x and y, index of its first vertex, number of vertices, and ring (0
-    is the inner square).
+    All places are relative to the grid's centre. A line is: x and y of its first vertex, steps in x and y, index of its
+    first vertex, number of vertices, and ring (0 is the inner square).
     """
     count = 0
     n = n_half

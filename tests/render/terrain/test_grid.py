@@ -1,5 +1,3 @@
-import re
-
 import numpy as np
 import pytest
 from tests.helpers.scenes import config_with
@@ -106,20 +104,3 @@ def test_half_width_for_is_where_the_spacing_is_reached():
     half = grid.half_width_for(2.0)
     assert grid.spacing_at(half - 5) <= 2.0 <= grid.spacing_at(half + 20)
     assert grid.half_width_for(0.01) == 0
-
-
-@pytest.mark.parametrize("most", [250_000, 900_000, 1_234_567])
-def test_too_many_vertices_are_refused_and_a_spacing_is_named_that_passes(most):
-    with pytest.raises(UserError, match=r"dataset.terrain.spacing_px: got 0.5 needs 5,.* vertices") as refusal:
-        graded_grid(config_with(terrain={"max_vertices": most}).terrain, VIEW)
-    named = float(re.search(r"at least ([0-9.]+),", refusal.value.expected)[1])
-    wider = config_with(terrain={"max_vertices": most, "spacing_px": named})
-    assert graded_grid(wider.terrain, VIEW).n_vertices <= most
-    finer = config_with(terrain={"max_vertices": most, "spacing_px": round(named - 0.01, 2)})
-    with pytest.raises(UserError, match="spacing_px"):
-        graded_grid(finer.terrain, VIEW)
-
-
-def test_a_mesh_that_no_spacing_makes_small_enough_names_none():
-    with pytest.raises(UserError, match=r"expected a larger dataset.terrain.max_vertices, fewer or wider pixels"):
-        graded_grid(config_with(terrain={"max_vertices": 10_000}).terrain, VIEW)

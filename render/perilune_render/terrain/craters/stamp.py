@@ -41,15 +41,17 @@ class _Ground(NamedTuple):
     """`Grid.n_half`."""
     half_widths: Array
     """`Grid.half_widths_m`."""
+    weights: Array
+    """Weights of the vertices of the inner square and of each ring in the fit of older ground (n_rings + 1,)."""
 
 
 class _Shapes(NamedTuple):
     """Craters as the kernels need them, oldest first."""
 
     x: Array
-    """x of the centres, O_L, metres (N,)."""
+    """x of the centres from the grid's centre, metres (N,)."""
     y: Array
-    """y of the centres, O_L, metres (N,)."""
+    """y of the centres from the grid's centre, metres (N,)."""
     radius: Array
     """Radii of the fresh crests, which scale the profile, metres (N,)."""
     label_radius: Array
@@ -93,21 +95,29 @@ class _Profile(NamedTuple):
 
 
 def stamp_craters(
-    height_m: Array, albedo: Array, grid: Grid, craters: Craters, brightness: Array, profile: str = "fassett_thomson"
+    height_m: Array,
+    albedo: Array,
+    grid: Grid,
+    craters: Craters,
+    brightness: Array,
+    profile: str = "fassett_thomson",
+    *,
+    by_area: bool = False,
 ) -> Stamped:
     """Stamp `craters` on height_m (n_vertices,) and brighten albedo (n_vertices,), both in place.
 
     A crater first replaces the ground below it by a plane fitted to that ground, and then adds its own profile. The
     more worn a crater is, the less of the older ground it replaces. `brightness` (N,) is the relative brightening
-    within the rim.
+    within the rim. With `by_area` the vertices are weighted by their share of the ground in this fit, so that the plane
+    is the same on levels of different spacing.
     """
     tables = profile_tables(profile)
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     # The label's circle is the current crest; the profile is scaled by the fresh crest's radius.
     grown = crest_radius(wear, craters.fresh_depth_m / craters.rim_height_m, profile)
     shapes = _Shapes(
-        craters.x_m,
-        craters.y_m,
+        craters.x_m - grid.centre_x_m,
+        craters.y_m - grid.centre_y_m,
         craters.diameter_m / 2 / grown,
         craters.diameter_m / 2,
         craters.fresh_depth_m,
@@ -118,7 +128,8 @@ def stamp_craters(
         craters.crest,
         brightness,
     )
-    ground = _Ground(height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m)
+    weights = grid.cell_areas_m2 if by_area else np.ones(len(grid.half_widths_m))
+    ground = _Ground(height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m, weights)
     bowls = np.stack([tables.bowl, tables.flat_bowl])
     return Stamped(*_stamp(ground, shapes, _Tables(tables.rim, bowls, tables.removed)))
 
@@ -138,7 +149,7 @@ def _stamp(ground, shapes, tables):
         _interpolate_profile(shapes, k, tables, profile)
         x, y, reach = shapes.x[k], shapes.y[k], REACH * shapes.radius[k]
         count = lines_in(x - reach, x + reach, y - reach, y + reach, ground.n_half, ground.half_widths, lines)
-        found, plane = _fit_plane(ground.height, x, y, shapes.radius[k], lines, count)
+        found, plane = _fit_plane(ground.height, ground.weights, x, y, shapes.radius[k], lines, count)
         if not found:
             continue
         sag[k] = _sag(plane, profile.removed)

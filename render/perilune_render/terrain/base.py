@@ -1,0 +1,85 @@
+"""The ground before craters: flat, or an elevation model and its surroundings."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.config_terrain import ReliefConfig, TerrainConfig
+from perilune_render.terrain.craters.population import Craters
+from perilune_render.terrain.craters.profile import REACH
+from perilune_render.terrain.elevation.model import ElevationModel, base_heights, beyond_m, raster_places, resolved_m
+from perilune_render.terrain.elevation.surroundings import FittedRelief, add_fitted_relief, fitted_relief
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.relief import add_relief
+from perilune_shared.geometry.frames import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Base:
+    """The ground before craters: flat, or an elevation model and its surroundings."""
+
+    height_m: Array
+    """Heights (n_vertices,), metres, changed in place."""
+    beyond_m: Array
+    """Distances (n_vertices,) from known ground of the model, metres; infinite without a model."""
+    model: ElevationModel | None
+    """The elevation model, if any."""
+    surroundings: FittedRelief | None
+    """Relief of the procedural ground beyond the model, if there is such ground."""
+
+    @property
+    def largest_m(self) -> float | None:
+        """Largest diameter of generated craters, metres; None to use the configured one."""
+        return None if self.model is None or self.surroundings is not None else resolved_m(self.model)
+
+    def add_waves(
+        self,
+        grid: Grid,
+        relief: ReliefConfig,
+        seed: int,
+        shortest_m: float,
+        longest_m: float,
+        whole: Grid | None = None,
+    ) -> None:
+        """Add relief: on a model only wavelengths that it does not resolve, around it all wavelengths.
+
+        If `grid` is a level, the relief is that of the grid `whole`.
+        """
+        resolved = np.inf if self.model is None else resolved_m(self.model)
+        add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved), whole)
+        if self.surroundings is not None:
+            around = self.surroundings, self.beyond_m
+            add_fitted_relief(self.height_m, grid, *around, seed, shortest_m, longest_m, whole)
+
+    def permitted(self, craters: Craters) -> Craters:
+        """The craters to add: those too small for the model to resolve, and those that do not reach the model."""
+        if self.model is None or self.surroundings is None:
+            return craters
+        large = craters.diameter_m > resolved_m(self.model)
+        column, row = raster_places(self.model, craters.x_m[large], craters.y_m[large])
+        allowed = np.ones(len(craters), bool)
+        allowed[large] = beyond_m(self.model, column, row) >= REACH * craters.diameter_m[large] / 2
+        return craters.chosen(allowed)
+
+
+def base_of(
+    model: ElevationModel | None,
+    grid: Grid,
+    terrain: TerrainConfig,
+    seed: int,
+    grids: Sequence[Grid] = (),
+    finest: Base | None = None,
+) -> Base:
+    """The base: an elevation model and its surroundings, or flat ground.
+
+    If `grid` is one of several `grids`, the surroundings are those of the base `finest` of the first one.
+    """
+    if model is None:
+        return Base(np.zeros(grid.n_vertices), np.full(grid.n_vertices, np.inf), None, None)
+    height, beyond = base_heights(model, grid, terrain.elevation.outside, grids)
+    if finest is not None:
+        return Base(height, beyond, model, finest.surroundings)
+    needed = terrain.elevation.outside == "procedural" and bool((beyond > 0).any())
+    surroundings = fitted_relief(model, terrain.relief, terrain.craters, seed) if needed else None
+    return Base(height, beyond, model, surroundings)
