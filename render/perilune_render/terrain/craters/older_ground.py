@@ -27,10 +27,11 @@ class _Plane(NamedTuple):
 
 
 @njit(inline="always")
-def _fit_plane(height, weights, x, y, radius, lines, count):
+def _fit_plane(height, weights, least_spread, x, y, radius, lines, count):
     """Least-squares plane of the ground around (x, y); returns whether it has enough vertices, and the plane.
 
-    `weights` (n_rings + 1,) are those of the vertices of the inner square and of each ring.
+    `weights` (n_rings + 1,) are those of the vertices of the inner square and of each ring. The plane is level if the
+    variance of x or y is not above `least_spread` square radii.
     """
     s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
     n_rim = n_floor = h_rim = h_floor = 0.0
@@ -66,7 +67,8 @@ def _fit_plane(height, weights, x, y, radius, lines, count):
     determinant = cxx * cyy - cxy * cxy
     slope_x = slope_y = 0.0
     # A few nearly collinear vertices do not determine the slope across them: the plane would become a spike.
-    if number >= 6 and determinant > 0.05 * cxx * cyy:
+    spread = min(cxx, cyy) > least_spread * s0 * square_r or least_spread == 0
+    if spread and number >= 6 and determinant > 0.05 * cxx * cyy:
         slope_x = (cxh * cyy - cyh * cxy) / determinant
         slope_y = (cyh * cxx - cxh * cxy) / determinant
     level = (sh - slope_x * sx - slope_y * sy) / s0

@@ -12,6 +12,9 @@ from perilune_render.terrain.craters.profile import REACH, crest_radius, profile
 from perilune_render.terrain.grid import Grid, lines_in, place_in_ring, vertex_of_ring
 from perilune_shared.geometry.frames import Array
 
+_LEAST_SPREAD = 0.15
+"""Variance of x and of y of the vertices, square radii, from which the plane's slope is fitted on a level, since out of
+view the spacing along a ring is much smaller than from ring to ring. That of an even disc is 0.42."""
 _N_RIM = 16
 """Number of points at which a rim's survival is sampled."""
 
@@ -43,6 +46,8 @@ class _Ground(NamedTuple):
     """`Grid.half_widths_m`."""
     weights: Array
     """Weights of the vertices of the inner square and of each ring in the fit of older ground (n_rings + 1,)."""
+    least_spread: float
+    """Least variance of the vertices for a plane with a slope, square radii."""
 
 
 class _Shapes(NamedTuple):
@@ -129,7 +134,9 @@ def stamp_craters(
         brightness,
     )
     weights = grid.cell_areas_m2 if by_area else np.ones(len(grid.half_widths_m))
-    ground = _Ground(height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m, weights)
+    ground = _Ground(
+        height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m, weights, _LEAST_SPREAD * by_area
+    )
     bowls = np.stack([tables.bowl, tables.flat_bowl])
     return Stamped(*_stamp(ground, shapes, _Tables(tables.rim, bowls, tables.removed)))
 
@@ -149,7 +156,9 @@ def _stamp(ground, shapes, tables):
         _interpolate_profile(shapes, k, tables, profile)
         x, y, reach = shapes.x[k], shapes.y[k], REACH * shapes.radius[k]
         count = lines_in(x - reach, x + reach, y - reach, y + reach, ground.n_half, ground.half_widths, lines)
-        found, plane = _fit_plane(ground.height, ground.weights, x, y, shapes.radius[k], lines, count)
+        found, plane = _fit_plane(
+            ground.height, ground.weights, ground.least_spread, x, y, shapes.radius[k], lines, count
+        )
         if not found:
             continue
         sag[k] = _sag(plane, profile.removed)
