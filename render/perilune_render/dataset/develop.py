@@ -32,7 +32,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_shared.progress import Progress
-from perilune_shared.storage import files
+from perilune_shared.storage.checksums import sha256_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +69,13 @@ def develop_dataset(
     incomplete or lacks EXRs, or if the EXRs do not cover the camera's view.
     """
     if len(source.info.recipes) != 1:
-        raise UserError(source.root, "recipes", len(source.info.recipes), "one recipe (a dataset that was not merged)")
+        raise UserError(source.store, "recipes", len(source.info.recipes), "one recipe (a dataset that was not merged)")
     old = source.info.recipe()
     config = _changed(source, config_file, settings)
     camera, exr_camera = _cameras(source, config)
     made_of = Origin(
         name=source.info.name,
-        sha256=files.sha256_of(source.root / "dataset.json"),
+        sha256=sha256_of(source.store, "dataset.json"),
         camera_config=old.config.get("camera", {}),
     )
     recipe = old.model_copy(
@@ -98,9 +98,9 @@ def develop_dataset(
         }
     )
     if source.table("frames", ["exr_path"])["exr_path"].null_count:
-        raise UserError(source.root, "exr_path", "null", "a dataset rendered with dataset.render.exr=true")
+        raise UserError(source.store, "exr_path", "null", "a dataset rendered with dataset.render.exr=true")
     if source.info.images != "files":
-        raise UserError(source.root, "images", source.info.images, "a dataset with its EXRs")
+        raise UserError(source.store, "images", source.info.images, "a dataset with its EXRs")
     with writing(out):
         return _develop(source, config, info, (camera, exr_camera), out, progress)
 
@@ -134,7 +134,7 @@ def _develop(
 
 def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
     """The source's settings with the user's changes, which may concern the sensor and the camera only."""
-    where = str(source.root / "dataset.json")
+    where = str(source.store.at("dataset.json"))
     given = settings_of(source.info.recipe())
     before = resolve_over(DatasetConfig, "dataset", where, given)
     after = resolve_over(DatasetConfig, "dataset", where, given, config_file, settings)
@@ -153,7 +153,7 @@ def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...
 def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
     """The camera of the new frames and that of the EXRs. Raises UserError if the EXRs do not cover the new view."""
     if not source.info.complete:
-        raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
+        raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
     camera = camera_of(config.camera)
     exr_camera = source.exr_camera
     if not exr_camera.covers(camera):

@@ -35,7 +35,7 @@ def plan_from_manifest(
     its recipe names. Raises UserError if the manifest has several recipes (merged from different datasets), if its
     frames were developed again, or if the elevation model differs.
     """
-    info, where = manifest.info, manifest.root / "dataset.json"
+    info, where = manifest.info, manifest.store.at("dataset.json")
     if len(info.recipes) != 1:
         expected = "one recipe; select its scenes with `perilune-manifest subset --where \"recipe == '...'\"`"
         raise UserError(where, "recipes", len(info.recipes), expected)

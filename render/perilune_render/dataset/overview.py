@@ -24,4 +24,4 @@ def write_overview(dataset: Dataset) -> None:
         own = labels[labels["frame_id"] == frame.frame_id].merge(craters, on="crater_id")
         drawn = draw_labels(image, Labels.from_table(own), selected(own, SELECTIONS["visible"]))
         pictures += [enlarge(image, 2), drawn]
-    write_sheet(dataset.root / "overview.png", pictures, 6)
+    write_sheet(dataset.file("overview.png"), pictures, 6)

@@ -91,7 +91,7 @@ def regenerate(
     known = set(frames["frame_id"].to_pylist())
     for frame_id in frame_ids:
         if frame_id not in known:
-            raise UserError(dataset.root, "frame_id", frame_id, f"a frame of the manifest, such as {min(known)}")
+            raise UserError(dataset.store, "frame_id", frame_id, f"a frame of the manifest, such as {min(known)}")
     frames = frames.filter(pc.is_in(frames["frame_id"], pa.array(list(frame_ids), pa.string())))
     task = progress.add_task("regenerate", total=len(frames), unit="frames")
     outcomes = []
@@ -113,7 +113,7 @@ def spread(dataset: Dataset, n_frames: int) -> list[str]:
 def _of_scene(
     dataset: Dataset, scene: dict, rows: list[dict], out: Path, dem: Path | None, catalogue: Path | None, advance
 ) -> list[Outcome]:
-    where = dataset.root / "dataset.json"
+    where = dataset.store.at("dataset.json")
     recipe = dataset.info.recipes.get(scene["recipe"])
     if recipe is None:
         raise UserError(where, "recipes", f"no {scene['recipe']}", f"the recipe of {scene['scene_id']}")
@@ -121,7 +121,7 @@ def _of_scene(
     seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
     for row in rows:
         if row["trajectory_id"] not in seed_of:
-            raise UserError(dataset.root, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
+            raise UserError(dataset.store, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
     config = config_of(recipe, where, dem, catalogue)
     ground_config = _ground_config(recipe, config, where)
     camera, exr_camera = camera_of(config.camera), camera_of(ground_config.camera).covering_pinhole()
@@ -133,7 +133,7 @@ def _of_scene(
     if not same_source(ground.dem_source, scene["dem_source"]):
         raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
     poses = (np.array([row[name] for row in rows]) for name in ("position_m", "rotation_wxyz"))
-    check_poses(Poses([row["frame_id"] for row in rows], *poses), exr_camera, ground, dataset.root)
+    check_poses(Poses([row["frame_id"] for row in rows], *poses), exr_camera, ground, dataset.store)
     tables = ground_tables(scene["scene_id"], ground)
     same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
     outcomes, dark = [], []
@@ -154,7 +154,7 @@ def _of_scene(
     return outcomes
 
 
-def _ground_config(recipe: Recipe, config: DatasetConfig, where: Path) -> DatasetConfig:
+def _ground_config(recipe: Recipe, config: DatasetConfig, where: object) -> DatasetConfig:
     """The settings of ground and EXRs; for a developed dataset, its settings with the camera of its source."""
     origin = recipe.developed_from
     if origin is None:

@@ -16,7 +16,10 @@ from perilune_shared.terminal import progress_bar
 EXIT_DIFFERENT = 1
 
 
-DatasetArgument = Annotated[Path, typer.Argument(help="Folder of a dataset (contains dataset.json).")]
+DatasetArgument = Annotated[
+    str,
+    typer.Argument(help="Folder of a dataset (contains dataset.json), or its address: s3://bucket/prefix, gs://..."),
+]
 OutOption = Annotated[Path, typer.Option(help="New folder for the result.")]
 ImagesOption = Annotated[
     ImageChoice,
@@ -52,7 +55,7 @@ def _print_counts(out: Path) -> None:
 
 def merge(
     datasets: Annotated[
-        list[Path], typer.Argument(help="Folders of two or more datasets of the same kind and camera.")
+        list[str], typer.Argument(help="Folders or addresses of two or more datasets of the same kind and camera.")
     ],
     out: OutOption,
     name: Annotated[str, typer.Option(help="Name of the result.")] = "merged",
@@ -156,7 +159,7 @@ def unpack(dataset: DatasetArgument, out: OutOption, link: LinkOption = False) -
 
 def attach(
     manifest: DatasetArgument,
-    frames: Annotated[Path, typer.Option(help="Folder written by `perilune-render regenerate --out`.")],
+    frames: Annotated[str, typer.Option(help="Folder written by `perilune-render regenerate --out`.")],
     out: OutOption,
     rehash: Annotated[
         bool, typer.Option("--rehash", help="Accept frames with other hashes and record their hashes.")

@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
@@ -11,27 +10,31 @@ from perilune_shared.config_errors import expected_of, formatted
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.errors import UserError, shortened
-from perilune_shared.storage import files
+from perilune_shared.storage.store import Address, open_store
 
 INFO_NAME = "dataset.json"
 _LARGEST_INFO_BYTES = 10_000_000
+_EXPECTED = "the folder or address of a dataset (see `make dataset`)"
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """Read the JSON object in a file. Raises UserError if the file is missing, too large or not a JSON object."""
-    if not path.exists() and not path.is_symlink():
-        raise UserError(path.parent, path.name, "no such file", "the folder of a dataset (see `make dataset`)")
-    n_bytes = files.check_plain_file(path)
-    if n_bytes > _LARGEST_INFO_BYTES:
-        raise UserError(path, "size", f"{n_bytes} bytes", f"at most {_LARGEST_INFO_BYTES}")
+def read_object(address: Address) -> dict[str, Any]:
+    """Read the JSON object in dataset.json. Raises UserError if it is missing, too large or not a JSON object."""
+    store = open_store(address)
+    where = store.at(INFO_NAME)
+    if store.folder is not None:
+        path = store.folder / INFO_NAME
+        if not path.exists() and not path.is_symlink():
+            raise UserError(store, INFO_NAME, "no such file", _EXPECTED)
+        store.plain_size(INFO_NAME)
+    elif not store.exists(INFO_NAME):
+        raise UserError(store, INFO_NAME, "no such file", _EXPECTED)
+    text = store.read(INFO_NAME, most_bytes=_LARGEST_INFO_BYTES)
     try:
-        content = json.loads(
-            path.read_bytes(), object_pairs_hook=_with_unique_names, parse_constant=_finite, parse_float=_finite
-        )
+        content = json.loads(text, object_pairs_hook=_with_unique_names, parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
-        raise UserError(path, "content", error, "JSON") from None
+        raise UserError(where, "content", error, "JSON") from None
     if not isinstance(content, dict):
-        raise UserError(path, "content", type(content).__name__, "a JSON object")
+        raise UserError(where, "content", type(content).__name__, "a JSON object")
     return content
 
 
@@ -51,24 +54,25 @@ def _finite(number: str) -> float:
     return float(number)
 
 
-def read_info(root: Path) -> DatasetInfo:
-    """Read a folder's dataset.json. Raises UserError if it is missing, damaged or of another schema version."""
-    path = root / INFO_NAME
-    content = read_object(path)
-    for folder in (root / "manifest", root / "shards", *(root / "manifest" / table for table in TABLES)):
-        if folder.is_symlink():
-            raise UserError(folder, "folder", "a link", "a folder")
-    if content.get("images") == "packed" and (root / "images").exists():
+def read_info(address: Address) -> DatasetInfo:
+    """Read a dataset's dataset.json. Raises UserError if it is missing, damaged or of another schema version."""
+    store = open_store(address)
+    content = read_object(store)
+    for name in ("manifest", "shards", *(f"manifest/{table}" for table in TABLES)):
+        if store.folder is not None and (store.folder / name).is_symlink():
+            raise UserError(store.at(name), "folder", "a link", "a folder")
+    if content.get("images") == "packed" and store.folder is not None and (store.folder / "images").exists():
         expected = "frames in shards/; unpack the dataset with the version of perilune that packed it"
-        raise UserError(path, "images", "frames in images/*.parquet", expected)
+        raise UserError(store.at(INFO_NAME), "images", "frames in images/*.parquet", expected)
     version = content.get("schema_version")
     if version != SCHEMA_VERSION:
-        raise UserError(path, "schema_version", version, f"{SCHEMA_VERSION}; see `perilune-manifest migrate`")
-    return checked_info(content, path)
+        expected = f"{SCHEMA_VERSION}; see `perilune-manifest migrate`"
+        raise UserError(store.at(INFO_NAME), "schema_version", version, expected)
+    return checked_info(content, store.at(INFO_NAME))
 
 
-def checked_info(content: dict[str, Any], path: Path) -> DatasetInfo:
-    """Validate plain data as a DatasetInfo. Raises UserError about the first wrong field."""
+def checked_info(content: dict[str, Any], path: object) -> DatasetInfo:
+    """Validate plain data as a DatasetInfo. Raises UserError about the first wrong field of `path`."""
     try:
         info = DatasetInfo.model_validate_json(json.dumps(content))
     except ValidationError as error:
@@ -84,7 +88,7 @@ def checked_info(content: dict[str, Any], path: Path) -> DatasetInfo:
     return info
 
 
-def _check_texts(info: DatasetInfo, path: Path) -> None:
+def _check_texts(info: DatasetInfo, path: object) -> None:
     """Check the texts of recipes, since settings are untrusted and are shown on pages and terminals."""
     for recipe in info.recipes.values():
         unsafe = _unsafe_text([recipe.config, recipe.developed_from.camera_config if recipe.developed_from else None])
@@ -103,7 +107,8 @@ def _unsafe_text(tree: object) -> str | None:
     return None
 
 
-def write_info(root: Path, info: DatasetInfo) -> None:
+def write_info(address: Address, info: DatasetInfo) -> None:
     """Write dataset.json atomically. Raises UserError if texts of its recipes contain unsafe characters."""
-    _check_texts(info, root / INFO_NAME)
-    files.write_text(root / INFO_NAME, info.model_dump_json(indent=2) + "\n")
+    store = open_store(address)
+    _check_texts(info, store.at(INFO_NAME))
+    store.replace(INFO_NAME, (info.model_dump_json(indent=2) + "\n").encode())

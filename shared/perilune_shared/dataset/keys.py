@@ -28,7 +28,7 @@ def check_keys(dataset: Dataset) -> None:
     check = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
     _checked_ids_and_keys(dataset, "boulders", check.scene_of)
     for part in dataset.parts("labels"):
-        opened = Part(part, "labels")
+        opened = Part(dataset.store, part, "labels")
         for group in range(opened.n_groups):
             check.add_labels(opened.read(KEYS["labels"], [group]))
     check.finish()
@@ -55,7 +55,7 @@ class KeyCheck:
         missing = set(zip(*(frames[name].to_pylist() for name in KEYS["trajectories"]), strict=True)) - known
         if missing:
             raise UserError(
-                dataset.root, "frames: trajectory_id", f"no {'/'.join(min(missing))}", f"trajectories; {_HINT}"
+                dataset.store, "frames: trajectory_id", f"no {'/'.join(min(missing))}", f"trajectories; {_HINT}"
             )
         self._frame_of = {name: place for place, name in enumerate(frames["frame_id"].to_pylist())}
         if len(self._frame_of) != len(frames):
@@ -79,7 +79,7 @@ class KeyCheck:
         if not known.all():
             row = rows.slice(int(np.argmin(known)), 1).to_pylist()[0]
             found = f"no crater {row['crater_id']} of a label of {row['frame_id']} names"
-            raise UserError(self._dataset.root, "labels: crater_id", found, f"a crater of the frame's scene; {_HINT}")
+            raise UserError(self._dataset.store, "labels: crater_id", found, f"a crater of the frame's scene; {_HINT}")
         self._seen.append(frame * len(self._numbers) + number)
         return frame
 
@@ -93,7 +93,7 @@ class KeyCheck:
             frame_place, number_place = divmod(int(keys[repeated[0]]), len(self._numbers))
             frame_id = next(name for name, place in self._frame_of.items() if place == frame_place)
             found = f"crater {self._numbers[number_place]} of {frame_id} twice"
-            raise UserError(self._dataset.root, "labels: frame_id+crater_id", found, f"unique keys; {_HINT}")
+            raise UserError(self._dataset.store, "labels: frame_id+crater_id", found, f"unique keys; {_HINT}")
 
 
 def _looked_up(column: pa.ChunkedArray, place_of: Mapping[str, int]) -> NDArray[np.int64]:
@@ -125,7 +125,7 @@ def _check_known(
     found = _looked_up(column, place_of)
     if (found < 0).any():
         missing = column[int(np.argmin(found))].as_py()
-        raise UserError(dataset.root, f"{table}: {name}", f"no {missing}", f"{name.removesuffix('_id')}s; {_HINT}")
+        raise UserError(dataset.store, f"{table}: {name}", f"no {missing}", f"{name.removesuffix('_id')}s; {_HINT}")
     return found
 
 
@@ -133,4 +133,4 @@ def _check_unique(dataset: Dataset, table: str, rows: pd.DataFrame) -> None:
     repeated = rows.duplicated(KEYS[table])
     if repeated.any():
         found = " ".join(map(str, rows[KEYS[table]].iloc[int(np.argmax(repeated))])) + " twice"
-        raise UserError(dataset.root, f"{table}: {'+'.join(KEYS[table])}", found, f"unique keys; {_HINT}")
+        raise UserError(dataset.store, f"{table}: {'+'.join(KEYS[table])}", found, f"unique keys; {_HINT}")

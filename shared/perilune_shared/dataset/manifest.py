@@ -10,7 +10,7 @@ Parts are written atomically and never rewritten. Use:
 import contextlib
 import functools
 from collections.abc import Iterator, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pandas as pd
 import pyarrow as pa
@@ -23,11 +23,12 @@ from perilune_shared.dataset.metadata import Counts, DatasetInfo
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.packed import read_packed, shards_of
 from perilune_shared.dataset.part_rows import may_contain, rows_of_part
-from perilune_shared.dataset.parts import Part
+from perilune_shared.dataset.parts import Part, parquet_files
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.storage import files
+from perilune_shared.storage.store import Address, open_store
 
 LARGEST_FRAME_BYTES = 2**30
 """Maximum size of a PNG or EXR, bytes."""
@@ -37,11 +38,12 @@ _MAX_KEPT_OPEN = 32
 class Dataset:
     """A dataset, open for reading."""
 
-    _opened: dict[Path, Part] | None = None
+    _opened: dict[str, Part] | None = None
 
-    def __init__(self, root: Path, info: DatasetInfo):
-        self.root = root
+    def __init__(self, address: Address, info: DatasetInfo):
+        self.store = open_store(address)
         self.info = info
+        self._listed: dict[str, list[str]] = {}
 
     @contextlib.contextmanager
     def parts_kept_open(self) -> Iterator[None]:
@@ -55,12 +57,12 @@ class Dataset:
         finally:
             self._opened = None
 
-    def open_part(self, path: Path, table: str) -> Part:
+    def open_part(self, path: str, table: str) -> Part:
         """Open a part of a table. Raises UserError as `Part` does."""
         if self._opened is None:
-            return Part(path, table)
+            return Part(self.store, path, table)
         if path not in self._opened:
-            part = Part(path, table)
+            part = Part(self.store, path, table)
             while len(self._opened) >= _MAX_KEPT_OPEN:
                 del self._opened[next(iter(self._opened))]
             self._opened[path] = part
@@ -123,11 +125,14 @@ class Dataset:
         ((_, png),) = self.pngs(pa.table({name: [row[name]] for name in ("frame_id", "png_path")}))
         return Frame(row, labels.to_pandas(), png)
 
-    def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[Path]:
-        """Return a table's part files, sorted by name; with ids, those that may contain matching rows."""
-        files = self.root.joinpath("manifest", table).glob("[A-Za-z0-9]*.parquet")
-        found = sorted(files, key=lambda part: part.stem)
-        return [part for part in found if may_contain(part.stem, scene_id, trajectory_id)]
+    def parts(self, table: str, scene_id: str | None = None, trajectory_id: str | None = None) -> list[str]:
+        """Return the paths of a table's parts, sorted by name; with ids, those that may contain matching rows."""
+        found = self._listed.get(table)
+        if found is None:
+            found = parquet_files(self.store, f"manifest/{table}")
+            if not self.store.is_local:  # listing an object store takes a request
+                self._listed[table] = found
+        return [part for part in found if may_contain(PurePosixPath(part).stem, scene_id, trajectory_id)]
 
     def table(
         self,
@@ -178,8 +183,10 @@ class Dataset:
         return {name: self.table(name, scene_id=scene_id) for name in TABLES}
 
     def file(self, relative: str) -> Path:
-        """Return the path of a frame's file. Raises UserError if it is outside the dataset."""
-        return files.inside(self.root, relative)
+        """Return the local path of a frame's file. Raises UserError if it is outside the dataset or not local."""
+        if self.store.folder is None:
+            raise UserError(self.store, "address", "an object store", "a local folder")
+        return files.inside(self.store.folder, relative)
 
     def pngs(self, frames: pa.Table) -> Iterator[tuple[str, bytes]]:
         """Yield frame_id and PNG bytes of the frames in `frames`, which has frame_id and png_path.
@@ -190,28 +197,27 @@ class Dataset:
         if self.info.images in ("absent", "planned"):
             command = "regenerate" if self.info.images == "absent" else "dataset --manifest"
             expected = f"a dataset with frames; render them with `perilune-render {command}`"
-            raise UserError(self.root, "images", self.info.images, expected)
+            raise UserError(self.store, "images", self.info.images, expected)
         rows = frames.select(["frame_id", "png_path"]).to_pydict()
         paths = dict(zip(rows["frame_id"], rows["png_path"], strict=True))
         if self.info.images == "packed":
-            yield from read_packed(self.root, set(paths))
+            yield from read_packed(self.store, set(paths))
             return
         for frame_id, relative in paths.items():
-            path = self.file(relative)
-            if not path.is_file():
-                raise UserError(path, "frame", "no such file", "the PNG listed in the manifest")
-            if path.stat().st_size > LARGEST_FRAME_BYTES:
-                raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {LARGEST_FRAME_BYTES}")
-            yield frame_id, path.read_bytes()
+            yield frame_id, self.store.read(relative, most_bytes=LARGEST_FRAME_BYTES)
 
-    def shards(self, split: str | None = None) -> list[Path]:
-        """Return the Parquet files that contain packed frames, of all splits or of one, sorted by name."""
-        return shards_of(self.root, split)
+    def shards(self, split: str | None = None) -> list[str]:
+        """Return the paths of the Parquet files that contain packed frames, of all splits or of one, sorted by name."""
+        return shards_of(self.store, split)
 
 
-def open_dataset(root: str | Path) -> Dataset:
-    """Open a dataset. Raises UserError if it is missing, damaged or of another schema version."""
-    return Dataset(Path(root), read_info(Path(root)))
+def open_dataset(address: Address) -> Dataset:
+    """Open a dataset in a local folder or at an address such as s3://bucket/moon.
+
+    Raises UserError if it is missing, damaged or of another schema version.
+    """
+    store = open_store(address)
+    return Dataset(store, read_info(store))
 
 
 def count_rows(dataset: Dataset) -> Counts:

@@ -3,7 +3,6 @@
 import json
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +10,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.names import SPLITS
-from perilune_shared.dataset.parts import Part
+from perilune_shared.dataset.parts import Part, parquet_files
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Store
 
 FOLDER = "shards"
 _NAME = re.compile(rf"({'|'.join(SPLITS)})-([0-9]{{5}})-of-([0-9]{{5}})\.parquet")
@@ -65,32 +65,32 @@ def shard_name(split: str, number: int, count: int) -> str:
     return f"{FOLDER}/{split}-{number:05d}-of-{count:05d}.parquet"
 
 
-def split_of(shard: Path) -> str:
+def split_of(shard: str) -> str:
     """Return the split that the name of a shard states."""
-    return shard.name.partition("-")[0]
+    return shard.rpartition("/")[2].partition("-")[0]
 
 
-def shards_of(root: Path, split: str | None = None) -> list[Path]:
-    """Return the shards of a dataset, or of one split, sorted by name. Other files are not shards."""
-    found = sorted(path for path in root.joinpath(FOLDER).glob("*.parquet") if _NAME.fullmatch(path.name))
+def shards_of(store: Store, split: str | None = None) -> list[str]:
+    """Return the paths of the shards of a dataset, or of one split, sorted by name. Other files are not shards."""
+    found = [path for path in parquet_files(store, FOLDER) if _NAME.fullmatch(path.rpartition("/")[2])]
     return [path for path in found if split in (None, split_of(path))]
 
 
-def open_shard(path: Path) -> Part:
+def open_shard(store: Store, path: str) -> Part:
     """Open a shard and check its footer. Raises UserError as `Part` does."""
-    return Part(path, FOLDER, SHARDS)
+    return Part(store, path, FOLDER, SHARDS)
 
 
-def read_packed(root: Path, frame_ids: set[str]) -> Iterator[tuple[str, bytes]]:
+def read_packed(store: Store, frame_ids: set[str]) -> Iterator[tuple[str, bytes]]:
     """Yield frame_id and PNG bytes of packed frames, in the order in which they are stored.
 
     Raises UserError if a frame is missing.
     """
     missing = set(frame_ids)
-    for path in shards_of(root):
+    for path in shards_of(store):
         if not missing:
             return
-        shard = open_shard(path)
+        shard = open_shard(store, path)
         for group in shard.groups_within("frame_id", min(missing), max(missing) + "\x00"):
             keys = shard.read(["frame_id"], [group])["frame_id"].to_pylist()
             if missing.isdisjoint(keys):
@@ -101,7 +101,7 @@ def read_packed(root: Path, frame_ids: set[str]) -> Iterator[tuple[str, bytes]]:
                     missing.remove(frame_id)
                     yield frame_id, image["bytes"].as_py() or b""
     if missing:
-        raise UserError(root / FOLDER, "frame_id", f"no {min(missing)}", "every frame of the manifest")
+        raise UserError(store.at(FOLDER), "frame_id", f"no {min(missing)}", "every frame of the manifest")
 
 
 def packed_rows(frames: pa.Table, labels: pa.Table, pngs: list[bytes | None]) -> pa.Table:

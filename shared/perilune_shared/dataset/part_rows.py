@@ -33,7 +33,7 @@ def rows_of_part(
     by_frame = scene_id is not None and "scene_id" not in columns
     prefix = f"{scene_id}/{trajectory_id}/" if trajectory_id is not None else f"{scene_id}/"
     groups = None
-    if is_whole(part.path.stem) and scene_id is not None:
+    if is_whole(part.stem) and scene_id is not None:
         # In sorted order the frame ids "S/..." are in ["S/", "S0"), since "0" is the character after "/".
         if "frame_id" in columns:
             groups = part.groups_within("frame_id", prefix, prefix[:-1] + "0")
@@ -51,9 +51,9 @@ def rows_of_part(
         try:
             rows = rows.filter(expression)
         except pa.ArrowException as error:
-            raise UserError(part.path, "condition", error, "numbers within the range of their columns") from None
+            raise UserError(part.address, "condition", error, "numbers within the range of their columns") from None
     for name, value in equal.items():
         rows = rows.filter(pc.equal(rows[name], value))
-    if by_frame and (is_whole(part.path.stem) or part.path.stem == scene_id):
+    if by_frame and (is_whole(part.stem) or part.stem == scene_id):
         rows = rows.filter(pc.starts_with(rows["frame_id"], prefix))
     return rows.select(list(names))

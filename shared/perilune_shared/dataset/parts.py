@@ -6,11 +6,13 @@ the part `all`, whose row groups contain one scene or a few trajectories each. A
 """
 
 import contextlib
+import errno
 import io
+import os
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
-from typing import BinaryIO
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -20,8 +22,8 @@ from pyarrow.fs import LocalFileSystem
 
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.errors import UserError
-from perilune_shared.storage import files
 from perilune_shared.storage.pages import pages_of
+from perilune_shared.storage.store import Address, Store, open_store
 
 WHOLE_TABLE = "all"
 """Name of the part that contains all rows of its table, or the first ones of a table with several parts."""
@@ -38,13 +40,14 @@ _MAX_FOOTER_TEXT_BYTES = 10_000_000
 _SPARE_ROWS, _BYTES_PER_ROW = 10_000, 4
 _SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
-_NESTED_ROWS = "labels."
-"""Start of the columns of a shard that contain rows of another table, any number for each frame."""
 _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
 """Pattern of scene_id and trajectory_id, which become file names."""
 FRAME_ID_PATTERN = f"^{_ID}/{_ID}/[0-9]{{6}}$"
+_NESTED_ROWS = "labels."
+"""Start of the columns of a shard that contain rows of another table, any number for each frame."""
 PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
+_PARQUET_FILE = re.compile(r"[A-Za-z0-9][^/]*\.parquet", re.DOTALL)
 _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
 
 
@@ -53,41 +56,56 @@ def is_whole(stem: str) -> bool:
     return stem.partition(".")[0] == WHOLE_TABLE
 
 
+def parquet_files(store: Store, folder: str) -> list[str]:
+    """Return the paths of the Parquet files directly in a folder of a store, sorted by name; not hidden ones."""
+    if store.folder is not None:
+        place = store.folder / folder
+        names = [path.name for path in place.iterdir()] if place.is_dir() else []
+    else:
+        names = [item.path.removeprefix(f"{folder}/") for item in store.list(folder)]
+    return [f"{folder}/{name}" for name in sorted(names, key=lambda name: name[:-8]) if _PARQUET_FILE.fullmatch(name)]
+
+
 class Part:
     """An open part whose footer has been checked."""
 
-    def __init__(self, path: Path, table: str, schema: pa.Schema | None = None, version: str = SCHEMA_VERSION):
-        """Open a part. Raises UserError if it is no Parquet file, of another table or schema version, or too large.
+    def __init__(
+        self, store: Store, path: str, table: str, schema: pa.Schema | None = None, version: str = SCHEMA_VERSION
+    ):
+        """Open the part at a path of a store.
+
+        Raises UserError if it is no Parquet file, of another table or schema version, or too large.
 
         `schema` replaces the table's schema in TABLES, for older versions and for shards. Unknown columns are ignored.
         Missing columns of `MAY_BE_ABSENT` are read as null.
         """
-        self.path, self.schema = path, schema or TABLES[table]
+        self.store, self.path, self.schema = store, path, schema or TABLES[table]
+        self.address, self.stem = store.at(path), PurePosixPath(path).stem
         self._may_be_absent = MAY_BE_ABSENT.get(table, ()) if version == SCHEMA_VERSION else ()
-        self._n_bytes = files.check_plain_file(path)
+        self._n_bytes = store.plain_size(path)
         self._checked: set[tuple[int, str]] = set()
         try:
             # Read a small file at once; of a large file read only the requested columns.
-            self._content = path.read_bytes() if self._n_bytes <= _SMALL_BYTES else None
+            self._content = store.read(path) if self._n_bytes <= _SMALL_BYTES else None
             texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
             self.file = self._parquet(texts)
             self.found = self.file.metadata.schema.to_arrow_schema()
             self._check_size()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-            raise UserError(path, "content", error, "a complete Parquet file") from None
+            raise UserError(self.address, "content", error, "a complete Parquet file") from None
         metadata = self.found.metadata or {}
         for name, expected in (("schema_version", version), ("table", table)):
             got = metadata.get(f"perilune.{name}".encode(), b"none").decode(errors="replace")
             if got != expected:
                 hint = "; see `perilune-manifest migrate`" if name == "schema_version" else ""
-                raise UserError(path, f"perilune.{name}", got, expected + hint)
+                raise UserError(self.address, f"perilune.{name}", got, expected + hint)
 
     def _parquet(self, texts: Sequence[str]) -> pq.ParquetFile:
         """Open the file; the columns `texts` are read as dictionaries.
 
         Otherwise a short file could decompress to gigabytes of text before the text's length is checked.
         """
-        source = self.path if self._content is None else pa.BufferReader(self._content)
+        source = self._source()
         options = {
             "pre_buffer": False,
             "thrift_string_size_limit": _MAX_FOOTER_TEXT_BYTES,
@@ -98,6 +116,12 @@ class Part:
         with pq.ParquetFile(source, **options) as plain:
             names = plain.metadata.schema.names
         return pq.ParquetFile(source, read_dictionary=[name for name in texts if name in names], **options)
+
+    def _source(self) -> Any:
+        """Return what pyarrow opens: a local path, the bytes of a small file, or a stream of an object."""
+        if self._content is not None:
+            return pa.BufferReader(self._content)
+        return self.store.folder / self.path if self.store.folder is not None else self.store.open(self.path)
 
     @property
     def n_rows(self) -> int:
@@ -119,7 +143,7 @@ class Part:
             n_rows += rows.num_rows
             if not 0 <= rows.num_rows <= min(_MAX_GROUP_ROWS, most_rows):
                 expected = f"at most {min(_MAX_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
-                raise UserError(self.path, "rows", f"{rows.num_rows} in a row group", expected)
+                raise UserError(self.address, "rows", f"{rows.num_rows} in a row group", expected)
             for place in range(rows.num_columns):
                 column = rows.column(place)
                 if column.path_in_schema.split(".")[0] not in self.schema.names:
@@ -130,19 +154,22 @@ class Part:
                     n_nested[column.path_in_schema] = n_nested.get(column.path_in_schema, 0) + column.num_values
                     if column.num_values > _MAX_GROUP_ROWS or n_nested[column.path_in_schema] > most_rows:
                         expected = f"at most {most_rows} for {self._n_bytes} bytes"
-                        raise UserError(self.path, column.path_in_schema, f"{column.num_values} values", expected)
+                        raise UserError(self.address, column.path_in_schema, f"{column.num_values} values", expected)
                 # The longest other list is a quaternion.
                 elif column.num_values > 4 * rows.num_rows:
                     raise UserError(
-                        self.path, column.path_in_schema, f"{column.num_values} values", "at most 4 per row"
+                        self.address, column.path_in_schema, f"{column.num_values} values", "at most 4 per row"
                     )
         if footer.num_rows != n_rows or n_rows > most_rows:
             expected = f"{n_rows}, the sum of the row groups, at most {most_rows} for {self._n_bytes} bytes"
-            raise UserError(self.path, "rows", footer.num_rows, expected)
+            raise UserError(self.address, "rows", footer.num_rows, expected)
         most = min(_MAX_BYTES, _SPARE_BYTES + _MAX_COMPRESSION * self._n_bytes)
         if n_bytes > most:
             raise UserError(
-                self.path, "size", f"{n_bytes} bytes after decompression", f"at most {most} for {self._n_bytes} bytes"
+                self.address,
+                "size",
+                f"{n_bytes} bytes after decompression",
+                f"at most {most} for {self._n_bytes} bytes",
             )
 
     def read(
@@ -161,11 +188,13 @@ class Part:
         for field in map(schema.field, present):
             place = self.found.get_field_index(field.name)
             if place < 0:
-                raise UserError(self.path, "columns", f"no {field.name}", f"every column of version {SCHEMA_VERSION}")
+                raise UserError(
+                    self.address, "columns", f"no {field.name}", f"every column of version {SCHEMA_VERSION}"
+                )
             if self.found.field(place).type != field.type:
-                raise UserError(self.path, field.name, self.found.field(place).type, f"{field.type}")
+                raise UserError(self.address, field.name, self.found.field(place).type, f"{field.type}")
         try:
-            opened: BinaryIO = self.path.open("rb") if self._content is None else io.BytesIO(self._content)
+            opened: BinaryIO = self.store.open(self.path) if self._content is None else io.BytesIO(self._content)
             with opened as stream:
                 for group in chosen:
                     self._check_pages(stream, group, present)
@@ -181,7 +210,7 @@ class Part:
             rows.validate(full=True)
             return rows
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
-            raise UserError(self.path, "content", error, "a complete Parquet file") from None
+            raise UserError(self.address, "content", error, "a complete Parquet file") from None
 
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
         """Check that the pages do not exceed the sizes in the footer, which have been checked."""
@@ -194,10 +223,10 @@ class Part:
             if pages.uncompressed_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
                 found = f"{pages.uncompressed_bytes} bytes after decompression and {pages.n_values} values"
                 expected = f"at most {column.total_uncompressed_size} and {column.num_values}, as in the footer"
-                raise UserError(self.path, name, found, expected)
+                raise UserError(self.address, name, found, expected)
             # With a dictionary, a small file could repeat one image and decompress to any size.
             if name.startswith("image.") and pages.has_dictionary:
-                raise UserError(self.path, name, "a dictionary", "plain bytes for each frame")
+                raise UserError(self.address, name, "a dictionary", "plain bytes for each frame")
             self._checked.add((group, name))
 
     def _check_text(self, name: str, column: pa.ChunkedArray, pattern: str | None) -> None:
@@ -205,10 +234,10 @@ class Part:
             words = chunk.dictionary if pa.types.is_dictionary(chunk.type) else chunk
             longest = pc.max(pc.binary_length(words)).as_py() or 0
             if longest > _MAX_TEXT_BYTES:
-                raise UserError(self.path, name, f"text of {longest} bytes", f"at most {_MAX_TEXT_BYTES}")
+                raise UserError(self.address, name, f"text of {longest} bytes", f"at most {_MAX_TEXT_BYTES}")
             mismatch = _first_mismatch(words, pattern) if pattern is not None else None
             if mismatch is not None:
-                raise UserError(self.path, name, repr(mismatch), f"text like {pattern}")
+                raise UserError(self.address, name, repr(mismatch), f"text like {pattern}")
 
     def groups_within(self, column: str, low: str, high: str) -> list[int]:
         """Return the row groups that may contain texts in [low, high), by their statistics."""
@@ -232,7 +261,10 @@ class Part:
         """Return the row groups that may contain rows that fulfil a condition, by their statistics."""
         try:
             # The footer was checked when the part was opened.
-            whole = ds.ParquetFileFormat().make_fragment(str(self.path.absolute()), LocalFileSystem())
+            source, local = self._source(), None
+            if isinstance(source, Path):
+                source, local = str(source.absolute()), LocalFileSystem()
+            whole = ds.ParquetFileFormat().make_fragment(source, local)
             return [group.id for group in whole.subset(filter=condition, schema=self.schema).row_groups]
         except (pa.ArrowException, ValueError, KeyError):
             return list(range(self.n_groups))
@@ -248,20 +280,21 @@ def _first_mismatch(words: pa.Array, pattern: str) -> str | None:
 
 
 def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read one part. Raises UserError if it cannot be read or is of another table or schema version."""
-    return Part(path, table).read(columns)
+    """Read one local part. Raises UserError if it cannot be read or is of another table or schema version."""
+    return Part(open_store(path.parent), path.name, table).read(columns)
 
 
-def write_part(root: Path, table: str, name: str, rows: pa.Table, rows_per_group: int | None = None) -> Path:
-    """Write the part `manifest/<table>/<name>.parquet`. Raises FileExistsError if it exists.
+def write_part(address: Address, table: str, name: str, rows: pa.Table, rows_per_group: int | None = None) -> None:
+    """Write the part `manifest/<table>/<name>.parquet` of a dataset. Raises FileExistsError if it exists.
 
     Raises UserError if the name, which may come from the rows of an untrusted dataset, is not a valid part name.
     """
+    store = open_store(address)
     if not re.fullmatch(PART_PATTERN, name) or name.endswith("\n"):
-        raise UserError(root, "part", repr(name), f"a name like {PART_PATTERN}")
-    part = root / "manifest" / table / f"{name}.parquet"
-    if part.exists():
-        raise FileExistsError(part)
-    with files.written_aside(part) as aside:
-        pq.write_table(complete(table, rows), aside, compression="zstd", row_group_size=rows_per_group)
-    return part
+        raise UserError(store, "part", repr(name), f"a name like {PART_PATTERN}")
+    path = f"manifest/{table}/{name}.parquet"
+    if store.exists(path):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), store.at(path))
+    sink = pa.BufferOutputStream()
+    pq.write_table(complete(table, rows), sink, compression="zstd", row_group_size=rows_per_group)
+    store.write(path, sink.getvalue().to_pybytes())

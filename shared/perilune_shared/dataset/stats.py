@@ -20,13 +20,13 @@ def summary(dataset: Dataset) -> pd.DataFrame:
     frames = dataset.table("frames", [*FRAME_COLUMNS, "split", "png_bytes", "n_craters_above_max_radius"])
     keys = KeyCheck(dataset, frames)
     if not len(frames):
-        raise UserError(dataset.root, "frames", "none", "a dataset with frames")
+        raise UserError(dataset.store, "frames", "none", "a dataset with frames")
     found = {split: _Gathered() for split in sorted(frames["split"].unique().to_pylist())}
     split_of = frames["split"].combine_chunks().dictionary_encode()
     names = np.array(split_of.dictionary.to_pylist(), object)
     codes = split_of.indices.to_numpy()
     for part in dataset.parts("labels"):
-        opened = Part(part, "labels")
+        opened = Part(dataset.store, part, "labels")
         for group in range(opened.n_groups):
             rows = opened.read(["frame_id", "crater_id", "radius_px", "visible_fraction"], [group])
             code = codes[keys.add_labels(rows)]

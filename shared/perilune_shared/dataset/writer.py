@@ -109,7 +109,10 @@ class DatasetWriter:
             for kind in IMAGE_KINDS:
                 if row.get(f"{kind}_path") is not None:
                     to = files.inside(self.root, frame_path(names[frame_id], kind))
-                    files.copy_or_link(source.file(row[f"{kind}_path"]), to, link=link)
+                    if source.store.is_local:
+                        files.copy_or_link(source.file(row[f"{kind}_path"]), to, link=link)
+                    else:
+                        files.write_bytes(to, source.store.read(row[f"{kind}_path"]), durable=False)
 
     def finish(self, out: Path, progress: Progress = NO_PROGRESS) -> None:
         """Write buffered rows, dataset.json and the checksums. Raises UserError about `out` if there are no frames."""

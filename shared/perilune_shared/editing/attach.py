@@ -10,13 +10,14 @@ from perilune_shared.dataset.writer import new_dataset, with_column
 from perilune_shared.editing.rewrite import check_source
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
-from perilune_shared.storage import files
+from perilune_shared.storage import checksums
 from perilune_shared.storage.png import png_header
+from perilune_shared.storage.store import Address
 
 
 def attach(
     manifest: Dataset,
-    frames_root: Path,
+    frames_root: Address,
     out: Path,
     rehash: bool = False,
     progress: Progress = NO_PROGRESS,
@@ -33,7 +34,7 @@ def attach(
     check_source(manifest, out, progress)
     if manifest.info.images != "absent":
         expected = "absent: a manifest with labels and without frames"
-        raise UserError(manifest.root, "images", manifest.info.images, expected)
+        raise UserError(manifest.store, "images", manifest.info.images, expected)
     source = Dataset(frames_root, manifest.info.model_copy(update={"images": "files"}))
     line = "frames attached" + (", hashed anew" if rehash else "")
     info = manifest.info.changed(line, images="files")
@@ -55,26 +56,25 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
     found: dict[str, list] = {f"{kind}_{name}": [] for kind in IMAGE_KINDS for name in ("sha256", "bytes", "path")}
     for row in rows:
         for kind in IMAGE_KINDS:
-            path = source.file(row[f"{kind}_path"]) if row[f"{kind}_path"] is not None else None
-            there = path is not None and path.is_file()
-            if kind == "png" and not there:
-                raise UserError(source.root, "frame", f"no {row['png_path']}", "every frame of the manifest")
-            sha256 = files.sha256_of(path) if there and path is not None else None
-            if there and not rehash and sha256 != row[f"{kind}_sha256"]:
+            path = row[f"{kind}_path"]
+            size = source.store.size(path) if path is not None else None
+            if kind == "png" and size is None:
+                raise UserError(source.store, "frame", f"no {row['png_path']}", "every frame of the manifest")
+            sha256 = checksums.sha256_of(source.store, path) if size is not None else None
+            if size is not None and not rehash and sha256 != row[f"{kind}_sha256"]:
                 expected = f"the file with SHA-256 {row[f'{kind}_sha256']}, or --rehash"
-                raise UserError(path, f"{kind}_sha256", sha256, expected)
+                raise UserError(source.store.at(path), f"{kind}_sha256", sha256, expected)
             found[f"{kind}_sha256"].append(sha256)
-            found[f"{kind}_bytes"].append(path.stat().st_size if there and path is not None else None)
-            found[f"{kind}_path"].append(row[f"{kind}_path"] if there else None)
-        with source.file(row["png_path"]).open("rb") as stream:
-            head = stream.read(64)
+            found[f"{kind}_bytes"].append(size)
+            found[f"{kind}_path"].append(path if size is not None else None)
+        head = source.store.read(row["png_path"], 0, 64)
         try:
             header = png_header(head)
         except ValueError as error:
-            raise UserError(source.root / row["png_path"], "frame", error, "a grey PNG") from None
+            raise UserError(source.store.at(row["png_path"]), "frame", error, "a grey PNG") from None
         if (header.width_px, header.height_px) != (camera.width_px, camera.height_px):
-            size = f"{header.width_px} x {header.height_px}"
-            raise UserError(row["png_path"], "size", size, f"{camera.width_px} x {camera.height_px} pixels")
+            found_px = f"{header.width_px} x {header.height_px}"
+            raise UserError(row["png_path"], "size", found_px, f"{camera.width_px} x {camera.height_px} pixels")
     if None in found["exr_path"]:
         found |= {name: [None] * len(rows) for name in found if name.startswith("exr")}
     for name, values in found.items():

@@ -38,7 +38,7 @@ def merge(
     """
     if len(sources) < 2:
         raise UserError("merge", "datasets", len(sources), "at least two")
-    for source in {source.root.resolve(): source for source in sources}.values():
+    for source in {_place(source): source for source in sources}.values():
         check_source(source, out, progress)
     info = _joined_info(sources, name, state_of(list(sources), images))
     groups = _same_scenes(sources, planned=info.images == "planned")
@@ -58,18 +58,22 @@ def _joined_info(sources: Sequence[Dataset], name: str, images: str) -> DatasetI
     for source in sources:
         for field in ("kind", "camera"):
             if getattr(source.info, field) != getattr(first, field):
-                raise UserError(source.root, field, f"a different {field}", f"the {field} of {sources[0].root}")
+                raise UserError(source.store, field, f"a different {field}", f"the {field} of {sources[0].store}")
     info = first.model_copy(
         update={
             "name": name,
             "images": images,
             "exr_camera": _exr_camera(sources),
             "recipes": {key: recipe for source in sources for key, recipe in source.info.recipes.items()},
-            "licence": joined_licence((source.root, source.info.licence) for source in sources),
+            "licence": joined_licence((source.store, source.info.licence) for source in sources),
             "history": tuple(dict.fromkeys(line for source in sources for line in source.info.history)),
         }
     )
     return info.changed("merge of " + ", ".join(source.info.name for source in sources))
+
+
+def _place(source: Dataset) -> object:
+    return source.store.folder.resolve() if source.store.folder is not None else source.store
 
 
 def _exr_camera(sources: Sequence[Dataset]) -> CameraRecord | None:
@@ -77,8 +81,8 @@ def _exr_camera(sources: Sequence[Dataset]) -> CameraRecord | None:
     with_exrs = [source for source in sources if _has_exrs(source)]
     for source in with_exrs:
         if source.info.exr_camera != with_exrs[0].info.exr_camera:
-            expected = f"the exr_camera of {with_exrs[0].root}; `perilune-manifest pack` leaves EXRs out"
-            raise UserError(source.root, "exr_camera", "a different camera", expected)
+            expected = f"the exr_camera of {with_exrs[0].store}; `perilune-manifest pack` leaves EXRs out"
+            raise UserError(source.store, "exr_camera", "a different camera", expected)
     return with_exrs[0].info.exr_camera if with_exrs else None
 
 
@@ -127,7 +131,7 @@ def _join(
     first: SceneTables = {}
     for source, own in members:
         tables = source.scene(own)
-        check_scene(source.root, tables)
+        check_scene(source.store, tables)
         if not first:
             first = {
                 name: with_column(tables[name], "scene_id", [scene_id] * len(tables[name])) for name in _TERRAIN_TABLES
@@ -182,7 +186,7 @@ def _check_same(source: Dataset, row: dict, earlier: dict) -> None:
     for name in _FIXED_IN_FRAMES:
         if None not in (row[name], earlier[name]) and row[name] != earlier[name]:
             raise UserError(
-                source.root, row["frame_id"], f"a different {name}", "the same value as in the other dataset"
+                source.store, row["frame_id"], f"a different {name}", "the same value as in the other dataset"
             )
 
 

@@ -19,6 +19,7 @@ from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES
 from perilune_shared.dataset.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
+from perilune_shared.storage.store import Address, Store, open_store
 
 _ADDED_IN_3 = {"scenes": ("recipe", "content_sha256"), "labels": ("contrast",)}
 _ADDED_IN_2 = {"craters": ("origin",)}
@@ -36,14 +37,14 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
 """Schemas of the tables in older versions."""
 
 
-def migrate(root: Path, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
+def migrate(address: Address, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Convert a dataset of schema version 1 or 2 to the current version; frames are copied, or hard-linked with `link`.
 
     Older versions did not record the contrast of labels; it becomes null. Raises UserError if the dataset already has
     the current version, is damaged or is not complete.
     """
-    path = root / INFO_NAME
-    content = read_object(path)
+    store = open_store(address)
+    content, path = read_object(store), store.at(INFO_NAME)
     version = content.get("schema_version")
     if version == SCHEMA_VERSION:
         raise UserError(path, "schema_version", version, "an older version: this is the current one")
@@ -52,7 +53,7 @@ def migrate(root: Path, out: Path, progress: Progress = NO_PROGRESS, *, link: bo
     if content.get("complete") is not True:
         raise UserError(path, "complete", content.get("complete"), "a finished dataset")
     info = _info(content, path)
-    source = _OldDataset(root, info, version)
+    source = _OldDataset(store, info, version)
     scene_ids = sorted(source.rows("scenes")["scene_id"].to_pylist())
     task = progress.add_task("migrating", total=len(scene_ids), unit="scenes")
     with new_dataset(out, info, progress=progress) as writer:
@@ -64,7 +65,7 @@ def migrate(root: Path, out: Path, progress: Progress = NO_PROGRESS, *, link: bo
             progress.advance(task)
 
 
-def _info(content: dict[str, Any], path: Path) -> DatasetInfo:
+def _info(content: dict[str, Any], path: str) -> DatasetInfo:
     """Convert dataset.json of version 1 or 2, in which settings, seed and versions were not grouped in recipes."""
     version = content["schema_version"]
     missing = [name for name in ("preset", "kind", "seed", "config", "versions") if name not in content]
@@ -93,14 +94,14 @@ def _info(content: dict[str, Any], path: Path) -> DatasetInfo:
 class _OldDataset(Dataset):
     """A dataset of an older schema version; its rows are converted to the current version on reading."""
 
-    def __init__(self, root: Path, info: DatasetInfo, version: str):
-        super().__init__(root, info)
+    def __init__(self, store: Store, info: DatasetInfo, version: str):
+        super().__init__(store, info)
         self.version = version
 
     def rows(self, table: str, scene_id: str | None = None) -> pa.Table:
         """Read a table, of one scene or all, with the columns of the current version."""
         schema = OLD_TABLES[self.version][table]
-        pieces = [Part(part, table, schema, self.version).read() for part in self.parts(table, scene_id)]
+        pieces = [Part(self.store, part, table, schema, self.version).read() for part in self.parts(table, scene_id)]
         rows = pa.concat_tables(pieces) if pieces else schema.empty_table()
         if scene_id is None:
             return rows

@@ -54,11 +54,12 @@ def check_source(source: Dataset, out: Path, progress: Progress = NO_PROGRESS) -
     if its keys are broken, or if `out` is inside its folder.
     """
     if not source.info.complete:
-        raise UserError(source.root / "dataset.json", "complete", "false", "a finished dataset")
-    if out.resolve().is_relative_to(source.root.resolve()):
-        raise UserError(out, "--out", f"a folder in {source.root}", "one outside the dataset")
-    for name, found, expected in checksums.faults_of(source.root, progress):
-        raise UserError(source.root / name, "SHA-256", found, f"{expected}; see `perilune-manifest validate`")
+        raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
+    folder = source.store.folder
+    if folder is not None and out.resolve().is_relative_to(folder.resolve()):
+        raise UserError(out, "--out", f"a folder in {source.store}", "one outside the dataset")
+    for name, found, expected in checksums.faults_of(source.store, progress):
+        raise UserError(source.store.at(name), "SHA-256", found, f"{expected}; see `perilune-manifest validate`")
     check_keys(source)
 
 
@@ -68,12 +69,14 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
     if states == {"planned"} or images == "plan":
         return "planned"
     if "planned" in states:
-        raise UserError(sources[0].root, "images", ", ".join(sorted(states)), "all datasets planned, or none of them")
+        raise UserError(sources[0].store, "images", ", ".join(sorted(states)), "all datasets planned, or none of them")
     if images == "none" or states == {"absent"}:
         return "absent"
     if "absent" in states:
         missing = next(source for source in sources if source.info.images == "absent")
-        raise UserError(missing.root, "images", "absent", "its frames (`perilune-render regenerate`), or --images none")
+        raise UserError(
+            missing.store, "images", "absent", "its frames (`perilune-render regenerate`), or --images none"
+        )
     return "files"
 
 

@@ -42,7 +42,7 @@ def split_dataset(
     n_val, n_test = (int(np.ceil(share * len(units))) for share in (val_share, test_share))
     if n_val + n_test >= len(units):
         expected = f"more than {n_val + n_test}, for train, val and test"
-        raise UserError(source.root, "--by", f"{len(units)} {key}{'s' if len(units) > 1 else ''}", expected)
+        raise UserError(source.store, "--by", f"{len(units)} {key}{'s' if len(units) > 1 else ''}", expected)
     names = np.array(["train"] * (len(units) - n_val - n_test) + ["val"] * n_val + ["test"] * n_test)
     assigned = dict(zip(units, np.random.default_rng(seed).permutation(names), strict=True))
     split_of = dict(zip(frames["frame_id"], frames[key].map(assigned), strict=True))

@@ -82,10 +82,10 @@ def _first_frames(
         frames = tables["frames"].filter(pa.array(_all_hold(on_frames, tables, tables["frames"])))
         pieces.append(frames.select(["frame_id", "scene_id", "trajectory_id", "frame_index", "png_bytes"]).to_pandas())
     if not pieces:
-        raise UserError(source.root, "scenes", "none", "a dataset with frames")
+        raise UserError(source.store, "scenes", "none", "a dataset with frames")
     table = pd.concat(pieces, ignore_index=True)
     if megabytes is not None and table["png_bytes"].isna().any():
-        raise UserError(source.root, "png_bytes", "null", "--frames instead: unrendered frames have no size")
+        raise UserError(source.store, "png_bytes", "null", "--frames instead: unrendered frames have no size")
     table["turn"] = table.groupby("scene_id")["trajectory_id"].transform(lambda ids: pd.factorize(ids, sort=True)[0])
     table = table.sort_values(["turn", "scene_id", "frame_index"], ignore_index=True)
     if n_frames is not None:

@@ -19,7 +19,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo, Recipe
 from perilune_shared.dataset.stats import summary
 from perilune_shared.errors import UserError, one_line, shortened
-from perilune_shared.export.added_files import add_files, check_sums
+from perilune_shared.export.added_files import add_files, check_sums, default_path
 from perilune_shared.export.card_head import head_of, table_configs
 from perilune_shared.export.card_pictures import TITLES, Gathered, draw, gather
 from perilune_shared.export.croissant import citation_of
@@ -46,7 +46,7 @@ def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[
     `out` is by default README.md in the dataset. Raises UserError if a file that is not a card would be overwritten,
     the dataset has no frames or its checksums are wrong.
     """
-    out = out or dataset.root / CARD_NAME
+    out = out or default_path(dataset, CARD_NAME)
     if out.suffix != ".md":
         raise UserError(out, "--out", out.name, "a name that ends in .md")
     picture = out.with_name(_PICTURE_NAME) if out.name == CARD_NAME else out.with_suffix(".png")

@@ -54,7 +54,7 @@ def table_configs(dataset: Dataset) -> list[dict[str, Any]]:
     names = ["frames", *(name for name in TABLES if name != "frames")]
     configs = [_config(name, {"mixed": f"manifest/{name}/*.parquet"}) for name in names if counts[name]]
     if dataset.info.images == "packed":
-        splits = [split for split in SPLITS if shards_of(dataset.root, split)]
+        splits = [split for split in SPLITS if shards_of(dataset.store, split)]
         configs.insert(0, _config("packed", {split: f"{FOLDER}/{split}-*.parquet" for split in splits}))
     return [{**configs[0], "default": True}, *configs[1:]] if configs else []
 

@@ -60,7 +60,7 @@ def gather(dataset: Dataset, progress: Progress) -> Gathered:
     """Collect the data in one pass over the scenes. Raises UserError if there are no frames."""
     ids = dataset.scene_ids()
     if not ids:
-        raise UserError(dataset.root, "scenes", "none", "a dataset with frames")
+        raise UserError(dataset.store, "scenes", "none", "a dataset with frames")
     task = progress.add_task("reading", total=len(ids), unit="scenes")
     collected: dict[str, dict[str, list[np.ndarray]]] = {}
     samples: list[tuple[dict, pd.DataFrame]] = []

@@ -38,7 +38,7 @@ def export_coco(
     not empty, the dataset is a plan, a png_path is outside the dataset or the split has no frames.
     """
     if dataset.info.images == "planned":
-        raise UserError(dataset.root, "images", "planned", "a rendered dataset: a plan has no labels")
+        raise UserError(dataset.store, "images", "planned", "a rendered dataset: a plan has no labels")
     task = progress.add_task("coco", total=len(dataset.scene_ids()), unit="scenes")
     opened: dict[str, _SplitFile] = {}
     with files.new_folder(out) as folder:

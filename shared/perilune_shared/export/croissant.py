@@ -21,9 +21,9 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import KEYS, MAY_BE_ABSENT, TABLES
 from perilune_shared.errors import UserError
-from perilune_shared.export.added_files import add_files, check_sums
+from perilune_shared.export.added_files import add_files, check_sums, default_path
 from perilune_shared.progress import NO_PROGRESS, Progress
-from perilune_shared.storage import files
+from perilune_shared.storage import checksums
 
 CROISSANT_NAME = "croissant.json"
 # mlcroissant does not support the registered media type, application/vnd.apache.parquet.
@@ -79,18 +79,18 @@ def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progre
 
     Raises UserError if `out` is elsewhere, the dataset is not complete or its checksums are wrong.
     """
-    out = out or dataset.root / CROISSANT_NAME
-    if out.resolve().parent != dataset.root.resolve() or out.suffix != ".json":
+    out = out or default_path(dataset, CROISSANT_NAME)
+    if out.resolve().parent != default_path(dataset, CROISSANT_NAME).resolve().parent or out.suffix != ".json":
         raise UserError(
             out,
             "--out",
             "a file in another folder or of another type",
-            f"a .json file in {dataset.root}, since its paths are relative",
+            f"a .json file in {dataset.store}, since its paths are relative",
         )
     if out.name == INFO_NAME:
         raise UserError(out, "--out", INFO_NAME, "another name")
     if not dataset.info.complete:
-        raise UserError(dataset.root, "complete", "false", "a finished dataset")
+        raise UserError(dataset.store, "complete", "false", "a finished dataset")
     known = check_sums(dataset, [out], progress)
     text = json.dumps(metadata_of(dataset, known or {}), indent=1, allow_nan=False) + "\n"
     add_files(dataset, {out: text.encode()}, known)
@@ -112,7 +112,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
             "description": "metadata of the dataset: camera, splits, recipes, edits since rendering",
             "contentUrl": INFO_NAME,
             "encodingFormat": "application/json",
-            "sha256": files.sha256_of(dataset.root / INFO_NAME),
+            "sha256": checksums.sha256_of(dataset.store, INFO_NAME),
         }
     ]
     record_sets = []
@@ -123,7 +123,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
             name
             for name in MAY_BE_ABSENT.get(table, ())
             for part in dataset.parts(table)
-            if name not in Part(part, table).found.names
+            if name not in Part(dataset.store, part, table).found.names
         }
         record_sets.append(
             {
@@ -155,7 +155,7 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
 
 def citation_of(dataset: Dataset) -> str:
     """Return a BibTeX entry that identifies this dataset by a hash."""
-    sha256 = files.sha256_of(dataset.root / INFO_NAME)
+    sha256 = checksums.sha256_of(dataset.store, INFO_NAME)
     key = "".join(c if c.isascii() and c.isalnum() else "-" for c in dataset.info.name).strip("-")
     note = f"Rendered images of lunar landing trajectories. SHA-256 of {INFO_NAME}: {sha256}"
     return f"@misc{{{key}, title = {{{dataset.info.name}}}, howpublished = {{perilune dataset}}, note = {{{note}}}}}"
@@ -179,13 +179,13 @@ def _distribution(dataset: Dataset, table: str, known: Mapping[str, str]) -> dic
     parts = dataset.parts(table)
     common = {"name": f"{table}-parquet", "encodingFormat": _PARQUET}
     if len(parts) == 1:
-        url = parts[0].relative_to(dataset.root).as_posix()
+        url = parts[0]
         return {
             "@type": "cr:FileObject",
             "@id": f"{table}-parquet",
             **common,
             "contentUrl": url,
-            "sha256": known.get(url) or files.sha256_of(parts[0]),
+            "sha256": known.get(url) or checksums.sha256_of(dataset.store, url),
         }
     return {
         "@type": "cr:FileSet",

@@ -66,7 +66,7 @@ def scenes_of(
         unknown = sorted(set(frames["split"]) - set(SPLITS))
         if unknown:
             # Split names become file names, and datasets are untrusted.
-            raise UserError(dataset.root, "split", unknown[0], "one of " + ", ".join(SPLITS))
+            raise UserError(dataset.store, "split", unknown[0], "one of " + ", ".join(SPLITS))
         frames["image_id"] = np.arange(len(frames)) + n_frames + 1
         n_frames += len(frames)
         rows = dataset.table("labels", scene_id=scene_id) if with_labels else TABLES["labels"].empty_table()
@@ -83,7 +83,7 @@ def scenes_of(
             yield SceneRows(scene_id, frames, labels)
     if not n_yielded:
         raise UserError(
-            dataset.root, "frames", "none" if split is None else f"none of split {split}", "at least one frame"
+            dataset.store, "frames", "none" if split is None else f"none of split {split}", "at least one frame"
         )
 
 

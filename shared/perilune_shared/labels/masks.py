@@ -70,7 +70,7 @@ def frame_masks(
     frames = dataset.table("frames", columns, scene_id, trajectory_id).to_pandas()
     frame = frames[frames["frame_id"] == frame_id]
     if len(frame) != 1:
-        raise UserError(dataset.root, "frame_id", frame_id, "a frame of the dataset")
+        raise UserError(dataset.store, "frame_id", frame_id, "a frame of the dataset")
     pose = frame.iloc[0]
     if crater_ids is None:
         labels = dataset.table("labels", ["frame_id", "crater_id"], scene_id, trajectory_id).to_pandas()
@@ -78,7 +78,7 @@ def frame_masks(
     craters = dataset.table("craters", _CRATER, scene_id=pose["scene_id"]).to_pandas().set_index("crater_id")
     unknown = [crater for crater in crater_ids if crater not in craters.index]
     if unknown:
-        raise UserError(dataset.root, "crater_id", unknown[0], f"a crater of {pose['scene_id']}")
+        raise UserError(dataset.store, "crater_id", unknown[0], f"a crater of {pose['scene_id']}")
     rows = craters.loc[list(crater_ids)]
     camera, exr_camera = dataset.camera, dataset.exr_camera
     if depth_m is not None:

@@ -53,6 +53,9 @@ class Store(abc.ABC):
         """Return the address of one file, for messages."""
         return f"{self.address}/{path}"
 
+    def __str__(self) -> str:
+        return self.address
+
     def __repr__(self) -> str:
         return f"open_store({self.address!r})"
 
@@ -86,8 +89,8 @@ class Store(abc.ABC):
         """Return the size of a file, bytes; None if it is missing. Raises UserError if it is no file of the store."""
 
     @abc.abstractmethod
-    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes:
-        """Return the bytes [start, end) of a file. Raises UserError if it is missing."""
+    def read(self, path: str, start: int = 0, end: int | None = None, *, most_bytes: int | None = None) -> bytes:
+        """Return the bytes [start, end) of a file. Raises UserError if it is missing, or larger than `most_bytes`."""
 
     @abc.abstractmethod
     def open(self, path: str) -> BinaryIO:
@@ -107,6 +110,10 @@ class Store(abc.ABC):
     @abc.abstractmethod
     def delete(self, path: str) -> None:
         """Delete a file if it exists."""
+
+
+Address = str | os.PathLike[str] | Store
+"""A local path, the address of a prefix of an object store, or an open store."""
 
 
 class LocalStore(Store):
@@ -142,15 +149,24 @@ class LocalStore(Store):
         files.inside(self.folder, path)
         return size
 
-    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes:
-        with self.open(path) as stream:
+    def read(self, path: str, start: int = 0, end: int | None = None, *, most_bytes: int | None = None) -> bytes:
+        size = self._plain_or_linked(path)
+        if most_bytes is not None and size > most_bytes:
+            raise _too_large(self, path, size, most_bytes)
+        with (self.folder / path).open("rb") as stream:
             stream.seek(start)
-            return stream.read() if end is None else stream.read(max(end - start, 0))
+            return stream.read() if end is None else stream.read(max(min(end, size) - start, 0))
 
     def open(self, path: str) -> BinaryIO:
-        if self.size(path) is None:
-            raise _missing(self, path)
+        self._plain_or_linked(path)
         return (self.folder / path).open("rb")
+
+    def _plain_or_linked(self, path: str) -> int:
+        """Return the size of a file, bytes; it may be a link within the folder. Raises UserError if it is missing."""
+        size = self.size(path)
+        if size is None:
+            raise _missing(self, path)
+        return size
 
     def write(self, path: str, content: bytes, *, durable: bool = True) -> None:
         target = files.inside(self.folder, path)
@@ -219,14 +235,19 @@ class ObjectStore(Store):
                 return None
         return int(found["size"]) if found["type"] == "file" else None
 
-    def read(self, path: str, start: int = 0, end: int | None = None) -> bytes:
+    def read(self, path: str, start: int = 0, end: int | None = None, *, most_bytes: int | None = None) -> bytes:
         if end is not None and end <= start:
             return b""
+        if most_bytes is not None:
+            end = min(most_bytes + 1, most_bytes + 1 if end is None else end)
         with store_faults(self.at(path)):
             try:
-                return cast(bytes, self._system.cat_file(self._key(path), start=start or None, end=end))
+                content = cast(bytes, self._system.cat_file(self._key(path), start=start or None, end=end))
             except FileNotFoundError:
                 raise _missing(self, path) from None
+        if most_bytes is not None and start + len(content) > most_bytes:
+            raise _too_large(self, path, start + len(content), most_bytes)
+        return content
 
     def open(self, path: str) -> BinaryIO:
         with store_faults(self.at(path)):
@@ -259,11 +280,13 @@ class ObjectStore(Store):
                 return
 
 
-def open_store(address: str | os.PathLike[str]) -> Store:
+def open_store(address: Address) -> Store:
     """Open the store at a path, s3://bucket/prefix, gs://bucket/prefix or memory://name; nothing is read or written.
 
-    Raises UserError if the address is of another kind, or the library for it is not installed.
+    A store is returned as it is. Raises UserError if the address is of another kind, or its library is not installed.
     """
+    if isinstance(address, Store):
+        return address
     text = os.fspath(address)
     kind, found, prefix = text.partition("://")
     if not found or kind == "file":
@@ -287,6 +310,10 @@ def _entries(folder: Path, prefix: str) -> Iterator[Item]:
             yield from _entries(Path(entry.path), f"{prefix}{entry.name}/")
         else:
             yield Item(prefix + entry.name, entry.stat(follow_symlinks=False).st_size)
+
+
+def _too_large(store: Store, path: str, size: int, most_bytes: int) -> UserError:
+    return UserError(store.at(path), "size", f"{size} bytes", f"at most {most_bytes}")
 
 
 def _missing(store: Store, path: str) -> UserError:

@@ -4,9 +4,8 @@ Other tools may read files that this package ignores: any file below manifest/, 
 So every unexpected file is a fault, even if it is listed in SHA256SUMS.
 """
 
-import os
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import PurePosixPath
 
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
@@ -41,39 +40,28 @@ def unexpected(dataset: Dataset) -> Iterator[str]:
     """
     own_folders = {"manifest", *(f"manifest/{table}" for table in TABLES)}
     own_files = {INFO_NAME, SUMS_NAME, *EXTRA_NAMES, *_LOCKS}
-    own_files |= {path.relative_to(dataset.root).as_posix() for table in TABLES for path in dataset.parts(table)}
+    own_files |= {path for table in TABLES for path in dataset.parts(table)}
     if dataset.info.images == "packed":
         own_folders.add("shards")
-        own_files |= {path.relative_to(dataset.root).as_posix() for path in dataset.shards()}
+        own_files |= set(dataset.shards())
     if dataset.info.images == "files":
         frames = dataset.table("frames", ["png_path", "exr_path"])
         for kind in ("png", "exr"):
             # Files of other types stay unexpected, even if a row of `frames` lists them.
             paths = [path for path in frames[f"{kind}_path"].to_pylist() if path and path.endswith(f".{kind}")]
             own_files |= {path for path in paths if path.split("/")[0] not in ("manifest", "shards")}
-        own_folders |= {str(parent) for path in own_files for parent in Path(path).parents if str(parent) != "."}
-    n_found = 0
-    for root, folders, names in os.walk(dataset.root):
-        place = Path(root).relative_to(dataset.root)
-        if not dataset.info.complete and root == str(dataset.root) and _RECORDS in folders:
-            folders.remove(_RECORDS)
-        inner = [(place / name).as_posix() for name in folders]
-        folders[:] = [name for name, path in zip(folders, inner, strict=True) if path in own_folders]
-        found = [path for path in inner if path not in own_folders and _contains_files(dataset.root / path)]
-        found += [path for path in inner if path in own_folders and (dataset.root / path).is_symlink()]
-        for name in names:
-            path = (place / name).as_posix()
-            if path not in own_files and (dataset.info.complete or not TEMPORARY_FILE.fullmatch(name)):
-                found.append(path)
-        for path in sorted(found):
-            n_found += 1
-            yield path
-            if n_found == _MAX_REPORTED:
+        own_folders |= {str(parent) for path in own_files for parent in PurePosixPath(path).parents} - {"."}
+    reported: set[str] = set()
+    for item in dataset.store.list():
+        path = PurePosixPath(item.path)
+        if item.path in own_files or (not dataset.info.complete and TEMPORARY_FILE.fullmatch(path.name)):
+            continue
+        if not dataset.info.complete and path.parts[0] == _RECORDS:
+            continue
+        folders = [str(folder) for folder in reversed(path.parents) if str(folder) != "."]
+        found = next((folder for folder in folders if folder not in own_folders), item.path)
+        if found not in reported:
+            reported.add(found)
+            yield found
+            if len(reported) == _MAX_REPORTED:
                 return
-
-
-def _contains_files(folder: Path) -> bool:
-    """Whether a folder is a link, or contains a file or link at any depth."""
-    return folder.is_symlink() or any(
-        names or any(Path(root, name).is_symlink() for name in folders) for root, folders, names in os.walk(folder)
-    )

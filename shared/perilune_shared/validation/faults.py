@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import PurePosixPath
 
 import numpy as np
 import pyarrow as pa
@@ -95,17 +95,17 @@ class Fault:
         return cls.of(file, row, error.field, error.found, error.expected)
 
 
-def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
+def part_faults(dataset: Dataset, where: str, table: str) -> Iterator[Fault]:
     """Yield the faults that can be found in one part alone."""
-    where = path.relative_to(dataset.root).as_posix()
-    if path.is_symlink() or not path.resolve().is_relative_to(dataset.root.resolve()):
+    path, stem = dataset.store.folder and dataset.store.folder / where, PurePosixPath(where).stem
+    if path is not None and path.is_symlink():
         yield Fault.of(where, None, "part", "a link", "a regular file")
         return
-    if not matches(PART_PATTERN, path.stem):
-        yield Fault.of(where, None, "part", path.stem, f"a name like {PART_PATTERN}")
+    if not matches(PART_PATTERN, stem):
+        yield Fault.of(where, None, "part", stem, f"a name like {PART_PATTERN}")
         return
     try:
-        part = dataset.open_part(path, table)
+        part = dataset.open_part(where, table)
         names, known = part.found.names, TABLES[table].names
         missing = set(known) - set(names) - set(MAY_BE_ABSENT.get(table, ()))
         odd = sorted({name for name in names if name not in known and not matches(_COLUMN, name)} | missing)
@@ -120,7 +120,7 @@ def part_faults(dataset: Dataset, path: Path, table: str) -> Iterator[Fault]:
         first_row = 0
         for group in range(part.n_groups):
             rows = part.read(groups=[group], any_ids=True)
-            yield from _name_faults(where, first_row, path.stem, rows)
+            yield from _name_faults(where, first_row, stem, rows)
             for field in rows.schema:
                 yield from _value_faults(where, first_row, field, rows[field.name].combine_chunks())
             first_row += len(rows)

@@ -1,8 +1,8 @@
 """Check a dataset's frames, as files, against the manifest."""
 
 import contextlib
+import hashlib
 from collections.abc import Iterator
-from pathlib import Path
 
 import pyarrow as pa
 
@@ -10,7 +10,6 @@ from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.names import IMAGE_KINDS
 from perilune_shared.errors import UserError
 from perilune_shared.progress import Progress
-from perilune_shared.storage import files
 from perilune_shared.storage.png import png_header
 from perilune_shared.validation.faults import Fault
 
@@ -19,10 +18,9 @@ def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     """Yield missing frames and faults in size, header and hash of the files of every frame."""
     task = progress.add_task("hashing", total=dataset.info.counts.frames, unit="frames")
     columns = ["frame_id", *(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "bytes", "sha256"))]
-    for part in dataset.parts("frames"):
-        where = part.relative_to(dataset.root).as_posix()
+    for where in dataset.parts("frames"):
         first_row = 0
-        for rows in _readable_groups(dataset, part, columns):
+        for rows in _readable_groups(dataset, where, columns):
             for row, frame in enumerate(rows.to_pylist(), first_row):
                 for kind in IMAGE_KINDS:
                     if frame[f"{kind}_path"] is not None:
@@ -31,7 +29,7 @@ def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
             first_row += len(rows)
 
 
-def _readable_groups(dataset: Dataset, part: Path, columns: list[str]) -> Iterator[pa.Table]:
+def _readable_groups(dataset: Dataset, part: str, columns: list[str]) -> Iterator[pa.Table]:
     """Yield the readable row groups of a part of `frames`; `part_faults` reports the unreadable ones."""
     with contextlib.suppress(UserError):
         opened = dataset.open_part(part, "frames")
@@ -42,25 +40,22 @@ def _readable_groups(dataset: Dataset, part: Path, columns: list[str]) -> Iterat
 def _file_faults(dataset: Dataset, frame: dict, kind: str, row: int, where: str) -> Iterator[Fault]:
     relative = frame[f"{kind}_path"]
     try:
-        path = dataset.file(relative)
+        content = dataset.store.read(relative, most_bytes=LARGEST_FRAME_BYTES)
     except UserError as error:
-        yield Fault.of(where, row, f"{kind}_path", error.found, error.expected)
+        if error.field == "path":
+            yield Fault.of(where, row, f"{kind}_path", error.found, error.expected)
+        else:
+            column = f"{kind}_bytes" if error.field == "size" else f"{kind}_path"
+            yield Fault.of(relative, row, column, error.found, error.expected)
         return
-    if not path.is_file():
-        yield Fault.of(relative, row, f"{kind}_path", "no such file", "the frame")
-        return
-    n_bytes = path.stat().st_size
-    if n_bytes > LARGEST_FRAME_BYTES:
-        yield Fault.of(relative, row, f"{kind}_bytes", n_bytes, f"at most {LARGEST_FRAME_BYTES}")
-    elif n_bytes != frame[f"{kind}_bytes"]:
-        yield Fault.of(relative, row, f"{kind}_bytes", n_bytes, frame[f"{kind}_bytes"])
+    sha256 = hashlib.sha256(content).hexdigest()
+    if len(content) != frame[f"{kind}_bytes"]:
+        yield Fault.of(relative, row, f"{kind}_bytes", len(content), frame[f"{kind}_bytes"])
     elif kind == "exr":
-        if files.sha256_of(path) != frame["exr_sha256"]:
+        if sha256 != frame["exr_sha256"]:
             yield Fault.of(relative, row, "exr_sha256", "a different SHA-256", frame["exr_sha256"])
     else:
-        with path.open("rb") as stream:
-            head = stream.read(64)
-        yield from png_faults(dataset, head, n_bytes, files.sha256_of(path), frame, row, relative)
+        yield from png_faults(dataset, content, len(content), sha256, frame, row, relative)
 
 
 def png_faults(

@@ -24,10 +24,9 @@ def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     task = progress.add_task("hashing", total=dataset.info.counts.frames, unit="frames")
     missing = set(dataset.table("frames", ["frame_id"])["frame_id"].to_pylist())
     shards = dataset.shards()
-    for path in shards:
-        where = path.relative_to(dataset.root).as_posix()
+    for where in shards:
         try:
-            shard = open_shard(path)
+            shard = open_shard(dataset.store, where)
             first_row = 0
             for group in range(shard.n_groups):
                 rows = shard.read(groups=[group])
@@ -35,7 +34,7 @@ def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
                     if frame_id not in missing:
                         yield Fault.of(where, row, "frame_id", frame_id, "frames of the manifest, each once")
                     missing.discard(frame_id)
-                yield from _row_faults(dataset, rows, where, split_of(path), first_row)
+                yield from _row_faults(dataset, rows, where, split_of(where), first_row)
                 first_row += len(rows)
                 progress.advance(task, len(rows))
         except UserError as error:
@@ -44,7 +43,7 @@ def shard_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
         yield Fault.of(FOLDER, None, "frame_id", f"no {min(missing)}", "every frame of the manifest")
     names = defaultdict(list)
     for path in shards:
-        names[split_of(path)].append(path.relative_to(dataset.root).as_posix())
+        names[split_of(path)].append(path)
     for split, found in names.items():
         expected = [shard_name(split, number, len(found)) for number in range(len(found))]
         if found != expected:

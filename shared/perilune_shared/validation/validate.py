@@ -6,6 +6,7 @@ Tables are read by part, then by trajectory, so memory does not grow with the da
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import PurePosixPath
 
 import numpy as np
 import pyarrow as pa
@@ -43,7 +44,7 @@ def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
 def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
     faults = [
         Fault.of(file, None, "SHA-256", found, expected)
-        for file, found, expected in checksums.faults_of(dataset.root, progress)
+        for file, found, expected in checksums.faults_of(dataset.store, progress)
     ]
     try:
         expected = "only files of the dataset format (docs/reference/validation.md)"
@@ -180,12 +181,11 @@ def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, reported: set[
     Skips faults of files and columns already in `reported`.
     """
     for fault in faults:
-        path = dataset.root / fault.file
         if (fault.file, fault.column) in reported:
             continue
         reported.add((fault.file, fault.column))
-        if fault.row is not None and is_whole(path.stem):
-            part = dataset.open_part(path, path.parent.name)
+        if fault.row is not None and is_whole(PurePosixPath(fault.file).stem):
+            part = dataset.open_part(fault.file, PurePosixPath(fault.file).parent.name)
             key = "frame_id" if "frame_id" in part.schema.names else "scene_id"
             keys = part.read([key])[key]
             found = pc.starts_with(keys, own) if key == "frame_id" else pc.equal(keys, own)
@@ -212,7 +212,7 @@ def _crater_faults(craters: pa.Table, scene: dict, where: str) -> Iterator[Fault
 
 def _file_of(dataset: Dataset, table: str, scene_id: str, trajectory_id: str | None = None) -> str:
     parts = dataset.parts(table, scene_id, trajectory_id)
-    return parts[0].relative_to(dataset.root).as_posix() if len(parts) == 1 else f"manifest/{table}"
+    return parts[0] if len(parts) == 1 else f"manifest/{table}"
 
 
 def _repeated_keys(dataset: Dataset, table: str, keys: pa.Table, where: str) -> Iterator[Fault]:

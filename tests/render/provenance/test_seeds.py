@@ -131,7 +131,7 @@ def test_a_manifest_rendered_again_keeps_its_seeds(tiny):
     recipe = manifest.info.recipe()
     renamed = recipe.model_copy(update={"config": {**recipe.config, "name": "other"}})
     info = manifest.info.model_copy(update={"recipes": recipes_of(renamed)})
-    plan, config, begun = plan_from_manifest(Dataset(manifest.root, info))
+    plan, config, begun = plan_from_manifest(Dataset(manifest.store.folder, info))
     stated = manifest.table("scenes").sort_by("scene_id")["seed"].to_pylist()
     assert [scene.seed for scene in plan.scenes] == stated
     assert stated != [scene.seed for scene in make_plan(config, "detect").scenes]

@@ -137,7 +137,7 @@ def test_conditions_skip_row_groups(crowded_packed):
     expected = frames[(frames["split"] == "val") | (frames["frame_id"] < "s000/t000/000002")]["frame_id"].tolist()
     assert dataset.table("frames", ["frame_id"], where=condition)["frame_id"].to_pylist() == expected
     (path,) = dataset.parts("craters")
-    part = Part(path, "craters")
+    part = Part(dataset.store, path, "craters")
     assert part.n_groups > 1
     few = part.groups_where(Condition("craters.scene_id == 's002'").within_table())
     assert 0 < len(few) < part.n_groups

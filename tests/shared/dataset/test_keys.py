@@ -62,9 +62,9 @@ def test_valid_keys_are_accepted(drawn, crowded_packed):
 def test_labels_are_checked_while_they_are_read(work, drawn, monkeypatch):
     opened, plain = [], Part.__init__
 
-    def counted(part, path, *rest):
-        opened.append(path.parent.name)
-        plain(part, path, *rest)
+    def counted(part, store, path, *rest):
+        opened.append(path.split("/")[1])
+        plain(part, store, path, *rest)
 
     monkeypatch.setattr(Part, "__init__", counted)
     work(open_dataset(drawn))

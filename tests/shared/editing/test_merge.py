@@ -140,7 +140,7 @@ def test_exrs_of_two_cameras_are_not_merged(little, tmp_path):
         roots.append(open_dataset(root))
     with pytest.raises(UserError, match="exr_camera"):
         merge(roots, tmp_path / "m", images="none")
-    same = with_info(roots[0].root, tmp_path / "same", name="same")
+    same = with_info(roots[0].store.folder, tmp_path / "same", name="same")
     merge([roots[0], open_dataset(same), open_dataset(little)], tmp_path / "m", images="none")
     assert open_dataset(tmp_path / "m").info.exr_camera == roots[0].info.exr_camera
 

@@ -80,11 +80,12 @@ def test_editing_a_frame_of_a_subset_leaves_its_source_unchanged(little, tmp_pat
             unpacked(little, tmp_path / "u"),
         ]
     ):
-        assert (made.root / relative).read_bytes() == before and not (made.root / relative).samefile(little / relative)
-        (made.root / relative).write_bytes(b"edited %d" % k)
+        path = made.file(relative)
+        assert path.read_bytes() == before and not path.samefile(little / relative)
+        path.write_bytes(b"edited %d" % k)
     assert (little / relative).read_bytes() == before
     linked = subset_of(little, tmp_path / "l", images="link")
-    assert (linked.root / relative).samefile(little / relative)
+    assert (linked.store.folder / relative).samefile(little / relative)
 
 
 def split_of(source, out):

@@ -76,7 +76,7 @@ def test_images_are_the_frames(described):
 
 def test_fields_have_units_and_meanings(described):
     dataset, _ = described
-    content = json.loads((dataset.root / "croissant.json").read_text())
+    content = json.loads((dataset.store.folder / "croissant.json").read_text())
     fields = {field["@id"]: field for records in content["recordSet"] for field in records["field"]}
     assert fields["craters/diameter_m"]["description"] == "rim crest to rim crest [m]"
     assert fields["frames/rotation_wxyz"]["arrayShape"] == "4"

@@ -40,7 +40,7 @@ def parsed(folder) -> dict:
 @pytest.mark.parametrize("kind", ["crowded", "crowded_packed"])
 def test_boxes_and_images_equal_the_manifest(kind, request, tmp_path):
     dataset = open_dataset(request.getfixturevalue(kind))
-    found = parsed(exported(dataset.root, tmp_path / "yolo"))
+    found = parsed(exported(dataset.store.folder, tmp_path / "yolo"))
     frames = dataset.table("frames").to_pandas()
     labels = dataset.table("labels").to_pandas().sort_values(["frame_id", "crater_id"])
     assert {split: len(images) for split, images in found.items()} == frames.groupby("split").size().to_dict()

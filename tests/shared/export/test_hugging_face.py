@@ -41,7 +41,7 @@ def check_rows(dataset, split, rows):
 
 def test_shards_are_loaded_and_streamed_by_split(crowded_packed, offline, tmp_path):
     dataset, cache = open_dataset(crowded_packed), str(tmp_path / "cache")
-    files = {split: [str(path) for path in dataset.shards(split)] for split in ("train", "val", "test")}
+    files = {split: [dataset.store.at(path) for path in dataset.shards(split)] for split in ("train", "val", "test")}
     assert len(files["train"]) > 1
     loaded = offline.load_dataset("parquet", data_files=files, cache_dir=cache)
     for split, rows in loaded.items():
@@ -62,10 +62,10 @@ def test_shards_are_loaded_and_streamed_by_split(crowded_packed, offline, tmp_pa
 def test_shards_are_read_by_pandas_polars_and_duckdb(crowded_packed):
     duckdb, polars = pytest.importorskip("duckdb"), pytest.importorskip("polars")
     dataset = open_dataset(crowded_packed)
-    pattern = str(dataset.root / "shards/train-*.parquet")
+    pattern = str(dataset.file("shards") / "train-*.parquet")
     frames, labels = (dataset.table(name, split="train").to_pandas() for name in ("frames", "labels"))
     area = (np.pi * labels["radius_px"] ** 2).sum()
-    rows = pd.concat([pd.read_parquet(path) for path in dataset.shards("train")])
+    rows = pd.concat([pd.read_parquet(dataset.store.at(path)) for path in dataset.shards("train")])
     assert rows["frame_id"].tolist() == frames["frame_id"].tolist()
     assert sum(np.pi * each["radius_px"] ** 2 for own in rows["labels"] for each in own) == pytest.approx(area)
     found = polars.scan_parquet(pattern).select("frame_id", "labels").explode("labels").unnest("labels").collect()

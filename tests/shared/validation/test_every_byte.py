@@ -13,6 +13,7 @@ from tests.helpers.hostile import digest, edit, pack, put, rewrite, sealed
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage import checksums
+from perilune_shared.storage.store import open_store
 from perilune_shared.validation.validate import validate
 
 _HUGE = 2**32
@@ -81,7 +82,7 @@ def test_every_byte_of_small_files_is_checked(name, victim):
         (victim / name).write_bytes(content[:at] + bytes([content[at] ^ 0x01]) + content[at + 1 :])
         try:
             open_dataset(victim)
-            faults = list(checksums.faults_of(victim))
+            faults = list(checksums.faults_of(open_store(victim)))
         except UserError as error:
             assert name in str(error)
             continue

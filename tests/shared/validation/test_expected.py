@@ -1,6 +1,5 @@
 """Unexpected files in a dataset's folder are faults; each file is hashed once in a run."""
 
-import os
 import shutil
 
 import pyarrow.parquet as pq
@@ -14,7 +13,7 @@ from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_shared.export.card import write_card
 from perilune_shared.export.croissant import export_croissant
-from perilune_shared.storage import files
+from perilune_shared.storage import checksums
 from perilune_shared.storage.checksums import SUMS_NAME, seal
 from perilune_shared.storage.locks import locked
 from perilune_shared.validation.validate import validate
@@ -111,13 +110,14 @@ def test_cards_and_metadata_have_fixed_names_in_a_dataset(crowded, tmp_path):
 
 def test_each_file_is_hashed_once(crowded_packed, tmp_path, monkeypatch):
     root = shutil.copytree(crowded_packed, tmp_path / "set")
-    read, whole = [], files.sha256_of
+    read, whole = [], checksums.sha256_of
 
-    def counted(path, *rest):
-        read.append(os.path.relpath(path, root))
-        return whole(path, *rest)
+    def counted(store, path, *rest):
+        if store.folder == root:
+            read.append(path)
+        return whole(store, path, *rest)
 
-    monkeypatch.setattr(files, "sha256_of", counted)
+    monkeypatch.setattr(checksums, "sha256_of", counted)
     large = {path.relative_to(root).as_posix() for path in root.rglob("*.parquet")}
     with Progress(disable=True) as progress:
         for work in (

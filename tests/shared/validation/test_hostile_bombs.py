@@ -11,6 +11,7 @@ from perilune_shared.dataset.packed import SHARDS
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
+from perilune_shared.storage.store import open_store
 
 
 def constant(n, **cells):
@@ -143,6 +144,6 @@ def test_the_largest_real_part_is_read(tmp_path):
         for field in TABLES["labels"]
     ]
     pq.write_table(pa.table(columns, schema=TABLES["labels"]), tmp_path / "all.parquet", compression="zstd")
-    assert len(Part(tmp_path / "all.parquet", "labels").read()) == 300_000
+    assert len(Part(open_store(tmp_path), "all.parquet", "labels").read()) == 300_000
     with pytest.raises(UserError, match=r"perilune\.table"):
-        Part(tmp_path / "all.parquet", "frames")
+        Part(open_store(tmp_path), "all.parquet", "frames")

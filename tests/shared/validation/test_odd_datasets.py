@@ -194,9 +194,9 @@ def test_a_trajectory_developed_twice_is_one_trajectory(drawn, tmp_path):
     made = open_dataset(tmp_path / "m")
     assert made.info.counts.scenes == 10 and made.info.split_by == "frame" and validate(made) == []
     wrong_info = made.info.model_copy(update={"split_by": "trajectory"})
-    write_info(made.root, wrong_info)
-    seal(made.root)
-    assert "one split for each trajectory" in validate(open_dataset(made.root))[0].expected
+    write_info(made.store.folder, wrong_info)
+    seal(made.store.folder)
+    assert "one split for each trajectory" in validate(open_dataset(made.store.folder))[0].expected
 
 
 @pytest.mark.parametrize("inside", ["", "frames", "new/folder"])

@@ -124,7 +124,7 @@ def test_a_column_may_have_another_meaning_but_no_other_unit(tiny_detect, key, c
     changed = field.with_metadata({**field.metadata, key.encode(): b"other words"})
     pq.write_table(rows.cast(rows.schema.set(place, changed)), path)
     dataset = open_dataset(tiny_detect)
-    assert {fault.column for fault in part_faults(dataset, path, "frames")} == columns
+    assert {fault.column for fault in part_faults(dataset, dataset.parts("frames")[0], "frames")} == columns
     assert dataset.table("frames").num_rows > rows.num_rows
 
 
@@ -169,9 +169,9 @@ def test_every_part_is_opened_once(little, monkeypatch):
     opened = []
 
     class Counted(manifest.Part):
-        def __init__(self, path, *arguments):
+        def __init__(self, store, path, *arguments):
             opened.append(path)
-            super().__init__(path, *arguments)
+            super().__init__(store, path, *arguments)
 
     monkeypatch.setattr(manifest, "Part", Counted)
     dataset = open_dataset(little)

@@ -67,7 +67,7 @@ def frame_table(dataset: Dataset, split: str) -> pd.DataFrame:
     """
     table = dataset.table("frames", ["frame_id", *_ORDER, *_POSE, *_FILE], split=split).to_pandas()
     if table.empty:
-        raise UserError(dataset.root, "split", f"no {split} frames", "a dataset with frames in train, val and test")
+        raise UserError(dataset.store, "split", f"no {split} frames", "a dataset with frames in train, val and test")
     return table.sort_values(_ORDER, ignore_index=True)
 
 
@@ -90,7 +90,7 @@ def load_images(dataset: Dataset, table: pd.DataFrame, name: str) -> NDArray[np.
     n_bytes = len(table) * camera.height_px * camera.width_px
     if n_bytes > os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"):
         found = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
-        raise UserError(dataset.root, "frames", found, f"{name} frames that fit into this machine's memory")
+        raise UserError(dataset.store, "frames", found, f"{name} frames that fit into this machine's memory")
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
     place_of = {frame_id: place for place, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()
@@ -98,7 +98,7 @@ def load_images(dataset: Dataset, table: pd.DataFrame, name: str) -> NDArray[np.
 
     def unpack(frame: tuple[str, bytes]) -> None:
         i = place_of[frame[0]]
-        images[i] = decode(frame[1], f"{dataset.root}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
+        images[i] = decode(frame[1], f"{dataset.store}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
 
     # OpenCV releases Python's global interpreter lock while it decodes.
     with progress_bar() as progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as threads:

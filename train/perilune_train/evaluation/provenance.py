@@ -101,7 +101,7 @@ def split_terrain(dataset: Dataset, split: str, use: Use) -> frozenset[TerrainUs
     rows = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pylist()
     for row in rows:
         if not _NAME.fullmatch(row["scene_id"]):
-            raise UserError(dataset.root, "scene_id", repr(row["scene_id"]), _NAME_EXPECTED)
+            raise UserError(dataset.store, "scene_id", repr(row["scene_id"]), _NAME_EXPECTED)
     name, group = dataset.info.name, _group(dataset.info)
     return frozenset(
         TerrainUse(name, row["scene_id"], use, terrain_of(row["dem_source"], row["content_sha256"]), group)
@@ -207,7 +207,7 @@ def _compared(
         named = (*overlapping[:_MAX_NAMED], *([f"{more} more"] if more > 0 else []))
         if not allow_overlap:
             expected = "terrain not used to train, select or calibrate; --allow-overlap accepts it and marks all output"
-            raise UserError(dataset.root, "test terrain", ", ".join(named), expected)
+            raise UserError(dataset.store, "test terrain", ", ".join(named), expected)
         return _reported(TerrainCheck("overlap", named))
     if not known:
         return _reported(TerrainCheck("unknown"))

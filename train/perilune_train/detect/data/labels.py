@@ -107,7 +107,7 @@ def read_split_labels(
             if wrong.any():
                 found = labels["frame_id"][int(wrong.argmax())].as_py()
                 expected = f"only frames of scene {scene_id} in its part; see `perilune-manifest validate`"
-                raise UserError(dataset.root, "labels: frame_id", found, expected)
+                raise UserError(dataset.store, "labels: frame_id", found, expected)
             craters = read_craters(dataset, str(scene_id))
             # Labels of another split have the place -1.
             order = np.argsort(frame, kind="stable")[np.count_nonzero(frame < 0) :]

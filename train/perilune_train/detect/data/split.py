@@ -67,11 +67,11 @@ def load_split(
         if size % COARSEST_STRIDE:
             nearest = max(1, round(size / COARSEST_STRIDE)) * COARSEST_STRIDE
             expected = f"a multiple of {COARSEST_STRIDE}, the network's coarsest stride"
-            raise UserError(dataset.root, field, size, f"{expected}; render or develop the frames with {nearest}")
+            raise UserError(dataset.store, field, size, f"{expected}; render or develop the frames with {nearest}")
     table = frame_table(dataset, split)
     if len(table) < share.processes:
         expected = f"at least {share.processes}, one for each process"
-        raise UserError(dataset.root, f"{split} frames", len(table), expected)
+        raise UserError(dataset.store, f"{split} frames", len(table), expected)
     frames = load_frames(dataset, split, share)
     radius_px = _evaluated_range(dataset, settings)
     labels, sizes_px = read_split_labels(dataset, table, share, settings, radius_px, scale)

@@ -17,7 +17,7 @@ from perilune_train.training import runs
 _ANCHOR_STREAM = 1
 
 
-def build_network(config: DetectConfig, sizes_px: np.ndarray, where: Path) -> YOLOv3:
+def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> YOLOv3:
     """Build the network with anchors for these label sizes (N, 2). Raises UserError if there are no labels."""
     if len(sizes_px) == 0:
         raise UserError(where, "labels", "no visible crater in the training split", "at least one")

@@ -72,7 +72,7 @@ def run_detect(
     if runs.is_first_process():
         splits["test"] = load_split(dataset, "test", config.labels, scale["test"])
     sizes = splits["train"].label_sizes_px
-    network = build_network(config, sizes, dataset.root)
+    network = build_network(config, sizes, dataset.store)
     if config.init_from is not None and not resume:
         start_from(network, Path(config.init_from), config)
     teacher = None if config.teacher is None else load_teacher(Path(config.teacher), config)

@@ -101,14 +101,14 @@ def load_trajectories(dataset: Dataset, share: Share = ALONE) -> list[Trajectory
     processes.
     """
     if dataset.info.kind != "nav":
-        raise UserError(dataset.root, "kind", dataset.info.kind, "nav, a dataset of trajectories")
+        raise UserError(dataset.store, "kind", dataset.info.kind, "nav, a dataset of trajectories")
     if any(dataset.info.camera.distortion):
-        raise UserError(dataset.root, "camera.distortion", dataset.info.camera.distortion, "zeros")
+        raise UserError(dataset.store, "camera.distortion", dataset.info.camera.distortion, "zeros")
     rows = dataset.table("trajectories").to_pylist()
     curves = {(row["scene_id"], row["trajectory_id"]): row for row in rows}
     trajectories = [trajectory for split in SPLITS for trajectory in _split_trajectories(dataset, split, curves, share)]
     if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):
-        raise UserError(dataset.root, "split", "a trajectory in two splits", "one split for each trajectory")
+        raise UserError(dataset.store, "split", "a trajectory in two splits", "one split for each trajectory")
     return trajectories
 
 
@@ -119,7 +119,7 @@ def _split_trajectories(
     groups = list(table.groupby(["scene_id", "trajectory_id"]))
     if split == "train" and len(groups) < share.processes:
         expected = f"at least {share.processes}, one for each process"
-        raise UserError(dataset.root, "train trajectories", len(groups), expected)
+        raise UserError(dataset.store, "train trajectories", len(groups), expected)
     own = set(own_trajectories(split, len(groups), share))
     loaded = table.iloc[np.concatenate([[], *(groups[number][1].index for number in sorted(own))]).astype(int)]
     images, start = load_images(dataset, loaded, split), 0
@@ -136,7 +136,7 @@ def _split_trajectories(
         )
         if len(rows) < 2:
             raise UserError(
-                dataset.root, f"{scene_id}/{trajectory_id}", "one frame", "trajectories of at least two frames"
+                dataset.store, f"{scene_id}/{trajectory_id}", "one frame", "trajectories of at least two frames"
             )
         trajectories.append(
             Trajectory(
