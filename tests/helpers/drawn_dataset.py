@@ -149,7 +149,7 @@ def build_dataset(
                     "png_bytes": len(content),
                 }
             )
-            _add_labels(rows, frame, grounds[scene], camera, position, rotation)
+            _add_labels(rows, frame, split, grounds[scene], camera, position, rotation)
     tables = {name: _table(name, content_rows) for name, content_rows in rows.items()}
     for scene in rows["scenes"]:
         own = [
@@ -217,7 +217,13 @@ def _add_scene(rows: dict[str, list[dict]], scene: str, ground: _Ground, recipe:
 
 
 def _add_labels(
-    rows: dict[str, list[dict]], frame: str, ground: _Ground, camera: Camera, position: np.ndarray, rotation: np.ndarray
+    rows: dict[str, list[dict]],
+    frame: str,
+    split: str,
+    ground: _Ground,
+    camera: Camera,
+    position: np.ndarray,
+    rotation: np.ndarray,
 ) -> None:
     centres = camera_from_site(np.column_stack([ground.xy_m, np.zeros(len(ground.xy_m))]), position, rotation)
     normals = np.tile(rotation[:, 2], (len(centres), 1))
@@ -228,6 +234,8 @@ def _add_labels(
         rows["labels"].append(
             {
                 "frame_id": frame,
+                "scene_id": frame.partition("/")[0],
+                "split": split,
                 "crater_id": int(i),
                 "ellipse_cx_px": ellipses.cx_px[i],
                 "ellipse_cy_px": ellipses.cy_px[i],

@@ -31,7 +31,7 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Pat
     recipe = recipe_of(config, kind, preset, planned=True)
     info = new_info(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes")
-    with new_dataset(out, info, whole_tables=True) as writer:
+    with new_dataset(out, info) as writer:
         for scene_plan in plan.scenes:
             with interrupts_held():
                 scene = grow_scene(config, plan.view, scene_plan.seed)

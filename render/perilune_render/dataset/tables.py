@@ -20,7 +20,11 @@ _OF_LABELS = ("n_craters_above_max_radius",)
 
 
 def _table(name: str, columns: dict) -> pa.Table:
-    return complete(name, pa.table(columns, schema=pa.schema([TABLES[name].field(column) for column in columns])))
+    return complete(name, _columns(name, columns))
+
+
+def _columns(name: str, columns: dict) -> pa.Table:
+    return pa.table(columns, schema=pa.schema([TABLES[name].field(column) for column in columns]))
 
 
 def _vectors(values: ArrayLike) -> pa.Array:
@@ -141,9 +145,9 @@ def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) ->
 
 
 def label_table(frame_id: str, labels: Labels) -> pa.Table:
-    """Rows of the table `labels` for one frame."""
+    """Rows of the table `labels` for one frame, without the columns that repeat those of the frame."""
     e, boxes = labels.ellipses, labels.ellipses.bounding_boxes()
-    return _table(
+    return _columns(
         "labels",
         {
             "frame_id": [frame_id] * len(labels.crater_id),

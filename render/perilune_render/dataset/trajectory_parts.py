@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.storage import files
 
@@ -27,7 +28,7 @@ def finish_trajectory(root: Path, scene_id: str, trajectory_id: str, labels: lis
     name = f"{scene_id}.{trajectory_id}"
     # A run interrupted between the two leaves a labels part without its frames part.
     _path(root, "labels", name).unlink(missing_ok=True)
-    write_part(root, "labels", name, pa.concat_tables(labels))
+    write_part(root, "labels", name, with_frame_columns(pa.concat_tables(labels), frames))
     paths = (path for kind in ("png_path", "exr_path") for path in frames[kind].to_pylist() if path is not None)
     files.sync_all(root / path for path in paths)
     write_part(root, "frames", name, frames)

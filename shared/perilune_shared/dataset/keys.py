@@ -30,7 +30,7 @@ def check_keys(dataset: Dataset) -> None:
     for part in dataset.parts("labels"):
         opened = Part(dataset.store, part, "labels")
         for group in range(opened.n_groups):
-            check.add_labels(opened.read(KEYS["labels"], [group]))
+            check.add_labels(opened.read([*KEYS["labels"], "scene_id"], [group]))
     check.finish()
 
 
@@ -66,9 +66,15 @@ class KeyCheck:
     def add_labels(self, rows: pa.Table) -> NDArray[np.int64]:
         """Return the row number (N,) of each label's frame in the table frames; `rows` has frame_id and crater_id.
 
-        Raises UserError if a frame or crater is missing.
+        Raises UserError if a frame or crater is missing, or if `rows` has scene_id and it is not that of the frame.
         """
         frame = _check_known(self._dataset, "labels", "frame_id", rows["frame_id"], self._frame_of)
+        if "scene_id" in rows.column_names:
+            own = _looked_up(rows["scene_id"], self.scene_of) == self._scene_of_frame[frame]
+            if not own.all():
+                row = rows.slice(int(np.argmin(own)), 1).to_pylist()[0]
+                found = f"{row['scene_id']} in a label of {row['frame_id']}"
+                raise UserError(self._dataset.store, "labels: scene_id", found, f"the scene of the frame; {_HINT}")
         ids = rows["crater_id"].to_numpy()
         number = np.searchsorted(self._numbers, ids)
         known = number < len(self._numbers)

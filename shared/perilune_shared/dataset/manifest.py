@@ -146,8 +146,8 @@ class Dataset:
         """Read a table as Arrow: all or some columns; all rows or those of a scene, a trajectory, a split.
 
         A trajectory_id needs its scene_id. `where` selects rows by a condition on columns of this table; row groups
-        whose statistics exclude it are skipped. Only the parts, row groups and columns needed are read. Labels belong
-        to the split of their frame; craters and boulders belong to no split. Raises UserError if a part is truncated or
+        whose statistics exclude it are skipped. Only the parts, row groups and columns needed are read. Craters and
+        boulders belong to no split. Raises UserError if a part is truncated or
         of another schema, or if the table or a column is unknown.
         """
         _check_names(table, columns)
@@ -159,20 +159,11 @@ class Dataset:
             raise UserError(table, "where", where.text, f"a condition only on columns of {table}")
         names = list(columns) if columns is not None else TABLES[table].names
         schema = pa.schema([TABLES[table].field(name) for name in names])
-        of_split = split if table != "labels" else None
         pieces = [
-            rows_of_part(self.open_part(part, table), names, scene_id, trajectory_id, of_split, where)
+            rows_of_part(self.open_part(part, table), names, scene_id, trajectory_id, split, where)
             for part in self.parts(table, scene_id, trajectory_id)
         ]
-        rows = pa.concat_tables(pieces).replace_schema_metadata() if pieces else schema.empty_table()
-        if split is not None and table == "labels":
-            if "frame_id" not in names:
-                return self.table(table, [*names, "frame_id"], scene_id, trajectory_id, split, where).select(names)
-            rows = rows.filter(pc.is_in(rows["frame_id"], self._frame_ids(scene_id, trajectory_id, split)))
-        return rows
-
-    def _frame_ids(self, scene_id: str | None, trajectory_id: str | None, split: str) -> pa.Array:
-        return self.table("frames", ["frame_id"], scene_id, trajectory_id, split)["frame_id"].combine_chunks()
+        return pa.concat_tables(pieces).replace_schema_metadata() if pieces else schema.empty_table()
 
     def scene_ids(self) -> list[str]:
         """Return all scene_ids, sorted."""

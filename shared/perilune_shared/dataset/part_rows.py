@@ -26,11 +26,12 @@ def rows_of_part(
     split: str | None,
     where: Condition | None,
 ) -> pa.Table:
-    """Read the rows of a part that belong to a scene, a trajectory and a split; labels are matched by frame_id."""
+    """Read the rows of a part that belong to a scene, a trajectory and a split."""
     columns = part.schema.names
     equal = {"scene_id": scene_id, "trajectory_id": trajectory_id, "split": split}
     equal = {name: value for name, value in equal.items() if value is not None and name in columns}
-    by_frame = scene_id is not None and "scene_id" not in columns
+    # The table labels has no trajectory_id.
+    by_frame = trajectory_id is not None and "trajectory_id" not in columns and "frame_id" in columns
     prefix = f"{scene_id}/{trajectory_id}/" if trajectory_id is not None else f"{scene_id}/"
     groups = None
     if is_whole(part.stem) and scene_id is not None:
@@ -41,6 +42,9 @@ def rows_of_part(
             groups = part.groups_within("scene_id", scene_id, scene_id + "\x00")
     needed = [*names, *equal, *(["frame_id"] if by_frame else [])]
     expression = None
+    if split is not None and "split" in columns:
+        chosen = set(part.groups_within("split", split, split + "\x00"))
+        groups = [group for group in (range(part.n_groups) if groups is None else groups) if group in chosen]
     if where is not None:
         expression = where.within_table()
         needed += [name for _, name in sorted(where.columns)]

@@ -27,7 +27,7 @@ from perilune_shared.storage.store import Address, Store, open_store
 
 WHOLE_TABLE = "all"
 """Name of the part that contains all rows of its table, or the first ones of a table with several parts."""
-MOST_ROWS_WRITTEN = 10_000_000
+MOST_ROWS_WRITTEN = 2_000_000
 """Maximum number of rows of a written part; below the reader's limits for every table."""
 _MAX_ROWS = 50_000_000
 _MAX_GROUP_ROWS = 2**21
@@ -81,7 +81,7 @@ class Part:
         """
         self.store, self.path, self.schema = store, path, schema or TABLES[table]
         self.address, self.stem = store.at(path), PurePosixPath(path).stem
-        self._may_be_absent = MAY_BE_ABSENT.get(table, ()) if version == SCHEMA_VERSION else ()
+        self._may_be_absent = MAY_BE_ABSENT.get(table, ())
         self._n_bytes = store.plain_size(path)
         self._checked: set[tuple[int, str]] = set()
         try:

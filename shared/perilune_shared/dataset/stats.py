@@ -28,7 +28,7 @@ def summary(dataset: Dataset) -> pd.DataFrame:
     for part in dataset.parts("labels"):
         opened = Part(dataset.store, part, "labels")
         for group in range(opened.n_groups):
-            rows = opened.read(["frame_id", "crater_id", "radius_px", "visible_fraction"], [group])
+            rows = opened.read(["frame_id", "scene_id", "crater_id", "radius_px", "visible_fraction"], [group])
             code = codes[keys.add_labels(rows)]
             radius, visible = rows["radius_px"].to_numpy(), rows["visible_fraction"].to_numpy()
             for k, name in enumerate(names):

@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 
 from perilune_shared.content import terrain_of
 from perilune_shared.dataset.info_file import checked_info, write_info
+from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo
 from perilune_shared.dataset.names import IMAGE_KINDS, SplitUnit, frame_path
@@ -32,11 +33,8 @@ _PER_TRAJECTORY = ("frames", "labels")
 class DatasetWriter:
     """Writer of a dataset; created by `new_dataset`."""
 
-    def __init__(
-        self, root: Path, info: DatasetInfo, *, whole_tables: bool = False, most_rows: int = MOST_ROWS_WRITTEN
-    ):
-        self.root, self.info = root, info
-        self.whole_tables, self._most_rows = whole_tables, most_rows
+    def __init__(self, root: Path, info: DatasetInfo, *, most_rows: int = MOST_ROWS_WRITTEN):
+        self.root, self.info, self._most_rows = root, info, most_rows
         self._n_whole = dict.fromkeys(TABLES, 0)
         self._rows = dict.fromkeys(TABLES, 0)
         self._buffered: dict[str, list[pa.Table]] = defaultdict(list)
@@ -63,19 +61,13 @@ class DatasetWriter:
             self._splits_of_trajectory[terrain, trajectory["seed"]] |= set(splits[own])
         self._has_exr |= frames["exr_path"].null_count < len(frames)
         self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
-        tables = {**tables, "frames": frames, "trajectories": _with_counts_and_splits(tables["trajectories"], frames)}
-        scene_id = scene["scene_id"]
+        trajectories = _with_counts_and_splits(tables["trajectories"], frames)
+        labels = with_frame_columns(tables["labels"], frames)
+        tables = {**tables, "frames": frames, "trajectories": trajectories, "labels": labels}
         for name, rows in tables.items():
             self._rows[name] += len(rows)
             rows = complete(name, rows)
-            if self.whole_tables:
-                self._buffer(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
-            elif name in _PER_TRAJECTORY:
-                for trajectory_id in pc.unique(frames["trajectory_id"]).to_pylist():
-                    own = pc.starts_with(rows["frame_id"], f"{scene_id}/{trajectory_id}/")
-                    write_part(self.root, name, f"{scene_id}.{trajectory_id}", rows.filter(own))
-            else:
-                write_part(self.root, name, scene_id, rows)
+            self._buffer(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
 
     def _buffer(self, name: str, rows: pa.Table) -> None:
         """Buffer rows of a table; write a part whenever it reaches the maximum number of rows."""
@@ -118,7 +110,7 @@ class DatasetWriter:
         """Write buffered rows, dataset.json and the checksums. Raises UserError about `out` if there are no frames."""
         if not self._rows["frames"]:
             raise UserError(out, "frames", "none left", "conditions that select at least one frame")
-        for name in TABLES if self.whole_tables else ():
+        for name in TABLES:
             if self._buffered[name] or not self._n_whole[name]:
                 self._write_whole(name)
         # One flight may occur twice: rendered, and developed again with another sensor.
@@ -139,19 +131,18 @@ def new_dataset(
     out: Path,
     info: DatasetInfo,
     *,
-    whole_tables: bool = False,
     most_rows: int = MOST_ROWS_WRITTEN,
     progress: Progress = NO_PROGRESS,
 ) -> Iterator[DatasetWriter]:
     """Yield a writer for a new dataset; it appears at `out` only when the block succeeds.
 
-    With `whole_tables` each table is one part, or several of at most `most_rows` rows. `info` provides the metadata
+    Each table is one part, or several of at most `most_rows` rows. `info` provides the metadata
     that is not computed from the rows. Raises UserError if there are no frames or `out` is not empty.
     """
     with files.new_folder(out) as aside:
         # Copies with replaced fields have not been validated.
         checked_info(json.loads(info.model_dump_json()), out)
-        writer = DatasetWriter(aside, info, whole_tables=whole_tables, most_rows=most_rows)
+        writer = DatasetWriter(aside, info, most_rows=most_rows)
         yield writer
         writer.finish(out, progress)
 

@@ -2,6 +2,7 @@
 
 Version 2 added the column `origin` to `craters` and made age and fresh depth nullable. Version 3 added
 recipes and content hashes to `scenes`, `contrast` to `labels`, checksums of all files, and the state of the frames.
+Version 4 added `scene_id` and `split` to `labels`, and made their real columns float32.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,6 +22,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address, Store, open_store
 
+_ADDED_IN_4 = {"labels": ("scene_id", "split")}
 _ADDED_IN_3 = {"scenes": ("recipe", "content_sha256"), "labels": ("contrast",)}
 _ADDED_IN_2 = {"craters": ("origin",)}
 
@@ -32,16 +34,21 @@ def _without(tables: dict[str, pa.Schema], added: Mapping[str, tuple[str, ...]])
     return kept
 
 
-_TABLES_2 = _without(_without(TABLES, MAY_BE_ABSENT), _ADDED_IN_3)
-OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2}
+def _with_float64(schema: pa.Schema) -> pa.Schema:
+    return pa.schema([field.with_type(pa.float64()) if field.type == pa.float32() else field for field in schema])
+
+
+_TABLES_3 = {name: _with_float64(schema) for name, schema in _without(TABLES, _ADDED_IN_4).items()}
+_TABLES_2 = _without(_without(_TABLES_3, MAY_BE_ABSENT), _ADDED_IN_3)
+OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2, "3": _TABLES_3}
 """Schemas of the tables in older versions."""
 
 
 def migrate(address: Address, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
-    """Convert a dataset of schema version 1 or 2 to the current version; frames are copied, or hard-linked with `link`.
+    """Convert a dataset of an older schema version to the current one; frames are copied, or hard-linked with `link`.
 
-    Older versions did not record the contrast of labels; it becomes null. Raises UserError if the dataset already has
-    the current version, is damaged or is not complete.
+    Versions 1 and 2 did not record the contrast of labels; it becomes null. Raises UserError if the dataset already has
+    the current version, is damaged, is not complete or has packed frames.
     """
     store = open_store(address)
     content, path = read_object(store), store.at(INFO_NAME)
@@ -52,6 +59,9 @@ def migrate(address: Address, out: Path, progress: Progress = NO_PROGRESS, *, li
         raise UserError(path, "schema_version", version, f"one of {', '.join(OLD_TABLES)}")
     if content.get("complete") is not True:
         raise UserError(path, "complete", content.get("complete"), "a finished dataset")
+    if content.get("images") == "packed":
+        expected = "frames as files; unpack it with the version of perilune that packed it"
+        raise UserError(path, "images", "packed", expected)
     info = _info(content, path)
     source = _OldDataset(store, info, version)
     scene_ids = sorted(source.rows("scenes")["scene_id"].to_pylist())
@@ -61,13 +71,19 @@ def migrate(address: Address, out: Path, progress: Progress = NO_PROGRESS, *, li
             tables = {name: source.rows(name, scene_id) for name in TABLES}
             writer.add_scene(tables)
             names = {name: name for name in tables["frames"]["frame_id"].to_pylist()}
-            writer.add_images(source, tables["frames"], names, link=link)
+            if info.images == "files":
+                writer.add_images(source, tables["frames"], names, link=link)
             progress.advance(task)
 
 
 def _info(content: dict[str, Any], path: str) -> DatasetInfo:
-    """Convert dataset.json of version 1 or 2, in which settings, seed and versions were not grouped in recipes."""
+    """Convert dataset.json. In versions 1 and 2 settings, seed and versions were not grouped in recipes."""
     version = content["schema_version"]
+    line = f"migrated from schema version {version}"
+    if version == "3":
+        history = content.get("history", [])
+        history = [*history, line] if isinstance(history, list) else history
+        return checked_info({**content, "schema_version": SCHEMA_VERSION, "history": history}, path)
     missing = [name for name in ("preset", "kind", "seed", "config", "versions") if name not in content]
     if missing:
         raise UserError(path, missing[0], "nothing", f"a value, as in every dataset of version {version}")
@@ -85,7 +101,7 @@ def _info(content: dict[str, Any], path: str) -> DatasetInfo:
             "schema_version": SCHEMA_VERSION,
             "images": "files",
             "recipes": {recipe.key: recipe.model_dump(mode="json")},
-            "history": [f"migrated from schema version {version}"],
+            "history": [line],
         },
         path,
     )
@@ -109,9 +125,9 @@ class _OldDataset(Dataset):
         columns = {
             name: rows[name] if name in schema.names else self._added(table, name, rows, scene_id)
             for name in TABLES[table].names
-            if name not in MAY_BE_ABSENT.get(table, ())
+            if name in schema.names or name not in MAY_BE_ABSENT.get(table, ())
         }
-        return complete(table, pa.table(columns, schema=pa.schema(map(TABLES[table].field, columns))))
+        return complete(table, pa.table(columns))
 
     def _of_scene(self, table: str, rows: pa.Table, scene_id: str) -> pa.Table:
         key = "scene_id" if "scene_id" in rows.column_names else "frame_id"
@@ -119,10 +135,17 @@ class _OldDataset(Dataset):
         own = [value == scene_id if key == "scene_id" else value.startswith(f"{scene_id}/") for value in values]
         return rows.filter(pa.array(own, pa.bool_()))
 
+    def _splits(self, frame_ids: pa.ChunkedArray, scene_id: str) -> list[str | None]:
+        frames = self.rows("frames", scene_id)
+        split_of = dict(zip(frames["frame_id"].to_pylist(), frames["split"].to_pylist(), strict=True))
+        return [split_of.get(frame_id) for frame_id in frame_ids.to_pylist()]
+
     def _added(self, table: str, name: str, rows: pa.Table, scene_id: str) -> pa.Array:
         """Return a column that the older version lacks."""
         n = len(rows)
         fill: dict[tuple[str, str], Callable[[], list]] = {
+            ("labels", "scene_id"): lambda: [scene_id] * n,
+            ("labels", "split"): lambda: self._splits(rows["frame_id"], scene_id),
             # Before version 2 all craters were primary: there were no clusters and no catalogues.
             ("craters", "origin"): lambda: ["primary"] * n,
             ("labels", "contrast"): lambda: [None] * n,

@@ -51,7 +51,7 @@ def pack(
     info = source.info
     if packed:
         info = info.changed("packed", images="packed", exr_camera=None)
-    with new_dataset(out, info, whole_tables=True, most_rows=most_rows, progress=progress) as writer:
+    with new_dataset(out, info, most_rows=most_rows, progress=progress) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
             writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
@@ -122,7 +122,7 @@ def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Ta
 
 
 def unpack(source: Dataset, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
-    """Write a dataset with a part for each scene and trajectory, and frames as files.
+    """Write a dataset with frames as files.
 
     Frames that already are files are copied, or hard-linked with `link`.
     """

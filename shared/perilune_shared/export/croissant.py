@@ -71,7 +71,12 @@ _CONTEXT: dict[str, Any] = {
     "subField": "cr:subField",
     "transform": "cr:transform",
 }
-_DATA_TYPES = {pa.string(): "sc:Text", pa.int64(): "cr:Int64", pa.float64(): "cr:Float64"}
+_DATA_TYPES = {
+    pa.string(): "sc:Text",
+    pa.int64(): "cr:Int64",
+    pa.float32(): "cr:Float32",
+    pa.float64(): "cr:Float64",
+}
 
 
 def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progress = NO_PROGRESS) -> Path:

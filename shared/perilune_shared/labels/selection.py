@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.keys import FRAME_COLUMNS, KeyCheck
@@ -55,12 +56,13 @@ def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None
     Rows are in the order of the table labels. Depth and diameter (metres) come from the table craters, joined by
     scene_id and crater_id. Raises UserError if a part cannot be read or keys are broken.
     """
-    names = list(dict.fromkeys(["frame_id", "crater_id", *_THRESHOLDED, *columns]))
-    frames = dataset.table("frames", ["frame_id", "scene_id"], split=split).to_pandas()
-    rows = dataset.table("labels", names)
+    names = list(dict.fromkeys(["frame_id", "scene_id", "crater_id", *_THRESHOLDED, *columns]))
+    rows = dataset.table("labels", list(dict.fromkeys([*names, "split"])))
     keys = KeyCheck(dataset, dataset.table("frames", FRAME_COLUMNS))
     keys.add_labels(rows)
     keys.finish()
-    labels = rows.to_pandas().merge(frames, on="frame_id", validate="many_to_one")
+    if split is not None:
+        rows = rows.filter(pc.equal(rows["split"], split))
+    labels = rows.select(names).to_pandas()
     craters = dataset.table("craters", _CRATER).to_pandas()
     return labels.merge(craters, on=["scene_id", "crater_id"], how="left", validate="many_to_one")

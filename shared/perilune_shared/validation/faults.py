@@ -139,12 +139,12 @@ def _name_faults(where: str, first_row: int, stem: str, rows: pa.Table) -> Itera
     scene, _, trajectory = stem.partition(".")
     if is_whole(stem):
         return
-    if "scene_id" in rows.column_names:
-        own = pc.equal(rows["scene_id"], scene)
-        if trajectory and "trajectory_id" in rows.column_names:
-            own = pc.and_(own, pc.equal(rows["trajectory_id"], trajectory))
-    else:
-        own = pc.starts_with(rows["frame_id"], f"{scene}/{trajectory}/" if trajectory else f"{scene}/")
+    own = pc.equal(rows["scene_id"], scene)
+    if trajectory and "trajectory_id" in rows.column_names:
+        own = pc.and_(own, pc.equal(rows["trajectory_id"], trajectory))
+    if "frame_id" in rows.column_names:
+        prefix = f"{scene}/{trajectory}/" if trajectory else f"{scene}/"
+        own = pc.and_(own, pc.starts_with(rows["frame_id"], prefix))
     others = np.flatnonzero(~np.asarray(own, bool))
     if len(others):
         row = first_row + int(others[0])

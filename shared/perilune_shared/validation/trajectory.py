@@ -12,6 +12,8 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion, sun_d
 from perilune_shared.validation.faults import Fault
 
 _LABEL_TOLERANCE_PX = 1e-6
+_LABEL_ROUNDING = 2.0**-23
+"""Relative error of a float32, with a margin of 2."""
 _SUN_TOLERANCE = 1e-9
 _FARTHEST_M = 1e9
 _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
@@ -93,6 +95,12 @@ def _labels(
         if len(unknown):
             found = labels[name][int(unknown[0])].as_py()
             yield Fault.of(where, int(unknown[0]), name, found, f"a row of {name.removesuffix('_id')}s")
+    for name in ("scene_id", "split"):
+        expected = frames[name].take(pa.array(np.maximum(frame_of, 0)))
+        wrong = np.flatnonzero(~np.asarray(pc.equal(labels[name], expected), bool) & (frame_of >= 0))
+        if len(wrong):
+            row = int(wrong[0])
+            yield Fault.of(where, row, name, labels[name][row].as_py(), f"{expected[row].as_py()}, as of its frame")
     known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
     if not len(known):
         return
@@ -101,7 +109,7 @@ def _labels(
     misfit = np.zeros(len(known), bool)
     for name, values in projected.items():
         error = np.abs(labels[name].to_numpy()[known] - values)
-        tolerance = _LABEL_TOLERANCE_PX * size
+        tolerance = _LABEL_TOLERANCE_PX * size + _LABEL_ROUNDING * np.abs(values)
         if name == "ellipse_theta_rad":
             # The direction has period pi and is undefined for a circle.
             error = np.minimum(error, np.pi - error) * np.minimum(1, size - 1 - projected["ellipse_b_px"])

@@ -20,6 +20,7 @@ from perilune_shared.storage.checksums import seal
 BROKEN = {
     "a label of no crater": ("labels", lambda rows: rows[3].update(crater_id=12345), "labels: crater_id"),
     "a label of no frame": ("labels", lambda rows: rows[3].update(frame_id="s000/t000/000099"), "labels: frame_id"),
+    "a label of another scene": ("labels", lambda rows: rows[3].update(scene_id="s001"), "labels: scene_id"),
     "no craters": ("craters", lambda rows: rows.clear(), "labels: crater_id"),
     "a crater twice": ("craters", lambda rows: rows.append(dict(rows[5])), r"craters: scene_id\+crater_id"),
     "a label twice": ("labels", lambda rows: rows.append(dict(rows[5])), r"labels: frame_id\+crater_id"),

@@ -129,12 +129,37 @@ def test_old_datasets_are_migrated(version, tmp_path):
     assert made.info.history == (f"migrated from schema version {version}",)
     assert made.info.recipe().config["camera"]["width_px"] == 64 and made.info.recipe().seed == 20240117
     old = pq.read_table(next((OLD / version / "manifest/labels").glob("*.parquet")))
-    assert made.table("labels", ["ellipse_cx_px"])["ellipse_cx_px"].to_pylist() == old["ellipse_cx_px"].to_pylist()
+    assert made.table("labels", ["ellipse_cx_px"])["ellipse_cx_px"].equals(old["ellipse_cx_px"].cast(pa.float32()))
     assert made.table("labels")["contrast"].null_count == len(old)
     origins = set(made.table("craters")["origin"].to_pylist())
     assert origins == {"primary"} if version == "1" else "primary" in origins
     with pytest.raises(UserError, match="older version"):
         migrate(tmp_path / "new", tmp_path / "newer")
+
+
+def test_a_dataset_of_version_3_is_migrated(tmp_path):
+    migrate(OLD / "3", tmp_path / "new")
+    made, old = open_dataset(tmp_path / "new"), OLD / "3/manifest"
+    assert validate(made) == [] and made.info.history == ("migrated from schema version 3",)
+    for name in TABLES:
+        before = pq.read_table(old / name / "all.parquet")
+        after = made.table(name, before.column_names)
+        assert after.equals(before.replace_schema_metadata().cast(after.schema)), name
+    labels = made.table("labels", ["frame_id", "scene_id", "split"]).to_pylist()
+    split_of = {row["frame_id"]: row["split"] for row in made.table("frames").to_pylist()}
+    assert {row["split"] for row in labels} == {"train", "val"}
+    assert all(row["split"] == split_of[row["frame_id"]] for row in labels)
+    assert all(row["frame_id"].startswith(f"{row['scene_id']}/") for row in labels)
+    for path in old.parent.glob("frames/*/*/*.png"):
+        assert (tmp_path / "new" / path.relative_to(old.parent)).read_bytes() == path.read_bytes()
+
+
+def test_packed_frames_of_version_3_are_refused(tmp_path):
+    old = shutil.copytree(OLD / "3", tmp_path / "old")
+    text = (old / "dataset.json").read_text()
+    (old / "dataset.json").write_text(text.replace('"images": "files"', '"images": "packed"'))
+    with pytest.raises(UserError, match=r"images: got packed, expected .*unpack"):
+        migrate(old, tmp_path / "new")
 
 
 def test_damaged_old_datasets_are_refused(tmp_path):

@@ -217,3 +217,12 @@ def test_conditions_on_labels_of_a_plan_are_refused(drawn, tmp_path):
         open_dataset(drawn).table("labels", split="tset")
     with pytest.raises(UserError, match="dataset --manifest"):
         list(open_dataset(tmp_path / "p").pngs(open_dataset(drawn).table("frames")))
+
+
+@pytest.mark.parametrize(("column", "value"), [("split", "test"), ("scene_id", "s001")])
+def test_labels_of_another_split_or_scene_than_their_frame_are_faults(column, value, victim):
+    rows = rows_of(victim, "labels")
+    values = rows[column].to_pylist()
+    replaced(victim, "labels", with_column(rows, column, [value, *values[1:]]))
+    faults = validate(open_dataset(victim))
+    assert faults and all(fault.file.startswith("manifest/labels") for fault in faults)
