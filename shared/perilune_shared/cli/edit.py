@@ -1,6 +1,5 @@
 """Commands of `perilune-manifest` that edit or compare datasets."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -20,7 +19,7 @@ DatasetArgument = Annotated[
     str,
     typer.Argument(help="Folder of a dataset (contains dataset.json), or its address: s3://bucket/prefix, gs://..."),
 ]
-OutOption = Annotated[Path, typer.Option(help="New folder for the result.")]
+OutOption = Annotated[str, typer.Option(help="New folder or address for the result.")]
 ImagesOption = Annotated[
     ImageChoice,
     typer.Option(help="Frames: copy, none (leave them out), plan (leave out craters, boulders and labels too)."),
@@ -44,7 +43,7 @@ def add_to(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def _print_counts(out: Path) -> None:
+def _print_counts(out: str) -> None:
     """Print the counts of the new dataset and whether its splits share terrain."""
     info = ps.open_dataset(out).info
     counts = info.counts

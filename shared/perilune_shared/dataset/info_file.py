@@ -110,5 +110,10 @@ def _unsafe_text(tree: object) -> str | None:
 def write_info(address: Address, info: DatasetInfo) -> None:
     """Write dataset.json atomically. Raises UserError if texts of its recipes contain unsafe characters."""
     store = open_store(address)
-    _check_texts(info, store.at(INFO_NAME))
-    store.replace(INFO_NAME, (info.model_dump_json(indent=2) + "\n").encode())
+    store.replace(INFO_NAME, info_bytes(info, store.at(INFO_NAME)))
+
+
+def info_bytes(info: DatasetInfo, where: object) -> bytes:
+    """Return the content of dataset.json. Raises UserError about `where` if texts of its recipes are unsafe."""
+    _check_texts(info, where)
+    return (info.model_dump_json(indent=2) + "\n").encode()

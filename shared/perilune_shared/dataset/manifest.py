@@ -10,7 +10,7 @@ Parts are written atomically and never rewritten. Use:
 import contextlib
 import functools
 from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import pandas as pd
 import pyarrow as pa
@@ -23,7 +23,7 @@ from perilune_shared.dataset.metadata import Counts, DatasetInfo
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.packed import read_packed, shards_of
 from perilune_shared.dataset.part_rows import may_contain, rows_of_part
-from perilune_shared.dataset.parts import Part, parquet_files
+from perilune_shared.dataset.parts import Part, parquet_files, stem_of
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
@@ -132,7 +132,7 @@ class Dataset:
             found = parquet_files(self.store, f"manifest/{table}")
             if not self.store.is_local:  # listing an object store takes a request
                 self._listed[table] = found
-        return [part for part in found if may_contain(PurePosixPath(part).stem, scene_id, trajectory_id)]
+        return [part for part in found if may_contain(stem_of(part), scene_id, trajectory_id)]
 
     def table(
         self,

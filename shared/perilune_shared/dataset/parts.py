@@ -7,11 +7,13 @@ the part `all`, whose row groups contain one scene or a few trajectories each. A
 
 import contextlib
 import errno
+import hashlib
 import io
 import os
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import pyarrow as pa
@@ -51,16 +53,33 @@ _PARQUET_FILE = re.compile(r"[A-Za-z0-9][^/]*\.parquet", re.DOTALL)
 _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
 
 
+def stem_of(path: str) -> str:
+    """Return the name of a part, without folders and suffix."""
+    return path.rpartition("/")[2].removesuffix(".parquet")
+
+
 def is_whole(stem: str) -> bool:
     """Whether a part of this name may contain rows of any scene."""
     return stem.partition(".")[0] == WHOLE_TABLE
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A file that was written, hashed while its bytes were in memory."""
+
+    path: str
+    """Path relative to the dataset."""
+    size_bytes: int
+    """Size, bytes."""
+    sha256: str
+    """SHA-256, hexadecimal."""
 
 
 def parquet_files(store: Store, folder: str) -> list[str]:
     """Return the paths of the Parquet files directly in a folder of a store, sorted by name; not hidden ones."""
     if store.folder is not None:
         place = store.folder / folder
-        names = [path.name for path in place.iterdir()] if place.is_dir() else []
+        names = [entry.name for entry in os.scandir(place)] if place.is_dir() else []
     else:
         names = [item.path.removeprefix(f"{folder}/") for item in store.list(folder)]
     return [f"{folder}/{name}" for name in sorted(names, key=lambda name: name[:-8]) if _PARQUET_FILE.fullmatch(name)]
@@ -80,7 +99,7 @@ class Part:
         Missing columns of `MAY_BE_ABSENT` are read as null.
         """
         self.store, self.path, self.schema = store, path, schema or TABLES[table]
-        self.address, self.stem = store.at(path), PurePosixPath(path).stem
+        self.address, self.stem = store.at(path), stem_of(path)
         self._may_be_absent = MAY_BE_ABSENT.get(table, ())
         self._n_bytes = store.plain_size(path)
         self._checked: set[tuple[int, str]] = set()
@@ -284,7 +303,7 @@ def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> p
     return Part(open_store(path.parent), path.name, table).read(columns)
 
 
-def write_part(address: Address, table: str, name: str, rows: pa.Table, rows_per_group: int | None = None) -> None:
+def write_part(address: Address, table: str, name: str, rows: pa.Table, rows_per_group: int | None = None) -> Written:
     """Write the part `manifest/<table>/<name>.parquet` of a dataset. Raises FileExistsError if it exists.
 
     Raises UserError if the name, which may come from the rows of an untrusted dataset, is not a valid part name.
@@ -297,4 +316,6 @@ def write_part(address: Address, table: str, name: str, rows: pa.Table, rows_per
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), store.at(path))
     sink = pa.BufferOutputStream()
     pq.write_table(complete(table, rows), sink, compression="zstd", row_group_size=rows_per_group)
-    store.write(path, sink.getvalue().to_pybytes())
+    content = sink.getvalue().to_pybytes()
+    store.write(path, content)
+    return Written(path, len(content), hashlib.sha256(content).hexdigest())

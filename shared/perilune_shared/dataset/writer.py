@@ -4,19 +4,19 @@ The row counts, the number of frames and split of each trajectory, and the split
 """
 
 import contextlib
+import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.content import terrain_of
-from perilune_shared.dataset.info_file import checked_info, write_info
+from perilune_shared.dataset.info_file import INFO_NAME, checked_info, info_bytes
 from perilune_shared.dataset.label_rows import with_frame_columns
-from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo
 from perilune_shared.dataset.names import IMAGE_KINDS, SplitUnit, frame_path
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WHOLE_TABLE, write_part
@@ -24,6 +24,8 @@ from perilune_shared.dataset.schema import TABLES, complete
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums, files
+from perilune_shared.storage.new_store import new_store
+from perilune_shared.storage.store import Address, Store
 
 SceneTables = dict[str, pa.Table]
 """All tables of one scene, by name."""
@@ -33,8 +35,9 @@ _PER_TRAJECTORY = ("frames", "labels")
 class DatasetWriter:
     """Writer of a dataset; created by `new_dataset`."""
 
-    def __init__(self, root: Path, info: DatasetInfo, *, most_rows: int = MOST_ROWS_WRITTEN):
-        self.root, self.info, self._most_rows = root, info, most_rows
+    def __init__(self, store: Store, info: DatasetInfo, *, most_rows: int = MOST_ROWS_WRITTEN):
+        self.store, self.info, self._most_rows = store, info, most_rows
+        self._hashes: dict[str, str] = {}
         self._n_whole = dict.fromkeys(TABLES, 0)
         self._rows = dict.fromkeys(TABLES, 0)
         self._buffered: dict[str, list[pa.Table]] = defaultdict(list)
@@ -82,7 +85,8 @@ class DatasetWriter:
     def _write_whole(self, name: str) -> None:
         rows = pa.concat_tables([TABLES[name].empty_table(), *self._buffered.pop(name, [])])
         stem = f"{WHOLE_TABLE}.{self._n_whole[name]:04d}" if self._n_whole[name] else WHOLE_TABLE
-        write_part(self.root, name, stem, rows, max(1000, len(rows) // 200))
+        written = write_part(self.store, name, stem, rows, max(1000, len(rows) // 200))
+        self._hashes[written.path] = written.sha256
         self._n_whole[name] += 1
 
     def add_images(self, source: Dataset, frames: pa.Table, names: dict[str, str], *, link: bool) -> None:
@@ -93,21 +97,28 @@ class DatasetWriter:
         by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path"]).to_pylist()}
         if source.info.images == "packed":
             for frame_id, png in source.pngs(frames):
-                files.write_bytes(files.inside(self.root, frame_path(names[frame_id], "png")), png, durable=False)
+                self.store.write(frame_path(names[frame_id], "png"), png, durable=False)
         else:
             for row in frames.select(["frame_id", "png_path"]).to_pylist():
                 by_id[row["frame_id"]]["png_path"] = row["png_path"]
         for frame_id, row in by_id.items():
             for kind in IMAGE_KINDS:
                 if row.get(f"{kind}_path") is not None:
-                    to = files.inside(self.root, frame_path(names[frame_id], kind))
-                    if source.store.is_local:
-                        files.copy_or_link(source.file(row[f"{kind}_path"]), to, link=link)
+                    to = frame_path(names[frame_id], kind)
+                    if source.store.is_local and self.store.folder is not None:
+                        to_path = files.inside(self.store.folder, to)
+                        files.copy_or_link(source.file(row[f"{kind}_path"]), to_path, link=link)
                     else:
-                        files.write_bytes(to, source.store.read(row[f"{kind}_path"]), durable=False)
+                        content = source.store.read(row[f"{kind}_path"], most_bytes=LARGEST_FRAME_BYTES)
+                        self.store.write(to, content, durable=False)
 
-    def finish(self, out: Path, progress: Progress = NO_PROGRESS) -> None:
-        """Write buffered rows, dataset.json and the checksums. Raises UserError about `out` if there are no frames."""
+    def add_file(self, path: str, content: bytes) -> None:
+        """Write another file of the dataset."""
+        self.store.write(path, content, durable=False)
+        self._hashes[path] = hashlib.sha256(content).hexdigest()
+
+    def finish(self, out: Address, progress: Progress = NO_PROGRESS) -> None:
+        """Write buffered rows, checksums, then dataset.json. Raises UserError about `out` if there are no frames."""
         if not self._rows["frames"]:
             raise UserError(out, "frames", "none left", "conditions that select at least one frame")
         for name in TABLES:
@@ -122,13 +133,15 @@ class DatasetWriter:
         info = self.info.model_copy(
             update={"split_by": unit, "recipes": recipes, "exr_camera": exr_camera, "counts": Counts(**self._rows)}
         )
-        write_info(self.root, info)
-        checksums.seal(self.root, progress)
+        content = info_bytes(info, out)
+        self._hashes[INFO_NAME] = hashlib.sha256(content).hexdigest()
+        checksums.seal(self.store, progress, self._hashes)
+        self.store.replace(INFO_NAME, content)
 
 
 @contextlib.contextmanager
 def new_dataset(
-    out: Path,
+    out: Address,
     info: DatasetInfo,
     *,
     most_rows: int = MOST_ROWS_WRITTEN,
@@ -139,10 +152,11 @@ def new_dataset(
     Each table is one part, or several of at most `most_rows` rows. `info` provides the metadata
     that is not computed from the rows. Raises UserError if there are no frames or `out` is not empty.
     """
-    with files.new_folder(out) as aside:
-        # Copies with replaced fields have not been validated.
-        checked_info(json.loads(info.model_dump_json()), out)
-        writer = DatasetWriter(aside, info, most_rows=most_rows)
+    # Copies with replaced fields have not been validated.
+    checked_info(json.loads(info.model_dump_json()), out)
+    claim = info_bytes(info.model_copy(update={"complete": False}), out)
+    with new_store(out, INFO_NAME, claim) as store:
+        writer = DatasetWriter(store, info, most_rows=most_rows)
         yield writer
         writer.finish(out, progress)
 

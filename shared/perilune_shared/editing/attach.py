@@ -1,7 +1,5 @@
 """Combine a manifest without frames and the frames rendered from it into a dataset."""
 
-from pathlib import Path
-
 import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
@@ -18,7 +16,7 @@ from perilune_shared.storage.store import Address
 def attach(
     manifest: Dataset,
     frames_root: Address,
-    out: Path,
+    out: Address,
     rehash: bool = False,
     progress: Progress = NO_PROGRESS,
     *,

@@ -1,7 +1,6 @@
 """Merge several datasets into one."""
 
 from collections.abc import Container, Sequence
-from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -14,6 +13,7 @@ from perilune_shared.editing.licence import joined_licence
 from perilune_shared.editing.rewrite import check_source, state_of, without_derived_rows
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
+from perilune_shared.storage.store import Address
 
 _TERRAIN_TABLES = ("scenes", "craters", "boulders")
 _FREE_IN_TRAJECTORIES = ("scene_id", "trajectory_id", "n_frames", "split")
@@ -24,7 +24,7 @@ _FIXED_IN_FRAMES = ("position_m", "rotation_wxyz", "time_s", "png_sha256")
 
 def merge(
     sources: Sequence[Dataset],
-    out: Path,
+    out: Address,
     name: str = "merged",
     images: ImageMode = "copy",
     progress: Progress = NO_PROGRESS,

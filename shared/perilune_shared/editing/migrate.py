@@ -6,7 +6,6 @@ Version 4 added `scene_id` and `split` to `labels`, and made their real columns 
 """
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -44,7 +43,7 @@ OLD_TABLES = {"1": _without(_TABLES_2, _ADDED_IN_2), "2": _TABLES_2, "3": _TABLE
 """Schemas of the tables in older versions."""
 
 
-def migrate(address: Address, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
+def migrate(address: Address, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Convert a dataset of an older schema version to the current one; frames are copied, or hard-linked with `link`.
 
     Versions 1 and 2 did not record the contrast of labels; it becomes null. Raises UserError if the dataset already has

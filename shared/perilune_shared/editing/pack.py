@@ -1,7 +1,6 @@
 """Pack a dataset into shards that can be streamed, and unpack it. A shard has frames with pose, image and labels."""
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -13,11 +12,11 @@ from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.packed import LABEL, SHARDS, packed_rows, shard_name
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.dataset.writer import new_dataset, with_column, with_new_paths
+from perilune_shared.dataset.writer import DatasetWriter, new_dataset, with_column, with_new_paths
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
-from perilune_shared.storage import files
+from perilune_shared.storage.store import Address
 
 MOST_FRAMES_WRITTEN = 100_000
 """Maximum number of frames of a shard; it gives at most 1,563 row groups, and readers accept 10,000."""
@@ -30,7 +29,7 @@ _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_ind
 
 def pack(
     source: Dataset,
-    out: Path,
+    out: Address,
     shard_mb: float = 128,
     progress: Progress = NO_PROGRESS,
     *,
@@ -59,20 +58,21 @@ def pack(
             task = progress.add_task("packing", total=source.info.counts.frames, unit="frames")
             for split in SPLITS:
                 sizes = _sizes(source, split, shard_mb * 1e6, most_frames)
-                for n_frames in _write_shards(source, writer.root, split, sizes):
+                for n_frames in _write_shards(source, writer, split, sizes):
                     progress.advance(task, n_frames)
 
 
-def _write_shards(source: Dataset, root: Path, split: str, shards: list[list[int]]) -> Iterator[int]:
+def _write_shards(source: Dataset, writer: DatasetWriter, split: str, shards: list[list[int]]) -> Iterator[int]:
     """Write the shards of one split, with row groups of given sizes; yield the size of each when it is written."""
     groups = _groups(source, split, [size for shard in shards for size in shard])
     for number, shard in enumerate(shards):
-        with files.written_aside(root / shard_name(split, number, len(shards)), durable=False) as path:
-            text = [field.name for field in SHARDS if pa.types.is_string(field.type)]
-            with pq.ParquetWriter(path, SHARDS, compression="zstd", use_dictionary=text) as writer:
-                for n_frames, rows in zip(shard, groups, strict=False):
-                    writer.write_table(rows)
-                    yield n_frames
+        text = [field.name for field in SHARDS if pa.types.is_string(field.type)]
+        sink = pa.BufferOutputStream()
+        with pq.ParquetWriter(sink, SHARDS, compression="zstd", use_dictionary=text) as file:
+            for n_frames, rows in zip(shard, groups, strict=False):
+                file.write_table(rows)
+                yield n_frames
+        writer.add_file(shard_name(split, number, len(shards)), sink.getvalue().to_pybytes())
 
 
 def _sizes(source: Dataset, split: str, shard_bytes: float, most_frames: int) -> list[list[int]]:
@@ -121,7 +121,7 @@ def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Ta
             yield _without_exr(frames.sort_by(_ORDER)), labels
 
 
-def unpack(source: Dataset, out: Path, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
+def unpack(source: Dataset, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
     """Write a dataset with frames as files.
 
     Frames that already are files are copied, or hard-linked with `link`.

@@ -1,7 +1,6 @@
 """Rewrite a dataset as a new one; used by all tools that change or select rows."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import pyarrow.compute as pc
 
@@ -13,13 +12,14 @@ from perilune_shared.dataset.writer import SceneTables, new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums
+from perilune_shared.storage.store import Address, Store, open_store
 
 _DERIVED_TABLES = ("craters", "boulders", "labels")
 
 
 def rewrite(
     source: Dataset,
-    out: Path,
+    out: Address,
     info: DatasetInfo,
     change: Callable[[SceneTables], SceneTables],
     images: ImageMode,
@@ -47,7 +47,7 @@ def rewrite(
             progress.advance(task)
 
 
-def check_source(source: Dataset, out: Path, progress: Progress = NO_PROGRESS) -> None:
+def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS) -> None:
     """Raise UserError if a dataset must not be rewritten into `out`.
 
     A dataset is refused if it is not complete, if its files do not match SHA256SUMS (new sums would hide the damage),
@@ -55,12 +55,18 @@ def check_source(source: Dataset, out: Path, progress: Progress = NO_PROGRESS) -
     """
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
-    folder = source.store.folder
-    if folder is not None and out.resolve().is_relative_to(folder.resolve()):
+    if _within(open_store(out), source.store):
         raise UserError(out, "--out", f"a folder in {source.store}", "one outside the dataset")
     for name, found, expected in checksums.faults_of(source.store, progress):
         raise UserError(source.store.at(name), "SHA-256", found, f"{expected}; see `perilune-manifest validate`")
     check_keys(source)
+
+
+def _within(store: Store, other: Store) -> bool:
+    """Whether a store is another one, or below it."""
+    if store.folder is not None and other.folder is not None:
+        return store.folder.resolve().is_relative_to(other.folder.resolve())
+    return store == other or store.address.startswith(f"{other.address}/")
 
 
 def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:

@@ -1,7 +1,5 @@
 """Re-split a dataset into train, val and test."""
 
-from pathlib import Path
-
 import numpy as np
 import pyarrow as pa
 
@@ -12,11 +10,12 @@ from perilune_shared.editing.flights import terrains_and_flights
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
+from perilune_shared.storage.store import Address
 
 
 def split_dataset(
     source: Dataset,
-    out: Path,
+    out: Address,
     by: SplitUnit = "scene",
     val_share: float = 0.1,
     test_share: float = 0.1,

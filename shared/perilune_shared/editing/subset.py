@@ -1,7 +1,6 @@
 """Take part of a dataset: by conditions on columns, by number of frames, or by size."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -15,11 +14,12 @@ from perilune_shared.dataset.writer import SceneTables
 from perilune_shared.editing.rewrite import check_source, rewrite
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
+from perilune_shared.storage.store import Address
 
 
 def subset(
     source: Dataset,
-    out: Path,
+    out: Address,
     where: Sequence[str] = (),
     n_frames: int | None = None,
     megabytes: float | None = None,

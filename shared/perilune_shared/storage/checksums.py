@@ -23,11 +23,12 @@ _OWN_FOLDERS = ("manifest", "shards")
 def seal(address: Address, progress: Progress = NO_PROGRESS, known: Mapping[str, str] | None = None) -> None:
     """Write SHA256SUMS for all files of the dataset, except links and invalid names, which are faults.
 
-    `known` contains hashes computed earlier in this run; these files are not read again.
+    `known` contains hashes computed earlier in this run; these files are not read again and may not be written yet.
     """
     store = open_store(address)
-    sizes = {name: size for name, size in _covered(store).items() if _is_plain(store, name)}
     hashes = dict(known or {})
+    found = {name: size for name, size in _covered(store).items() if name in hashes or _is_plain(store, name)}
+    sizes = {name: found.get(name, 0) for name in sorted({*found, *hashes})}
     with _hashing({name: size for name, size in sizes.items() if name not in hashes}, progress) as advance:
         for name in sizes:
             if name not in hashes:
