@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
@@ -172,9 +173,7 @@ def _develop_trajectory(source: Dataset, out: Path, frame_source: FrameSource, f
     scene_id, trajectory_id = (frames[name][0].as_py() for name in ("scene_id", "trajectory_id"))
     known = None
     if frame_source.camera == source.camera:
-        table = source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id).to_pandas()
-        known = {frame_id: rows for frame_id, rows in table.groupby("frame_id")}
-        none = table.iloc[:0]
+        known = source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id)
     written: list[dict] = []
     labels = []
     for row in frames.to_pylist():
@@ -183,9 +182,11 @@ def _develop_trajectory(source: Dataset, out: Path, frame_source: FrameSource, f
         if known is None:
             found = frame_source.labels(frame)
             written[-1]["n_craters_above_max_radius"] = found.n_above
+            labels.append(tables.label_table(frame_id, found))
         else:
-            found = frame_source.with_contrast(Labels.from_table(known.get(frame_id, none)), frame)
-        labels.append(tables.label_table(frame_id, found))
+            own = known.filter(pc.equal(known["frame_id"], frame_id))
+            found = frame_source.with_contrast(Labels.from_table(own.to_pandas()), frame)
+            labels.append(with_column(own, "contrast", found.contrast))
     rows = tables.developed_frame_table(frames, frame_source.camera, written)
     finish_trajectory(out, scene_id, trajectory_id, labels, rows)
 

@@ -95,7 +95,7 @@ def _labels(
         if len(unknown):
             found = labels[name][int(unknown[0])].as_py()
             yield Fault.of(where, int(unknown[0]), name, found, f"a row of {name.removesuffix('_id')}s")
-    for name in ("scene_id", "split"):
+    for name in ("scene_id", "split") if len(frames) else ():
         expected = frames[name].take(pa.array(np.maximum(frame_of, 0)))
         wrong = np.flatnonzero(~np.asarray(pc.equal(labels[name], expected), bool) & (frame_of >= 0))
         if len(wrong):

@@ -137,9 +137,10 @@ def test_bombs_are_refused_within_memory_and_time_limits(name, victim):
 def test_the_largest_real_part_is_read(tmp_path):
     """The limits accept what the renderer writes: numbers that hardly compress."""
     rng = np.random.default_rng(1)
+    texts = {"frame_id": "s000/t000/%06d", "scene_id": "s%03d", "split": "train%d"}
     columns = [
-        pa.array([f"s000/t000/{i % 1000:06d}" for i in range(300_000)])
-        if field.name == "frame_id"
+        pa.array([texts[field.name] % (i % 1000) for i in range(300_000)])
+        if field.name in texts
         else pa.array(rng.integers(0, 2**40, 300_000) if field.type == pa.int64() else rng.random(300_000))
         for field in TABLES["labels"]
     ]

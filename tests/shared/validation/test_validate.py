@@ -52,7 +52,7 @@ DAMAGES = {
     "moved ellipse": ("labels", put("ellipse_cx_px", 12.0), "ellipse_cx_px"),
     "grown box": ("labels", put("bbox_x1_px", 500.0), "bbox_x1_px"),
     "negative radius": ("labels", put("radius_px", -1.0), "radius_px"),
-    "fraction above one": ("labels", put("visible_fraction", 1.2), "visible_fraction"),
+    "fraction above one": ("labels", put("visible_fraction", 1.25), "visible_fraction"),
     "unknown crater": ("labels", put("crater_id", 999_999), "crater_id"),
     "unknown frame": ("labels", put("frame_id", "scene-0000/none/000000"), "frame_id"),
     "latitude": ("scenes", put("latitude_deg", 95.0), "latitude_deg"),
