@@ -54,7 +54,7 @@ def batch_loader(
     `pinned` puts the batches into page-locked memory, from which a GPU copies them without making the process wait.
     """
     if workers:
-        cv2.setNumThreads(1)
+        one_thread()
     return torch_data.DataLoader(
         dataset,
         batch_sampler=batches,
@@ -62,11 +62,12 @@ def batch_loader(
         num_workers=workers,
         pin_memory=pinned,
         persistent_workers=workers > 0,
-        worker_init_fn=_one_thread,
+        worker_init_fn=one_thread,
     )
 
 
-def _one_thread(_: int) -> None:
+def one_thread(_: int = 0) -> None:
+    """Let OpenCV use one thread in this process, a worker or one that is about to fork workers."""
     # A forked worker has inherited it; a spawned one has not.
     if cv2.getNumThreads() != 1:
         cv2.setNumThreads(1)

@@ -1,0 +1,275 @@
+"""Frames of a packed dataset as a stream: shuffled, divided among processes and workers, resumable within an epoch.
+
+Use:
+
+    stream = FrameStream(open_dataset("packed"), "train", batch_size=8, seed=0)
+    for epoch in range(10):
+        stream.set_epoch(epoch)
+        for batch in stream_loader(stream, workers=2):
+            ...  # a list of StreamedFrame, or what `make` returns
+            state = stream.state_dict()  # load_state_dict(state) continues after this batch
+
+Everything is a function of seed, epoch, and the numbers of processes and workers: the row groups of all shards are
+permuted, cut into equal shares, and each share is read in windows of a few row groups, whose frames are permuted. So a
+position is enough to resume, and each frame occurs exactly once in an epoch.
+
+Memory of each worker (of the process itself without workers): two windows, one being used and one being read. `pack`
+limits a row group to 64 frames and 8 MiB (more only for a single frame), so a window takes at most 64 MiB.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from torch.utils import data as torch_data
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.packed import SHARDS, open_shard, shard_name
+from perilune_shared.dataset.parts import Part
+from perilune_shared.errors import UserError
+from perilune_train.data.epochs import one_thread
+
+_GROUPS_PER_WINDOW = 8
+_MAX_OPEN_SHARDS = 16
+"""Open local shards of a worker. Of an object store one is open: it keeps the blocks that it has fetched."""
+_NESTED = ("image", "labels")
+COLUMNS = tuple(name for name in SHARDS.names if name not in _NESTED)
+"""Columns of the table frames, by default all are read."""
+_STATE = ("batch_size", "seed", "processes", "workers", "frames")
+
+
+@dataclass(frozen=True, slots=True)
+class StreamedFrame:
+    """One frame of the stream."""
+
+    number: int
+    """Number of the frame within its split, from 0, in the order of the shards."""
+    row: dict[str, Any]
+    """The frame's row of the table frames."""
+    png: bytes
+    """Content of the PNG file."""
+    labels: pa.StructArray
+    """The frame's rows of the table labels, without the columns that `row` has."""
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """Row groups of all shards of a split, in the order of the shards."""
+
+    shard: list[str]
+    """Path of the shard of each row group (G)."""
+    in_shard: NDArray[np.int64]
+    """Number of each row group within its shard (G,)."""
+    n_frames: NDArray[np.int64]
+    """Number of frames of each row group (G,)."""
+
+    @property
+    def first(self) -> NDArray[np.int64]:
+        """Number of the first frame of each row group (G,)."""
+        return np.cumsum(self.n_frames) - self.n_frames
+
+
+def _unchanged(frames: list[StreamedFrame], epoch: int) -> list[StreamedFrame]:
+    return frames
+
+
+class FrameStream(torch_data.IterableDataset):
+    """Batches of the frames of a split that belong to one of several processes; see the module.
+
+    All processes have the same number of batches, `len(stream)`, of `batch_size` frames each. The last batch of an
+    epoch has what is left: at least one frame, at most batch_size + 1.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        split: str,
+        batch_size: int,
+        seed: int,
+        process: int = 0,
+        processes: int = 1,
+        make: Callable[[list[StreamedFrame], int], Any] = _unchanged,
+        columns: tuple[str, ...] = COLUMNS,
+        images: bool = True,
+    ):
+        """Read the footers of the split's shards.
+
+        `make` converts a batch of an epoch in the worker that reads it. `columns` of the table frames are read; without
+        `images` the PNGs are empty. Raises UserError if a shard is missing or damaged, or if
+        there are fewer frames than processes.
+        """
+        self.dataset, self.split, self.batch_size, self.seed = dataset, split, batch_size, seed
+        self.process, self.processes, self.make, self.columns = process, processes, make, columns
+        self._nested = _NESTED if images else _NESTED[1:]
+        self.epoch = self.batches = self.workers = 0
+        self._groups = _groups_of(dataset, split)
+        self.n_frames = int(self._groups.n_frames.sum())
+        if self.n_frames < processes:
+            expected = f"at least {processes}, one for each process"
+            raise UserError(dataset.store, f"{split} frames", self.n_frames, expected)
+
+    def __len__(self) -> int:
+        return -(-(self.n_frames // self.processes) // self.batch_size)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch of the next iteration. If it is another one, iteration starts at its first batch."""
+        if epoch != self.epoch:
+            self.epoch, self.batches = epoch, 0
+
+    def state_dict(self) -> dict[str, int]:
+        """Return the position of the stream and what the order of frames depends on."""
+        return {"epoch": self.epoch, "batches": self.batches, **self._settings()}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Continue at a position. Raises UserError if the order of frames would be another one."""
+        for name, value in self._settings().items():
+            # Before the first iteration, the number of workers is not known.
+            if state[name] != value and not (name == "workers" and 0 in (value, state[name])):
+                raise UserError("state of the stream", name, value, f"{state[name]}, as when the state was saved")
+        self.epoch, self.batches = state["epoch"], state["batches"]
+
+    def _settings(self) -> dict[str, int]:
+        values = (self.batch_size, self.seed, self.processes, self.workers, self.n_frames)
+        return dict(zip(_STATE, values, strict=True))
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yield the batches of this worker, or all of the process, from batch `batches` of the epoch on.
+
+        In a worker an error of the user is yielded instead of raised: torch would lose its type (`stream_loader`).
+        """
+        worker = torch_data.get_worker_info()
+        number, workers = (worker.id, worker.num_workers) if worker is not None else (0, 1)
+        try:
+            # The loader asks worker 0 first, also on resuming.
+            yield from self._batches((self.batches + number) % workers, workers)
+        except UserError as error:
+            if worker is None:
+                raise
+            yield error
+
+    def _batches(self, lane: int, lanes: int) -> Iterator[Any]:
+        """Yield batches lane, lane + lanes, ... of this process, without those before `batches`."""
+        start, stop = (self.n_frames * place // self.processes for place in (self.process, self.process + 1))
+        sizes = np.full(len(self), self.batch_size)
+        sizes[-1] = stop - start - sizes[:-1].sum()
+        start += sum(int(sizes[before::lanes].sum()) for before in range(lane))
+        own = np.arange(len(self))[lane::lanes]
+        done = int(sizes[own[own < self.batches]].sum())
+        frames = self._frames(start, start + int(sizes[own].sum()), done)
+        for batch in own[own >= self.batches]:
+            yield self.make([next(frames) for _ in range(sizes[batch])], self.epoch)
+
+    def _frames(self, start: int, stop: int, done: int) -> Iterator[StreamedFrame]:
+        """Yield the frames at the places [start, stop) of the epoch's order of row groups, after the first `done`."""
+        opened: dict[str, Part] = {}
+        with ThreadPoolExecutor(1) as reader:
+            pending = []
+            for window in self._windows(start, stop, done):
+                pending.append((window, reader.submit(self._read, opened, np.unique(window[0]))))
+                if len(pending) > 1:
+                    yield from self._of_window(*pending.pop(0))
+            for last in pending:
+                yield from self._of_window(*last)
+
+    def _windows(self, start: int, stop: int, done: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Yield row groups (N,) and rows in them (N,) of the frames of each window, in their order."""
+        order = np.random.default_rng([self.seed, self.epoch]).permutation(len(self._groups.shard))
+        ends = np.cumsum(self._groups.n_frames[order])
+        first, last = np.searchsorted(ends, [start, stop - 1], side="right")
+        for window in range(first, last + 1, _GROUPS_PER_WINDOW):
+            places = range(window, min(window + _GROUPS_PER_WINDOW, last + 1))
+            sizes = self._groups.n_frames[order[places]]
+            groups = np.repeat(order[places], sizes)
+            rows = np.concatenate([np.arange(size) for size in sizes])
+            at = np.arange(len(rows)) + ends[window] - sizes[0]
+            own = np.flatnonzero((at >= start) & (at < stop))
+            own = np.random.default_rng([self.seed, self.epoch, int(at[own[0]])]).permutation(own)
+            skipped, done = own[:done], max(done - len(own), 0)
+            own = own[len(skipped) :]
+            if len(own):
+                yield groups[own], rows[own]
+
+    def _read(self, opened: dict[str, Part], groups: NDArray[np.int64]) -> dict[int, pa.Table]:
+        """Read row groups, by number."""
+        tables = {}
+        for group in groups.tolist():
+            path = self._groups.shard[group]
+            if path not in opened:
+                while len(opened) >= (_MAX_OPEN_SHARDS if self.dataset.store.is_local else 1):
+                    del opened[next(iter(opened))]
+                opened[path] = open_shard(self.dataset.store, path)
+            tables[group] = opened[path].read([*self.columns, *self._nested], [int(self._groups.in_shard[group])])
+            if len(tables[group]) != self._groups.n_frames[group]:
+                found, expected = len(tables[group]), f"{self._groups.n_frames[group]}, as when the stream was opened"
+                raise UserError(self.dataset.store.at(path), "rows", found, expected)
+        return tables
+
+    def _of_window(self, window: tuple[NDArray[np.int64], NDArray[np.int64]], tables: Any) -> Iterator[StreamedFrame]:
+        read, first = tables.result(), self._groups.first
+        rows_of = {group: table.select(self.columns).to_pylist() for group, table in read.items()}
+        nested = {group: {name: table[name].combine_chunks() for name in self._nested} for group, table in read.items()}
+        for group, row in zip(*(part.tolist() for part in window), strict=True):
+            png = nested[group]["image"][row]["bytes"].as_py() or b"" if "image" in self._nested else b""
+            yield StreamedFrame(int(first[group]) + row, rows_of[group][row], png, nested[group]["labels"][row].values)
+
+
+def _groups_of(dataset: Dataset, split: str) -> _Groups:
+    """Read the row groups of a split's shards. Raises UserError if there are none, or if one is missing or damaged."""
+    if dataset.info.images != "packed":
+        raise UserError(dataset.store, "images", dataset.info.images, "packed; see `perilune-manifest pack`")
+    shards = dataset.shards(split)
+    count = int(PurePosixPath(shards[0]).stem.rpartition("-")[2]) if shards else 1
+    for number in range(count):
+        path = shard_name(split, number, count)
+        if path not in shards:
+            raise UserError(
+                dataset.store.at(path), "shard", "no such file", f"one of the {count} shards of the split {split}"
+            )
+    with ThreadPoolExecutor(16) as readers:
+        sizes = list(readers.map(functools.partial(_group_sizes, dataset), shards))
+    return _Groups(
+        [path for path, own in zip(shards, sizes, strict=True) for _ in own],
+        np.array([number for own in sizes for number in range(len(own))]),
+        np.array([size for own in sizes for size in own]),
+    )
+
+
+def _group_sizes(dataset: Dataset, path: str) -> list[int]:
+    footer = open_shard(dataset.store, path).file.metadata
+    return [footer.row_group(group).num_rows for group in range(footer.num_row_groups)]
+
+
+class StreamLoader:
+    """Batches of a stream from worker processes, or from the calling process; counts them in the stream."""
+
+    def __init__(self, stream: FrameStream, workers: int = 0, pinned: bool = False):
+        """`pinned` puts the batches into page-locked memory, from which a GPU copies them without waiting."""
+        self.stream, self.workers, self.pinned = stream, workers, pinned
+        stream.workers = max(workers, 1)
+        # Lightning calls `set_epoch` of a loader's attribute `sampler` before each epoch.
+        self.sampler = stream
+
+    def __len__(self) -> int:
+        return len(self.stream)
+
+    def __iter__(self) -> Iterator[Any]:
+        if self.workers:
+            one_thread()
+        loader = torch_data.DataLoader(
+            self.stream,
+            batch_size=None,
+            num_workers=self.workers,
+            pin_memory=self.pinned,
+            worker_init_fn=one_thread,
+        )
+        for batch in loader:
+            if isinstance(batch, UserError):
+                raise batch
+            self.stream.batches += 1
+            yield batch
