@@ -90,7 +90,7 @@ def load_images(dataset: Dataset, table: pd.DataFrame, name: str) -> NDArray[np.
     n_bytes = len(table) * camera.height_px * camera.width_px
     if n_bytes > os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"):
         found = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
-        raise UserError(dataset.store, "frames", found, f"{name} frames that fit into this machine's memory")
+        raise UserError(dataset.store, "frames", found, f"{name} frames that fit into memory; see detect.stream")
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
     place_of = {frame_id: place for place, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()

@@ -176,6 +176,10 @@ class DetectConfig(Section):
     workers: Annotated[int, Field(ge=0, le=64)] = 0
     """Worker processes that augment frames; 0 augments in the training process, which is best on few cores."""
 
+    stream: bool = False
+    """Read the training frames of a packed dataset as a stream instead of loading them into memory. The order of
+    frames then also depends on `workers`, which must be the same when a run is resumed."""
+
     @model_validator(mode="after")
     def _check(self) -> "DetectConfig":
         if self.strides not in ((8, 16, 32), (4, 8, 16)):

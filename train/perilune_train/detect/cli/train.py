@@ -14,7 +14,12 @@ def train(
     preset: Preset = "small",
     config: ConfigFile = None,
     set_: Settings = None,
-    dataset: Annotated[Path | None, typer.Option(help="Folder of the dataset. [default: data/<preset>/detect]")] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(
+            help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<preset>/detect]"
+        ),
+    ] = None,
     runs: RunsFolder = Path("runs"),
     name: RunName = None,
     allow_overlap: AllowOverlap = False,

@@ -104,19 +104,21 @@ def training_loader(
     frames = TrainingFrames(split, config)
     fewest = split.n_frames // split.share.processes
     batches = EpochBatches(frames.keys, fewest, config.batch_size, epoch, start)
-    return batch_loader(frames, batches, _collate(config, anchors), config.workers, _pinned(config))
+    return batch_loader(frames, batches, collate_of(config, anchors), config.workers, pinned(config))
 
 
 def evaluation_loader(split: DetectSplit, config: DetectConfig, anchors: Tensor | None = None) -> torch_data.DataLoader:
     """Batches of a share in order, not augmented; with `anchors` as in training, else without assignments."""
     frames = EvaluationFrames(split)
     batches = torch_data.BatchSampler(range(len(frames)), config.batch_size, drop_last=False)
-    return batch_loader(frames, batches, _collate(config, anchors), config.workers, _pinned(config))
+    return batch_loader(frames, batches, collate_of(config, anchors), config.workers, pinned(config))
 
 
-def _collate(config: DetectConfig, anchors: Tensor | None) -> Collate:
+def collate_of(config: DetectConfig, anchors: Tensor | None) -> Collate:
+    """Make batches with assignments to anchors (scales, 3, 2); without, if they are None."""
     return Collate(None if anchors is None else anchors.cpu(), config.strides, config.anchor_ratio)
 
 
-def _pinned(config: DetectConfig) -> bool:
+def pinned(config: DetectConfig) -> bool:
+    """Whether batches are put into page-locked memory: if they are copied to a GPU."""
     return choose_device(config.device) == "cuda"

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 import pandas as pd
@@ -124,6 +124,31 @@ def read_split_labels(
     return frames.joined(), np.concatenate(sizes)
 
 
+def frame_labels(
+    dataset: Dataset,
+    row: dict[str, Any],
+    labels: pa.Table,
+    craters: Craters,
+    selection: Selection,
+    radius_px: tuple[float, float],
+    scale: tuple[float, float],
+) -> FrameLabels:
+    """Labels and ignored craters of one frame, given its row, its rows of the table labels and its scene's craters.
+
+    The craters are sorted by id. Raises UserError if the crater of a label is missing.
+    """
+    ids = labels["crater_id"].to_numpy()
+    known = (np.append(craters.crater_id, -1)[np.searchsorted(craters.crater_id, ids)] == ids) & (ids >= 0)
+    if not known.all():
+        found = f"{ids[known.argmin()]} in {row['frame_id']}"
+        raise UserError(dataset.store, "labels: crater_id", found, "craters; see `perilune-manifest validate`")
+    own = _SceneLabels.of(labels, craters, selection)
+    ignored = unlabelled_craters(craters, dataset.camera, row, radius_px, scale, own.crater_id)
+    frames = _Joined()
+    frames.add(own.shape, own.selected, own.depth_ratio, ignored)
+    return frames.joined()[0]
+
+
 @dataclass(frozen=True)
 class _SceneLabels:
     """Labels of one scene, sorted by frame."""
@@ -141,7 +166,7 @@ class _SceneLabels:
     def of(cls, labels: pa.Table, craters: Craters, selection: Selection) -> "_SceneLabels":
         """From rows of the table labels, whose craters all exist."""
         ids = labels["crater_id"].to_numpy()
-        by_id = np.argsort(craters.crater_id)
+        by_id = np.argsort(craters.crater_id, kind="stable")  # fast if they are sorted
         row = by_id[np.searchsorted(craters.crater_id, ids, sorter=by_id)]
         depth_m, diameter_m = craters.depth_m[row], craters.diameter_m[row]
         columns = {name: labels[name].to_numpy() for name in _THRESHOLDED}

@@ -62,23 +62,28 @@ def load_split(
     `scale` has the smallest and the largest zoom factor that will be applied to frames; the range of ignored craters is
     extended accordingly. The edge account needs a largest factor of 1 / EDGE.
     """
+    check_frame_size(dataset)
+    table = frame_table(dataset, split)
+    if len(table) < share.processes:
+        expected = f"at least {share.processes}, one for each process"
+        raise UserError(dataset.store, f"{split} frames", len(table), expected)
+    frames = load_frames(dataset, split, share)
+    radius_px = evaluated_range(dataset, settings)
+    labels, sizes_px = read_split_labels(dataset, table, share, settings, radius_px, scale)
+    return DetectSplit(frames, labels, radius_px, sizes_px, len(table), share)
+
+
+def check_frame_size(dataset: Dataset) -> None:
+    """Raise UserError if the sides of the frames are no multiples of the network's coarsest stride."""
     camera = dataset.info.camera
     for field, size in (("width_px", camera.width_px), ("height_px", camera.height_px)):
         if size % COARSEST_STRIDE:
             nearest = max(1, round(size / COARSEST_STRIDE)) * COARSEST_STRIDE
             expected = f"a multiple of {COARSEST_STRIDE}, the network's coarsest stride"
             raise UserError(dataset.store, field, size, f"{expected}; render or develop the frames with {nearest}")
-    table = frame_table(dataset, split)
-    if len(table) < share.processes:
-        expected = f"at least {share.processes}, one for each process"
-        raise UserError(dataset.store, f"{split} frames", len(table), expected)
-    frames = load_frames(dataset, split, share)
-    radius_px = _evaluated_range(dataset, settings)
-    labels, sizes_px = read_split_labels(dataset, table, share, settings, radius_px, scale)
-    return DetectSplit(frames, labels, radius_px, sizes_px, len(table), share)
 
 
-def _evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
+def evaluated_range(dataset: Dataset, settings: LabelSettings) -> tuple[float, float]:
     """Smallest and largest selected radius, pixels; limits that the selection does not set are those of the labels."""
     if settings.radius_px is None:
         limits = pc.min_max(dataset.table("labels", ["radius_px"])["radius_px"]).as_py()

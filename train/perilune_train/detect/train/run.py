@@ -2,11 +2,15 @@
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.terminal import console
 from perilune_train.data.shares import ALONE
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.data.streamed import open_streamed
 from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.metrics import curve, figures
 from perilune_train.detect.evaluate.report import write_evaluation
@@ -40,7 +44,7 @@ from perilune_train.training.fit import fit, own_share
 
 def run_detect(
     config: DetectConfig,
-    dataset_root: Path,
+    dataset_address: str | Path,
     runs_root: Path,
     name: str,
     overwrite: bool = False,
@@ -57,21 +61,25 @@ def run_detect(
     """
     console.quiet = not runs.is_first_process()
     run = runs.RunFolder(runs_root / "detect" / name)
-    inputs = hashes_of({"dataset": dataset_root, "teacher": None if config.teacher is None else Path(config.teacher)})
+    inputs = hashes_of(
+        {"dataset": dataset_address, "teacher": None if config.teacher is None else Path(config.teacher)}
+    )
     state = state_of(run, "detect", config, inputs, overwrite)
     if state == "finished":
         return run
     resume = state == "resume"
-    dataset = open_dataset(dataset_root)
+    dataset = open_dataset(dataset_address)
     terrain = training_provenance(dataset).joined(inherited_terrain(config, run.last if resume else None))
     terrain_check = check_terrain(terrain, dataset, "test", allow_overlap)
     device = runs.choose_device(config.device)
     scale = {"train": config.augment.scale, "val": (1.0, 1.0), "test": (1.0, 1 / EDGE)}
     share = own_share(config.devices, config.num_nodes)
-    splits = {name: load_split(dataset, name, config.labels, scale[name], share) for name in ("train", "val")}
+    in_memory = ("val",) if config.stream else ("train", "val")
+    splits = {name: load_split(dataset, name, config.labels, scale[name], share) for name in in_memory}
+    train = open_streamed(dataset, config, share) if config.stream else splits["train"]
     if runs.is_first_process():
         splits["test"] = load_split(dataset, "test", config.labels, scale["test"])
-    sizes = splits["train"].label_sizes_px
+    sizes = train.label_sizes_px
     network = build_network(config, sizes, dataset.store)
     if config.init_from is not None and not resume:
         start_from(network, Path(config.init_from), config)
@@ -87,7 +95,7 @@ def run_detect(
     # The anchors of a resumed run are in its state and may differ.
     if not resume:
         console.print(anchor_report(network, sizes, config.anchor_ratio))
-    task = DetectTask(network, config, splits["train"], splits["val"], frozen_epochs, teacher)
+    task = DetectTask(network, config, train, splits["val"], frozen_epochs, teacher)
     task.terrain = terrain.plain()
     seconds = fit(
         run,
@@ -120,7 +128,7 @@ def run_detect(
         "multiply_adds": multiply_adds_of_a_frame(network, config, *splits["test"].frames.images.shape[1:]),
     }
     metrics |= selection_entries(config, splits["test"])
-    metrics |= dataset_entries(dataset, "test", config) | evaluate(run, config, dataset, splits)
+    metrics |= dataset_entries(dataset, "test", config) | evaluate(run, config, dataset, splits, sizes)
     mark_files(run.root, WRITTEN, terrain_check.mark)
     metrics |= terrain_check.metrics()
     write_metrics(run.root, metrics)
@@ -133,8 +141,12 @@ def evaluate(
     config: DetectConfig,
     dataset: Dataset,
     splits: dict[str, DetectSplit],
+    sizes_px: NDArray[np.float64],
 ) -> Metrics:
-    """Evaluate the best weights on val and test; write tables and pictures. The threshold is chosen on val only."""
+    """Evaluate the best weights on val and test; write tables and pictures. The threshold is chosen on val only.
+
+    `sizes_px` (S, 2) are those of the training labels.
+    """
     detector = open_detector(run.best, config)
     found_val, _ = detect_split(detector, splits["val"], "val")
     found, rate = detect_split(detector, splits["test"], "test")
@@ -143,7 +155,7 @@ def evaluate(
     evaluation = evaluate_split(splits["test"], found, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found)
     about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{rule} on val")
-    about.append(anchor_report(detector.network, splits["train"].label_sizes_px, config.anchor_ratio))
+    about.append(anchor_report(detector.network, sizes_px, config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), about)
     metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}
     metrics |= {f"test/{key}": value for key, value in evaluation.figures().items()}

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import Batch, evaluation_loader, network_input, training_loader
 from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.data.streamed import StreamedSplit, streamed_loader
 from perilune_train.detect.evaluate.matching import Detections, joined, match_split
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.inference.suppression import detections_of
@@ -74,7 +75,7 @@ class DetectTask(lightning.LightningModule):
         self,
         network: YOLOv3,
         config: DetectConfig,
-        train: DetectSplit,
+        train: DetectSplit | StreamedSplit,
         val: DetectSplit,
         frozen_epochs: int,
         teacher: Teacher | None = None,
@@ -89,7 +90,7 @@ class DetectTask(lightning.LightningModule):
             "attention": config.attention,
             "strides": list(config.strides),
         }
-        self.splits = {"train": train, "val": val}
+        self.train_split, self.val_split = train, val
         self.detections: list[Detections] = []
         self.images_seen = 0
         self.terrain: dict[str, Any] | None = None
@@ -105,10 +106,13 @@ class DetectTask(lightning.LightningModule):
         epoch = self._trainer.fit_loop.epoch_progress.current.processed if self._trainer else 0
         resumed_epoch, batches = self.resumed
         start = batches if epoch == resumed_epoch else 0
-        return training_loader(self.splits["train"], self.config, self.network.anchors, epoch, start)
+        split, anchors = self.train_split, self.network.anchors
+        if isinstance(split, StreamedSplit):
+            return streamed_loader(split, self.config, anchors, epoch, start)
+        return training_loader(split, self.config, anchors, epoch, start)
 
     def val_dataloader(self) -> Any:
-        return evaluation_loader(self.splits["val"], self.config)
+        return evaluation_loader(self.val_split, self.config)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["epoch_and_batches"] = [
@@ -116,12 +120,16 @@ class DetectTask(lightning.LightningModule):
             self.trainer.fit_loop.epoch_loop.batch_progress.current.processed,
         ]
         checkpoint["images_seen"] = self.images_seen
+        if isinstance(self.train_split, StreamedSplit):
+            checkpoint["stream"] = self.train_split.stream.state_dict()
         if self.terrain is not None:
             checkpoint[RECORD] = self.terrain
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         epoch, batches = checkpoint["epoch_and_batches"]
         self.resumed = (epoch, batches)
+        if isinstance(self.train_split, StreamedSplit):
+            self.train_split.stream.load_state_dict(checkpoint["stream"])
         self.images_seen = checkpoint.get("images_seen", 0)
 
     def configure_optimizers(self) -> Any:
@@ -201,7 +209,7 @@ class DetectTask(lightning.LightningModule):
         self.detections += detections_of(boxes, scores, self.config.evaluation)
 
     def on_validation_epoch_end(self) -> None:
-        split, processes = self.splits["val"], self.process[1]
+        split, processes = self.val_split, self.process[1]
         height, width = split.frames.images.shape[1:]
         match_iou = self.config.evaluation.match_iou
         matches = match_split(self.detections, split.labels, (width, height), match_iou, split.radius_px)

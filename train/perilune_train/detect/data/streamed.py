@@ -1,0 +1,117 @@
+"""Training frames of the detector as a stream, for packed datasets larger than memory."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from torch import Tensor
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_train.data.frames import decode, normalised
+from perilune_train.data.shares import Share
+from perilune_train.data.stream import FrameStream, StreamedFrame, StreamLoader
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.augment import augment
+from perilune_train.detect.data.batches import Batch, Collate, Sample, collate_of, pinned
+from perilune_train.detect.data.ignored import Craters, read_craters
+from perilune_train.detect.data.labels import FrameLabels, frame_labels
+from perilune_train.detect.data.split import check_frame_size, evaluated_range
+
+_COLUMNS = ("frame_id", "scene_id", "position_m", "rotation_wxyz", "png_bytes")
+_SAMPLED_FRAMES = 2048
+_MAX_SCENES = 16
+
+
+@dataclass(frozen=True)
+class StreamedSplit:
+    """The training split as a stream; see FrameStream."""
+
+    stream: FrameStream
+    """The share of this process."""
+    radius_px: tuple[float, float]
+    """Range of radii that are labelled and evaluated, pixels."""
+    label_sizes_px: NDArray[np.float64]
+    """Widths and heights of the selected labels of up to 2,048 frames from random row groups, pixels (S, 2)."""
+
+
+def open_streamed(dataset: Dataset, config: DetectConfig, share: Share) -> StreamedSplit:
+    """Open the training split of a packed dataset as a stream.
+
+    Raises UserError on damaged or missing shards, on frame sizes unfit for the network and on fewer frames than
+    processes.
+    """
+    check_frame_size(dataset)
+    radius_px = evaluated_range(dataset, config.labels)
+    sampled = FrameStream(dataset, "train", 64, config.seed, columns=_COLUMNS, images=False)
+    labels = _Labels(dataset, config, radius_px)
+    sizes = []
+    for batch in sampled:
+        boxes = [own.boxes[own.selected] for own in map(labels, batch)]
+        sizes += [own[:, 2:] - own[:, :2] for own in boxes]
+        if len(sizes) >= _SAMPLED_FRAMES:
+            break
+    stream = FrameStream(
+        dataset, "train", config.batch_size, config.seed, share.process, share.processes, columns=_COLUMNS
+    )
+    # A resumed run checks it before there is a loader.
+    stream.workers = max(config.workers, 1)
+    return StreamedSplit(stream, radius_px, np.concatenate(sizes))
+
+
+def streamed_loader(
+    split: StreamedSplit, config: DetectConfig, anchors: Tensor, epoch: int = 0, start: int = 0
+) -> StreamLoader:
+    """Training batches of a stream, in every epoch in its order; the first one, `epoch`, from batch `start` on.
+
+    `anchors` (scales, 3, 2) are those of the network.
+    """
+    stream = split.stream
+    stream.make = _Batches(_Labels(stream.dataset, config, split.radius_px), collate_of(config, anchors))
+    stream.epoch, stream.batches = epoch, start
+    return StreamLoader(stream, config.workers, pinned(config))
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """Labels and ignored craters of streamed frames; keeps the craters of the last scenes."""
+
+    dataset: Dataset
+    config: DetectConfig
+    radius_px: tuple[float, float]
+    scenes: dict[str, Craters] = field(default_factory=dict)
+
+    def __call__(self, frame: StreamedFrame) -> FrameLabels:
+        """Return the labels of a frame. Raises UserError if the crater of one is missing."""
+        scene_id = frame.row["scene_id"]
+        craters = self.scenes.pop(scene_id, None)
+        if craters is None:
+            craters = read_craters(self.dataset, scene_id)
+            craters = craters.chosen(np.argsort(craters.crater_id, kind="stable"))
+        while len(self.scenes) >= _MAX_SCENES:
+            del self.scenes[next(iter(self.scenes))]
+        self.scenes[scene_id] = craters
+        labels, scale = pa.Table.from_struct_array(frame.labels), self.config.augment.scale
+        return frame_labels(self.dataset, frame.row, labels, craters, self.config.labels, self.radius_px, scale)
+
+
+@dataclass(frozen=True)
+class _Batches:
+    """Makes a batch of streamed frames. A class, so that `spawn` can pickle it."""
+
+    labels: _Labels
+    collate: Collate
+
+    def __call__(self, frames: list[StreamedFrame], epoch: int) -> Batch:
+        return self.collate([self.sample(frame, epoch) for frame in frames])
+
+    def sample(self, frame: StreamedFrame, epoch: int) -> Sample:
+        """Decode and augment a frame; the augmentation depends on seed, epoch and frame only, as in memory."""
+        config, camera, labels = self.labels.config, self.labels.dataset.info.camera, self.labels(frame)
+        name, size = frame.row["frame_id"], frame.row["png_bytes"]
+        image = decode(frame.png, f"{self.labels.dataset.store}/{name}", camera.height_px, camera.width_px, size)
+        rng = np.random.default_rng([config.seed, epoch, frame.number])
+        pixels, boxes, selected = augment(
+            image, labels.boxes, labels.selected, self.labels.radius_px, config.augment, rng
+        )
+        return normalised(pixels), boxes, selected
