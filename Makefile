@@ -31,7 +31,8 @@ COMMON := --preset $(PRESET) $(if $(CONFIG),--config $(call quoted,$(CONFIG))) $
 TRAIN := $(COMMON) --out $(call quoted,$(RUNS)) --name $(NAME)
 RENDER = $(BIN)/perilune-render dataset $(COMMON) $(if $(DEM),--dem $(call quoted,$(DEM))) \
   $(if $(CATALOGUE),--catalogue $(call quoted,$(CATALOGUE))) \
-  $(if $(WORKERS),--workers $(WORKERS)) $(if $(THREADS),--threads $(THREADS)) --out $(call quoted,$(DATA))
+  $(if $(WORKERS),--workers $(WORKERS)) $(if $(THREADS),--threads $(THREADS)) \
+  $(if $(EXECUTOR),--executor $(EXECUTOR)) $(if $(ADDRESS),--address $(ADDRESS)) --out $(call quoted,$(DATA))
 
 DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
@@ -42,7 +43,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
 	@echo
-	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads'
+	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port'
 	@echo
 	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""

@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -37,8 +37,12 @@ _UNITS = ((12, "TB"), (9, "GB"), (6, "MB"), (3, "kB"), (0, "bytes"))
 class _How:
     """How a job is rendered, and which part of it."""
 
-    workers: int
-    """Number of worker processes; 0 renders in this process."""
+    executor: Literal["local", "ray"]
+    """Processes on this machine, or actors of Ray."""
+    address: str | None
+    """Address of a running Ray cluster; None starts Ray on this machine."""
+    workers: int | None
+    """Number of worker processes; 0 renders in this process; None for the executor's default."""
     threads: int | None
     """Number of threads of each process; None divides the cores among the workers."""
     shard: tuple[int, int] | None
@@ -49,7 +53,16 @@ class _How:
     """Whether only to estimate."""
 
     @classmethod
-    def of(cls, workers: int, threads: int | None, shard: str | None, finish: bool, dry_run: bool) -> "_How":
+    def of(
+        cls,
+        executor: Literal["local", "ray"],
+        address: str | None,
+        workers: int | None,
+        threads: int | None,
+        shard: str | None,
+        finish: bool,
+        dry_run: bool,
+    ) -> "_How":
         """From the options of the command. Raises UserError on a shard that is none, and on options that exclude."""
         given = [name for name, is_set in (("--shard", shard), ("--finish", finish), ("--dry-run", dry_run)) if is_set]
         if len(given) > 1:
@@ -58,7 +71,12 @@ class _How:
         numbers = (int(matched[1]), int(matched[2])) if matched is not None else None
         if shard is not None and (numbers is None or numbers[0] > numbers[1]):
             raise UserError("--shard", "shard", shard, "its number and the count of shards, from 1/64 to 64/64")
-        return cls(workers, threads, numbers, finish, dry_run)
+        if address is not None and executor != "ray":
+            raise UserError("--address", "executor", executor, "--executor ray, which connects to that cluster")
+        if workers == 0 and executor == "ray":
+            raise UserError("--workers", "workers", workers, "1 or more with --executor ray")
+        workers = 1 if workers is None and executor == "local" else workers
+        return cls(executor, address, workers, threads, numbers, finish, dry_run)
 
 
 def dataset(
@@ -77,9 +95,20 @@ def dataset(
         Path | None,
         typer.Option(help="Manifest or plan to render into --out, in place of a preset."),
     ] = None,
+    executor: Annotated[
+        Literal["local", "ray"], typer.Option(help="Processes on this machine, or Ray (extra `ray`).")
+    ] = "local",
+    address: Annotated[
+        str | None, typer.Option(help="Running Ray cluster, as host:6379; by default Ray is started on this machine.")
+    ] = None,
     workers: Annotated[
-        int, typer.Option(min=0, max=1024, help="Worker processes; 0 renders in the command's own process.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            min=0,
+            max=1024,
+            help="Worker processes; 0 renders in the command's own process. [default: 1; with Ray as many as fit]",
+        ),
+    ] = None,
     threads: Annotated[
         int | None,
         typer.Option(min=1, max=1024, help="Threads of each process. [default: the cores, divided by the workers]"),
@@ -94,7 +123,7 @@ def dataset(
     ] = False,
 ) -> None:
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
-    how = _How.of(workers, threads, shard, finish, dry_run)
+    how = _How.of(executor, address, workers, threads, shard, finish, dry_run)
     if manifest is not None:
         given = [name for name in ("preset", "config", "setting", "kind") if _was_given(context, name)]
         _render_manifest(manifest, out, dem, catalogue, given, how)
@@ -129,7 +158,7 @@ def _made(job: "Job", out: Path, how: _How) -> "Dataset | None":
     """Do what the options ask for; the dataset if it is finished. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
-    job = job.with_threads(how.threads, how.workers)
+    job = job.with_threads(how.threads, how.workers or 1)
     if how.finish:
         return finish_job(job, out)
     if how.dry_run:
@@ -147,7 +176,7 @@ def _print_estimate(job: "Job", out: Path, how: _How) -> None:
     from perilune_render.jobs.estimate import estimate
 
     with progress_bar() as progress:
-        found = estimate(job, out, progress, _executor(how), how.workers)
+        found = estimate(job, out, progress, _executor(how), how.workers or 1)
     hours = f"{found.seconds / 3600:.2f} hours" if found.seconds > 360 else f"{found.seconds:.0f} seconds"
     size = next(f"{found.n_bytes / 10**n:.3g} {unit}" for n, unit in _UNITS if found.n_bytes >= 10**n or n == 0)
     Console().print(f"{out}: {found.n_frames} frames left, {hours}, {size}", soft_wrap=True)
@@ -166,9 +195,15 @@ def _executor(how: _How) -> "MakeExecutor":
         from perilune_render.jobs.here import Here
 
         return Here
+    if how.executor == "ray":
+        try:
+            from perilune_render.jobs.ray_actors import RayActors
+        except ModuleNotFoundError:
+            raise UserError("--executor", "ray", "not installed", "pip install 'perilune-render[ray]'") from None
+        return partial(RayActors, n_workers=how.workers, address=how.address)
     from perilune_render.jobs.local import LocalWorkers
 
-    return partial(LocalWorkers, n_workers=how.workers)
+    return partial(LocalWorkers, n_workers=how.workers or 1)
 
 
 def _was_given(context: typer.Context, name: str) -> bool:

@@ -22,11 +22,11 @@ from perilune_shared.errors import UserError
 
 RECYCLED_AFTER = 64
 """Number of trajectories after which a worker is replaced, so that its memory cannot grow without limit."""
-_LOST_STARTS = 3
+LOST_STARTS = 3
 """Number of workers in a row that may end before they are ready."""
 _END_S = 5.0
 """Longest time for a worker to end by itself, seconds."""
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """The number of threads of linear algebra changes the last digits of results."""
 
 
@@ -143,7 +143,7 @@ class LocalWorkers:
         except (EOFError, BrokenPipeError, ConnectionResetError):
             self._end(worker)
             self._lost_starts += not worker.ready
-            if self._lost_starts > _LOST_STARTS * self._n_workers:
+            if self._lost_starts > LOST_STARTS * self._n_workers:
                 expected = "a worker that starts: see the messages above, and the machine's free memory"
                 raise UserError("perilune-render", "worker", worker.end, expected) from None
             return None
@@ -163,7 +163,7 @@ class LocalWorkers:
                     # -P: a module in the current folder must not take the place of an installed one.
                     [sys.executable, "-P", "-m", "perilune_render.jobs.worker", *arguments],
                     pass_fds=[theirs.fileno()],
-                    env={**os.environ, **dict.fromkeys(_ONE_THREAD, "1")},
+                    env={**os.environ, **dict.fromkeys(ONE_THREAD, "1")},
                     stdin=subprocess.DEVNULL,
                     # Ctrl-C goes to this process alone, which then ends its workers.
                     process_group=0,

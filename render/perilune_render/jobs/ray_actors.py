@@ -1,0 +1,162 @@
+"""Render a job with Ray, on this machine or on a cluster: one actor per process, each with its own renderer.
+
+Ray places the actors on machines, and places new ones when a process or a machine is lost. Work is handed out
+as to local workers (`WorkList`), so that an actor stays with its scene.
+"""
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.exceptions import RayActorError, RayTaskError
+
+from perilune_render.jobs.job import Job
+from perilune_render.jobs.local import LOST_STARTS, ONE_THREAD, RECYCLED_AFTER
+from perilune_render.jobs.report import Report
+from perilune_render.jobs.scene_renderer import SceneRenderer
+from perilune_render.jobs.work_list import WorkList
+from perilune_shared.errors import UserError, ends_run
+
+
+class _Renderer:
+    """The actor: a scene renderer in a process of Ray."""
+
+    def start(self, job: Job, out: Path) -> None:
+        """Receive the job. Raises UserError if the code of this process is not that of the job."""
+        self._renderer = SceneRenderer(job, out)
+
+    def grow(self, scene_id: str) -> None:
+        """Generate a scene and check that its poses fit it."""
+        self._renderer.grow(scene_id)
+
+    def render(self, place: int) -> list[str]:
+        """Render a trajectory; returns the ids of its dark frames."""
+        return self._renderer.render(place, lambda: None, lambda text: None)
+
+
+@dataclass(slots=True, eq=False)
+class _Actor:
+    """An actor, as the driver sees it."""
+
+    handle: Any
+    """Ray's handle of the actor."""
+    ready: bool = False
+    """Whether it runs."""
+    place: int | None = None
+    """The trajectory that it renders."""
+    scene_id: str | None = None
+    """The scene that it keeps."""
+    n_done: int = 0
+    """Number of trajectories that it has rendered."""
+
+
+class RayActors:
+    """The executor that renders with Ray, in `n_workers` actors, by default as many as the cluster has cores for.
+
+    `address` is that of a running cluster; None starts Ray on this machine for the duration of the block. `out` must be
+    at the same path on all machines.
+    """
+
+    def __init__(self, job: Job, out: Path, n_workers: int | None, address: str | None):
+        self._job, self._out, self._address = job, out.absolute(), address
+        self._n_workers = n_workers
+        self._n_threads = job.config.render.threads or 1
+        self._actors: list[_Actor] = []
+        self._pending: dict[Any, _Actor] = {}
+        self._lost_starts = 0
+
+    def __enter__(self) -> "RayActors":
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        local = {"num_cpus": self._n_workers * self._n_threads} if self._n_workers and self._address is None else {}
+        try:
+            ray.init(
+                self._address or "local",
+                include_dashboard=None if self._address else False,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                **local,
+            )
+        except ConnectionError as error:
+            raise UserError("--address", "Ray", error, "the address of a running Ray cluster, as host:6379") from None
+        if self._n_workers is None:
+            self._n_workers = max(int(ray.cluster_resources().get("CPU", 1)) // self._n_threads, 1)
+        self._remote_job = ray.put(self._job)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        ray.shutdown()
+
+    def check_scene(self, scene_id: str) -> None:
+        """Generate a scene in an actor and check that its poses fit it. Raises UserError."""
+        self._start(1)
+        try:
+            ray.get([*self._pending, self._actors[0].handle.grow.remote(scene_id)])
+        except RayTaskError as error:
+            raise error.cause from None
+        self._actors[0].scene_id = scene_id
+
+    def render(self, work: WorkList, report: Report) -> None:
+        """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
+        while True:
+            busy = [actor for actor in self._actors if actor.place is not None]
+            if not busy and not work.n_waiting:
+                return
+            self._start(min(self._n_workers or 1, len(busy) + work.n_waiting))
+            for actor in self._actors:
+                if actor.ready and actor.place is None:
+                    self._hand_out(actor, work, report)
+            (finished,), _ = ray.wait(list(self._pending), num_returns=1)
+            self._handle(self._pending.pop(finished), finished, work, report)
+
+    def _hand_out(self, actor: _Actor, work: WorkList, report: Report) -> None:
+        place = work.take(actor.scene_id)
+        if place is not None:
+            actor.place, actor.scene_id = place, self._job.plan.trajectories[place].scene_id
+            self._pending[actor.handle.render.remote(place)] = actor
+            report.started(place)
+            report.note(actor.scene_id)
+
+    def _handle(self, actor: _Actor, finished: Any, work: WorkList, report: Report) -> None:
+        place = actor.place
+        try:
+            dark = ray.get(finished)
+        except RayActorError as error:
+            self._actors.remove(actor)
+            if place is not None:
+                text = f"a process of Ray was lost ({type(error).__name__})"
+                report.failed(place, text, work.failed(place, text))
+            elif (lost := self._lost_starts + 1) <= LOST_STARTS * (self._n_workers or 1):
+                self._lost_starts = lost
+            else:
+                raise UserError("perilune-render", "Ray", error, "processes that start: see Ray's logs") from None
+            return
+        except RayTaskError as error:
+            if place is None or ends_run(error.cause):
+                raise error.cause from None
+            text = f"{type(error.cause).__name__}: {error.cause}"
+            report.failed(place, text, work.failed(place, text))
+            actor.place = None
+            return
+        actor.ready, actor.place, self._lost_starts = True, None, 0
+        if place is not None:
+            for _ in range(self._job.n_frames(place)):
+                report.frame(place)
+            work.done(place)
+            report.done(place, dark)
+            actor.n_done += 1
+            if actor.n_done >= RECYCLED_AFTER:
+                self._actors.remove(actor)
+                ray.kill(actor.handle)
+
+    def _start(self, n_actors: int) -> None:
+        """Start actors until there are `n_actors`; each gets work once it runs."""
+        remote = ray.remote(
+            num_cpus=self._n_threads, max_restarts=0, runtime_env={"env_vars": dict.fromkeys(ONE_THREAD, "1")}
+        )(_Renderer)
+        while len(self._actors) < n_actors:
+            actor = _Actor(remote.remote())
+            self._actors.append(actor)
+            self._pending[actor.handle.start.remote(self._remote_job, self._out)] = actor

@@ -1,0 +1,45 @@
+"""Rendering with Ray on this machine: the same bytes as in one process, also when a process of Ray is killed."""
+
+import os
+import signal
+from functools import partial
+from pathlib import Path
+
+import pytest
+from rich.progress import Progress
+
+from perilune_render.jobs.run import render_job
+
+pytest.importorskip("ray", reason="needs Ray (extra `ray`)")
+
+
+def processes_named(word):
+    """Ids of the processes of this user whose command line begins with a word."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if folder.joinpath("cmdline").read_bytes().startswith(word.encode()):
+                found.append(int(folder.name))
+        except OSError:
+            continue
+    return found
+
+
+class KillsOnce(Progress):
+    """A progress bar that kills the processes of Ray that hold a renderer, when the first trajectory is finished."""
+
+    killed = False
+
+    def advance(self, task_id, advance=1):
+        super().advance(task_id, advance)
+        if advance == 1 and not self.killed:
+            self.killed = [os.kill(pid, signal.SIGKILL) for pid in processes_named("ray::_Renderer")] != []
+
+
+def test_ray_gives_the_same_bytes_although_its_processes_are_killed(job, whole, files_of, tmp_path, capsys):
+    from perilune_render.jobs.ray_actors import RayActors
+
+    progress = KillsOnce(disable=True)
+    render_job(job, tmp_path, progress, partial(RayActors, n_workers=2, address=None))
+    assert files_of(tmp_path) == whole
+    assert progress.killed and "a process of Ray was lost (ActorDiedError); trying again" in capsys.readouterr().err
