@@ -99,13 +99,19 @@ def planned(n_threads: int):
 
 def render(out: Path, n_threads: int, scenes: list[int]) -> dict[str, Any]:
     """Render some scenes, given by their indices, in this process; returns times and processor times, seconds."""
+    from perilune_render.flight.plan import TrajectoryPlan
     from perilune_render.jobs.here import Here
     from perilune_render.jobs.run import render_job
 
     imported_s, recorder, job = time.monotonic(), Recorder(), planned(n_threads)
     own = tuple(job.plan.scenes[index] for index in scenes)
-    trajectories = tuple(trajectory for scene in own for trajectory in job.plan.of_scene(scene.scene_id))
-    job = replace(job, plan=replace(job.plan, scenes=own, trajectories=trajectories))
+    trajectories: list[TrajectoryPlan] = []
+    places = {}
+    for scene in own:
+        first = len(trajectories)
+        trajectories += job.plan.of_scene(scene.scene_id)
+        places[scene.scene_id] = range(first, len(trajectories))
+    job = replace(job, plan=replace(job.plan, scenes=own, trajectories=trajectories, places=places))
     render_job(job, out, recorder, Here)
     return {
         "imported_s": imported_s,

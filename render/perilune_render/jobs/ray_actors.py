@@ -18,6 +18,7 @@ from perilune_render.jobs.local import LOST_STARTS, ONE_THREAD, RECYCLED_AFTER
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.work_list import WorkList
+from perilune_render.processor import SETTINGS
 from perilune_shared.errors import UserError, ends_run
 
 
@@ -154,7 +155,10 @@ class RayActors:
     def _start(self, n_actors: int) -> None:
         """Start actors until there are `n_actors`; each gets work once it runs."""
         remote = ray.remote(
-            num_cpus=self._n_threads, max_restarts=0, runtime_env={"env_vars": dict.fromkeys(ONE_THREAD, "1")}
+            num_cpus=self._n_threads,
+            max_restarts=0,
+            # Ray may import NumPy before perilune, and other machines do not inherit this process's environment.
+            runtime_env={"env_vars": {**SETTINGS, **dict.fromkeys(ONE_THREAD, "1")}},
         )(_Renderer)
         while len(self._actors) < n_actors:
             actor = _Actor(remote.remote())
