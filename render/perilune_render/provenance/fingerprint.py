@@ -152,8 +152,9 @@ class _Walk:
 @functools.cache
 def _parsed(text: str, settings: bool = False) -> _Module:
     """Parse a source file without docstrings and error messages; `settings` also omits fields and checks."""
-    module = _Module()
-    for node in _Stripped(settings).visit(ast.parse(text)).body:
+    module, tree = _Module(), ast.parse(text)
+    # Imports inside a function too.
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 bound = alias.asname or alias.name.partition(".")[0]
@@ -161,7 +162,8 @@ def _parsed(text: str, settings: bool = False) -> _Module:
         elif isinstance(node, ast.ImportFrom) and node.module:
             for alias in node.names:
                 module.imported[alias.asname or alias.name] = (node.module, alias.name)
-        elif defined := _defined(node):
+    for node in _Stripped(settings).visit(tree).body:
+        if defined := _defined(node):
             for name in defined:
                 module.definitions.setdefault(name, []).append(node)
         elif not isinstance(node, ast.Pass):
@@ -170,7 +172,7 @@ def _parsed(text: str, settings: bool = False) -> _Module:
 
 
 class _Stripped(ast.NodeTransformer):
-    """Removes docstrings, other bare strings and raised errors; for settings also fields and their checks."""
+    """Removes imports, docstrings, other bare strings and raised errors; for settings also fields and their checks."""
 
     def __init__(self, settings: bool):
         self.settings = settings
@@ -186,6 +188,16 @@ class _Stripped(ast.NodeTransformer):
         self.generic_visit(node)
         bare = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
         return ast.Pass() if bare else node
+
+    def visit_Import(self, node: ast.Import) -> None:
+        return None
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        return None
+
+    def visit_If(self, node: ast.If) -> ast.AST | None:
+        self.generic_visit(node)
+        return None if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING" else node
 
     def visit_Raise(self, node: ast.Raise) -> ast.AST:
         return ast.Raise()

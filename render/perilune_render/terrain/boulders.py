@@ -6,11 +6,13 @@ some are cut by planes, like fractured rocks. Deviation: near fresh craters, obs
 the crater's diameter.
 """
 
+from __future__ import annotations
+
 import dataclasses
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 
 from perilune_render.config_terrain import BouldersConfig
 from perilune_render.streams import stream
@@ -18,6 +20,9 @@ from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.size_frequency import BoulderLaw, draw_diameters, log_bins
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+
+if TYPE_CHECKING:
+    import trimesh
 
 _BURIED_SHARE = 0.3
 """Share of a boulder's height that is below the ground."""
@@ -45,7 +50,7 @@ class Boulders:
     def __len__(self) -> int:
         return len(self.x_m)
 
-    def chosen(self, selection: np.ndarray) -> "Boulders":
+    def chosen(self, selection: np.ndarray) -> Boulders:
         """The boulders selected by indices or by a mask."""
         return Boulders(*(getattr(self, field.name)[selection] for field in dataclasses.fields(self)))
 
@@ -114,6 +119,8 @@ def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:
 
     Fewer points make the same kind of rock with fewer faces, for boulders only a few pixels wide.
     """
+    import trimesh  # here, since it takes half a second
+
     rng = stream(seed, "rock", shape_id)
     points = rng.normal(size=(60, 3))[:n_points]
     points /= np.linalg.norm(points, axis=1, keepdims=True)

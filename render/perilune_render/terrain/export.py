@@ -3,8 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import rasterio
-import trimesh
 
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.grid import Grid
@@ -37,6 +35,8 @@ def coarser(grid: Grid, step: int) -> Grid:
 
 def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = True) -> None:
     """Write a mesh of ground and boulders in O_L, metres; `step` multiplies the ground's vertex spacing."""
+    import trimesh
+
     grid = scene.grid if step == 1 else coarser(scene.grid, step)
     height = scene.height_m if step == 1 else value_at(scene.height_m, scene.grid, *grid.vertices_xy())
     faces = grid.quads()
@@ -54,6 +54,8 @@ def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
 
     The site is at height 0. Raises UserError unless a side has 1 to 20,000 pixels.
     """
+    import rasterio
+
     n = int(np.floor(scene.grid.extent_m / pixel_m))
     if not 1 <= n <= _LARGEST_SIDE:
         raise UserError(path, "pixel size", f"{pixel_m} m, which makes {n} pixels per side", f"1 to {_LARGEST_SIDE}")

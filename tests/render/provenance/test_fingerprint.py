@@ -128,6 +128,28 @@ def test_splitting_a_file_changes_no_hash(tmp_path):
     assert hashes["whole"] == hashes["split"] != hashes["other"]
 
 
+def test_an_import_in_a_function_counts_as_one_at_the_top_of_the_file(tmp_path):
+    function = "def f():\n    return scipy.special.erf(N)\n"
+    inside = "def f():\n    import scipy.special\n    from package.b import N\n\n    return scipy.special.erf(N)\n"
+    types = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import scipy\n"
+    files = {
+        "top/a.py": "import scipy.special\nfrom package.b import N\n" + function,
+        "top/b.py": "N = 3\n",
+        "inside/a.py": types + inside,
+        "inside/b.py": "N = 3\n",
+        "other/a.py": inside,
+        "other/b.py": "N = 4\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    top, inside, other = (
+        fingerprint("package.a:f", folders={"package": tmp_path / name}) for name in ("top", "inside", "other")
+    )
+    assert top.libraries == inside.libraries == other.libraries == {"scipy"}
+    assert top.sha256 == inside.sha256 != other.sha256 and top.modules == other.modules
+
+
 def test_every_library_that_computes_is_recorded():
     prints = [fingerprint(*roots) for roots in ROOTS.values()]
     assert all(isinstance(each, Fingerprint) and sys.stdlib_module_names.isdisjoint(each.libraries) for each in prints)

@@ -1,14 +1,14 @@
 """Use a real elevation model as the base of a scene: any projection and pixel size, holes allowed."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import rasterio
-import rasterio.warp
-from rasterio.errors import RasterioError
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline
 
@@ -19,6 +19,9 @@ from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, selenographic_from_site
 from perilune_shared.storage.files import sha256_of
+
+if TYPE_CHECKING:
+    import rasterio
 
 _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
 _LARGEST_PIXELS = 100_000_000
@@ -59,6 +62,8 @@ class ElevationModel:
 
     def selenographic(self, column: Array, row: Array) -> tuple[Array, Array]:
         """Latitude and longitude, degrees, of raster coordinates (N,) that are 0 at the raster's top left corner."""
+        import rasterio.warp
+
         longitude, latitude = rasterio.warp.transform(self.crs, _MOON, *(self.transform @ (column, row)))
         return np.array(latitude), np.array(longitude)
 
@@ -71,6 +76,10 @@ def read_elevation(path: Path) -> ElevationModel:
     matter, since the site is set to height 0. Quantised heights are smoothed within half a step
     (`perilune_render.terrain.elevation.quantisation`).
     """
+    # Imported where it is used, since it takes a fifth of a second.
+    import rasterio.warp
+    from rasterio.errors import RasterioError
+
     if not path.is_file():
         raise UserError(path, "dem", "no such file", "a GeoTIFF elevation model")
     try:
@@ -126,6 +135,8 @@ def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
     """Column and row, 0 at the raster's top left corner, of places (...) of O_L's plane, metres."""
+    import rasterio.warp
+
     lat, lon = selenographic_from_site(x_m, y_m, model.latitude_deg, model.longitude_deg)
     east, north = (np.array(v) for v in rasterio.warp.transform(_MOON, model.crs, np.ravel(lon), np.ravel(lat)))
     if model.crs.is_geographic:
@@ -256,6 +267,8 @@ def _pixel_sides_m(
     transform: rasterio.Affine, crs: rasterio.crs.CRS, middle: tuple[float, float], lat: float, lon: float
 ) -> tuple[float, float]:
     """Ground size of the middle pixel from row to row and from column to column, from great-circle distances."""
+    import rasterio.warp
+
     places = [transform @ (middle[0], middle[1] + 1), transform @ (middle[0] + 1, middle[1])]
     lons, lats = rasterio.warp.transform(crs, _MOON, [p[0] for p in places], [p[1] for p in places])
     to_east = np.cos(np.radians(lat)) * np.radians((np.array(lons) - lon + 180) % 360 - 180)
