@@ -29,7 +29,7 @@ N_SCENES, N_FRAMES, N_LABELS, N_CRATERS = 1000, 100, 50, 2000
 _MEASURED = """
 import sys, time
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.stats import summary
+from perilune_shared.export.stats import summary
 import pandas
 
 def peak_gib():

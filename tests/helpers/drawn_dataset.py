@@ -16,7 +16,8 @@ import perilune_shared
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
-from perilune_shared.dataset.parts import WHOLE_TABLE, write_part
+from perilune_shared.dataset.names import WHOLE_TABLE
+from perilune_shared.dataset.parts import write_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.geometry import frames
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site

@@ -28,7 +28,7 @@ from perilune_shared.config import resolve_over
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
 from perilune_shared.dataset.parts import write_part
-from perilune_shared.dataset.writer import with_column
+from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array

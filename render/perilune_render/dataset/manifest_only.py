@@ -14,7 +14,7 @@ from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground, grow_scene
 from perilune_shared.dataset.names import ImageKind, Kind, frame_path
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.dataset.writer import new_dataset
+from perilune_shared.editing.writer import new_dataset
 from perilune_shared.interrupts import interrupts_held
 from perilune_shared.progress import Progress
 

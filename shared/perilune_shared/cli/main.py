@@ -51,7 +51,7 @@ def validate(
 @app.command()
 def stats(dataset: DatasetArgument) -> None:
     """Print counts, labels per frame and crater radii for each split."""
-    from perilune_shared.dataset.stats import summary
+    from perilune_shared.export.stats import summary
 
     opened = ps.open_dataset(dataset)
     frame = summary(opened)

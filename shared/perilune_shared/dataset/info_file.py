@@ -1,5 +1,6 @@
 """Read and write dataset.json, which may be untrusted."""
 
+import hashlib
 import json
 import math
 from typing import Any
@@ -10,9 +11,10 @@ from perilune_shared.config_errors import expected_of, formatted
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.errors import UserError, shortened
-from perilune_shared.storage.store import Address, open_store
+from perilune_shared.storage.store import Address, Store, open_store
 
 INFO_NAME = "dataset.json"
+_OWN_HASH = "sha256"
 _LARGEST_INFO_BYTES = 10_000_000
 _EXPECTED = "the folder or address of a dataset (see `make dataset`)"
 
@@ -35,6 +37,7 @@ def read_object(address: Address) -> dict[str, Any]:
         raise UserError(where, "content", error, "JSON") from None
     if not isinstance(content, dict):
         raise UserError(where, "content", type(content).__name__, "a JSON object")
+    content.pop(_OWN_HASH, None)
     return content
 
 
@@ -116,4 +119,17 @@ def write_info(address: Address, info: DatasetInfo) -> None:
 def info_bytes(info: DatasetInfo, where: object) -> bytes:
     """Return the content of dataset.json. Raises UserError about `where` if texts of its recipes are unsafe."""
     _check_texts(info, where)
-    return (info.model_dump_json(indent=2) + "\n").encode()
+    return with_own_hash(info.model_dump_json(indent=2).encode())
+
+
+def with_own_hash(content: bytes) -> bytes:
+    """Return a JSON object with the last member `sha256`: the hash of the text before that member."""
+    head = content.rstrip().removesuffix(b"}").rstrip()
+    return head + f',\n  "{_OWN_HASH}": "{hashlib.sha256(head).hexdigest()}"\n}}\n'.encode()
+
+
+def has_own_hash(store: Store) -> bool:
+    """Whether dataset.json is as it was written, by the hash that it contains."""
+    content = store.read(INFO_NAME, most_bytes=_LARGEST_INFO_BYTES)
+    head, _, _ = content.rpartition(f',\n  "{_OWN_HASH}": '.encode())
+    return with_own_hash(head + b"}") == content

@@ -20,10 +20,10 @@ from perilune_shared.dataset.expression import Condition
 from perilune_shared.dataset.frame import Frame
 from perilune_shared.dataset.info_file import read_info
 from perilune_shared.dataset.metadata import Counts, DatasetInfo
-from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.names import SPLITS, stem_of
 from perilune_shared.dataset.packed import read_packed, shards_of
 from perilune_shared.dataset.part_rows import may_contain, rows_of_part
-from perilune_shared.dataset.parts import Part, parquet_files, stem_of
+from perilune_shared.dataset.parts import Part, parquet_files
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera

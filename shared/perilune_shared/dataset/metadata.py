@@ -13,6 +13,7 @@ from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 
 LARGEST_IMAGE_PX = 2**27
 """Largest image that is decompressed, pixels."""
+_LARGEST_INDEX_BYTES = 2**30
 _FAR = 1e9
 _ROTATION_TOLERANCE = 1e-6
 # Names appear in tables, pages and quoted shell commands: only letters, digits and punctuation that is safe there.
@@ -129,6 +130,17 @@ class Recipe(_Info):
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+class IndexPart(_Info):
+    """One part of the dataset's index (perilune_shared.dataset.index)."""
+
+    path: Annotated[str, Field(pattern=r"^index/[0-9a-f]{16}\.parquet$")]
+    """Path relative to the dataset; its name is the first 16 digits of the hash."""
+    bytes: Annotated[int, Field(gt=0, le=_LARGEST_INDEX_BYTES)]
+    """File size, bytes."""
+    sha256: _Sha256
+    """SHA-256 of the file."""
+
+
 class DatasetInfo(_Info):
     """Content of dataset.json."""
 
@@ -156,6 +168,8 @@ class DatasetInfo(_Info):
     """Number of rows of each table; set when the dataset is complete."""
     licence: Annotated[str, Field(pattern=r"^[A-Za-z0-9(][A-Za-z0-9 ._+:()-]{0,499}$")]
     """Licence of the dataset, as an SPDX expression."""
+    index: tuple[IndexPart, ...] = ()
+    """Parts of the index, which names all other files; none while the dataset is not complete."""
 
     @property
     def leak(self) -> str:

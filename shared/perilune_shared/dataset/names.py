@@ -1,4 +1,4 @@
-"""Names that datasets and command lines use: kinds, splits, states of images; ids and paths of frames.
+"""Names that datasets and command lines use: kinds, splits, states of images; ids and paths of frames and parts.
 
 Without pandas and pyarrow, so that configurations and `--help` load without them.
 """
@@ -20,6 +20,13 @@ ImageChoice = Literal["copy", "none", "plan"]
 and poses determine them)."""
 ImageMode = Literal[ImageChoice, "link"]
 """Also `link`: hard links where the file system allows them, so that an edit of a frame changes both datasets."""
+WHOLE_TABLE = "all"
+"""Name of the part that contains all rows of its table, or the first ones of a table with several parts."""
+_ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
+ID_PATTERN = f"^{_ID}$"
+"""Pattern of scene_id and trajectory_id, which become file names."""
+FRAME_ID_PATTERN = f"^{_ID}/{_ID}/[0-9]{{6}}$"
+PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
 KINDS: tuple[Kind, ...] = get_args(Kind)
 SPLITS: tuple[Split, ...] = get_args(Split)
 IMAGE_KINDS: tuple[ImageKind, ...] = get_args(ImageKind)
@@ -31,6 +38,16 @@ def frame_path(frame_id: str, kind: ImageKind) -> str:
     The columns png_path and exr_path of other datasets may contain other paths.
     """
     return f"frames/{frame_id}.{kind}"
+
+
+def stem_of(path: str) -> str:
+    """Return the name of a part, without folders and suffix."""
+    return path.rpartition("/")[2].removesuffix(".parquet")
+
+
+def is_whole(stem: str) -> bool:
+    """Whether a part of this name may contain rows of any scene."""
+    return stem.partition(".")[0] == WHOLE_TABLE
 
 
 def frame_id_of(scene_id: str, trajectory_id: str, frame_index: int) -> str:

@@ -6,7 +6,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.expression import Condition
-from perilune_shared.dataset.parts import Part, is_whole
+from perilune_shared.dataset.names import is_whole
+from perilune_shared.dataset.parts import Part
 from perilune_shared.errors import UserError
 
 

@@ -22,13 +22,12 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from pyarrow.fs import LocalFileSystem
 
+from perilune_shared.dataset.names import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, stem_of
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.errors import UserError
 from perilune_shared.storage.pages import pages_of
 from perilune_shared.storage.store import Address, Store, open_store
 
-WHOLE_TABLE = "all"
-"""Name of the part that contains all rows of its table, or the first ones of a table with several parts."""
 MOST_ROWS_WRITTEN = 2_000_000
 """Maximum number of rows of a written part; below the reader's limits for every table."""
 _MAX_ROWS = 50_000_000
@@ -42,25 +41,10 @@ _MAX_FOOTER_TEXT_BYTES = 10_000_000
 _SPARE_ROWS, _BYTES_PER_ROW = 10_000, 4
 _SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
-_ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
-ID_PATTERN = f"^{_ID}$"
-"""Pattern of scene_id and trajectory_id, which become file names."""
-FRAME_ID_PATTERN = f"^{_ID}/{_ID}/[0-9]{{6}}$"
 _NESTED_ROWS = "labels."
 """Start of the columns of a shard that contain rows of another table, any number for each frame."""
-PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
 _PARQUET_FILE = re.compile(r"[A-Za-z0-9][^/]*\.parquet", re.DOTALL)
 _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
-
-
-def stem_of(path: str) -> str:
-    """Return the name of a part, without folders and suffix."""
-    return path.rpartition("/")[2].removesuffix(".parquet")
-
-
-def is_whole(stem: str) -> bool:
-    """Whether a part of this name may contain rows of any scene."""
-    return stem.partition(".")[0] == WHOLE_TABLE
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +57,11 @@ class Written:
     """Size, bytes."""
     sha256: str
     """SHA-256, hexadecimal."""
+
+    @classmethod
+    def of(cls, path: str, content: bytes) -> "Written":
+        """Describe a file by its content."""
+        return cls(path, len(content), hashlib.sha256(content).hexdigest())
 
 
 def parquet_files(store: Store, folder: str) -> list[str]:
@@ -303,19 +292,31 @@ def read_part(path: Path, table: str, columns: Sequence[str] | None = None) -> p
     return Part(open_store(path.parent), path.name, table).read(columns)
 
 
-def write_part(address: Address, table: str, name: str, rows: pa.Table, rows_per_group: int | None = None) -> Written:
-    """Write the part `manifest/<table>/<name>.parquet` of a dataset. Raises FileExistsError if it exists.
+def write_part(
+    address: Address,
+    table: str,
+    name: str,
+    rows: pa.Table,
+    rows_per_group: int | None = None,
+    *,
+    replace: bool = False,
+) -> Written:
+    """Write the part `manifest/<table>/<name>.parquet` of a dataset.
 
-    Raises UserError if the name, which may come from the rows of an untrusted dataset, is not a valid part name.
+    Raises FileExistsError if it exists, unless `replace`. Raises UserError if the name, which may come from the rows of
+    an untrusted dataset, is not a valid part name.
     """
     store = open_store(address)
     if not re.fullmatch(PART_PATTERN, name) or name.endswith("\n"):
         raise UserError(store, "part", repr(name), f"a name like {PART_PATTERN}")
     path = f"manifest/{table}/{name}.parquet"
-    if store.exists(path):
+    if not replace and store.exists(path):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), store.at(path))
     sink = pa.BufferOutputStream()
     pq.write_table(complete(table, rows), sink, compression="zstd", row_group_size=rows_per_group)
     content = sink.getvalue().to_pybytes()
-    store.write(path, content)
-    return Written(path, len(content), hashlib.sha256(content).hexdigest())
+    if replace:
+        store.replace(path, content)
+    else:
+        store.write(path, content)
+    return Written.of(path, content)

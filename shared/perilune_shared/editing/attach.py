@@ -4,8 +4,8 @@ import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import IMAGE_KINDS
-from perilune_shared.dataset.writer import new_dataset, with_column
 from perilune_shared.editing.rewrite import check_source
+from perilune_shared.editing.writer import new_dataset, with_column
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums

@@ -55,7 +55,7 @@ def differences(first: Dataset, second: Dataset) -> list[Difference]:
 
 
 def _plain(dataset: Dataset) -> dict:
-    return dataset.info.model_dump(mode="json", exclude={"images", "counts"})
+    return dataset.info.model_dump(mode="json", exclude={"images", "counts", "index"})
 
 
 def _info(one: object, two: object, path: str) -> Iterator[Difference]:

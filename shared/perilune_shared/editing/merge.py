@@ -8,9 +8,9 @@ import pyarrow.compute as pc
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
 from perilune_shared.dataset.names import ImageMode, frame_id_of
-from perilune_shared.dataset.writer import SceneTables, check_scene, new_dataset, with_column
 from perilune_shared.editing.licence import joined_licence
 from perilune_shared.editing.rewrite import check_source, state_of, without_derived_rows
+from perilune_shared.editing.writer import SceneTables, check_scene, new_dataset, with_column
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address

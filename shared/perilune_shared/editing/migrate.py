@@ -16,7 +16,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo, Recipe
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
-from perilune_shared.dataset.writer import new_dataset
+from perilune_shared.editing.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address, Store, open_store

@@ -12,8 +12,8 @@ from perilune_shared.dataset.names import SPLITS
 from perilune_shared.dataset.packed import LABEL, SHARDS, packed_rows, shard_name
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.dataset.writer import DatasetWriter, new_dataset, with_column, with_new_paths
 from perilune_shared.editing.rewrite import check_source, rewrite
+from perilune_shared.editing.writer import DatasetWriter, new_dataset, with_column, with_new_paths
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address

@@ -8,7 +8,7 @@ from perilune_shared.dataset.keys import check_keys
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import ImageMode, ImageState
-from perilune_shared.dataset.writer import SceneTables, new_dataset
+from perilune_shared.editing.writer import SceneTables, new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import checksums

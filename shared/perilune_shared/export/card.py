@@ -17,12 +17,12 @@ from perilune_shared.content import terrain_of
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo, Recipe
-from perilune_shared.dataset.stats import summary
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.export.added_files import add_files, check_sums, default_path
 from perilune_shared.export.card_head import head_of, table_configs
 from perilune_shared.export.card_pictures import TITLES, Gathered, draw, gather
 from perilune_shared.export.croissant import citation_of
+from perilune_shared.export.stats import summary
 from perilune_shared.progress import Progress
 
 CARD_NAME = "README.md"

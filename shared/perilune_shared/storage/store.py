@@ -11,29 +11,21 @@ All paths are relative POSIX paths of plain names. Every fault of an object stor
 
 import abc
 import errno
+import hashlib
 import os
 import stat
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.file_systems import OBJECT_STORES, file_system, open_ranges
+from perilune_shared.storage.items import Item, local_items, object_items
 from perilune_shared.storage.store_faults import store_faults
 
+_CHUNK_BYTES = 2**20
 _KINDS = "a path, s3://bucket/prefix, gs://bucket/prefix or memory://name"
-
-
-@dataclass(frozen=True, slots=True)
-class Item:
-    """One file of a store, as listed."""
-
-    path: str
-    """Path relative to the store."""
-    size_bytes: int
-    """Size, bytes."""
 
 
 class Store(abc.ABC):
@@ -75,6 +67,15 @@ class Store(abc.ABC):
         if size is None:
             raise _missing(self, path)
         return size
+
+    def sha256(self, path: str, advance: Callable[[int], object] = lambda n_bytes: None) -> str:
+        """Return the SHA-256 of a file (hexadecimal); calls `advance` with the bytes read since the last call."""
+        digest = hashlib.sha256()
+        with self.open(path) as stream:
+            while chunk := stream.read(_CHUNK_BYTES):
+                digest.update(chunk)
+                advance(len(chunk))
+        return digest.hexdigest()
 
     @abc.abstractmethod
     def sub(self, prefix: str) -> "Store":
@@ -131,7 +132,7 @@ class LocalStore(Store):
     def list(self, prefix: str = "") -> Iterator[Item]:
         top = files.inside(self.folder, prefix) if prefix else self.folder
         if top.is_dir():
-            yield from _entries(top, f"{prefix}/" if prefix else "")
+            yield from local_items(top, f"{prefix}/" if prefix else "")
 
     def size(self, path: str) -> int | None:
         try:
@@ -220,12 +221,7 @@ class ObjectStore(Store):
             except FileNotFoundError as error:
                 if "bucket" in str(error).lower():
                     raise
-        start = len(self._prefix) + 1
-        for key in sorted(found):
-            path = key.lstrip("/")[start:]
-            # A console may have made an empty object for a folder.
-            if path and not path.endswith("/"):
-                yield Item(path, int(found[key]["size"]))
+        yield from object_items(found, self._prefix)
 
     def size(self, path: str) -> int | None:
         with store_faults(self.at(path)):
@@ -298,18 +294,6 @@ def open_store(address: Address) -> Store:
         raise UserError(text, "address", repr(prefix), f"{_KINDS}, of plain names")
     file_system(kind, text)
     return ObjectStore(f"{kind}://{prefix}")
-
-
-def _entries(folder: Path, prefix: str) -> Iterator[Item]:
-    """Yield the files below a folder in the order of their paths; links are not followed."""
-    with os.scandir(folder) as scanned:
-        # "a-b" comes before "a/b", as in the listing of an object store.
-        found = sorted(scanned, key=lambda entry: entry.name + ("/" if entry.is_dir(follow_symlinks=False) else ""))
-    for entry in found:
-        if entry.is_dir(follow_symlinks=False):
-            yield from _entries(Path(entry.path), f"{prefix}{entry.name}/")
-        else:
-            yield Item(prefix + entry.name, entry.stat(follow_symlinks=False).st_size)
 
 
 def _too_large(store: Store, path: str, size: int, most_bytes: int) -> UserError:

@@ -10,8 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.names import SPLITS
-from perilune_shared.dataset.parts import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, is_whole
+from perilune_shared.dataset.names import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, SPLITS, is_whole
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, TABLES
 from perilune_shared.errors import UserError, one_line, shortened
 

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from perilune_shared.content import content_sha256, terrain_of
 from perilune_shared.dataset.manifest import Dataset, count_rows
-from perilune_shared.dataset.parts import is_whole
+from perilune_shared.dataset.names import is_whole
 from perilune_shared.dataset.schema import KEYS, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site

@@ -15,7 +15,7 @@ from perilune_render.flight import pose_checks
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
 from perilune_render.flight.trajectories import fly
-from perilune_shared.dataset.writer import with_column
+from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import quaternion_from_matrix
 

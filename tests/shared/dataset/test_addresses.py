@@ -6,10 +6,10 @@ from tests.helpers import in_process
 
 from perilune_shared.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.stats import summary
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
+from perilune_shared.export.stats import summary
 from perilune_shared.storage.store import open_store
 from perilune_shared.validation.validate import validate
 

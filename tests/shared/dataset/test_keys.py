@@ -8,12 +8,12 @@ from perilune_shared.cli.main import app
 from perilune_shared.dataset.keys import check_keys
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.parts import Part
-from perilune_shared.dataset.stats import summary
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack
 from perilune_shared.editing.split import split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
+from perilune_shared.export.stats import summary
 from perilune_shared.labels.selection import read_labels
 from perilune_shared.storage.checksums import seal
 

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from tests.helpers.drawn_dataset import build_dataset
 
 from perilune_shared.dataset.manifest import count_rows, open_dataset
-from perilune_shared.dataset.stats import summary
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.migrate import migrate
 from perilune_shared.editing.pack import pack, unpack
 from perilune_shared.editing.split import split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
+from perilune_shared.export.stats import summary
 from perilune_shared.validation.validate import validate
 
 OLD = Path(__file__).parents[1] / "old"

@@ -9,13 +9,13 @@ from tests.helpers.drawn_dataset import build_dataset
 from tests.helpers.hostile import edit, rewrite
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.stats import summary
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.licence import joined_licence
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.split import split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
+from perilune_shared.export.stats import summary
 from perilune_shared.storage.checksums import seal
 from perilune_shared.validation.validate import validate
 

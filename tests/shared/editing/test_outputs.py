@@ -5,13 +5,13 @@ from tests.helpers import in_process
 
 from perilune_shared.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.writer import new_dataset
 from perilune_shared.editing.attach import attach
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack, unpack
 from perilune_shared.editing.split import split_dataset
 from perilune_shared.editing.subset import subset
+from perilune_shared.editing.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import ObjectStore, open_store
 from perilune_shared.validation.validate import validate

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from perilune_shared.cli.main import app
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.dataset.writer import new_dataset
+from perilune_shared.editing.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.export.croissant import export_croissant
 from perilune_shared.validation.validate import validate

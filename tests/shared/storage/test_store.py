@@ -11,7 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from perilune_shared.errors import UserError
-from perilune_shared.storage.store import Item, open_store
+from perilune_shared.storage.items import Item
+from perilune_shared.storage.store import open_store
 
 
 @pytest.fixture(params=["local", "memory", "s3"])

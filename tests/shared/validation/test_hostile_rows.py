@@ -13,7 +13,7 @@ from tests.helpers.hostile import assert_refused, digest, edit, pack, part_of, p
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import Counts
 from perilune_shared.dataset.packed import SHARDS as SHARD_SCHEMA
-from perilune_shared.dataset.writer import new_dataset
+from perilune_shared.editing.writer import new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
 

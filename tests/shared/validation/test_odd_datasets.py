@@ -13,12 +13,12 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.dataset.schema import TABLES
-from perilune_shared.dataset.writer import with_column
 from perilune_shared.editing.attach import attach
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack, unpack
 from perilune_shared.editing.split import split_dataset
 from perilune_shared.editing.subset import subset
+from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.export.card import write_card
 from perilune_shared.export.coco import export_coco

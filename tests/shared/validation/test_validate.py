@@ -16,8 +16,8 @@ from perilune_shared.dataset import manifest
 from perilune_shared.dataset.manifest import count_rows, open_dataset
 from perilune_shared.dataset.parts import read_part, write_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
-from perilune_shared.dataset.stats import summary
 from perilune_shared.errors import UserError
+from perilune_shared.export.stats import summary
 from perilune_shared.validation.faults import part_faults
 from perilune_shared.validation.validate import validate
 

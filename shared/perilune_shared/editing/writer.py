@@ -18,8 +18,8 @@ from perilune_shared.dataset.info_file import INFO_NAME, checked_info, info_byte
 from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo
-from perilune_shared.dataset.names import IMAGE_KINDS, SplitUnit, frame_path
-from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, WHOLE_TABLE, write_part
+from perilune_shared.dataset.names import IMAGE_KINDS, WHOLE_TABLE, SplitUnit, frame_path
+from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, write_part
 from perilune_shared.dataset.schema import TABLES, complete
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress

@@ -1,0 +1,58 @@
+"""Write whole tables: the parts `all`, `all.0001` and so on, of at most a given number of rows each."""
+
+from collections import defaultdict
+
+import pyarrow as pa
+
+from perilune_shared.dataset.metadata import Counts
+from perilune_shared.dataset.names import WHOLE_TABLE
+from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, Written, write_part
+from perilune_shared.dataset.schema import TABLES, complete
+from perilune_shared.storage.store import Store
+
+_FEWEST_ROWS_PER_GROUP, _MOST_GROUPS = 1000, 200
+
+
+class WholeTables:
+    """Writer of all tables of a dataset. Rows are in memory until a part is full.
+
+    With `replace`, parts that exist are overwritten; otherwise they raise FileExistsError.
+    """
+
+    def __init__(self, store: Store, *, most_rows: int = MOST_ROWS_WRITTEN, replace: bool = False):
+        self._store, self._most_rows, self._replace = store, most_rows, replace
+        self._buffered: dict[str, list[pa.Table]] = defaultdict(list)
+        self._n_parts = dict.fromkeys(TABLES, 0)
+        self._n_rows = dict.fromkeys(TABLES, 0)
+        self._written: list[Written] = []
+
+    @property
+    def counts(self) -> Counts:
+        """Number of rows added to each table."""
+        return Counts(**self._n_rows)
+
+    def add(self, name: str, rows: pa.Table) -> None:
+        """Append rows to a table; write a part whenever it reaches the maximum number of rows."""
+        rows = complete(name, rows)
+        self._n_rows[name] += len(rows)
+        while len(rows):
+            free = self._most_rows - sum(map(len, self._buffered[name]))
+            if not free:
+                self._write(name)
+                continue
+            self._buffered[name].append(rows[:free])
+            rows = rows[free:]
+
+    def finish(self) -> list[Written]:
+        """Write buffered rows, and one empty part for each table without rows; return all parts."""
+        for name in TABLES:
+            if self._buffered[name] or not self._n_parts[name]:
+                self._write(name)
+        return self._written
+
+    def _write(self, name: str) -> None:
+        rows = pa.concat_tables([TABLES[name].empty_table(), *self._buffered.pop(name, [])])
+        stem = f"{WHOLE_TABLE}.{self._n_parts[name]:04d}" if self._n_parts[name] else WHOLE_TABLE
+        per_group = max(_FEWEST_ROWS_PER_GROUP, len(rows) // _MOST_GROUPS)
+        self._written.append(write_part(self._store, name, stem, rows, per_group, replace=self._replace))
+        self._n_parts[name] += 1
