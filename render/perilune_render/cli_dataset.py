@@ -1,7 +1,7 @@
 """The command `perilune-render dataset`."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -42,7 +42,7 @@ class _How:
     address: str | None
     """Address of a running Ray cluster; None starts Ray on this machine."""
     workers: int | None
-    """Number of worker processes; 0 renders in this process; None for the executor's default."""
+    """Number of worker processes; 0 renders in this process; None for as many as the cores and the memory allow."""
     threads: int | None
     """Number of threads of each process; None divides the cores among the workers."""
     shard: tuple[int, int] | None
@@ -75,7 +75,6 @@ class _How:
             raise UserError("--address", "executor", executor, "--executor ray, which connects to that cluster")
         if workers == 0 and executor == "ray":
             raise UserError("--workers", "workers", workers, "1 or more with --executor ray")
-        workers = 1 if workers is None and executor == "local" else workers
         return cls(executor, address, workers, threads, numbers, finish, dry_run)
 
 
@@ -106,12 +105,15 @@ def dataset(
         typer.Option(
             min=0,
             max=1024,
-            help="Worker processes; 0 renders in the command's own process. [default: 1; with Ray as many as fit]",
+            help="Worker processes; 0 renders in the command's own process. [default: one for each core, as memory "
+            "allows; with Ray one for each core of the cluster]",
         ),
     ] = None,
     threads: Annotated[
         int | None,
-        typer.Option(min=1, max=1024, help="Threads of each process. [default: the cores, divided by the workers]"),
+        typer.Option(
+            min=1, max=1024, help="Threads of each process. [default: the cores, divided by the workers; with Ray 1]"
+        ),
     ] = None,
     shard: Annotated[
         str | None,
@@ -158,6 +160,10 @@ def _made(job: "Job", out: Path, how: _How) -> "Dataset | None":
     """Do what the options ask for; the dataset if it is finished. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
+    if how.workers is None and how.executor == "local":
+        from perilune_render.jobs.local import default_workers
+
+        how = replace(how, workers=default_workers(job, how.threads))
     job = job.with_threads(how.threads, how.workers or 1)
     if how.finish:
         return finish_job(job, out)

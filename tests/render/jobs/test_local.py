@@ -67,3 +67,29 @@ def test_code_that_changed_since_the_beginning_is_refused(job, tmp_path):
     changed = replace(job, info=job.info.model_copy(update={"recipes": {other.key: other}}))
     with pytest.raises(UserError, match=r"perilune_render: versions: got imaging .* expected the code that"):
         SceneRenderer(changed, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("n_cores", "n_threads", "free_gib", "n_workers"),
+    [(2, None, 100, 2), (3, None, 100, 3), (16, None, 100, 4), (3, 2, 100, 1), (3, None, 1.9, 2), (3, None, 0.1, 1)],
+)
+def test_default_is_a_worker_for_each_core_as_trajectories_and_memory_allow(
+    n_cores, n_threads, free_gib, n_workers, job, monkeypatch
+):
+    job = replace(
+        job, config=job.config.model_copy(update={"render": job.config.render.model_copy(update={"threads": 0})})
+    )
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(n_cores)))
+    monkeypatch.setattr(local, "_free_bytes", lambda: free_gib * 2**30)
+    assert local.default_workers(job, n_threads) == n_workers
+
+
+def test_free_memory_is_that_of_the_container_if_it_is_less(tmp_path, monkeypatch):
+    monkeypatch.setattr(local, "_CGROUP", tmp_path)
+    of_machine = local._free_bytes()
+    assert 2**27 < of_machine < 2**45
+    tmp_path.joinpath("memory.max").write_text("max\n")
+    tmp_path.joinpath("memory.current").write_text("1000\n")
+    assert local._free_bytes() == pytest.approx(of_machine, rel=0.5)
+    tmp_path.joinpath("memory.max").write_text("5000\n")
+    assert local._free_bytes() == 4000
