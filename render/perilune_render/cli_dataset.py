@@ -22,6 +22,7 @@ from perilune_render.cli_options import (
 )
 from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import UserError
+from perilune_shared.interrupts import ended_by_interrupt
 from perilune_shared.terminal import console, progress_bar
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from perilune_shared.dataset.manifest import Dataset
 
 
+_ENDED_S = 2.0
+"""Time from Ctrl-C to the end of a rendering, if its current step takes longer, seconds. SIGKILL would do no harm."""
 _UNITS = ((12, "TB"), (9, "GB"), (6, "MB"), (3, "kB"), (0, "bytes"))
 
 
@@ -170,7 +173,7 @@ def _made(job: "Job", out: Path, how: _How) -> "Dataset | None":
     if how.dry_run:
         _print_estimate(job, out, how)
         return None
-    with progress_bar() as progress:
+    with ended_by_interrupt(after_s=_ENDED_S), progress_bar() as progress:
         if how.shard is None:
             return render_job(job, out, progress, _executor(how))
         n_rendered = render_shard(job, out, Shard(*how.shard), progress, _executor(how))

@@ -6,7 +6,9 @@ import sys
 from collections.abc import Callable
 
 EXIT_USER_ERROR = 2
-_EXIT_INTERRUPTED = 130
+EXIT_INTERRUPTED = 130
+STOPPED = "stopped; finished files stay valid; run the same command again to resume"
+"""What a command prints last after Ctrl-C."""
 _DISK_FAULTS = (
     errno.ENOSPC,
     errno.EDQUOT,
@@ -69,10 +71,10 @@ def run_command_line(app: Callable[[], object]) -> None:
         message = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; finished files stay valid"
     except (KeyboardInterrupt, SystemExit) as stop:
         # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
-        if isinstance(stop, SystemExit) and stop.code != _EXIT_INTERRUPTED:
+        if isinstance(stop, SystemExit) and stop.code != EXIT_INTERRUPTED:
             raise
-        print("stopped; finished files stay valid; run the same command again to resume", file=sys.stderr)
-        sys.exit(_EXIT_INTERRUPTED)
+        print(STOPPED, file=sys.stderr)
+        sys.exit(EXIT_INTERRUPTED)
     else:
         return
     print(message, file=sys.stderr)

@@ -1,11 +1,16 @@
-"""Delay Ctrl-C until a step is finished."""
+"""Delay Ctrl-C until a step is finished, but not for long."""
 
 import contextlib
 import os
+import select
 import signal
 import threading
 from collections.abc import Iterator
 
+from perilune_shared.errors import EXIT_INTERRUPTED, STOPPED
+
+_BELOW_BAR = "\n\x1b[?25h"
+"""New line, and the control sequence that shows the cursor."""
 _NOTICE = b"\nstopping after this step; press Ctrl-C again to end at once\n"
 
 
@@ -37,3 +42,42 @@ def interrupts_held() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if asked:
         raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def ended_by_interrupt(*, after_s: float) -> Iterator[None]:
+    """End the process `after_s` seconds after Ctrl-C, if the block has not ended by then: with one line and code 130.
+
+    For commands whose output survives SIGKILL. Python raises KeyboardInterrupt only between two steps of its own, and
+    one call of Blender or NumPy may take longer. Without effect if Ctrl-C is ignored, and outside the main thread.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    # Python's signal handler in C writes the signal's number here at once, also during native code.
+    (asked, signalled), (ended, end) = os.pipe(), os.pipe()
+    os.set_blocking(signalled, False)
+    before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
+    watcher = threading.Thread(target=_end_late, args=(asked, ended, after_s), daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(end)
+        watcher.join()
+        for descriptor in (asked, signalled, ended):
+            os.close(descriptor)
+
+
+def _end_late(asked: int, ended: int, after_s: float) -> None:
+    """Wait for Ctrl-C in the pipe `asked`, then for the end of the block, which closes the other end of `ended`."""
+    while True:
+        ready, _, _ = select.select([asked, ended], [], [])
+        if ended in ready:
+            return
+        if signal.SIGINT in os.read(asked, 100) and not select.select([ended], [], [], after_s)[0]:
+            with contextlib.suppress(OSError):
+                # A progress bar hides the cursor.
+                os.write(2, f"{_BELOW_BAR if os.isatty(2) else ''}{STOPPED}\n".encode())
+            os._exit(EXIT_INTERRUPTED)

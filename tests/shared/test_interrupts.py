@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -17,6 +18,18 @@ with interrupts_held():
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(0.01)
     print("went on")
+"""
+
+NATIVE = """
+import hashlib, sys
+from perilune_shared.errors import run_command_line
+from perilune_shared.interrupts import ended_by_interrupt
+def command():
+    with ended_by_interrupt(after_s=0.5):
+        print("begun", flush=True)
+        hashlib.pbkdf2_hmac("sha256", b"", b"", int(sys.argv[1]))  # seconds in native code, without Python's lock
+    print("went on")
+run_command_line(command)
 """
 
 
@@ -45,3 +58,25 @@ def test_ctrl_c_that_is_ignored_stays_ignored():
             assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("ignored", [False, True], ids=["heard", "ignored"])
+def test_ctrl_c_ends_a_command_that_is_in_native_code(ignored):
+    before = signal.getsignal(signal.SIGINT)
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        n_rounds = 1_000_000 if ignored else 20_000_000
+        command = [sys.executable, "-c", NATIVE, str(n_rounds)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert process.stdout.readline() == "begun\n"
+    asked_s = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=60)
+    if ignored:
+        assert process.returncode == 0 and out == "went on\n" and error == ""
+    else:
+        assert time.monotonic() - asked_s < 3 and process.returncode == 130 and out == ""
+        assert error == "stopped; finished files stay valid; run the same command again to resume\n"
