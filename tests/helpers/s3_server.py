@@ -35,6 +35,19 @@ def s3_server() -> Iterator[dict[str, str]]:
             process.kill()
 
 
+@contextlib.contextmanager
+def s3_variables() -> Iterator[None]:
+    """Start a server, and set its variables in this process's environment while the block runs."""
+    with s3_server() as variables:
+        before = {name: os.environ.get(name) for name in variables}
+        os.environ.update(variables)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
 def new_bucket() -> str:
     """Create an empty bucket; return its address, s3://bucket."""
     name = f"bucket-{os.getpid()}-{next(_numbers)}"
