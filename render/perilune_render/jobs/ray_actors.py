@@ -92,12 +92,19 @@ class RayActors:
 
     def check_scene(self, scene_id: str) -> None:
         """Generate a scene in an actor and check that its poses fit it. Raises UserError."""
-        self._start(1)
-        try:
-            ray.get([*self._pending, self._actors[0].handle.grow.remote(scene_id)])
-        except RayTaskError as error:
-            raise error.cause from None
-        self._actors[0].scene_id = scene_id
+        while True:
+            self._start(1)
+            actor = self._actors[0]
+            try:
+                ray.get([*self._pending, actor.handle.grow.remote(scene_id)])
+            except RayActorError as error:
+                self._pending.clear()
+                self._lose_start(actor, error)
+            except RayTaskError as error:
+                raise error.cause from None
+            else:
+                actor.scene_id = scene_id
+                return
 
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""
@@ -125,14 +132,12 @@ class RayActors:
         try:
             dark = ray.get(finished)
         except RayActorError as error:
+            if place is None:
+                self._lose_start(actor, error)
+                return
             self._actors.remove(actor)
-            if place is not None:
-                text = f"a process of Ray was lost ({type(error).__name__})"
-                report.failed(place, text, work.failed(place, text))
-            elif (lost := self._lost_starts + 1) <= LOST_STARTS * (self._n_workers or 1):
-                self._lost_starts = lost
-            else:
-                raise UserError("perilune-render", "Ray", error, "processes that start: see Ray's logs") from None
+            text = f"a process of Ray was lost ({type(error).__name__})"
+            report.failed(place, text, work.failed(place, text))
             return
         except RayTaskError as error:
             if place is None or ends_run(error.cause):
@@ -151,6 +156,13 @@ class RayActors:
             if actor.n_done >= RECYCLED_AFTER:
                 self._actors.remove(actor)
                 ray.kill(actor.handle)
+
+    def _lose_start(self, actor: _Actor, error: RayActorError) -> None:
+        """Remove an actor that was lost before it rendered. Raises UserError if too many were, one after another."""
+        self._actors.remove(actor)
+        self._lost_starts += 1
+        if self._lost_starts > LOST_STARTS * (self._n_workers or 1):
+            raise UserError("perilune-render", "Ray", error, "processes that start: see Ray's logs") from None
 
     def _start(self, n_actors: int) -> None:
         """Start actors until there are `n_actors`; each gets work once it runs."""

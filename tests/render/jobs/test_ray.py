@@ -43,3 +43,45 @@ def test_ray_gives_the_same_bytes_although_its_processes_are_killed(job, whole, 
     render_job(job, tmp_path, progress, partial(RayActors, n_workers=2, address=None))
     assert files_of(tmp_path) == whole
     assert progress.killed and "a process of Ray was lost (ActorDiedError); trying again" in capsys.readouterr().err
+
+
+def test_a_process_that_is_lost_while_it_generates_the_first_scene_is_replaced(job, tmp_path):
+    import ray
+
+    from perilune_render.jobs.ray_actors import RayActors
+
+    class Loses(RayActors):
+        lost = False
+
+        def _start(self, n_actors):
+            super()._start(n_actors)
+            if not self.lost:
+                self.lost = True
+                ray.kill(self._actors[0].handle)
+
+    with Loses(job, tmp_path, n_workers=1, address=None) as actors:
+        actors.check_scene("scene-0000")
+        assert actors.lost and [actor.scene_id for actor in actors._actors] == ["scene-0000"]
+
+
+def test_a_lost_node_is_replaced_by_one_that_joins(job, whole, files_of, tmp_path, capsys):
+    from benchmarks.ray_cluster import LocalCluster
+    from perilune_render.jobs.ray_actors import RayActors
+
+    class LosesNode(Progress):
+        """Kills the only node and adds another when the first trajectory is finished."""
+
+        n_killed = 0
+
+        def advance(self, task_id, advance=1):
+            super().advance(task_id, advance)
+            if advance and not self.n_killed:
+                self.n_killed = cluster.kill(0)
+                cluster.add()
+
+    with LocalCluster(1) as cluster:
+        progress = LosesNode(disable=True)
+        render_job(job, tmp_path, progress, partial(RayActors, n_workers=1, address=cluster.address))
+    # The node's raylet and agent, and the process that renders.
+    assert progress.n_killed >= 2 and "a process of Ray was lost" in capsys.readouterr().err
+    assert files_of(tmp_path) == whole
