@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint docs docs-build bench-render bench-scale compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test lint docs docs-build bench-render bench-kill bench-scale compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -122,7 +122,10 @@ docs-build: setup ## build the documentation into site/; a broken link or name i
 bench-render: setup ## time of a frame, compared with a bare Blender loop; writes runs/bench/render.json
 	@$(BIN)/python -m benchmarks.dataset.render
 
-bench-scale: setup ## frames per second by number of processes and threads; writes runs/bench/scale.json
+bench-kill: setup ## renderings disturbed at random moments (SIGKILL, Ctrl-C, full disk, lost nodes and stores), resumed and compared; writes runs/bench/kill.json
+	@$(BIN)/python -m benchmarks.kill
+
+bench-scale: setup ## frames per second by executor, number of processes and threads; writes runs/bench/scale.json
 	@$(BIN)/python -m benchmarks.dataset.scale
 
 compare-nac: setup ## compare rendered frames with real NAC crops (NAC=folder); writes runs/nac/

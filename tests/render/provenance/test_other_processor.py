@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from tests.helpers.other_processor import OTHER_PROCESSOR
 from tests.helpers.scenes import config_with
 
 from perilune_render.flight.plan import make_plan
@@ -19,14 +20,6 @@ from perilune_shared.geometry.camera import Camera
 
 CAMERA = Camera.from_field_of_view(32, 32, 50.0)
 CONFIG = config_with(terrain={"spacing_px": 2.0})
-OTHER_PROCESSOR = {
-    "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR AVX2 FMA3",
-    "OPENBLAS_CORETYPE": "Prescott",
-    "OPENBLAS_NUM_THREADS": "2",
-    "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,AVX,FP16,SSE4.2,SSE4.1",
-    "NUMBA_CPU_NAME": "generic",
-}
-"""What NumPy, OpenBLAS, OpenCV and numba would choose on another processor with more threads."""
 SMALL = (
     "dataset.camera={width_px: 64, height_px: 48, distortion: {k1: -0.05}}",
     "dataset.terrain.spacing_px=1.0",
