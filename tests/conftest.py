@@ -34,19 +34,27 @@ LONGEST_FIRST = (
     "test_data_manifests.py",
     "test_regenerate.py",
     "test_processes.py",
-    "test_facets.py",
-    "test_chains.py",
-    "test_render.py",
-    "test_population.py",
-    "test_every_byte.py",
-    "test_deploy.py",
     "test_develop.py",
-    "test_evaluate.py",
-    "test_run.py",
-    "test_card.py",
-    "test_transfer.py",
     "test_renderer.py",
-    "test_image_evaluation.py",
+    "test_levels.py",
+    "test_run.py",
+    "test_deploy.py",
+    "test_every_byte.py",
+    "test_stream.py",
+    "test_streamed.py",
+    "test_population.py",
+    "test_ray.py",
+    "test_render.py",
+    "test_hostile_rows.py",
+    "test_facets.py",
+    "test_transfer.py",
+    "test_hostile_bombs.py",
+    "test_card.py",
+    "test_other_processor.py",
+    "test_local.py",
+    "test_chains.py",
+    "test_evaluate.py",
+    "test_rooms.py",
 )
 """Files by the CPU time of their tests; handed out last, one of them would keep a process busy alone at the end.
 
@@ -80,6 +88,9 @@ def tiny(tmp_path_factory) -> Path:
         "tiny",
         "--out",
         str(folder),
+        # In the command's own process, so that Blender is loaded once.
+        "--workers",
+        "0",
     ]
     with FileLock(f"{folder}.lock"):
         if not Path(f"{folder}.made").exists():

@@ -24,6 +24,8 @@ from perilune_shared.validation.validate import validate
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
 DETECT = ["dataset", "--preset", "tiny", "--kind", "detect"]
+ONE_WORKER = ["--workers", "1"]
+"""By default there is one for each core, and each loads Blender."""
 IN_PROCESS = ["--workers", "0"]
 """Renders in the process of the test, where Blender is loaded once."""
 QUICK = [
@@ -106,7 +108,7 @@ def test_stopped_and_resumed_is_the_same_dataset(tmp_path):
     command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", *QUICK]
     assert run(*command[1:], *IN_PROCESS, "--out", tmp_path / "whole").returncode == 0
     process = subprocess.Popen(
-        [*command, "--out", str(tmp_path / "cut")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*command, *ONE_WORKER, "--out", str(tmp_path / "cut")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     parts = tmp_path / "cut/detect/manifest/frames"
     deadline = time.monotonic() + 60
@@ -128,7 +130,7 @@ def test_stopped_and_resumed_is_the_same_dataset(tmp_path):
 
 
 def test_ctrl_c_is_answered_in_one_line(tmp_path):
-    command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", str(tmp_path)]
+    command = [RENDER, *DETECT, *QUICK, *ONE_WORKER, "--out", str(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     deadline = time.monotonic() + 60
     while not any(tmp_path.rglob("*.png")) and time.monotonic() < deadline:
@@ -184,7 +186,7 @@ def test_a_full_disk_leaves_what_was_finished(tmp_path):
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
 
-    command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", str(tmp_path)]
+    command = [RENDER, *DETECT, *QUICK, *ONE_WORKER, "--out", str(tmp_path)]
     # Coverage could not write its own file either.
     plain = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
     result = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit, env=plain)

@@ -28,9 +28,10 @@ SMALL = (
 )
 
 
-def rendered(out, threads, environment):
+def rendered(out, workers, threads, environment):
     """The content of each file of a small dataset; its ground is not taken from a cache."""
     command = [str(Path(sys.executable).parent / "perilune-render"), "dataset", "--preset", "tiny", "--kind", "detect"]
+    command += ["--workers", str(workers)]
     settings = [f"--set={setting}" for setting in (*SMALL, f"dataset.render.threads={threads}")]
     command += [*settings, "--out", str(out / "made")]
     subprocess.run(
@@ -44,8 +45,8 @@ def rendered(out, threads, environment):
 
 
 def test_a_dataset_has_the_same_bytes_on_another_processor_with_more_threads(tmp_path):
-    one = rendered(tmp_path / "one", 1, {})
-    two = rendered(tmp_path / "two", 2, OTHER_PROCESSOR)
+    one = rendered(tmp_path / "one", 0, 1, {})
+    two = rendered(tmp_path / "two", 1, 2, OTHER_PROCESSOR)
     assert len(one) > 10 and open_dataset(tmp_path / "one/made/detect").info.counts.labels > 30
     assert sorted(one) == sorted(two)
     assert [name for name in one if one[name] != two[name]] == []

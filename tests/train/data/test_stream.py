@@ -85,6 +85,7 @@ def test_a_stream_is_resumed_with_exactly_the_batches_that_were_left(packed, wor
     monkeypatch.setattr(streaming, "_GROUPS_PER_WINDOW", 2)
     options = {"process": 1, "processes": 2, "workers": workers, "batch_size": 3}
     whole = epoch_of(packed, 5, **options)
+    following = epoch_of(packed, 6, **options)
     assert len(whole) == 6
     for done in range(len(whole) + 1):
         loader = loader_of(packed, **options)
@@ -97,7 +98,7 @@ def test_a_stream_is_resumed_with_exactly_the_batches_that_were_left(packed, wor
         again.sampler.set_epoch(5)
         assert list(again) == whole[done:]
         again.sampler.set_epoch(6)
-        assert list(again) == epoch_of(packed, 6, **options)
+        assert list(again) == following
 
 
 def test_a_state_of_another_stream_is_refused_in_one_line(packed):

@@ -1,12 +1,11 @@
 """Navigation trained by two processes: shares, equal weights, resuming."""
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from tests.train.navigate import forked
 
 from perilune_shared.errors import UserError
 from perilune_train.navigate.config import NavigateConfig
@@ -29,15 +28,9 @@ SETTINGS = NavigateConfig(
 
 def train(dataset: Path, out: Path, name: str, stop: str = "") -> subprocess.CompletedProcess[str]:
     """Both networks in two processes; with `stop` ("fusion epoch") interrupted there."""
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    script = [str(Path(__file__).with_name("two_processes.py")), str(dataset), str(out)]
-    return subprocess.run(
-        [*torchrun, *script, name, SETTINGS.model_dump_json(), stop],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    script = Path(__file__).with_name("two_processes.py")
+    log = out / f"{name}{stop}.log"
+    return forked.run(script, log, str(dataset), str(out), name, SETTINGS.model_dump_json(), stop)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""What each of two processes trained on and ended with; started by torchrun in test_processes.py."""
+"""What each of two processes trained on and ended with; started by test_processes.py."""
 
 import sys
 from pathlib import Path
