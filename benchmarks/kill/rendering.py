@@ -62,6 +62,14 @@ class Rendering:
         """Whether it still runs."""
         return self.process.poll() is None
 
+    def send(self, number: int) -> bool:
+        """Send a signal; returns whether it still ran."""
+        try:
+            self.process.send_signal(number)
+        except psutil.NoSuchProcess:
+            return False
+        return True
+
     def below(self) -> list[psutil.Process]:
         """All processes that it has started and that still run."""
         try:

@@ -1,6 +1,5 @@
 """Trials: one rendering each, disturbed at one or more random moments. Each returns its record."""
 
-import os
 import random
 import signal
 import time
@@ -47,8 +46,11 @@ def killed_worker(out: str, whole: Undisturbed, draw: random.Random) -> Record:
 
     def kill(run: Rendering) -> bool:
         workers = run.workers()
-        if workers:
-            draw.choice(workers).kill()
+        try:
+            if workers:
+                draw.choice(workers).kill()
+        except psutil.NoSuchProcess:
+            return False
         return bool(workers)
 
     return _continues(Rendering(out, "--workers", "2"), whole, draw, kill)
@@ -103,9 +105,9 @@ def killed(run: Rendering, whole: Undisturbed, draw: random.Random) -> Record:
 
 def _killed(run: Rendering) -> Record:
     """SIGKILL to a command; waits until its workers have ended, too."""
-    record: Record = {"moment_s": run.age_s, "phase": phase(run.out), "disturbed": run.runs}
+    record: Record = {"moment_s": run.age_s, "phase": phase(run.out)}
     below = run.below()
-    run.process.kill()
+    record["disturbed"] = run.send(signal.SIGKILL)
     run.wait()
     _, alive = psutil.wait_procs(below, timeout=30)
     return {**record, "orphans": len(alive)}
@@ -115,9 +117,8 @@ def _interrupted(run: Rendering) -> Record:
     """Ctrl-C to a command; waits until its processes have ended, too."""
     record: Record = {"moment_s": run.age_s, "phase": phase(run.out)}
     below, asked_s = run.below(), time.monotonic()
-    if not run.runs:
+    if not run.send(signal.SIGINT):
         return {**record, "disturbed": False}
-    os.kill(run.process.pid, signal.SIGINT)
     code = run.wait()
     psutil.wait_procs(below, timeout=60)
     record |= {"seconds": time.monotonic() - asked_s, "disturbed": code != 0}
