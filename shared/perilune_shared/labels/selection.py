@@ -6,7 +6,7 @@ Use:
     seen = labels[selected(labels, SELECTIONS["visible"])]
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -19,26 +19,28 @@ from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.labels.thresholds import Selection, default_label_bound_px
 
 _THRESHOLDED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
+Columns = pd.DataFrame | Mapping[str, NDArray]
 _CRATER = ["scene_id", "crater_id", "depth_m", "diameter_m"]
 
 
-def selected(labels: pd.DataFrame, selection: Selection) -> NDArray[np.bool_]:
+def selected(labels: Columns, selection: Selection) -> NDArray[np.bool_]:
     """Return whether each label (N,) is selected.
 
     Needs the columns radius_px, visible_fraction, sunlit_fraction, contrast, depth_m and diameter_m (see
     `read_labels`). An unknown contrast (NaN, in migrated datasets) passes; any other unknown value fails its threshold.
     """
-    chosen = np.ones(len(labels), np.bool_)
+    radius_px = np.asarray(labels["radius_px"])
+    chosen = np.ones(len(radius_px), np.bool_)
     if selection.radius_px is not None:
         least_px, largest_px = selection.radius_px
-        chosen &= labels["radius_px"].between(least_px, np.inf if largest_px is None else largest_px).to_numpy()
+        chosen &= (radius_px >= least_px) & (radius_px <= (np.inf if largest_px is None else largest_px))
     for column in ("visible_fraction", "sunlit_fraction", "contrast"):
         least = getattr(selection, f"min_{column}")
         if least is not None:
-            values = labels[column].to_numpy()
+            values = np.asarray(labels[column])
             chosen &= (values >= least) | (np.isnan(values) & (column == "contrast"))
     if selection.min_depth_ratio is not None:
-        chosen &= labels["depth_m"].to_numpy() >= selection.min_depth_ratio * labels["diameter_m"].to_numpy()
+        chosen &= np.asarray(labels["depth_m"]) >= selection.min_depth_ratio * np.asarray(labels["diameter_m"])
     return chosen
 
 

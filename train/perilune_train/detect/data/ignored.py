@@ -1,7 +1,7 @@
 """Craters that a frame shows just outside the labelled range; the detector ignores them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ _SIZE = ["diameter_m", "depth_m"]
 
 @dataclass(frozen=True)
 class Craters:
-    """Craters of one scene, in the order of the table craters."""
+    """Craters of one scene, sorted by id."""
 
     crater_id: NDArray[np.int64]
     """Ids within the scene (N,)."""
@@ -36,14 +36,10 @@ class Craters:
     depth_m: Array
     """Depths, metres (N,)."""
 
-    def chosen(self, rows: NDArray) -> "Craters":
-        """Those of some rows, given by number or by a mask (N,)."""
-        return Craters(*(getattr(self, field.name)[rows] for field in fields(self)))
-
 
 def read_craters(dataset: Dataset, scene_id: str) -> Craters:
     """Read the craters of one scene."""
-    table = dataset.table("craters", ["crater_id", *_CENTRE, *_NORMAL, *_SIZE], scene_id=scene_id)
+    table = dataset.table("craters", ["crater_id", *_CENTRE, *_NORMAL, *_SIZE], scene_id=scene_id).sort_by("crater_id")
     sizes = (_real(table[name]) for name in _SIZE)
     return Craters(table["crater_id"].to_numpy(), _vectors(table, _CENTRE), _vectors(table, _NORMAL), *sizes)
 
@@ -71,14 +67,15 @@ def unlabelled_craters(
     low, high = radius_px[0] * MARGIN / max(scale[1], 1.0), radius_px[1] / MARGIN / min(scale[0], 1.0)
     rotation = matrix_from_quaternion(frame["rotation_wxyz"])
     # First select by size: a scene has a hundred thousand craters, and the other checks cost more.
-    craters = craters.chosen(_right_size(craters, camera, rotation[2], frame["position_m"], (low, high)))
+    rows = _right_size(craters, camera, rotation[2], frame["position_m"], (low, high))
+    centre = camera_from_site(craters.centre_m[rows], frame["position_m"], rotation)
+    radius_m = craters.diameter_m[rows] / 2
+    (u, v), reach_px = camera.project(centre).T, 2 * camera.fx_px * radius_m / centre[:, 2]
+    near = (u > -reach_px) & (u < camera.width_px + reach_px) & (v > -reach_px) & (v < camera.height_px + reach_px)
     if labelled is not None:
-        craters = craters.chosen(~np.isin(craters.crater_id, labelled))
-    centre, radius_m = camera_from_site(craters.centre_m, frame["position_m"], rotation), craters.diameter_m / 2
-    middle, rough_px = camera.project(centre), camera.fx_px * radius_m / centre[:, 2]
-    near = (middle > -2 * rough_px[:, None]).all(1)
-    near &= (middle < np.array([camera.width_px, camera.height_px]) + 2 * rough_px[:, None]).all(1)
-    shapes = project_circles(camera, centre[near], craters.normal[near] @ rotation.T, radius_m[near])
+        near &= ~np.isin(craters.crater_id[rows], labelled)
+    near = np.flatnonzero(near)
+    shapes = project_circles(camera, centre[near], craters.normal[rows[near]] @ rotation.T, radius_m[near])
     box, radius = shapes.bounding_boxes(), shapes.radius_px()
     seen = (box[:, 2:] > 0).all(1) & (box[:, :2] < [camera.width_px, camera.height_px]).all(1)
     seen &= (radius >= low) & (radius <= high)
@@ -88,15 +85,15 @@ def unlabelled_craters(
 
 def _right_size(
     craters: Craters, camera: Camera, forward: Array, position_m: Any, range_px: tuple[float, float]
-) -> NDArray[np.bool_]:
-    """Select craters (N,) in front of the camera whose radius in the frame may be in a range, from their depth only.
+) -> NDArray[np.int64]:
+    """Rows (M,) of craters in front of the camera whose radius in the frame may be in a range, from their depth only.
 
     Exact for level ground and a level camera; the effect of a tilt is well within the margins. `forward` is the
     camera's z axis in O_L.
     """
     depth_m = craters.centre_m @ forward - np.asarray(position_m, np.float64) @ forward
     scaled = camera.fx_px * (craters.diameter_m / 2)
-    return (depth_m > 0) & (scaled > 0.8 * range_px[0] * depth_m) & (scaled < 2 * range_px[1] * depth_m)
+    return np.flatnonzero((depth_m > 0) & (scaled > 0.8 * range_px[0] * depth_m) & (scaled < 2 * range_px[1] * depth_m))
 
 
 def _real(column: pa.ChunkedArray) -> Array:

@@ -135,7 +135,7 @@ def frame_labels(
 ) -> FrameLabels:
     """Labels and ignored craters of one frame, given its row, its rows of the table labels and its scene's craters.
 
-    The craters are sorted by id. Raises UserError if the crater of a label is missing.
+    Raises UserError if the crater of a label is missing.
     """
     ids = labels["crater_id"].to_numpy()
     known = (np.append(craters.crater_id, -1)[np.searchsorted(craters.crater_id, ids)] == ids) & (ids >= 0)
@@ -166,11 +166,10 @@ class _SceneLabels:
     def of(cls, labels: pa.Table, craters: Craters, selection: Selection) -> "_SceneLabels":
         """From rows of the table labels, whose craters all exist."""
         ids = labels["crater_id"].to_numpy()
-        by_id = np.argsort(craters.crater_id, kind="stable")  # fast if they are sorted
-        row = by_id[np.searchsorted(craters.crater_id, ids, sorter=by_id)]
+        row = np.searchsorted(craters.crater_id, ids)
         depth_m, diameter_m = craters.depth_m[row], craters.diameter_m[row]
         columns = {name: labels[name].to_numpy() for name in _THRESHOLDED}
-        chosen = selected(pd.DataFrame({**columns, "depth_m": depth_m, "diameter_m": diameter_m}), selection)
+        chosen = selected({**columns, "depth_m": depth_m, "diameter_m": diameter_m}, selection)
         shape = np.column_stack([labels[name].to_numpy().astype(np.float64, copy=False) for name in _SHAPE])
         return cls(ids, shape, chosen, depth_m / diameter_m)
 

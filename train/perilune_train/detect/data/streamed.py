@@ -87,7 +87,6 @@ class _Labels:
         craters = self.scenes.pop(scene_id, None)
         if craters is None:
             craters = read_craters(self.dataset, scene_id)
-            craters = craters.chosen(np.argsort(craters.crater_id, kind="stable"))
         while len(self.scenes) >= _MAX_SCENES:
             del self.scenes[next(iter(self.scenes))]
         self.scenes[scene_id] = craters
