@@ -28,9 +28,12 @@ def read_object(address: Address) -> dict[str, Any]:
         if not path.exists() and not path.is_symlink():
             raise UserError(store, INFO_NAME, "no such file", _EXPECTED)
         store.plain_size(INFO_NAME)
-    elif not store.exists(INFO_NAME):
-        raise UserError(store, INFO_NAME, "no such file", _EXPECTED)
-    text = store.read(INFO_NAME, most_bytes=_LARGEST_INFO_BYTES)
+    try:
+        text = store.read(INFO_NAME, most_bytes=_LARGEST_INFO_BYTES)
+    except UserError as error:
+        if error.field == "file" and not store.is_local:
+            raise UserError(store, INFO_NAME, error.found, _EXPECTED) from None
+        raise
     try:
         content = json.loads(text, object_pairs_hook=_with_unique_names, parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:

@@ -10,6 +10,7 @@ Parts are written atomically and never rewritten. Use:
 import contextlib
 import functools
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pandas as pd
@@ -33,6 +34,8 @@ from perilune_shared.storage.store import Address, open_store
 LARGEST_FRAME_BYTES = 2**30
 """Maximum size of a PNG or EXR, bytes."""
 _MAX_KEPT_OPEN = 32
+_MAX_REQUESTS = 16
+"""Number of frames of an object store that are read at a time."""
 
 
 class Dataset:
@@ -179,11 +182,11 @@ class Dataset:
             raise UserError(self.store, "address", "an object store", "a local folder")
         return files.inside(self.store.folder, relative)
 
-    def pngs(self, frames: pa.Table) -> Iterator[tuple[str, bytes]]:
+    def pngs(self, frames: pa.Table, split: str | None = None) -> Iterator[tuple[str, bytes]]:
         """Yield frame_id and PNG bytes of the frames in `frames`, which has frame_id and png_path.
 
-        Frames stored as files come in the order of the rows, packed frames in the order in which they are stored.
-        Raises UserError if a frame is missing.
+        If all are of one `split`, packed frames of other splits are not searched. Frames stored as files come in the
+        order of the rows, packed frames in the order in which they are stored. Raises UserError if a frame is missing.
         """
         if self.info.images in ("absent", "planned"):
             command = "regenerate" if self.info.images == "absent" else "dataset --manifest"
@@ -192,10 +195,19 @@ class Dataset:
         rows = frames.select(["frame_id", "png_path"]).to_pydict()
         paths = dict(zip(rows["frame_id"], rows["png_path"], strict=True))
         if self.info.images == "packed":
-            yield from read_packed(self.store, set(paths))
+            yield from read_packed(self.store, set(paths), split)
             return
-        for frame_id, relative in paths.items():
-            yield frame_id, self.store.read(relative, most_bytes=LARGEST_FRAME_BYTES)
+        read = functools.partial(self.store.read, most_bytes=LARGEST_FRAME_BYTES)
+        if self.store.is_local:
+            for frame_id, relative in paths.items():
+                yield frame_id, read(relative)
+            return
+        with ThreadPoolExecutor(_MAX_REQUESTS) as readers:
+            for start in range(0, len(paths), _MAX_REQUESTS):
+                portion = list(paths.items())[start : start + _MAX_REQUESTS]
+                yield from zip(
+                    (name for name, _ in portion), readers.map(read, (place for _, place in portion)), strict=True
+                )
 
     def shards(self, split: str | None = None) -> list[str]:
         """Return the paths of the Parquet files that contain packed frames, of all splits or of one, sorted by name."""

@@ -81,13 +81,13 @@ def open_shard(store: Store, path: str) -> Part:
     return Part(store, path, FOLDER, SHARDS)
 
 
-def read_packed(store: Store, frame_ids: set[str]) -> Iterator[tuple[str, bytes]]:
-    """Yield frame_id and PNG bytes of packed frames, in the order in which they are stored.
+def read_packed(store: Store, frame_ids: set[str], split: str | None = None) -> Iterator[tuple[str, bytes]]:
+    """Yield frame_id and PNG bytes of packed frames, of all splits or of one, in the order in which they are stored.
 
     Raises UserError if a frame is missing.
     """
     missing = set(frame_ids)
-    for path in shards_of(store):
+    for path in shards_of(store, split):
         if not missing:
             return
         shard = open_shard(store, path)

@@ -7,14 +7,15 @@ the part `all`, whose row groups contain one scene or a few trajectories each. A
 
 import contextlib
 import errno
+import functools
 import hashlib
 import io
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -25,7 +26,8 @@ from pyarrow.fs import LocalFileSystem
 from perilune_shared.dataset.names import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, stem_of
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.errors import UserError
-from perilune_shared.storage.pages import pages_of
+from perilune_shared.storage.pages import pages_of, range_of
+from perilune_shared.storage.ranges import Ranges
 from perilune_shared.storage.store import Address, Store, open_store
 
 MOST_ROWS_WRITTEN = 2_000_000
@@ -95,6 +97,10 @@ class Part:
         try:
             # Read a small file at once; of a large file read only the requested columns.
             self._content = store.read(path) if self._n_bytes <= _SMALL_BYTES else None
+            self._ranges = None
+            if self._content is None and not store.is_local:
+                self._ranges = Ranges(functools.partial(store.read, path), self._n_bytes)
+                self._ranges.keep(self._n_bytes - _SMALL_BYTES)
             texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
             self.file = self._parquet(texts)
             self.found = self.file.metadata.schema.to_arrow_schema()
@@ -126,10 +132,10 @@ class Part:
         return pq.ParquetFile(source, read_dictionary=[name for name in texts if name in names], **options)
 
     def _source(self) -> Any:
-        """Return what pyarrow opens: a local path, the bytes of a small file, or a stream of an object."""
+        """Return what pyarrow opens: a local path, the bytes of a small file, or the ranges of an object."""
         if self._content is not None:
             return pa.BufferReader(self._content)
-        return self.store.folder / self.path if self.store.folder is not None else self.store.open(self.path)
+        return self._ranges if self.store.folder is None else self.store.folder / self.path
 
     @property
     def n_rows(self) -> int:
@@ -202,12 +208,11 @@ class Part:
             if self.found.field(place).type != field.type:
                 raise UserError(self.address, field.name, self.found.field(place).type, f"{field.type}")
         try:
-            opened: BinaryIO = self.store.open(self.path) if self._content is None else io.BytesIO(self._content)
-            with opened as stream:
+            with self._bytes_of(chosen, present) as stream:
                 for group in chosen:
                     self._check_pages(stream, group, present)
-            # Threads slow down the reading of a single row group.
-            rows = self.file.read_row_groups(chosen, columns=present, use_threads=len(chosen) > 1)
+                # Threads slow down the reading of a single row group.
+                rows = self.file.read_row_groups(chosen, columns=present, use_threads=len(chosen) > 1)
             for field in map(schema.field, present):
                 if pa.types.is_string(field.type):
                     self._check_text(field.name, rows[field.name], None if any_ids else _IDS.get(field.name))
@@ -219,6 +224,22 @@ class Part:
             return rows
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(self.address, "content", error, "a complete Parquet file") from None
+
+    @contextlib.contextmanager
+    def _bytes_of(self, groups: list[int], names: list[str]) -> Iterator[BinaryIO]:
+        """Open the file to read columns of row groups; of an object, they are read at once within the block."""
+        if self._ranges is None:
+            with self.store.open(self.path) if self._content is None else io.BytesIO(self._content) as stream:
+                yield stream
+            return
+        columns = [
+            range_of(row_group.column(place))
+            for row_group in map(self.file.metadata.row_group, groups)
+            for place in range(row_group.num_columns)
+            if row_group.column(place).path_in_schema.split(".")[0] in names
+        ]
+        with self._ranges.fetched(columns):
+            yield cast(BinaryIO, self._ranges)
 
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
         """Check that the pages do not exceed the sizes in the footer, which have been checked."""

@@ -26,15 +26,20 @@ class Pages:
     """Whether one of the pages is a dictionary."""
 
 
+def range_of(column: Any) -> tuple[int, int]:
+    """Return the range (start, end) of the pages of a column in the file, bytes; `column` is its metadata."""
+    start = column.data_page_offset
+    if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
+        start = column.dictionary_page_offset
+    return start, start + column.total_compressed_size
+
+
 def pages_of(stream: BinaryIO, column: Any) -> Pages:
     """Read all page headers of a column from an open file; `column` is pyarrow's column metadata.
 
     Raises ValueError if a header is damaged.
     """
-    start = column.data_page_offset
-    if column.has_dictionary_page and 0 < column.dictionary_page_offset < start:
-        start = column.dictionary_page_offset
-    end = start + column.total_compressed_size
+    start, end = range_of(column)
     uncompressed, n_values, has_dictionary = 0, 0, False
     while start < end and n_values < column.num_values:
         header, length = _header(stream, start)

@@ -11,6 +11,7 @@ All paths are relative POSIX paths of plain names. Every fault of an object stor
 
 import abc
 import errno
+import functools
 import hashlib
 import os
 import stat
@@ -20,9 +21,10 @@ from typing import Any, BinaryIO, cast
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
-from perilune_shared.storage.file_systems import OBJECT_STORES, file_system, open_ranges
+from perilune_shared.storage.file_systems import OBJECT_STORES, file_system
 from perilune_shared.storage.items import Item, local_items, object_items
-from perilune_shared.storage.store_faults import store_faults
+from perilune_shared.storage.ranges import Ranges
+from perilune_shared.storage.store_faults import is_missing_bucket, store_faults
 
 _CHUNK_BYTES = 2**20
 _KINDS = "a path, s3://bucket/prefix, gs://bucket/prefix or memory://name"
@@ -219,7 +221,7 @@ class ObjectStore(Store):
             try:
                 found = self._system.find(top, detail=True)
             except FileNotFoundError as error:
-                if "bucket" in str(error).lower():
+                if is_missing_bucket(error):
                     raise
         yield from object_items(found, self._prefix)
 
@@ -239,18 +241,16 @@ class ObjectStore(Store):
         with store_faults(self.at(path)):
             try:
                 content = cast(bytes, self._system.cat_file(self._key(path), start=start or None, end=end))
-            except FileNotFoundError:
+            except FileNotFoundError as error:
+                if is_missing_bucket(error):
+                    raise
                 raise _missing(self, path) from None
         if most_bytes is not None and start + len(content) > most_bytes:
             raise _too_large(self, path, start + len(content), most_bytes)
         return content
 
     def open(self, path: str) -> BinaryIO:
-        with store_faults(self.at(path)):
-            try:
-                return open_ranges(self._system, self._key(path), self.at(path))
-            except FileNotFoundError:
-                raise _missing(self, path) from None
+        return cast(BinaryIO, Ranges(functools.partial(self.read, path), self.plain_size(path)))
 
     def write(self, path: str, content: bytes, *, durable: bool = True) -> None:
         with store_faults(self.at(path)):

@@ -14,6 +14,11 @@ _CREDENTIALS = {
 }
 
 
+def is_missing_bucket(error: Exception) -> bool:
+    """Whether an exception says that the bucket is missing, not only an object in it."""
+    return isinstance(error, FileNotFoundError) and "specified bucket" in str(error).lower()
+
+
 @contextlib.contextmanager
 def store_faults(address: str) -> Iterator[None]:
     """Raise UserError about `address` instead of any exception of an object store, after the library's retries.
@@ -26,7 +31,7 @@ def store_faults(address: str) -> Iterator[None]:
         raise
     except Exception as error:
         text = one_line(f"{type(error).__name__}: {error}")
-        if "bucket" in text.lower() and isinstance(error, FileNotFoundError):
+        if is_missing_bucket(error):
             raise UserError(address, "bucket", "no such bucket", "the name of an existing bucket") from None
         if isinstance(error, FileNotFoundError):
             raise

@@ -71,18 +71,19 @@ def frame_table(dataset: Dataset, split: str) -> pd.DataFrame:
     return table.sort_values(_ORDER, ignore_index=True)
 
 
-def load_frames(dataset: Dataset, split: str, share: Share = ALONE) -> FrameStore:
+def load_frames(dataset: Dataset, split: str, share: Share = ALONE, table: pd.DataFrame | None = None) -> FrameStore:
     """Load the frames of a split, or only those of a share of it; a frame of 256 x 256 px takes 64 kB.
 
-    Raises UserError if the split is empty, if its frames do not fit into memory, or if one is invalid.
+    `table` is the `frame_table` of the split, if the caller has it. Raises UserError if the split is empty, if its
+    frames do not fit into memory, or if one is invalid.
     """
-    table = frame_table(dataset, split)
+    table = frame_table(dataset, split) if table is None else table
     own = table.iloc[list(share.of(len(table)))].reset_index(drop=True)
     return FrameStore(own, load_images(dataset, own, split))
 
 
-def load_images(dataset: Dataset, table: pd.DataFrame, name: str) -> NDArray[np.uint8]:
-    """Load the pixels (N, height, width) of N rows of `frame_table`; `name` is for the progress bar and messages.
+def load_images(dataset: Dataset, table: pd.DataFrame, split: str) -> NDArray[np.uint8]:
+    """Load the pixels (N, height, width) of N rows of the `frame_table` of a split.
 
     Raises UserError if they do not fit into memory or if one is invalid.
     """
@@ -90,7 +91,7 @@ def load_images(dataset: Dataset, table: pd.DataFrame, name: str) -> NDArray[np.
     n_bytes = len(table) * camera.height_px * camera.width_px
     if n_bytes > os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"):
         found = f"{len(table)} frames of {camera.width_px} x {camera.height_px} pixels, {n_bytes / 2**30:.1f} GiB"
-        raise UserError(dataset.store, "frames", found, f"{name} frames that fit into memory; see detect.stream")
+        raise UserError(dataset.store, "frames", found, f"{split} frames that fit into memory; see detect.stream")
     images = np.empty((len(table), camera.height_px, camera.width_px), np.uint8)
     place_of = {frame_id: place for place, frame_id in enumerate(table["frame_id"])}
     paths, sizes = table["png_path"].tolist(), table["png_bytes"].tolist()
@@ -102,8 +103,8 @@ def load_images(dataset: Dataset, table: pd.DataFrame, name: str) -> NDArray[np.
 
     # OpenCV releases Python's global interpreter lock while it decodes.
     with progress_bar() as progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as threads:
-        task = progress.add_task(f"load {name}", total=len(table), unit="frames", note="")
-        for portion in _portions(dataset.pngs(rows), _PORTION):
+        task = progress.add_task(f"load {split}", total=len(table), unit="frames", note="")
+        for portion in _portions(dataset.pngs(rows, split), _PORTION):
             for _ in threads.map(unpack, portion):
                 progress.advance(task)
     return images

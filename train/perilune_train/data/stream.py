@@ -37,7 +37,7 @@ from perilune_train.data.epochs import one_thread
 
 _GROUPS_PER_WINDOW = 8
 _MAX_OPEN_SHARDS = 16
-"""Open local shards of a worker. Of an object store one is open: it keeps the blocks that it has fetched."""
+"""Open shards of a worker. Of those in an object store the footers are kept."""
 _NESTED = ("image", "labels")
 COLUMNS = tuple(name for name in SHARDS.names if name not in _NESTED)
 """Columns of the table frames, by default all are read."""
@@ -201,7 +201,7 @@ class FrameStream(torch_data.IterableDataset):
         for group in groups.tolist():
             path = self._groups.shard[group]
             if path not in opened:
-                while len(opened) >= (_MAX_OPEN_SHARDS if self.dataset.store.is_local else 1):
+                while len(opened) >= _MAX_OPEN_SHARDS:
                     del opened[next(iter(opened))]
                 opened[path] = open_shard(self.dataset.store, path)
             tables[group] = opened[path].read([*self.columns, *self._nested], [int(self._groups.in_shard[group])])

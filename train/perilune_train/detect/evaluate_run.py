@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.storage.store import Address
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import EDGE
@@ -29,7 +30,7 @@ from perilune_train.training import runs
 def evaluate_again(
     run: Path,
     config: DetectConfig,
-    dataset_root: Path,
+    dataset_address: Address,
     split: str,
     threshold: float | None,
     out: Path | None,
@@ -48,7 +49,7 @@ def evaluate_again(
         "of the run, chosen on its validation split" if threshold is None else "given on the command line"
     )
     known = read_metrics(run).get("dataset/name")
-    dataset = open_dataset(dataset_root)
+    dataset = open_dataset(dataset_address)
     best = runs.RunFolder(run).best
     terrain = read_provenance(runs.load_weights(best), best)
     if choose_threshold:

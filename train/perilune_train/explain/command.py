@@ -16,7 +16,11 @@ def explain(
     config: ConfigFile = None,
     set_: Settings = None,
     dataset: Annotated[
-        Path | None, typer.Option(help="Folder that holds the datasets detect and nav. [default: data/<preset>]")
+        str | None,
+        typer.Option(
+            help="Folder, s3://bucket/prefix or gs://bucket/prefix that holds the datasets detect and nav."
+            " [default: data/<preset>]"
+        ),
     ] = None,
     runs: RunsFolder = Path("runs"),
     name: Annotated[
@@ -50,11 +54,11 @@ def explain(
     # Importing torch and Lightning takes seconds; check the settings first.
     from perilune_train.explain.run import explain_run
 
-    name, root = name or preset, dataset or Path("data", preset)
+    name, above = name or preset, (dataset or f"data/{preset}").rstrip("/")
     run = explain_run(
         settings,
-        root / "detect",
-        root / "nav",
+        f"{above}/detect",
+        f"{above}/nav",
         detector or runs / "detect" / name / "checkpoints" / "best.ckpt",
         navigator or runs / "navigate" / f"{name}-stack" / "checkpoints" / "best.ckpt",
         runs,

@@ -39,8 +39,8 @@ _PICTURES = {
 
 def explain_run(
     settings: ExplainConfig,
-    detect_data: Path,
-    nav_data: Path,
+    detect_data: str | Path,
+    nav_data: str | Path,
     detector: Path,
     navigator: Path,
     runs: Path,
@@ -123,15 +123,17 @@ def explain_run(
     return run
 
 
-def _check_terrain(networks: Mapping[str, tuple[Path, Path]], allow_overlap: bool) -> tuple[dict[str, str], Metrics]:
+def _check_terrain(
+    networks: Mapping[str, tuple[Path, str | Path]], allow_overlap: bool
+) -> tuple[dict[str, str], Metrics]:
     """Marks and entries of metrics.json by network, from each network's checkpoint and dataset.
 
     Raises UserError if a network was fitted to terrain of its dataset's test frames, unless `allow_overlap`.
     """
     marks: dict[str, str] = {}
     metrics: Metrics = {}
-    for part, (checkpoint, root) in networks.items():
-        dataset = open_dataset(root)
+    for part, (checkpoint, address) in networks.items():
+        dataset = open_dataset(address)
         check = check_terrain(read_provenance(load_weights(checkpoint), checkpoint), dataset, "test", allow_overlap)
         marks[part] = check.mark
         figures = {"dataset/protocol": protocol_of(dataset.info), **check.metrics()}
@@ -140,15 +142,15 @@ def _check_terrain(networks: Mapping[str, tuple[Path, Path]], allow_overlap: boo
 
 
 def detect_frames(
-    settings: ExplainConfig, detector: DetectConfig, root: Path
+    settings: ExplainConfig, detector: DetectConfig, address: str | Path
 ) -> tuple[np.ndarray, np.ndarray, Metrics]:
     """Test frames (N, height, width), the paper's masks G of them, float32 (N, height, width), and their selection.
 
     G contains only craters that the detector's own run selects, so no hardly visible ones.
     """
-    dataset = open_dataset(root)
+    dataset = open_dataset(address)
     if dataset.info.kind != "detect":
-        raise UserError(root, "kind", dataset.info.kind, "detect, a dataset with labels")
+        raise UserError(dataset.store, "kind", dataset.info.kind, "detect, a dataset with labels")
     split = load_split(dataset, "test", detector.labels)
     chosen = _evenly_spaced(range(len(split)), settings.n_frames)
     height, width = split.frames.images.shape[1:]

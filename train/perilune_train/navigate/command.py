@@ -15,7 +15,10 @@ def navigate(
     preset: Preset = "small",
     config: ConfigFile = None,
     set_: Settings = None,
-    dataset: Annotated[Path | None, typer.Option(help="Folder of the dataset. [default: data/<preset>/nav]")] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<preset>/nav]"),
+    ] = None,
     runs: RunsFolder = Path("runs"),
     name: RunName = None,
     allow_overlap: AllowOverlap = False,
@@ -35,6 +38,6 @@ def navigate(
 
     name = name or preset
     detector = runs / "detect" / name / "checkpoints" / "best.ckpt"
-    dataset = dataset or Path("data", preset, "nav")
-    for run in navigate_run(settings, dataset, runs, name, detector, overwrite, allow_overlap):
+    address = dataset or Path("data", preset, "nav")
+    for run in navigate_run(settings, address, runs, name, detector, overwrite, allow_overlap):
         console.print(f"{run.root}: metrics.json, navigation.parquet, descent.png, errors.png")

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
@@ -48,6 +49,14 @@ def test_nothing_is_left_to_learn_from_oneself():
     assert confidence.item() == pytest.approx(0, abs=1e-6)
     (box + confidence).backward()
     assert all(part.grad[..., 4].abs().max() < 1e-6 for part in raw)
+
+
+def test_no_step_of_the_loss_needs_a_value():
+    """A GPU would have to be waited for. Fake tensors have no values: an operation that needs one raises an error."""
+    with FakeTensorMode():
+        student, anchors = [part.requires_grad_() for part in outputs()], torch.full((3, 3, 2), 8.0)
+        sum(distill_loss(student, outputs(), anchors, STRIDES)).backward()
+        assert all(part.grad.shape == part.shape for part in student)
 
 
 def test_objectness_by_hand():

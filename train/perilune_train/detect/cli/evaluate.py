@@ -22,7 +22,10 @@ def evaluate(
     context: typer.Context,
     run: Annotated[Path, typer.Option(help="Folder of a finished detect run, for example runs/detect/small.")],
     dataset: Annotated[
-        Path | None, typer.Option(help="Folder of the dataset. [default: data/<name of the run>/detect]")
+        str | None,
+        typer.Option(
+            help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix. [default: data/<name of the run>/detect]"
+        ),
     ] = None,
     split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
     set_: Annotated[
@@ -98,6 +101,6 @@ def evaluate(
     # Importing torch takes seconds; check the settings first.
     from perilune_train.detect.evaluate_run import evaluate_again
 
-    root = dataset or Path("data", run.resolve().name, "detect")
-    folder = evaluate_again(run, config, root, split, threshold, out, choose_threshold, allow_overlap)
+    address = dataset or Path("data", run.resolve().name, "detect")
+    folder = evaluate_again(run, config, address, split, threshold, out, choose_threshold, allow_overlap)
     console.print(f"{folder}: metrics.json, report.md, precision_recall.png, bins.png, detections.png")

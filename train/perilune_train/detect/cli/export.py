@@ -16,7 +16,8 @@ def export(
     formats: Annotated[str, typer.Option(help="onnx, openvino, or both separated by a comma.")] = "onnx,openvino",
     size_px: Annotated[int, typer.Option(help="Side of the square images, a multiple of 32.")] = 256,
     dataset: Annotated[
-        Path | None, typer.Option(help="Dataset; the files are compared with torch on its validation frames.")
+        str | None,
+        typer.Option(help="Dataset (folder or address); the files are compared with torch on its validation frames."),
     ] = None,
     int8: Annotated[bool, typer.Option("--int8", help="Also try 8-bit integers; needs --dataset.")] = False,
     allow_overlap: AllowOverlap = False,

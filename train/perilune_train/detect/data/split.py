@@ -67,7 +67,7 @@ def load_split(
     if len(table) < share.processes:
         expected = f"at least {share.processes}, one for each process"
         raise UserError(dataset.store, f"{split} frames", len(table), expected)
-    frames = load_frames(dataset, split, share)
+    frames = load_frames(dataset, split, share, table)
     radius_px = evaluated_range(dataset, settings)
     labels, sizes_px = read_split_labels(dataset, table, share, settings, radius_px, scale)
     return DetectSplit(frames, labels, radius_px, sizes_px, len(table), share)

@@ -10,6 +10,7 @@ import numpy as np
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import new_folder, sha256_of, write_text
+from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
 from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
@@ -106,7 +107,7 @@ def export_run(
     out: Path,
     formats: tuple[str, ...] = FORMATS,
     size_px: int = 256,
-    dataset: Path | None = None,
+    dataset: Address | None = None,
     int8: bool = False,
     allow_overlap: bool = False,
 ) -> Int8Verdict | None:

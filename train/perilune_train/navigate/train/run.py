@@ -45,7 +45,7 @@ _WRITTEN = ("navigation.parquet", "errors.parquet", "descent.png", "errors.png")
 
 def navigate_run(
     settings: NavigateConfig,
-    dataset: Path,
+    dataset_address: str | Path,
     runs: Path,
     name: str,
     detector: Path | None,
@@ -66,7 +66,7 @@ def navigate_run(
     console.quiet = not is_first_process()
     fusions: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
     backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in fusions else (None, "", [])
-    inputs: dict[Fusion, dict[str, str | None]] = {"warp": hashes_of({"dataset": dataset})}
+    inputs: dict[Fusion, dict[str, str | None]] = {"warp": hashes_of({"dataset": dataset_address})}
     used = None if backbone is None else settings.detector or detector
     inputs["stack"] = inputs["warp"] | hashes_of({"detector": used})
     names = {"warp": name, "stack": f"{name}-stack"}
@@ -74,7 +74,7 @@ def navigate_run(
     states = {fusion: state_of(folders[fusion], "navigate", settings, inputs[fusion], overwrite) for fusion in fusions}
     if set(states.values()) == {"finished"}:
         return list(folders.values())
-    opened = open_dataset(dataset)
+    opened = open_dataset(dataset_address)
     own = training_provenance(opened)
     terrain = {"warp": own, "stack": own.joined(inherited)}
     # One check for both, because the table of the warp run includes the metrics of stack.

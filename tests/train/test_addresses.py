@@ -1,0 +1,179 @@
+"""Every command of the trainer reads datasets from an object store, a real server on this machine."""
+
+import pandas as pd
+import pytest
+import torch
+from tests.helpers import in_process
+from tests.helpers.s3_server import new_bucket, s3_server
+from tests.helpers.stored_run import store_run
+from tests.helpers.terrain_record import store_record
+
+from perilune_shared.config import resolve
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.editing import pack as packing
+from perilune_shared.editing.pack import pack
+from perilune_shared.errors import UserError
+from perilune_shared.storage.store import open_store
+from perilune_train.cli import main
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.train.run import run_detect
+from perilune_train.detect.train.task import DetectTask
+from perilune_train.evaluation.provenance import training_provenance
+from perilune_train.explain.config import ExplainConfig
+from perilune_train.explain.run import explain_run
+from perilune_train.models.navigator import StackNavigator
+from perilune_train.training.runs import save_weights
+
+_STACK = {
+    "fusion": "stack",
+    "size_px": 32,
+    "in_channels": 1,
+    "width": 0.125,
+    "attention": "cbam",
+    "hidden": 8,
+    "focal_over_width": 1.4,
+    "scales": {"mean_m": [0.0] * 3, "spread_m": [1.0] * 3, "rotation_rad": 0.01},
+}
+_NAVIGATE = ("fusion=warp", "device=cpu", "precision=float32", "warp.size_px=32", "warp.width=0.125", "warp.hidden=8")
+COMMANDS = {
+    "train": "detect train --preset tiny --name a --out {out} --dataset {address}/detect",
+    "evaluate": "detect evaluate --run {run} --dataset {address}/detect",
+    "export": "detect export --run {run} --out {out} --dataset {address}/detect",
+    "navigate": "navigate --preset tiny --name a --out {out} --dataset {address}/nav",
+    "explain": "explain --name a --out {out} --detector {run}/checkpoints/best.ckpt --navigator {stack} "
+    "--dataset {address}",
+}
+
+
+def uploaded(folder, address):
+    """Copy a dataset from a folder to an address."""
+    source, target = open_store(folder), open_store(address)
+    for item in source.list():
+        target.write(item.path, source.read(item.path))
+    return address
+
+
+@pytest.fixture(scope="module")
+def networks(few, dataset_nav, tmp_path_factory):
+    """The run of a detector and the weights of a navigator, not trained."""
+    folder = tmp_path_factory.mktemp("networks")
+    run = store_run(folder, "attention=cbam")
+    store_record(run / "checkpoints" / "best.ckpt", training_provenance(open_dataset(few)).uses)
+    save_weights(folder / "stack.ckpt", _STACK, StackNavigator(1, 0.125, "cbam", 8))
+    store_record(folder / "stack.ckpt", training_provenance(open_dataset(dataset_nav)).uses)
+    return run, folder / "stack.ckpt"
+
+
+@pytest.fixture
+def bucket(few, dataset_nav, s3_bucket):
+    """An address with a dataset `detect` and a dataset `nav`."""
+    uploaded(few, f"{s3_bucket}/detect")
+    uploaded(dataset_nav, f"{s3_bucket}/nav")
+    return s3_bucket
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_detector_is_evaluated_on_a_dataset_at_an_address(networks, few, bucket, tmp_path):
+    found = []
+    for name, address in (("local", few), ("remote", f"{bucket}/detect")):
+        done = in_process.call(
+            main, "detect", "evaluate", "--run", networks[0], "--dataset", address, "--out", tmp_path / name
+        )
+        assert done.returncode == 0, done.stderr
+        found.append(pd.read_parquet(tmp_path / name / "detections.parquet"))
+    assert len(found[0]) > 0 and found[0].equals(found[1])
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_navigator_is_trained_on_a_dataset_at_an_address(bucket, tmp_path):
+    epochs = ("warp.coarse_epochs=0", "warp.fine_epochs=1", "warp.sequence_pairs=4")
+    settings = [part for value in (*_NAVIGATE, *epochs) for part in ("--set", f"navigate.{value}")]
+    given = ("navigate", "--preset", "tiny", "--name", "a", "--out", tmp_path, "--dataset", f"{bucket}/nav")
+    done = in_process.call(main, *given, *settings)
+    assert done.returncode == 0, done.stderr
+    assert len(pd.read_parquet(tmp_path / "navigate" / "a" / "navigation.parquet")) == 5
+    inputs = (tmp_path / "navigate" / "a" / "inputs.json").read_text()
+    assert "null" not in inputs
+
+
+def test_masks_are_explained_on_datasets_at_an_address(networks, bucket, few, dataset_nav, tmp_path):
+    settings, checkpoint = ExplainConfig(n_frames=2, n_pairs=2, n_drawn=1, device="cpu"), networks[0] / "checkpoints"
+    found = []
+    for name, data in (("local", (few, dataset_nav)), ("remote", (f"{bucket}/detect", f"{bucket}/nav"))):
+        run = explain_run(settings, *data, checkpoint / "best.ckpt", networks[1], tmp_path, name)
+        found.append(pd.read_parquet(run.root / "correlations.parquet"))
+    assert len(found[0]) > 0 and found[0].equals(found[1])
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_an_address_without_a_dataset_is_refused_in_one_line(command, networks, s3_bucket, tmp_path):
+    run, stack = networks
+    out = tmp_path / "out"
+    for address, message in (
+        (s3_bucket, r"dataset.json: got no such file, expected the folder or address of a dataset"),
+        ("s3://no-such-bucket", "bucket: got no such bucket, expected the name of an existing bucket"),
+        ("http://host", "address: got http://, expected a path, s3://bucket/prefix"),
+    ):
+        given = COMMANDS[command].format(run=run, stack=stack, out=out, address=address)
+        done = in_process.call(main, *given.split())
+        *before, last = done.stderr.splitlines()
+        assert done.returncode == 2 and last.startswith("error: ") and address in last and message in last
+        assert len(before) <= 1 and "Traceback" not in done.stderr
+        assert not out.exists() or not list(out.rglob("*"))
+
+
+def test_missing_credentials_are_refused_in_one_line(networks, s3_bucket, monkeypatch, tmp_path):
+    import s3fs
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    s3fs.S3FileSystem.clear_instance_cache()
+    try:
+        done = in_process.call(main, "detect", "evaluate", "--run", networks[0], "--dataset", f"{s3_bucket}/detect")
+    finally:
+        s3fs.S3FileSystem.clear_instance_cache()
+    assert done.returncode == 2 and "expected credentials with access to it: AWS_ACCESS_KEY_ID" in done.stderr
+    assert done.stderr.strip().count("\n") == 0
+
+
+@pytest.mark.usefixtures("no_pictures", "s3_environment")
+def test_a_run_whose_store_vanishes_ends_in_one_line_and_is_resumed(few, tmp_path, monkeypatch):
+    monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
+    monkeypatch.setattr(packing, "_FRAMES_PER_GROUP", 2)
+    pack(open_dataset(few), tmp_path / "packed")
+    stated = ("epochs=2", "width=0.125", "precision=float32", "device=cpu", "stream=true", "batch_size=2", "workers=1")
+    config = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, tuple(f"detect.{one}" for one in stated))
+    whole = run_detect(config, tmp_path / "packed", tmp_path, "whole")
+    # The libraries' retries would take more than a minute.
+    monkeypatch.setattr("s3fs.S3FileSystem.retries", 1)
+    monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")
+    original, seen = DetectTask.training_step, []
+
+    def watched(self, batch, batch_idx):
+        if (self.current_epoch, batch_idx) == (1, 0):
+            raise AssertionError("the second epoch started without the store")
+        seen.append(batch_idx)
+        if batch_idx == 1:
+            server.__exit__(None, None, None)
+        return original(self, batch, batch_idx)
+
+    server = s3_server()
+    for name, value in server.__enter__().items():
+        monkeypatch.setenv(name, value)
+    address = uploaded(tmp_path / "packed", f"{new_bucket()}/packed")
+    with monkeypatch.context() as patch:
+        patch.setattr(DetectTask, "training_step", watched)
+        with pytest.raises(UserError, match=rf"{address}.*: connection: got .*; run the same command again to resume"):
+            run_detect(config, address, tmp_path, "a")
+    assert seen == [0, 1, 2]
+    with s3_server() as environment:
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        bucket = address.split("/")[2]
+        monkeypatch.setattr("tests.helpers.s3_server._numbers", iter([int(bucket.rpartition("-")[2])]))
+        assert new_bucket() == f"s3://{bucket}"
+        uploaded(tmp_path / "packed", address)
+        run = run_detect(config, address, tmp_path, "a")
+    first, again = (torch.load(each.last, weights_only=True)["state_dict"] for each in (whole, run))
+    assert first.keys() == again.keys() and all(torch.equal(first[key], again[key]) for key in first)
