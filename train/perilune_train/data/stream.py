@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import torch
 from numpy.typing import NDArray
 from torch.utils import data as torch_data
 
@@ -108,6 +109,8 @@ class FrameStream(torch_data.IterableDataset):
         self.process, self.processes, self.make, self.columns = process, processes, make, columns
         self._nested = _NESTED if images else _NESTED[1:]
         self.epoch = self.batches = self.workers = 0
+        # Epoch and first batch of the current iteration, for workers, which live longer than an epoch.
+        self._begun = torch.zeros(2, dtype=torch.int64).share_memory_()
         self._groups = _groups_of(dataset, split)
         self.n_frames = int(self._groups.n_frames.sum())
         if self.n_frames < processes:
@@ -145,6 +148,8 @@ class FrameStream(torch_data.IterableDataset):
         """
         worker = torch_data.get_worker_info()
         number, workers = (worker.id, worker.num_workers) if worker is not None else (0, 1)
+        if worker is not None:
+            self.epoch, self.batches = self._begun.tolist()
         try:
             # The loader asks worker 0 first, also on resuming.
             yield from self._batches((self.batches + number) % workers, workers)
@@ -258,17 +263,22 @@ class StreamLoader:
     def __len__(self) -> int:
         return len(self.stream)
 
-    def __iter__(self) -> Iterator[Any]:
+    @functools.cached_property
+    def _loader(self) -> torch_data.DataLoader:
         if self.workers:
             one_thread()
-        loader = torch_data.DataLoader(
+        return torch_data.DataLoader(
             self.stream,
             batch_size=None,
             num_workers=self.workers,
             pin_memory=self.pinned,
+            persistent_workers=self.workers > 0,
             worker_init_fn=one_thread,
         )
-        for batch in loader:
+
+    def __iter__(self) -> Iterator[Any]:
+        self.stream._begun.copy_(torch.tensor([self.stream.epoch, self.stream.batches]))
+        for batch in self._loader:
             if isinstance(batch, UserError):
                 raise batch
             self.stream.batches += 1
