@@ -20,7 +20,7 @@ ROOMS = {
     ),
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
-        "cache export"
+        "level_ground cache export"
     ),
     "render/perilune_render/jobs": (
         "job records steps work_list report scene_renderer worker local here ray_actors run status estimate"

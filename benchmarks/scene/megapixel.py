@@ -1,9 +1,9 @@
-"""A descent from 1500 m to 200 m in frames of 1024 x 1024 pixels at half-pixel spacing: memory, time, changes of level.
+"""Descents of a preset in frames of 1024 x 1024 pixels at half-pixel spacing: memory, time, changes of level.
 
-Of each level it renders the first two frames and the last one, with perilune and with a bare Blender loop over the same
-mesh (as in `benchmarks.dataset.render`), alternately. It measures the peak of the resident memory, terrain generation
-included, and the KLT residuals of consecutive frames within levels and across changes of level. Writes
-runs/bench/megapixel.json, and the frames on both sides of each change into runs/bench/megapixel/.
+Of each level of the first trajectory it renders the first two frames and the last one, with perilune and with a bare
+Blender loop over the same mesh (as in `benchmarks.dataset.render`), alternately. It measures the peak of the resident
+memory, terrain generation included, and the KLT residuals of consecutive frames within levels and across changes of
+level. Writes runs/bench/megapixel.json, and the frames on both sides of each change into runs/bench/megapixel/.
 """
 
 import argparse
@@ -30,6 +30,7 @@ from perilune_render.frame_source import Frame, FrameSource
 from perilune_render.imaging.exr import read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.cache import cached_scene
+from perilune_render.terrain.levels import cut_levels, level_index
 from perilune_shared.config import resolve
 from perilune_shared.terminal import progress_bar
 
@@ -37,9 +38,6 @@ SETTINGS = (
     "dataset.camera.width_px=1024",
     "dataset.camera.height_px=1024",
     "dataset.detect.n_frames=100",
-    # The default flight: every descent comes from the north.
-    "dataset.detect.flight.azimuth_deg=0",
-    "dataset.detect.flight.attitude_sigma_deg=0.3",
 )
 PICTURES = Path("runs/bench/megapixel")
 
@@ -67,19 +65,23 @@ def bare(renderer: Renderer, frame: Frame, out: Path) -> float:
 
 
 def main() -> None:
-    """Run the benchmark on the first scene and trajectory of `small` with a larger camera."""
+    """Run the benchmark on the first scene and trajectory of a preset with a larger camera."""
     parser = argparse.ArgumentParser()
+    parser.add_argument("--preset", default="small")
     parser.add_argument("--levels", type=int, nargs="*", help="levels to render, 0 is the finest; all if not given")
     parser.add_argument("--set", action="append", default=[], help="a setting, for a part of the descent")
+    parser.add_argument("--skip-bare", action="store_true", help="leave out the bare Blender loop")
     options = parser.parse_args()
     levels = options.levels
-    config = resolve(DatasetConfig, "dataset", "perilune_render", "small", settings=(*SETTINGS, *options.set))
+    config = resolve(DatasetConfig, "dataset", "perilune_render", options.preset, settings=(*SETTINGS, *options.set))
     plan = make_plan(config, "detect")
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
     start = time.perf_counter()
     scene = cached_scene(config, plan.view, scene_plan.seed)
     scene_s = time.perf_counter() - start
-    level = np.array([scene.level_index(z) for z in trajectory.flight.position_m[:, 2]])
+    scene_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    cut = cut_levels(config.terrain, plan.view, trajectory.flight.nominal.approach_deg)
+    level = np.array([level_index(cut, z) for z in trajectory.flight.position_m[:, 2]])
     chosen = [k for k in sorted(set(level.tolist()), reverse=True) if levels is None or k in levels]
     changes, ours, bares, within, across = [], [], [], [], []
     last: tuple[int, Frame] | None = None
@@ -96,11 +98,12 @@ def main() -> None:
                 if index == places[0]:
                     # The first rendering on a level includes the building of its mesh: time it apart.
                     begin = time.perf_counter()
-                    renderer.render(*planned_shot(trajectory, index).pose)
+                    source.render(planned_shot(trajectory, index))
                     changes.append(time.perf_counter() - begin)
                 frame, frame_s = take(source, trajectory, index, out)
                 ours.append(frame_s)
-                bares.append(bare(renderer, frame, out))
+                if not options.skip_bare:
+                    bares.append(bare(renderer, frame, out))
                 if last is not None and last[0] == index - 1:
                     poses = last[1].shot.pose, frame.shot.pose
                     residuals = klt_residuals_px(plan.exr_camera, last[1].radiance, frame.radiance, *poses)
@@ -109,18 +112,21 @@ def main() -> None:
                 PICTURES.mkdir(parents=True, exist_ok=True)
                 cv2.imwrite(str(PICTURES / f"{index:03d}-level-{k:02d}.png"), frame.image)
     figures = {
-        "levels": len(scene.finer) + 1,
+        "ground_vertices": scene.grid.n_vertices,
+        "levels": len(cut),
         "levels_rendered": len(chosen),
         "frames_rendered": len(ours),
-        "most_vertices": max(own.grid.n_vertices for own in (*scene.finer, scene)),
+        "most_vertices": max(own.grid.n_vertices for own in cut),
+        "vertices_of_all_levels": sum(own.grid.n_vertices for own in cut),
         "craters": len(scene.craters),
         "boulders": len(scene.boulders),
         "scene_s": scene_s,
+        "scene_peak_gib": scene_gib,
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
         "change_of_level_s": statistics.median(changes),
         "frame_s": statistics.median(ours),
-        "bare_frame_s": statistics.median(bares),
-        "ratio_to_bare": sum(ours) / sum(bares),
+        "bare_frame_s": statistics.median(bares) if bares else None,
+        "ratio_to_bare": sum(ours) / sum(bares) if bares else None,
         "klt_within_median_px": float(np.median(np.concatenate(within))) if within else None,
         "klt_across_median_px": float(np.median(np.concatenate(across))) if across else None,
         "klt_within_90_px": float(np.percentile(np.concatenate(within), 90)) if within else None,

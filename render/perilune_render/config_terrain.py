@@ -90,8 +90,9 @@ class TerrainConfig(Section):
     spacing_px: Annotated[float, Field(gt=0, le=LARGEST_SPACING_PX)] = 0.5
     """Vertex spacing, in pixels: relative to the smallest ground size that a pixel has at each place."""
     max_vertices: Annotated[int, Field(ge=10_000, le=40_000_000)] = 12_000_000
-    """Largest number of ground vertices of one mesh (about 450 bytes of memory each); a descent that needs more gets
-    several meshes, each for a band of altitudes."""
+    """Largest number of ground vertices of one mesh (about 450 bytes of memory each). If the ground needs more, each
+    trajectory is rendered with several meshes, each for a band of altitudes; such ground may have ten times as many
+    vertices (70 bytes each while it is generated)."""
     craters: CratersConfig = CratersConfig()
     """Craters."""
     boulders: BouldersConfig = BouldersConfig()

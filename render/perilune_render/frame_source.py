@@ -37,6 +37,8 @@ class Shot:
     """Random seed of the sequence of frames; in a dataset, the seed of the trajectory."""
     index: int = 0
     """Index of the frame in the sequence. Frames that differ in seed or index have independent noise."""
+    approach_deg: int = 0
+    """Direction from which the trajectory comes (`NominalTrajectory.approach_deg`); used only for ground in levels."""
 
     @property
     def pose(self) -> tuple[Array, Array]:
@@ -60,7 +62,7 @@ class Engine(Protocol):
     def sun(self) -> Array:
         """Unit vector towards the Sun, O_L (3,)."""
 
-    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int) -> Radiance:
+    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int, approach_deg: int) -> Radiance:
         """The rendering, in the pixels of `camera`, at a position (3,), O_L, metres, with a rotation matrix (3, 3)."""
 
 
@@ -112,7 +114,7 @@ class FrameSource:
 
     def render(self, shot: Shot) -> Radiance:
         """The engine's rendering of a shot, in the pixels of its camera. Raises what the engine raises."""
-        return self.engine.render(*shot.pose, seed=shot.render_seed)
+        return self.engine.render(*shot.pose, shot.render_seed, shot.approach_deg)
 
     def develop(self, shot: Shot, radiance: Radiance) -> Frame:
         """Develop the rendering of a shot. Another thread may do this while the engine renders the next shot."""

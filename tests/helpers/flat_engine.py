@@ -14,8 +14,8 @@ class FlatEngine:
     def __init__(self, law: str, camera: Camera, sun: Array):
         self.law, self.camera, self.sun = law, camera, sun
 
-    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int) -> Radiance:
-        """Render with one ray through each pixel centre; the seed has no effect, since nothing is sampled."""
+    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int, approach_deg: int = 0) -> Radiance:
+        """Render with one ray through each pixel centre; the seed and the approach have no effect."""
         rays = self.camera.rays(self.camera.pixel_centres()) @ rotation_camera_from_site
         depth_m = (-position_m[2] / rays[..., 2]).astype(np.float32)
         view = -rays / np.linalg.norm(rays, axis=-1, keepdims=True)

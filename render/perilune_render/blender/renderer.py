@@ -18,6 +18,9 @@ from perilune_render.blender import stage as blender_stage
 from perilune_render.config import DatasetConfig, LightConfig, RenderConfig
 from perilune_render.imaging.exr import read_exr
 from perilune_render.imaging.radiance import Radiance
+from perilune_render.terrain.envelope import ViewEnvelope
+from perilune_render.terrain.level_ground import on_level
+from perilune_render.terrain.levels import Level, cut_levels, level_index
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
@@ -37,8 +40,9 @@ _open: weakref.WeakSet["Renderer"] = weakref.WeakSet()
 class Renderer:
     """Renders frames of one scene. Use as a context manager: it holds a temporary folder and Blender's only scene.
 
-    A frame shows the level of the scene for the height of its camera. Blender holds the mesh of one level at a time, so
-    render frames in an order with few changes of level: a change takes as long as building the scene.
+    If the ground is too large for one mesh, a frame shows the level (`perilune_render.terrain.levels`) of its
+    trajectory for the height of its camera. Blender holds the mesh of one level at a time, so render frames in an order
+    with few changes of level.
 
     It is an `Engine` of `perilune_render.frame_source`: `camera` has no distortion, `sun` (3,) is the unit vector
     towards the Sun, O_L. Raises RuntimeError if another Renderer is open in this process: Blender holds only one scene.
@@ -60,17 +64,29 @@ class Renderer:
     def _build(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> None:
         self._scene, self._config = scene, config
         self._exact = config.render.exr
-        # Descents begin with the coarsest level.
-        self._show(len(scene.finer))
+        self._levels: tuple[int, tuple[Level, ...]] | None = None
+        self._shown: tuple[int, int] | None = None
+        if scene.view is None or scene.grid.n_vertices <= config.terrain.max_vertices:
+            self._stage_with(scene)
         self._folder = tempfile.TemporaryDirectory(prefix="perilune-")
 
-    def _show(self, level: int) -> None:
-        """Build the stage with a level of the scene; Blender frees the previous one first."""
-        self._level: int | None = None
-        scene = self._scene.at_level(level, self._config.terrain.boulders)
-        self.stage = blender_stage.build(scene, self._config, self.camera, self.sun)
+    def _stage_with(self, ground: Scene) -> None:
+        """Build the stage with one mesh."""
+        self.stage = blender_stage.build(ground, self._config, self.camera, self.sun)
         configure(self.stage, self.camera, self._config.render, self._config.light)
-        self._level = level
+
+    def _show_level(self, view: ViewEnvelope, approach_deg: int, z_m: float) -> None:
+        """Build the stage with the level of a trajectory for a height of the camera, unless it is shown already."""
+        terrain = self._config.terrain
+        if self._levels is None or self._levels[0] != approach_deg:
+            self._levels = approach_deg, cut_levels(terrain, view, approach_deg)
+        levels = self._levels[1]
+        level = approach_deg, level_index(levels, z_m)
+        if level != self._shown:
+            self._shown = None
+            blender_stage.clear()  # frees the last mesh before the next is sampled
+            self._stage_with(on_level(self._scene, levels[level[1]].grid, terrain.boulders))
+            self._shown = level
 
     def __enter__(self) -> "Renderer":
         return self
@@ -85,17 +101,19 @@ class Renderer:
         self._folder.cleanup()
         _open.discard(self)
 
-    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0) -> Radiance:
+    def render(
+        self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0, approach_deg: int = 0
+    ) -> Radiance:
         """Render one frame: radiance factor averaged over each pixel, and depth of the ray through its centre.
 
-        With dataset.render.exr the normal is also that of this ray, else the mean over the pixel's samples. Raises
-        OSError if Blender wrote no readable frame, and RuntimeError if the Renderer is closed.
+        With dataset.render.exr the normal is also that of this ray, else the mean over the pixel's samples.
+        `approach_deg` is `Shot.approach_deg`. Raises OSError if Blender wrote no readable frame, and RuntimeError if
+        the Renderer is closed.
         """
         if self not in _open:
             raise RuntimeError("this Renderer is closed")
-        level = self._scene.level_index(float(position_m[2]))
-        if level != self._level:
-            self._show(level)
+        if self._scene.view is not None and self._scene.grid.n_vertices > self._config.terrain.max_vertices:
+            self._show_level(self._scene.view, approach_deg, float(position_m[2]))
         blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
         path = Path(self._folder.name) / "frame.exr"
         try:

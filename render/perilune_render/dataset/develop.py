@@ -54,7 +54,7 @@ class Renderings:
         paths = {recorded_shot(row, seed).render_seed: source.file(row["exr_path"]) for row in rows}
         return cls(camera, np.array(rows[0]["sun_direction"]), paths)
 
-    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int) -> Radiance:
+    def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int, approach_deg: int = 0) -> Radiance:
         """Read the rendering of a random seed. Raises UserError if the file is damaged or of another size."""
         return read_radiance(self.paths[seed], (self.camera.width_px, self.camera.height_px))
 

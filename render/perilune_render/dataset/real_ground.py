@@ -26,7 +26,7 @@ def real_ground_share(
         return 0.0
     seen = camera.rays(camera.pixel_centres()[hit]) * depth_m[hit][:, None]
     place = seen @ rotation_camera_from_site + position_m
-    return float((value_at(scene.real.astype(np.float64), scene.grid, place[:, 0], place[:, 1]) > 0.5).mean())
+    return float((value_at(scene.real, scene.grid, place[:, 0], place[:, 1]) > 0.5).mean())
 
 
 def outline_m(model: ElevationModel) -> Array:

@@ -34,6 +34,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.dataset.names import ImageKind, frame_path
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.nominal_trajectory import approach_deg
 from perilune_shared.interrupts import interrupts_held
 from perilune_shared.progress import Progress
 from perilune_shared.storage.files import sha256_of
@@ -117,10 +118,11 @@ def _of_scene(
     recipe = dataset.info.recipes.get(scene["recipe"])
     if recipe is None:
         raise UserError(where, "recipes", f"no {scene['recipe']}", f"the recipe of {scene['scene_id']}")
-    seeds = dataset.table("trajectories", ["trajectory_id", "seed"], scene_id=scene["scene_id"]).to_pydict()
-    seed_of = dict(zip(seeds["trajectory_id"], seeds["seed"], strict=True))
+    columns = ["trajectory_id", "seed", "nominal_position_m"]
+    recorded = dataset.table("trajectories", columns, scene_id=scene["scene_id"]).to_pylist()
+    trajectories = {row["trajectory_id"]: row for row in recorded}
     for row in rows:
-        if row["trajectory_id"] not in seed_of:
+        if row["trajectory_id"] not in trajectories:
             raise UserError(dataset.store, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
     config = config_of(recipe, where, dem, catalogue)
     ground_config = _ground_config(recipe, config, where)
@@ -140,7 +142,9 @@ def _of_scene(
     with Renderer(ground, ground_config, exr_camera, np.array(rows[0]["sun_direction"])) as engine:
         source = FrameSource.of(engine, config, camera, RimCircles.of_scene(ground))
         for row in rows:
-            frame_id, frame = row["frame_id"], source.take(recorded_shot(row, seed_of[row["trajectory_id"]]))
+            frame_id, trajectory = row["frame_id"], trajectories[row["trajectory_id"]]
+            approach = approach_deg(trajectory["nominal_position_m"])
+            frame = source.take(recorded_shot(row, trajectory["seed"], approach))
             # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
             has_exr = row["exr_path"] is not None
             write_frame(out, frame_id, source, frame, exr=has_exr)

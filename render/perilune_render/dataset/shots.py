@@ -18,15 +18,17 @@ def planned_shot(trajectory: TrajectoryPlan, place: int) -> Shot:
         flight.velocity_mps[place],
         trajectory.seed,
         trajectory.frame_index[place],
+        flight.nominal.approach_deg,
     )
 
 
-def recorded_shot(row: dict[str, Any], trajectory_seed: int) -> Shot:
-    """The shot of a row of the manifest's table `frames`."""
+def recorded_shot(row: dict[str, Any], trajectory_seed: int, approach_deg: int = 0) -> Shot:
+    """The shot of a row of the manifest's table `frames`; only a renderer needs `Shot.approach_deg`."""
     return Shot(
         np.array(row["position_m"]),
         matrix_from_quaternion(row["rotation_wxyz"]),
         np.array(row["velocity_mps"]),
         trajectory_seed,
         row["frame_index"],
+        approach_deg,
     )

@@ -65,16 +65,14 @@ def half_view_m(camera: Camera, flight: FlightConfig, altitude_m: Array) -> Arra
 
 
 def seen_ground(camera: Camera, flight: FlightConfig) -> SeenGround:
-    """The ground in view by the camera's height, with the margins of `view_envelope` and `reach_m`."""
+    """The ground in view by the camera's height, with the margins of `view_envelope`.
+
+    Position and attitude are independent, so that three standard deviations of both are less than their sum.
+    """
     spread = 3 * flight.position_sigma_m
     lowest, highest = flight.end_altitude_m, flight.start_altitude_m
     z = np.geomspace(max(lowest - spread, 0.2 * lowest), highest + spread, _N_HEIGHTS)
-    nearest, farthest = (
-        nominal_distance_m(flight, np.clip(z + sign * spread, lowest, highest))[:, None, None] for sign in (-1, 1)
-    )
-    span = flight.azimuth_deg
-    azimuth = np.radians(np.append(np.arange(span.low, span.high, 1.0), span.high))
-    towards = -np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
-    places = np.concatenate([nearest * towards, farthest * towards], axis=1)
-    margin = (spread + 1.05 * half_view_m(camera, flight, z))[:, None]
-    return SeenGround(z, 0.95 * z, places.min(axis=1) - margin, places.max(axis=1) + margin)
+    nearest, farthest = (nominal_distance_m(flight, np.clip(z + sign * spread, lowest, highest)) for sign in (-1, 1))
+    level = half_view_m(camera, flight.model_copy(update={"attitude_sigma_deg": 0.0}), z)
+    margin = 1.05 * level + np.hypot(spread, 1.05 * (half_view_m(camera, flight, z) - level))
+    return SeenGround(z, 0.95 * z, nearest, farthest, margin)

@@ -33,6 +33,8 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """The number of threads of linear algebra changes the last digits of results."""
 _BASE_BYTES, _VERTEX_BYTES = 0.75 * 2**30, 500
 """Peak memory of a worker: 1.1 GiB for 1.2 million vertices and 3.1 GiB for 5.7 million were measured."""
+_GROUND_BYTES, _GROWING_BYTES = 16, 70
+"""Memory for each vertex of ground that is rendered in levels, and for each vertex while ground is generated."""
 _CGROUP = Path("/sys/fs/cgroup")
 """Limits of a container or a batch job, by kernel interface cgroup v2."""
 
@@ -197,8 +199,10 @@ def default_workers(job: Job, n_threads: int | None) -> int:
     many frames a second as one worker of two (docs/notebook/2026-11-22-cores.md).
     """
     n_cores = len(os.sched_getaffinity(0)) // (n_threads or job.config.render.threads or 1)
-    n_vertices = min(graded_grid(job.config.terrain, job.plan.view).n_vertices, job.config.terrain.max_vertices)
-    fitting = int(_free_bytes() // (_BASE_BYTES + _VERTEX_BYTES * n_vertices))
+    n_ground = graded_grid(job.config.terrain, job.plan.view).n_vertices
+    n_vertices = min(n_ground, job.config.terrain.max_vertices)
+    rendering = _VERTEX_BYTES * n_vertices + _GROUND_BYTES * (n_ground - n_vertices)
+    fitting = int(_free_bytes() // (_BASE_BYTES + max(rendering, _GROWING_BYTES * n_ground)))
     return max(min(n_cores, len(job.plan.trajectories), fitting), 1)
 
 

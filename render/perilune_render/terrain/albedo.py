@@ -21,11 +21,11 @@ _RAYED_WEAR = 0.004
 """Wear K/R^2 of a crater at which its rays have vanished."""
 
 
-def add_patches(albedo: Array, grid: Grid, strength: float, seed: int, whole: Grid | None = None) -> None:
-    """Add smooth patches to albedo (n_vertices,), in place; on a level, those of the grid `whole`."""
+def add_patches(albedo: Array, grid: Grid, strength: float, seed: int) -> None:
+    """Add smooth patches to albedo (n_vertices,), in place."""
     for length, amplitude in _PATCHES:
-        if length >= 3 * (whole or grid).spacings_m.min():
-            add_waves(albedo, grid, length, amplitude * strength, stream(seed, "albedo", length), whole)
+        if length >= 3 * grid.spacings_m.min():
+            add_waves(albedo, grid, length, amplitude * strength, stream(seed, "albedo", length))
 
 
 def brightness(craters: Craters) -> Array:
@@ -37,22 +37,11 @@ def brightness(craters: Craters) -> Array:
     return 0.5 * np.exp(-wear / 0.004) * (craters.origin != 2)
 
 
-def add_rays(
-    albedo: Array,
-    grid: Grid,
-    craters: Craters,
-    n_rayed: int,
-    strength: float,
-    seed: int,
-    whole: Grid | None = None,
-) -> None:
-    """Brighten albedo (n_vertices,) along the rays of the `n_rayed` largest fresh craters, in place.
-
-    If `grid` is a level, the rays are those of the grid `whole`.
-    """
+def add_rays(albedo: Array, grid: Grid, craters: Craters, n_rayed: int, strength: float, seed: int) -> None:
+    """Brighten albedo (n_vertices,) along the rays of the `n_rayed` largest fresh craters, in place."""
     rng = stream(seed, "rays")
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
-    local = (whole or grid).spacing_under(craters.x_m, craters.y_m)
+    local = grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
     able = np.flatnonzero((wear < _RAYED_WEAR) & (craters.diameter_m > 12 * local) & (craters.origin == 0))
     # The largest ones: rays of a small crater would be only a few pixels long.
     for k in able[np.argsort(-craters.diameter_m[able], kind="stable")][:n_rayed]:
@@ -65,8 +54,8 @@ def add_rays(
             albedo,
             grid.n_half,
             grid.half_widths_m,
-            craters.x_m[k] - grid.centre_x_m,
-            craters.y_m[k] - grid.centre_y_m,
+            craters.x_m[k],
+            craters.y_m[k],
             craters.diameter_m[k] / 2,
             direction,
             width,

@@ -1,6 +1,5 @@
 """The ground before craters: flat, or an elevation model and its surroundings."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,24 +32,12 @@ class Base:
         """Largest diameter of generated craters, metres; None to use the configured one."""
         return None if self.model is None or self.surroundings is not None else resolved_m(self.model)
 
-    def add_waves(
-        self,
-        grid: Grid,
-        relief: ReliefConfig,
-        seed: int,
-        shortest_m: float,
-        longest_m: float,
-        whole: Grid | None = None,
-    ) -> None:
-        """Add relief: on a model only wavelengths that it does not resolve, around it all wavelengths.
-
-        If `grid` is a level, the relief is that of the grid `whole`.
-        """
+    def add_waves(self, grid: Grid, relief: ReliefConfig, seed: int, shortest_m: float, longest_m: float) -> None:
+        """Add relief: on a model only wavelengths that it does not resolve, around it all wavelengths."""
         resolved = np.inf if self.model is None else resolved_m(self.model)
-        add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved), whole)
+        add_relief(self.height_m, grid, relief, seed, shortest_m, min(longest_m, resolved))
         if self.surroundings is not None:
-            around = self.surroundings, self.beyond_m
-            add_fitted_relief(self.height_m, grid, *around, seed, shortest_m, longest_m, whole)
+            add_fitted_relief(self.height_m, grid, self.surroundings, self.beyond_m, seed, shortest_m, longest_m)
 
     def permitted(self, craters: Craters) -> Craters:
         """The craters to add: those too small for the model to resolve, and those that do not reach the model."""
@@ -63,23 +50,11 @@ class Base:
         return craters.chosen(allowed)
 
 
-def base_of(
-    model: ElevationModel | None,
-    grid: Grid,
-    terrain: TerrainConfig,
-    seed: int,
-    grids: Sequence[Grid] = (),
-    finest: Base | None = None,
-) -> Base:
-    """The base: an elevation model and its surroundings, or flat ground.
-
-    If `grid` is one of several `grids`, the surroundings are those of the base `finest` of the first one.
-    """
+def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, seed: int) -> Base:
+    """The base: an elevation model and its surroundings, or flat ground."""
     if model is None:
         return Base(np.zeros(grid.n_vertices), np.full(grid.n_vertices, np.inf), None, None)
-    height, beyond = base_heights(model, grid, terrain.elevation.outside, grids)
-    if finest is not None:
-        return Base(height, beyond, model, finest.surroundings)
+    height, beyond = base_heights(model, grid, terrain.elevation.outside)
     needed = terrain.elevation.outside == "procedural" and bool((beyond > 0).any())
     surroundings = fitted_relief(model, terrain.relief, terrain.craters, seed) if needed else None
     return Base(height, beyond, model, surroundings)

@@ -24,8 +24,7 @@ from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.craters.rims import Rims
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.levels import cut_levels
-from perilune_render.terrain.scene import Level, Scene, grow_scene
+from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.storage.files import sha256_of, written_aside
 
 _PARTS: dict[str, type] = {"grid": Grid, "craters": Craters, "rims": Rims, "boulders": Boulders}
@@ -44,8 +43,7 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
     for name in ("dem", "catalogue"):
         if terrain[name] is not None and Path(terrain[name]).is_file():
             terrain[name] = [Path(terrain[name]).name, sha256_of(Path(terrain[name]))]
-    terrain.pop("max_vertices")  # a limit, which changes only the levels
-    levels = cut_levels(config.terrain, view)
+    terrain.pop("max_vertices")  # a limit on meshes, which changes no ground
     versions = ground_versions(with_dem=config.terrain.dem is not None)
     content = {
         "versions": {name: version for name, version in versions.items() if not name.startswith("perilune")},
@@ -53,7 +51,6 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
         "albedo_variation": config.light.albedo_variation,
         "view": [view.height_m.tolist(), view.reach_m.tolist(), view.focal_px],
         "seed": seed,
-        "levels": [level.highest_m for level in levels[:-1]],
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -63,7 +60,7 @@ def cached_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     if config.render.cache_gib == 0:
         return grow_scene(config, view, seed)
     path = cache_folder() / f"{scene_key(config, view, seed)}.npz"
-    scene = _read(path)
+    scene = _read(path, view)
     if scene is None:
         scene = grow_scene(config, view, seed)
         with contextlib.suppress(OSError):
@@ -73,48 +70,32 @@ def cached_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
 
 
 def _write(path: Path, scene: Scene) -> None:
-    arrays = _flat(scene, "")
+    arrays: dict[str, Any] = {}
+    for field in dataclasses.fields(scene):
+        value = getattr(scene, field.name)
+        if field.name in _PARTS:
+            for part in dataclasses.fields(value):
+                arrays[f"{field.name}.{part.name}"] = getattr(value, part.name)
+        elif field.name != "view":
+            arrays[field.name] = value
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_aside(path) as aside, aside.open("wb") as file:
         np.savez(file, **arrays)
 
 
-def _read(path: Path) -> Scene | None:
+def _read(path: Path, view: ViewEnvelope) -> Scene | None:
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         os.utime(path)
-        return _object(Scene, {name: array if array.ndim else array.item() for name, array in arrays.items()}, "")
+        values = {name: array if array.ndim else array.item() for name, array in arrays.items()}
+        parts = {
+            name: kind(**{part.name: values.pop(f"{name}.{part.name}") for part in dataclasses.fields(kind)})
+            for name, kind in _PARTS.items()
+        }
+        return Scene(**values, **parts, view=view)
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None
-
-
-def _flat(value: Any, prefix: str) -> dict[str, Any]:
-    """The fields of a dataclass and of the dataclasses in it, by their dotted names."""
-    found: dict[str, Any] = {}
-    for field in dataclasses.fields(value):
-        part, name = getattr(value, field.name), prefix + field.name
-        if field.name == "finer":
-            found[name] = len(part)
-            for k, level in enumerate(part):
-                found |= _flat(level, f"{name}.{k}.")
-        else:
-            found |= _flat(part, f"{name}.") if field.name in _PARTS else {name: part}
-    return found
-
-
-def _object(kind: type, values: dict[str, Any], prefix: str) -> Any:
-    """The dataclass whose fields are in `values` (see `_flat`)."""
-    fields: dict[str, Any] = {}
-    for field in dataclasses.fields(kind):
-        name = prefix + field.name
-        if field.name == "finer":
-            fields[field.name] = tuple(_object(Level, values, f"{name}.{k}.") for k in range(values[name]))
-        elif field.name in _PARTS:
-            fields[field.name] = _object(_PARTS[field.name], values, f"{name}.")
-        else:
-            fields[field.name] = values[name]
-    return kind(**fields)
 
 
 def _make_room(folder: Path, most_bytes: float) -> None:

@@ -15,10 +15,23 @@ class SeenGround:
     """Height of the camera above O_L's plane, ascending, metres (N,)."""
     height_m: Array
     """Lowest height of that camera above the ground in view, metres (N,)."""
-    low_m: Array
-    """Smallest x and y of the ground in view, metres (N, 2)."""
-    high_m: Array
-    """Largest x and y of the ground in view, metres (N, 2)."""
+    nearest_m: Array
+    """Smallest distance of the nominal trajectory from the site, metres (N,)."""
+    farthest_m: Array
+    """Largest distance of the nominal trajectory from the site, metres (N,)."""
+    margin_m: Array
+    """Largest |dx| or |dy| of the ground in view from the nominal trajectory, metres (N,)."""
+
+    def box_m(self, approach_deg: int) -> tuple[Array, Array]:
+        """Smallest and largest x and y, (N, 2) each, metres, of the ground that a trajectory's frames show.
+
+        The trajectory comes from the direction `approach_deg`, to within half a degree.
+        """
+        azimuth = np.radians(approach_deg + np.array([-0.5, 0.0, 0.5]))
+        towards = -np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
+        places = np.concatenate([d[:, None, None] * towards for d in (self.nearest_m, self.farthest_m)], axis=1)
+        margin = self.margin_m[:, None]
+        return places.min(axis=1) - margin, places.max(axis=1) + margin
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +50,7 @@ class ViewEnvelope:
     focal_px: float
     """Largest focal length of the camera, pixels: a pixel shows at least height / focal_px metres of ground."""
     seen: SeenGround | None = None
-    """The ground in view by the camera's height, which allows several levels; None allows one mesh only."""
+    """The ground in view by the camera's height, from which levels are cut; None allows one mesh only."""
 
     def __post_init__(self) -> None:
         columns = np.array([self.height_m, self.reach_m])

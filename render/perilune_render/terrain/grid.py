@@ -18,10 +18,9 @@ from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_shared.geometry.frames import Array
 
-FAR_GROWTH = 0.05
+FAR_GROWTH = 0.07
 """Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: the shadow
-of ground at a distance d enters the view only if it is about d tan(elevation of the Sun) high, and so many spacings
-wide."""
+of ground at a distance d enters the view only if it is about d tan(elevation of the Sun) high, and as wide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +63,11 @@ class Grid:
         return np.maximum(self.half_widths_m / self.n_half, across)
 
     @property
-    def cell_areas_m2(self) -> Array:
-        """Area of ground per vertex of the inner square and of each ring, square metres (n_rings + 1,)."""
+    def cell_sides_m(self) -> tuple[Array, Array]:
+        """Sides of the ground that belongs to a vertex, along and across its ring, metres, (n_rings + 1,) each."""
         around = self.half_widths_m / self.n_half
         across = np.gradient(self.half_widths_m) if len(self.half_widths_m) > 1 else around
-        return around * np.append(around[0], across[1:])
+        return around, np.append(around[0], across[1:])
 
     def spacing_at(self, distance_m: Array | float) -> Array:
         """Vertex spacing, metres, at distances max(|x|, |y|) from the centre, metres."""
@@ -113,7 +112,7 @@ class Grid:
 def graded_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
     """The grid for all views of a camera: spacing at most `terrain.spacing_px` times the smallest ground pixel.
 
-    It may have more vertices than `terrain.max_vertices` (`perilune_render.terrain.levels.cut_levels`).
+    It may have more vertices than `terrain.max_vertices` (`perilune_render.terrain.levels`).
     """
     return grid_of(view.reach_m, terrain.spacing_px * view.height_m / view.focal_px)
 

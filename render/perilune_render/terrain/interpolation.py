@@ -16,28 +16,37 @@ def value_at(field: Array, grid: Grid, x_m: Array | float, y_m: Array | float) -
 
 @njit()
 def _values_at(field, n_half, half_widths, x, y):
-    n = n_half
-    step = half_widths[0] / n
     values = np.empty(len(x))
     for k in range(len(x)):
-        distance = max(abs(x[k]), abs(y[k]))
-        if distance < half_widths[0]:
-            u, v = x[k] / step + n, y[k] / step + n
-            i, j = min(int(u), 2 * n - 1), min(int(v), 2 * n - 1)
-            f, g = u - i, v - j
-            first = j * (2 * n + 1) + i
-            low = field[first] * (1 - f) + field[first + 1] * f
-            high = field[first + 2 * n + 1] * (1 - f) + field[first + 2 * n + 2] * f
-            values[k] = low * (1 - g) + high * g
-            continue
-        ring = min(np.searchsorted(half_widths, distance), len(half_widths) - 1)
-        inner = max(ring - 1, 0)
-        width = half_widths[ring] - half_widths[inner]
-        g = min((distance - half_widths[inner]) / width, 1.0) if width > 0 else 0.0
-        along = place_in_ring(x[k], y[k], n)
-        place = int(along)
-        f = along - place
-        low = field[vertex_of_ring(inner, place, n)] * (1 - f) + field[vertex_of_ring(inner, place + 1, n)] * f
-        high = field[vertex_of_ring(ring, place, n)] * (1 - f) + field[vertex_of_ring(ring, place + 1, n)] * f
+        a, b, c, d, f, g = corners(x[k], y[k], n_half, half_widths)
+        low = field[a] * (1 - f) + field[b] * f
+        high = field[c] * (1 - f) + field[d] * f
         values[k] = low * (1 - g) + high * g
     return values
+
+
+@njit(inline="always")
+def corners(x, y, n_half, half_widths):
+    """Vertices around a place relative to the centre, lower two first, and the shares of the second and upper ones."""
+    n = n_half
+    distance = max(abs(x), abs(y))
+    if distance < half_widths[0]:
+        step = half_widths[0] / n
+        u, v = x / step + n, y / step + n
+        i, j = min(int(u), 2 * n - 1), min(int(v), 2 * n - 1)
+        first = j * (2 * n + 1) + i
+        return first, first + 1, first + 2 * n + 1, first + 2 * n + 2, u - i, v - j
+    ring = min(np.searchsorted(half_widths, distance), len(half_widths) - 1)
+    inner = max(ring - 1, 0)
+    width = half_widths[ring] - half_widths[inner]
+    g = min((distance - half_widths[inner]) / width, 1.0) if width > 0 else 0.0
+    along = place_in_ring(x, y, n)
+    place = int(along)
+    return (
+        vertex_of_ring(inner, place, n),
+        vertex_of_ring(inner, place + 1, n),
+        vertex_of_ring(ring, place, n),
+        vertex_of_ring(ring, place + 1, n),
+        along - place,
+        g,
+    )

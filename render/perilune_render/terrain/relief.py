@@ -34,22 +34,16 @@ def check_waves(config: ReliefConfig, grid: Grid) -> None:
 
 
 def add_relief(
-    height_m: Array,
-    grid: Grid,
-    config: ReliefConfig,
-    seed: int,
-    shortest_m: float,
-    longest_m: float,
-    whole: Grid | None = None,
+    height_m: Array, grid: Grid, config: ReliefConfig, seed: int, shortest_m: float, longest_m: float
 ) -> None:
     """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
     The RMS slope, drawn from `config.rms_slope_deg` by the seed, is that of all octaves down to 1 m. Long waves are
     added before the craters, which cut them. Short ones are added after, since a worn crater is as rough as the ground
-    around it. If `grid` is a level, the relief is that of the grid `whole`.
+    around it.
     """
-    finest = finest_wave_m(whole or grid)
-    check_waves(config, whole or grid)
+    finest = finest_wave_m(grid)
+    check_waves(config, grid)
     n_octaves = int(np.ceil(np.log2(config.longest_wavelength_m / min(finest, 1.0))))
     lengths = config.longest_wavelength_m / 2.0 ** np.arange(n_octaves)
     slopes = lengths ** (config.hurst_exponent - 1)
@@ -58,4 +52,4 @@ def add_relief(
     for length, slope in zip(lengths, slopes, strict=True):
         if max(finest, shortest_m) <= length < longest_m:
             rng = stream(seed, "relief", length)
-            add_waves(height_m, grid, float(length), float(slope * length / RMS_SLOPE), rng, whole)
+            add_waves(height_m, grid, float(length), float(slope * length / RMS_SLOPE), rng)

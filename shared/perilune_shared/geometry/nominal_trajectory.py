@@ -5,6 +5,7 @@ horizontal speed decreases linearly to zero at the end point. The path is a para
 vertically: p(t) = p0 + v0 t + a t^2 / 2.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,11 @@ class NominalTrajectory:
             float(duration_s),
         )
 
+    @property
+    def approach_deg(self) -> int:
+        """Direction from the site to the start (see `approach_deg`)."""
+        return approach_deg(self.position_m)
+
     def position_at(self, time_s: ArrayLike) -> Array:
         """Return positions (..., 3) in O_L, metres, at times (...)."""
         t = np.asarray(time_s, np.float64)[..., None]
@@ -59,3 +65,8 @@ class NominalTrajectory:
         return (
             np.array(self.velocity_mps) + np.array(self.acceleration_mps2) * np.asarray(time_s, np.float64)[..., None]
         )
+
+
+def approach_deg(start_m: Sequence[float]) -> int:
+    """Direction from the site to a start (3,), O_L, clockwise from north, in whole degrees; 0 above the site."""
+    return round(float(np.degrees(np.arctan2(-start_m[0], -start_m[1])))) % 360 if any(start_m[:2]) else 0

@@ -8,17 +8,24 @@ from tests.helpers.scenes import config_with
 
 from benchmarks.scene.tracking import klt_residuals_px
 from perilune_render.blender.renderer import Renderer
+from perilune_render.config import KindConfig
 from perilune_render.flight.trajectories import fly
 from perilune_render.flight.view import view_envelope
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.labels.frame_labels import RimCircles
+from perilune_render.terrain.level_ground import on_level
+from perilune_render.terrain.levels import cut_levels, level_index
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import sun_direction
 
 CAMERA = Camera.from_field_of_view(160, 160, 50.0)
 SUN = sun_direction(90, 30)
-CONFIG = config_with(terrain={"max_vertices": 600_000}, render={"exr": True})
+FLIGHT = {"azimuth_deg": {"low": 0.0, "high": 360.0}}
+KIND = KindConfig(n_scenes=1, trajectories_per_scene=1, n_frames=4, split_by="scene", flight=FLIGHT)
+CONFIG = config_with(detect=KIND, terrain={"max_vertices": 600_000}, render={"exr": True})
+EACH = config_with(detect=KIND, render={"exr": True})
+"""Settings under which the ground of a single level is one mesh."""
 LEVELS = (5, 4, 3, 2, 1, 0)
 
 
@@ -39,15 +46,17 @@ class Descent:
 def descent():
     scene = grow_scene(CONFIG, view_envelope(CAMERA, CONFIG.detect.flight), 5)
     flight = fly(CONFIG.detect.flight, 100, 3)
-    level = np.array([scene.level_index(z) for z in flight.position_m[:, 2]])
+    approach = flight.nominal.approach_deg
+    levels = cut_levels(CONFIG.terrain, scene.view, approach)
+    level = np.array([level_index(levels, z) for z in flight.position_m[:, 2]])
     found = Descent(scene, {}, {k: int(np.flatnonzero(level == k)[0]) for k in LEVELS[1:]}, {}, {})
     for k in LEVELS:
         pairs = [found.firsts[other] for other in (k, k - 1) if other in found.firsts]
-        with Renderer(scene.at_level(k, CONFIG.terrain.boulders), CONFIG, CAMERA, SUN) as engine:
+        with Renderer(on_level(scene, levels[k].grid, CONFIG.terrain.boulders), EACH, CAMERA, SUN) as engine:
             source = FrameSource.of(engine, CONFIG, CAMERA, RimCircles.of_scene(scene))
             for i in sorted({index for first in pairs for index in (first - 1, first)}):
                 pose = flight.position_m[i], flight.rotation_camera_from_site[i]
-                found.shots[i] = Shot(*pose, flight.velocity_mps[i], seed=7, index=i)
+                found.shots[i] = Shot(*pose, flight.velocity_mps[i], seed=7, index=i, approach_deg=approach)
                 found.frames[k, i] = source.take(found.shots[i])
                 found.labels[k, i] = source.labels(found.frames[k, i])
     return found
@@ -58,7 +67,7 @@ def test_a_renderer_shows_the_level_of_each_pose_in_any_order(descent):
     with Renderer(descent.scene, CONFIG, CAMERA, SUN) as engine:
         for index, k in ((first, 1), (first - 1, 2), (first, 1)):
             shot, expected = descent.shots[index], descent.frames[k, index].radiance
-            again = engine.render(*shot.pose, seed=shot.render_seed)
+            again = engine.render(*shot.pose, shot.render_seed, shot.approach_deg)
             assert np.array_equal(again.radiance_factor, expected.radiance_factor)
             assert np.array_equal(again.depth_m, expected.depth_m)
 

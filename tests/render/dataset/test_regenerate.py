@@ -51,6 +51,19 @@ def plan(tmp_path_factory):
     return out
 
 
+def test_frames_on_levels_of_ground_are_the_same_bytes(tmp_path):
+    """Also from a manifest without the frames before them, which determine no level."""
+    source, part = tmp_path / "source", tmp_path / "part"
+    settings = ("terrain.max_vertices=150000", "detect.n_scenes=1", "detect.n_frames=6", "detect.val_share=0")
+    chosen = [option for setting in settings for option in ("--set", f"dataset.{setting}")]
+    size = ("--set", "dataset.camera.width_px=64", "--set", "dataset.camera.height_px=64")
+    made = run("dataset", "--preset", "tiny", "--kind", "detect", "--out", source, *size, *chosen)
+    assert made.returncode == 0, made.stderr
+    subset(open_dataset(source / "detect"), part, ["frame_index in [1, 4]"], images="none")
+    outcomes = again(part, tmp_path / "out", spread(open_dataset(part), 2))
+    assert [outcome.state for outcome in outcomes] == ["identical", "identical"]
+
+
 def test_after_merge_subset_and_split_the_bytes_are_the_same(tiny, tmp_path):
     whole = open_dataset(tiny / "detect")
     subset(whole, tmp_path / "a", ["frame_index < 3"], images="none")

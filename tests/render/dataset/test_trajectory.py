@@ -25,11 +25,11 @@ class WatchingEngine(FlatEngine):
         super().__init__("lommel_seeliger", plan.camera, plan.scenes[0].sun)
         self.out, self.fails_at, self.n_files = out, fails_at, []
 
-    def render(self, position_m, rotation_camera_from_site, seed):
+    def render(self, position_m, rotation_camera_from_site, seed, approach_deg):
         if len(self.n_files) == self.fails_at:
             raise OSError("no frame")
         self.n_files.append(len(list(self.out.rglob("[!.]*.png"))))
-        return super().render(position_m, rotation_camera_from_site, seed)
+        return super().render(position_m, rotation_camera_from_site, seed, approach_deg)
 
 
 def render(out, fails_at=None, advance=lambda: None):

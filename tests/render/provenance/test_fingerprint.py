@@ -60,6 +60,7 @@ def changed(copy, module, pattern, replacement):
         ("perilune_render.imaging.photometry", "_LEAST_SINE_SQUARED", {"renderer"}),
         ("perilune_render.imaging.sensor", "_FAINT_E", {"imaging"}),
         ("perilune_render.config", "_SPREAD_FIELDS", {"generator", "renderer", "imaging"}),
+        ("perilune_render.terrain.level_ground", "_MOST_SAMPLES", {"renderer"}),
         ("perilune_render.labels.pixels", "_N_FITTED", {"imaging"}),
         ("perilune_render.labels.frame_labels", "_N_RIM", {"imaging"}),
         ("perilune_shared.labels.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
@@ -162,4 +163,4 @@ def test_every_library_that_computes_is_recorded():
 
 def test_compiled_functions_are_found_in_every_module():
     known = {name.partition(":")[0].rpartition(".")[2] for name in compiled_functions()}
-    assert known == {"pixels", "grid", "albedo", "older_ground", "stamp", "noise", "interpolation"}
+    assert known == {"pixels", "grid", "albedo", "older_ground", "stamp", "noise", "interpolation", "level_ground"}

@@ -27,48 +27,40 @@ class _Plane(NamedTuple):
 
 
 @njit(inline="always")
-def _fit_plane(height, weights, least_spread, x, y, radius, lines, count):
-    """Least-squares plane of the ground around (x, y); returns whether it has enough vertices, and the plane.
-
-    `weights` (n_rings + 1,) are those of the vertices of the inner square and of each ring. The plane is level if the
-    variance of x or y is not above `least_spread` square radii.
-    """
+def _fit_plane(height, x, y, radius, lines, count):
+    """Least-squares plane of the ground around (x, y); returns whether it has enough vertices, and the plane."""
     s0 = sx = sy = sxx = sxy = syy = sh = sxh = syh = 0.0
     n_rim = n_floor = h_rim = h_floor = 0.0
-    number = 0
     square_r = radius**2
     for line in range(count):
         dx, dy, step_x, step_y, first, start, stop = _chord(lines, line, x, y, _PLANE_REACH * radius)
-        weight = weights[int(lines[line, 6])]
-        number += max(stop - start, 0)
         for p in range(start, stop):
             px, py = dx + p * step_x, dy + p * step_y
             square = px * px + py * py
             h = height[first + p]
             if square < 0.0625 * square_r:
-                n_floor += weight
-                h_floor += weight * h
+                n_floor += 1.0
+                h_floor += h
             elif 0.81 * square_r < square < 1.21 * square_r:
-                n_rim += weight
-                h_rim += weight * h
-            s0 += weight
-            sx += weight * px
-            sy += weight * py
-            sxx += weight * px * px
-            sxy += weight * px * py
-            syy += weight * py * py
-            sh += weight * h
-            sxh += weight * px * h
-            syh += weight * py * h
-    if number < 3:
+                n_rim += 1.0
+                h_rim += h
+            s0 += 1.0
+            sx += px
+            sy += py
+            sxx += px * px
+            sxy += px * py
+            syy += py * py
+            sh += h
+            sxh += px * h
+            syh += py * h
+    if s0 < 3:
         return False, _Plane(0.0, 0.0, 0.0, 0.0, 0.0)
     cxx, cxy, cyy = sxx - sx * sx / s0, sxy - sx * sy / s0, syy - sy * sy / s0
     cxh, cyh = sxh - sx * sh / s0, syh - sy * sh / s0
     determinant = cxx * cyy - cxy * cxy
     slope_x = slope_y = 0.0
     # A few nearly collinear vertices do not determine the slope across them: the plane would become a spike.
-    spread = min(cxx, cyy) > least_spread * s0 * square_r or least_spread == 0
-    if spread and number >= 6 and determinant > 0.05 * cxx * cyy:
+    if s0 >= 6 and determinant > 0.05 * cxx * cyy:
         slope_x = (cxh * cyy - cyh * cxy) / determinant
         slope_y = (cyh * cxx - cxh * cxy) / determinant
     level = (sh - slope_x * sx - slope_y * sy) / s0

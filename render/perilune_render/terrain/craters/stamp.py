@@ -12,9 +12,6 @@ from perilune_render.terrain.craters.profile import REACH, crest_radius, profile
 from perilune_render.terrain.grid import Grid, lines_in, place_in_ring, vertex_of_ring
 from perilune_shared.geometry.frames import Array
 
-_LEAST_SPREAD = 0.15
-"""Variance of x and of y of the vertices, square radii, from which the plane's slope is fitted on a level, since out of
-view the spacing along a ring is much smaller than from ring to ring. That of an even disc is 0.42."""
 _N_RIM = 16
 """Number of points at which a rim's survival is sampled."""
 
@@ -44,19 +41,15 @@ class _Ground(NamedTuple):
     """`Grid.n_half`."""
     half_widths: Array
     """`Grid.half_widths_m`."""
-    weights: Array
-    """Weights of the vertices of the inner square and of each ring in the fit of older ground (n_rings + 1,)."""
-    least_spread: float
-    """Least variance of the vertices for a plane with a slope, square radii."""
 
 
 class _Shapes(NamedTuple):
     """Craters as the kernels need them, oldest first."""
 
     x: Array
-    """x of the centres from the grid's centre, metres (N,)."""
+    """x of the centres, O_L, metres (N,)."""
     y: Array
-    """y of the centres from the grid's centre, metres (N,)."""
+    """y of the centres, O_L, metres (N,)."""
     radius: Array
     """Radii of the fresh crests, which scale the profile, metres (N,)."""
     label_radius: Array
@@ -100,29 +93,21 @@ class _Profile(NamedTuple):
 
 
 def stamp_craters(
-    height_m: Array,
-    albedo: Array,
-    grid: Grid,
-    craters: Craters,
-    brightness: Array,
-    profile: str = "fassett_thomson",
-    *,
-    by_area: bool = False,
+    height_m: Array, albedo: Array, grid: Grid, craters: Craters, brightness: Array, profile: str = "fassett_thomson"
 ) -> Stamped:
     """Stamp `craters` on height_m (n_vertices,) and brighten albedo (n_vertices,), both in place.
 
     A crater first replaces the ground below it by a plane fitted to that ground, and then adds its own profile. The
     more worn a crater is, the less of the older ground it replaces. `brightness` (N,) is the relative brightening
-    within the rim. With `by_area` the vertices are weighted by their share of the ground in this fit, so that the plane
-    is the same on levels of different spacing.
+    within the rim.
     """
     tables = profile_tables(profile)
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     # The label's circle is the current crest; the profile is scaled by the fresh crest's radius.
     grown = crest_radius(wear, craters.fresh_depth_m / craters.rim_height_m, profile)
     shapes = _Shapes(
-        craters.x_m - grid.centre_x_m,
-        craters.y_m - grid.centre_y_m,
+        craters.x_m,
+        craters.y_m,
         craters.diameter_m / 2 / grown,
         craters.diameter_m / 2,
         craters.fresh_depth_m,
@@ -133,10 +118,7 @@ def stamp_craters(
         craters.crest,
         brightness,
     )
-    weights = grid.cell_areas_m2 if by_area else np.ones(len(grid.half_widths_m))
-    ground = _Ground(
-        height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m, weights, _LEAST_SPREAD * by_area
-    )
+    ground = _Ground(height_m, albedo, np.zeros(len(height_m)), grid.n_half, grid.half_widths_m)
     bowls = np.stack([tables.bowl, tables.flat_bowl])
     return Stamped(*_stamp(ground, shapes, _Tables(tables.rim, bowls, tables.removed)))
 
@@ -156,9 +138,7 @@ def _stamp(ground, shapes, tables):
         _interpolate_profile(shapes, k, tables, profile)
         x, y, reach = shapes.x[k], shapes.y[k], REACH * shapes.radius[k]
         count = lines_in(x - reach, x + reach, y - reach, y + reach, ground.n_half, ground.half_widths, lines)
-        found, plane = _fit_plane(
-            ground.height, ground.weights, ground.least_spread, x, y, shapes.radius[k], lines, count
-        )
+        found, plane = _fit_plane(ground.height, x, y, shapes.radius[k], lines, count)
         if not found:
             continue
         sag[k] = _sag(plane, profile.removed)

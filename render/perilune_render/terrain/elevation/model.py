@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -196,33 +195,27 @@ def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
     return lines
 
 
-def base_heights(
-    model: ElevationModel, grid: Grid, outside: Outside = "procedural", grids: Sequence[Grid] = ()
-) -> tuple[Array, Array]:
+def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedural") -> tuple[Array, Array]:
     """Heights (n_vertices,) of the model on the grid, and distances (n_vertices,) from known ground, both in metres.
 
     The site is at height 0. Heights are interpolated bicubically. Beyond the model the ground continues smoothly
     (`perilune_render.terrain.elevation.continuation`), and relief and craters are added later; with `outside` "mirror"
-    it is the model's mirror image. If `grid` is one of several `grids`, the ground is the same on all of them. Raises
-    UserError if the ground extends beyond the model and `outside` is "refuse".
+    it is the model's mirror image. Raises UserError if the ground extends beyond the model and `outside` is "refuse".
     """
     rows, columns = model.height_m.shape
     # Pixel coordinates vary slowly over a site: project a coarse lattice and interpolate.
-    widest = max(one.off_site_m + float(one.half_widths_m[-1]) for one in grids or (grid,))
-    net = np.linspace(-widest, widest, 65)
-    over_net = raster_places(model, *np.meshgrid(net, net))
-    # The last place is the site, in case that no vertex is there.
-    x, y = (np.append(places, 0.0) for places in grid.vertices_xy())
-    column, row = (RectBivariateSpline(net, net, place).ev(y, x) for place in over_net)
+    net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 65)
+    column, row = raster_places(model, *np.meshgrid(net, net))
+    x, y = grid.vertices_xy()
+    column, row = (RectBivariateSpline(net, net, place).ev(y, x) for place in (column, row))
     beyond = beyond_m(model, column, row)
-    site = -1 if grid.off_site_m else grid.n_half * (2 * grid.n_half + 2)
-    across, down = over_net if len(grids) > 1 else (column, row)
-    pixels = float(np.maximum.reduce([-down, down - rows, -across, across - columns]).max())
+    pixels = float(np.maximum.reduce([-row, row - rows, -column, column - columns]).max())
     sides = rows * model.pixel_sides_m[0], columns * model.pixel_sides_m[1]
     refuse_beyond(model, grid, outside)
+    middle = grid.n_half * (2 * grid.n_half + 2)
     if not beyond.any():
         height = ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="nearest")
-        return (height - height[site])[:-1], beyond[:-1]
+        return height - height[middle], beyond
     margin = int(np.ceil(max(pixels, 0))) + 2
     if outside == "procedural":
         margin = min(margin, int(np.ceil(margin_m(sides) / min(model.pixel_sides_m))) + 2)
@@ -241,7 +234,7 @@ def base_heights(
         padded = continued(model.height_m, far, margin, model.pixel_sides_m)
         height = ndimage.map_coordinates(padded, places, order=3, mode="nearest")
         height += mean_slope(model.height_m, row - 0.5, column - 0.5, beyond, min(sides))
-    return (height - height[site])[:-1], beyond[:-1]
+    return height - height[middle], beyond
 
 
 def _mirrored(height_m: Array, margin: int, pixel_m: float) -> Array:

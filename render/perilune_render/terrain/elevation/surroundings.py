@@ -59,25 +59,18 @@ def fitted_relief(model: ElevationModel, relief: ReliefConfig, craters: CratersC
 
 
 def add_fitted_relief(
-    height_m: Array,
-    grid: Grid,
-    fitted: FittedRelief,
-    beyond_m: Array,
-    seed: int,
-    shortest_m: float,
-    longest_m: float,
-    whole: Grid | None = None,
+    height_m: Array, grid: Grid, fitted: FittedRelief, beyond_m: Array, seed: int, shortest_m: float, longest_m: float
 ) -> None:
     """Add waves of at least `shortest_m` and less than `longest_m` to height_m (n_vertices,), in place.
 
     They are added beyond the model only. The amplitude of a wave grows with distance as the model's relief of the same
-    wavelength fades (`continuation.fade`). If `grid` is a level, the waves are those of the grid `whole`.
+    wavelength fades (`continuation.fade`).
     """
     outside = np.flatnonzero(beyond_m > 0)
     for length, amplitude in zip(fitted.wavelength_m, fitted.amplitude_m, strict=True):
         if shortest_m <= length < longest_m and amplitude > 0:
             waves = np.zeros(grid.n_vertices)
-            add_waves(waves, grid, float(length), float(amplitude), stream(seed, "surroundings", length), whole)
+            add_waves(waves, grid, float(length), float(amplitude), stream(seed, "surroundings", length))
             height_m[outside] += waves[outside] * (1 - fade(beyond_m[outside], float(length)) ** 2)
 
 

@@ -1,0 +1,71 @@
+"""The ground of a level: the ground of a scene, averaged over the cells of a level's vertices."""
+
+import dataclasses
+
+import numpy as np
+
+from perilune_render.config_terrain import BouldersConfig
+from perilune_render.provenance.kernels import njit
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.interpolation import corners
+from perilune_render.terrain.scene import Scene
+
+_MOST_SAMPLES = 8
+"""Largest number of places along one side of a cell; more would be needed only out of view."""
+
+
+def on_level(scene: Scene, grid: Grid, boulders: BouldersConfig) -> Scene:
+    """The scene with the ground of a level alone, and the boulders that are large enough for its mesh."""
+    height, albedo = (averaged(field, scene.grid, grid) for field in (scene.height_m, scene.albedo))
+    real = averaged(scene.real, scene.grid, grid) > 0.5 if scene.real.any() else np.zeros(grid.n_vertices, bool)
+    shown = scene.boulders.diameter_m >= boulders.min_diameter_spacings * grid.spacing_under(
+        scene.boulders.x_m, scene.boulders.y_m
+    )
+    return dataclasses.replace(
+        scene,
+        grid=grid,
+        height_m=height,
+        albedo=albedo,
+        real=real,
+        boulders=scene.boulders.chosen(shown),
+        boulder_z_m=scene.boulder_z_m[shown],
+    )
+
+
+def averaged(field: np.ndarray, whole: Grid, grid: Grid) -> np.ndarray:
+    """A field on the vertices of `whole`, averaged over the cell of each vertex of `grid`: (n_vertices,) float32.
+
+    A cell has as many evenly spaced places as `whole` has vertices in it, and at least one. Outside `whole` the field
+    has the values of its border.
+    """
+    x, y = grid.vertices_xy()
+    around, across = grid.cell_sides_m
+    site = whole.centre_x_m, whole.centre_y_m, whole.n_half, whole.half_widths_m, whole.spacings_m
+    level = grid.centre_x_m, grid.centre_y_m, (2 * grid.n_half + 1) ** 2, 8 * grid.n_half, around, across
+    return _averaged(field, *site, *level, x, y)
+
+
+@njit()
+def _averaged(field, x0, y0, n, half_widths, spacings, cx, cy, n_inner, n_ring, around, across, x, y):
+    means = np.empty(len(x), np.float32)
+    for k in range(len(x)):
+        ring = 0 if k < n_inner else 1 + (k - n_inner) // n_ring
+        px, py = x[k] - x0, y[k] - y0
+        # A ring runs along y where it crosses the x axis.
+        if abs(x[k] - cx) > abs(y[k] - cy):
+            side_x, side_y = across[ring], around[ring]
+        else:
+            side_x, side_y = around[ring], across[ring]
+        nearest = np.searchsorted(half_widths, max(abs(px), abs(py)))
+        spacing = spacings[min(nearest, len(spacings) - 1)]
+        n_x = min(max(round(side_x / spacing), 1), _MOST_SAMPLES)
+        n_y = min(max(round(side_y / spacing), 1), _MOST_SAMPLES)
+        total = 0.0
+        for j in range(n_y):
+            for i in range(n_x):
+                u = px + ((i + 0.5) / n_x - 0.5) * side_x
+                v = py + ((j + 0.5) / n_y - 0.5) * side_y
+                a, b, c, d, f, g = corners(u, v, n, half_widths)
+                total += (field[a] * (1 - f) + field[b] * f) * (1 - g) + (field[c] * (1 - f) + field[d] * f) * g
+        means[k] = total / (n_x * n_y)
+    return means
