@@ -34,9 +34,9 @@ def test_all_are_here():
 def test_it_is_whole_and_named_in_the_readme(name):
     dataset = open_dataset(FOLDER / name)
     assert validate(dataset) == [] and dataset.info.images == "planned"
-    sums = hashlib.sha256((FOLDER / name / "SHA256SUMS").read_bytes()).hexdigest()
+    sha256 = hashlib.sha256((FOLDER / name / "dataset.json").read_bytes()).hexdigest()
     readme = (FOLDER / "README.md").read_text(encoding="utf-8")
-    assert re.search(rf"`{name}`.*`{sums[:16]}`", readme), f"{name}: {sums[:16]}"
+    assert re.search(rf"`{name}`.*`{sha256[:16]}`", readme), f"{name}: {sha256[:16]}"
 
 
 def test_no_two_manifests_share_terrain_but_the_papers():

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from benchmarks.figures import write_figures
+from perilune_shared.dataset.index import index_rows, seal
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import count_rows, open_dataset
 from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
@@ -21,7 +22,7 @@ from perilune_shared.dataset.parts import write_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.editing.pack import pack
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.storage.checksums import seal
+from perilune_shared.storage.store import open_store
 from perilune_shared.terminal import progress_bar
 
 N_SCENES, N_FRAMES, N_LABELS, N_CRATERS = 1000, 100, 50, 2000
@@ -97,6 +98,7 @@ def _fill(root: Path, progress) -> None:
         licence="CC0-1.0",
     )
     write_info(root, info)
+    written = []
     for s in progress.track(range(N_SCENES), description="writing scenes"):
         scene = f"scene-{s:04d}"
         split = "test" if s % 10 == 0 else "val" if s % 10 == 1 else "train"
@@ -128,9 +130,9 @@ def _fill(root: Path, progress) -> None:
         for name in TABLES:
             n = sizes.get(name, N_FRAMES * N_LABELS)
             part = f"{scene}.trajectory-0000" if name in ("frames", "labels") else scene
-            write_part(root, name, part, _table(name, n, {**fixed, **own.get(name, {})}, rng))
-    write_info(root, info.model_copy(update={"counts": count_rows(open_dataset(root))}))
-    seal(root)
+            written.append(write_part(root, name, part, _table(name, n, {**fixed, **own.get(name, {})}, rng)))
+    counted = info.model_copy(update={"counts": count_rows(open_dataset(root))})
+    seal(open_store(root), counted, index_rows(written))
 
 
 def _table(name: str, n: int, known: dict, rng: np.random.Generator) -> pa.Table:

@@ -5,6 +5,7 @@ images, poses, labels and times are consistent.
 """
 
 import hashlib
+import json
 from pathlib import Path
 
 import cv2
@@ -14,16 +15,19 @@ import pyarrow.compute as pc
 
 import perilune_shared
 from perilune_shared.content import content_sha256
-from perilune_shared.dataset.info_file import write_info
+from perilune_shared.dataset.index import FOLDER, index_rows, write_index
+from perilune_shared.dataset.info_file import INFO_NAME, with_own_hash, write_info
 from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
 from perilune_shared.dataset.names import WHOLE_TABLE
-from perilune_shared.dataset.parts import write_part
+from perilune_shared.dataset.parts import Written, write_part
 from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.geometry import frames
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
-from perilune_shared.storage.checksums import seal
+from perilune_shared.storage.files import is_plain
+from perilune_shared.storage.locks import LOCK_NAME
+from perilune_shared.storage.store import open_store
 
 _TEXEL_M = 2.0
 _GROUND_TEXELS = 1400
@@ -176,6 +180,24 @@ def build_dataset(
     write_info(root, info)
     seal(root)
     return root
+
+
+def seal(root: Path) -> None:
+    """Write a valid index of all files, and a valid hash of dataset.json, which may have any other content."""
+    store, info = open_store(root), root / INFO_NAME
+    for old in (root / FOLDER).glob("*.parquet"):
+        old.unlink()
+    if not info.is_file() or info.is_symlink():
+        return
+    content = json.loads(info.read_bytes())
+    content.pop("sha256", None)
+    content["index"] = []
+    if content["complete"]:
+        paths = [item.path for item in store.list() if is_plain(item.path) and item.path not in (INFO_NAME, LOCK_NAME)]
+        plain = [path for path in paths if (root / path).is_file() and not (root / path).is_symlink()]
+        rows = index_rows(Written(path, (root / path).stat().st_size, store.sha256(path)) for path in plain)
+        content["index"] = [part.model_dump() for part in write_index(store, rows)]
+    info.write_bytes(with_own_hash(json.dumps(content, indent=2).encode()))
 
 
 def _add_scene(rows: dict[str, list[dict]], scene: str, ground: _Ground, recipe: str) -> None:

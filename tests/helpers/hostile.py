@@ -18,8 +18,8 @@ from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.packed import SHARDS, packed_rows, shard_name
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError, run_command_line
-from perilune_shared.storage import checksums
 from perilune_shared.validation.validate import validate
+from tests.helpers.drawn_dataset import seal
 
 FaultPlaces = list[tuple[str, str]]
 """File and column of each fault; for an error message, the message twice."""
@@ -187,10 +187,10 @@ def digest(content: bytes) -> str:
 
 
 def sealed(damage: Callable[[Path], object]) -> Callable[[Path], None]:
-    """Apply a damage, then write valid checksums."""
+    """Apply a damage, then write a valid index."""
 
     def both(root: Path) -> None:
         damage(root)
-        checksums.seal(root)
+        seal(root)
 
     return both

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
-from perilune_render.dataset.folder import begin_or_resume, finish, first_difference, open_finished, writing
+from perilune_render.dataset.folder import begin_or_resume, finish, first_difference, writing
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.trajectory_parts import finish_trajectory, is_finished
@@ -25,7 +25,7 @@ from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.provenance.recipe import recorded_settings, settings_of
 from perilune_render.provenance.versions import imaging_versions
 from perilune_shared.config import resolve_over
-from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.editing.writer import with_column
@@ -33,7 +33,6 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_shared.progress import Progress
-from perilune_shared.storage.checksums import sha256_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +75,7 @@ def develop_dataset(
     camera, exr_camera = _cameras(source, config)
     made_of = Origin(
         name=source.info.name,
-        sha256=sha256_of(source.store, "dataset.json"),
+        sha256=source.store.sha256("dataset.json"),
         camera_config=old.config.get("camera", {}),
     )
     recipe = old.model_copy(
@@ -118,7 +117,7 @@ def _develop(
     camera, exr_camera = cameras
     info = begin_or_resume(out, info)
     if info.complete:
-        return open_finished(out)
+        return open_dataset(out)
     task = progress.add_task("develop", total=source.info.counts.frames, unit="frames")
     for scene_id in source.scene_ids():
         _copy_scene(source, out, scene_id, info.recipe())

@@ -4,18 +4,19 @@ import contextlib
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.overview import write_overview
 from perilune_render.flight.plan import Plan, TrajectoryPlan
 from perilune_render.provenance.versions import all_versions
+from perilune_shared.dataset.index import frame_rows, index_rows, seal
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import Dataset, count_rows, open_dataset
 from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
-from perilune_shared.dataset.parts import read_part
-from perilune_shared.dataset.schema import SCHEMA_VERSION
+from perilune_shared.dataset.parts import Written, read_part
+from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
 from perilune_shared.errors import UserError
-from perilune_shared.storage.checksums import SUMS_NAME, seal
 from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE, locked
 
 LICENCE = "CC-BY-4.0"
@@ -45,7 +46,8 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
 
 def writing(out: Path) -> contextlib.AbstractContextManager[None]:
     """The lock of a dataset's folder; no lock for a finished dataset, which may be on a read-only disk."""
-    return contextlib.nullcontext() if (out / SUMS_NAME).exists() else locked(out)
+    is_finished = (out / "dataset.json").exists() and open_dataset(out).info.complete
+    return contextlib.nullcontext() if is_finished else locked(out)
 
 
 def is_begun(out: Path) -> bool:
@@ -125,19 +127,19 @@ def check_begun(out: Path, plan: Plan) -> None:
 
 
 def finish(out: Path, info: DatasetInfo) -> Dataset:
-    """Complete a dataset whose parts are all written: write overview, counts, checksums."""
+    """Complete a dataset whose parts are all written: write overview, index, counts."""
     dataset = Dataset(out, info)
     write_overview(dataset)
-    write_info(out, info.model_copy(update={"counts": count_rows(dataset), "complete": True}))
-    seal(out)
+    rows = [frame_rows(dataset.table("frames")), _rows_of_files(dataset)]
+    finished = info.model_copy(update={"counts": count_rows(dataset), "complete": True})
+    seal(dataset.store, finished, pa.concat_tables(rows))
     return open_dataset(out)
 
 
-def open_finished(out: Path) -> Dataset:
-    """Open a complete dataset; write its checksums if the run was interrupted just before that."""
-    if not (out / SUMS_NAME).exists():
-        seal(out)
-    return open_dataset(out)
+def _rows_of_files(dataset: Dataset) -> pa.Table:
+    """The rows of the index of overview and parts, which are read again."""
+    paths = ["overview.png", *(path for table in TABLES for path in dataset.parts(table))]
+    return index_rows(Written.of(path, dataset.store.read(path)) for path in paths if dataset.store.exists(path))
 
 
 def _compared(recipe: Recipe, name: str) -> object:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from perilune_render.dataset.folder import is_begun, open_finished, writing
+from perilune_render.dataset.folder import is_begun, writing
 from perilune_render.jobs import records, steps
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
-from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import Progress
 from perilune_shared.storage.locks import remove_temporary_files
@@ -67,7 +67,7 @@ def render_job(job: Job, out: Path, progress: Progress, executor: MakeExecutor) 
         with executor(job, out) as own:
             info = steps.prepare(job, out, own.check_scene)
             if info.complete:
-                return open_finished(out)
+                return open_dataset(out)
             records.remove_running(open_store(out))
             _render(job, out, steps.unfinished(job, out), own, progress)
         remove_temporary_files(out)  # of workers that were killed
@@ -95,7 +95,7 @@ def finish_job(job: Job, out: Path) -> Dataset:
         raise UserError(out, "--finish", "no dataset", "the folder of the rendered shards")
     with writing(out):
         info = steps.prepare(job, out, lambda scene_id: None)
-        return open_finished(out) if info.complete else steps.finish(job, out, info)
+        return open_dataset(out) if info.complete else steps.finish(job, out, info)
 
 
 def _render(job: Job, out: Path, places: list[int], executor: Executor, progress: Progress) -> None:

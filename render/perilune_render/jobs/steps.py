@@ -52,7 +52,7 @@ def unfinished(job: Job, out: Path) -> list[int]:
 
 
 def finish(job: Job, out: Path, info: DatasetInfo) -> Dataset:
-    """Write overview, counts and checksums of a dataset. Raises UserError if trajectories are still to be rendered."""
+    """Write overview, counts and index of a dataset. Raises UserError if trajectories are still to be rendered."""
     left = unfinished(job, out)
     if left:
         found = f"{len(left)} of {len(job.plan.trajectories)} trajectories not rendered, first {job.name(left[0])}"

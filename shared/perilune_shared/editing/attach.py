@@ -8,7 +8,6 @@ from perilune_shared.editing.rewrite import check_source
 from perilune_shared.editing.writer import new_dataset, with_column
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
-from perilune_shared.storage import checksums
 from perilune_shared.storage.png import png_header
 from perilune_shared.storage.store import Address
 
@@ -38,7 +37,7 @@ def attach(
     info = manifest.info.changed(line, images="files")
     scene_ids = manifest.scene_ids()
     task = progress.add_task("attaching", total=manifest.info.counts.frames, unit="frames")
-    with new_dataset(out, info, progress=progress) as writer:
+    with new_dataset(out, info) as writer:
         for scene_id in scene_ids:
             tables = manifest.scene(scene_id)
             frames = _checked(source, tables["frames"], rehash)
@@ -58,7 +57,7 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
             size = source.store.size(path) if path is not None else None
             if kind == "png" and size is None:
                 raise UserError(source.store, "frame", f"no {row['png_path']}", "every frame of the manifest")
-            sha256 = checksums.sha256_of(source.store, path) if size is not None else None
+            sha256 = source.store.sha256(path) if size is not None else None
             if size is not None and not rehash and sha256 != row[f"{kind}_sha256"]:
                 expected = f"the file with SHA-256 {row[f'{kind}_sha256']}, or --rehash"
                 raise UserError(source.store.at(path), f"{kind}_sha256", sha256, expected)

@@ -43,7 +43,7 @@ def merge(
     info = _joined_info(sources, name, state_of(list(sources), images))
     groups = _same_scenes(sources, planned=info.images == "planned")
     task = progress.add_task("merging", total=len(groups), unit="scenes")
-    with new_dataset(out, info, progress=progress) as writer:
+    with new_dataset(out, info) as writer:
         for scene_id, members in groups.items():
             tables, used_frames = _join(scene_id, [(sources[i], own) for i, own in members])
             writer.add_scene(without_derived_rows(tables) if info.images == "planned" else tables)

@@ -1,7 +1,7 @@
 """Convert datasets of older schema versions to the current one.
 
 Version 2 added the column `origin` to `craters` and made age and fresh depth nullable. Version 3 added
-recipes and content hashes to `scenes`, `contrast` to `labels`, checksums of all files, and the state of the frames.
+recipes and content hashes to `scenes`, `contrast` to `labels`, hashes of all files, and the state of the frames.
 Version 4 added `scene_id` and `split` to `labels`, and made their real columns float32.
 """
 
@@ -65,7 +65,7 @@ def migrate(address: Address, out: Address, progress: Progress = NO_PROGRESS, *,
     source = _OldDataset(store, info, version)
     scene_ids = sorted(source.rows("scenes")["scene_id"].to_pylist())
     task = progress.add_task("migrating", total=len(scene_ids), unit="scenes")
-    with new_dataset(out, info, progress=progress) as writer:
+    with new_dataset(out, info) as writer:
         for scene_id in scene_ids:
             tables = {name: source.rows(name, scene_id) for name in TABLES}
             writer.add_scene(tables)

@@ -50,7 +50,7 @@ def pack(
     info = source.info
     if packed:
         info = info.changed("packed", images="packed", exr_camera=None)
-    with new_dataset(out, info, most_rows=most_rows, progress=progress) as writer:
+    with new_dataset(out, info, most_rows=most_rows) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
             writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})

@@ -11,8 +11,8 @@ from perilune_shared.dataset.names import ImageMode, ImageState
 from perilune_shared.editing.writer import SceneTables, new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
-from perilune_shared.storage import checksums
 from perilune_shared.storage.store import Address, Store, open_store
+from perilune_shared.validation.files import check_files
 
 _DERIVED_TABLES = ("craters", "boulders", "labels")
 
@@ -33,7 +33,7 @@ def rewrite(
     info = info.model_copy(update={"images": state_of([source], images)})
     scene_ids = source.scene_ids() if scene_ids is None else scene_ids
     task = progress.add_task("writing", total=len(scene_ids), unit="scenes")
-    with new_dataset(out, info, progress=progress) as writer:
+    with new_dataset(out, info) as writer:
         for scene_id in scene_ids:
             tables = change(source.scene(scene_id))
             frames = tables["frames"]
@@ -50,15 +50,14 @@ def rewrite(
 def check_source(source: Dataset, out: Address, progress: Progress = NO_PROGRESS) -> None:
     """Raise UserError if a dataset must not be rewritten into `out`.
 
-    A dataset is refused if it is not complete, if its files do not match SHA256SUMS (new sums would hide the damage),
-    if its keys are broken, or if `out` is inside its folder.
+    A dataset is refused if it is not complete, if its files do not match its index (a new index would hide the
+    damage), if its keys are broken, or if `out` is inside its folder.
     """
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
     if _within(open_store(out), source.store):
         raise UserError(out, "--out", f"a folder in {source.store}", "one outside the dataset")
-    for name, found, expected in checksums.faults_of(source.store, progress):
-        raise UserError(source.store.at(name), "SHA-256", found, f"{expected}; see `perilune-manifest validate`")
+    check_files(source, progress)
     check_keys(source)
 
 

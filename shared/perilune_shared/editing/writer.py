@@ -4,7 +4,6 @@ The row counts, the number of frames and split of each trajectory, and the split
 """
 
 import contextlib
-import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterator
@@ -14,16 +13,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.content import terrain_of
+from perilune_shared.dataset.index import frame_rows, index_rows, seal
 from perilune_shared.dataset.info_file import INFO_NAME, checked_info, info_bytes
 from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
-from perilune_shared.dataset.metadata import Counts, DatasetInfo
-from perilune_shared.dataset.names import IMAGE_KINDS, WHOLE_TABLE, SplitUnit, frame_path
-from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, write_part
-from perilune_shared.dataset.schema import TABLES, complete
+from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.names import IMAGE_KINDS, SplitUnit, frame_path
+from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, Written
+from perilune_shared.dataset.whole_tables import WholeTables
 from perilune_shared.errors import UserError
-from perilune_shared.progress import NO_PROGRESS, Progress
-from perilune_shared.storage import checksums, files
+from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_store
 from perilune_shared.storage.store import Address, Store
 
@@ -36,11 +35,9 @@ class DatasetWriter:
     """Writer of a dataset; created by `new_dataset`."""
 
     def __init__(self, store: Store, info: DatasetInfo, *, most_rows: int = MOST_ROWS_WRITTEN):
-        self.store, self.info, self._most_rows = store, info, most_rows
-        self._hashes: dict[str, str] = {}
-        self._n_whole = dict.fromkeys(TABLES, 0)
-        self._rows = dict.fromkeys(TABLES, 0)
-        self._buffered: dict[str, list[pa.Table]] = defaultdict(list)
+        self.store, self.info = store, info
+        self._tables = WholeTables(store, most_rows=most_rows)
+        self._index: list[pa.Table] = []
         self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
         self._splits_of_trajectory: dict[tuple[str, int], set[str]] = defaultdict(set)
         self._has_exr = False
@@ -67,27 +64,10 @@ class DatasetWriter:
         trajectories = _with_counts_and_splits(tables["trajectories"], frames)
         labels = with_frame_columns(tables["labels"], frames)
         tables = {**tables, "frames": frames, "trajectories": trajectories, "labels": labels}
+        if self.info.images == "files":
+            self._index.append(frame_rows(frames))
         for name, rows in tables.items():
-            self._rows[name] += len(rows)
-            rows = complete(name, rows)
-            self._buffer(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
-
-    def _buffer(self, name: str, rows: pa.Table) -> None:
-        """Buffer rows of a table; write a part whenever it reaches the maximum number of rows."""
-        while len(rows):
-            free = self._most_rows - sum(map(len, self._buffered[name]))
-            if not free:
-                self._write_whole(name)
-                continue
-            self._buffered[name].append(rows[:free])
-            rows = rows[free:]
-
-    def _write_whole(self, name: str) -> None:
-        rows = pa.concat_tables([TABLES[name].empty_table(), *self._buffered.pop(name, [])])
-        stem = f"{WHOLE_TABLE}.{self._n_whole[name]:04d}" if self._n_whole[name] else WHOLE_TABLE
-        written = write_part(self.store, name, stem, rows, max(1000, len(rows) // 200))
-        self._hashes[written.path] = written.sha256
-        self._n_whole[name] += 1
+            self._tables.add(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
 
     def add_images(self, source: Dataset, frames: pa.Table, names: dict[str, str], *, link: bool) -> None:
         """Copy frames stored as files from another dataset: `frames` are its rows, `names` maps old to new frame_ids.
@@ -115,15 +95,14 @@ class DatasetWriter:
     def add_file(self, path: str, content: bytes) -> None:
         """Write another file of the dataset."""
         self.store.write(path, content, durable=False)
-        self._hashes[path] = hashlib.sha256(content).hexdigest()
+        self._index.append(index_rows([Written.of(path, content)]))
 
-    def finish(self, out: Address, progress: Progress = NO_PROGRESS) -> None:
-        """Write buffered rows, checksums, then dataset.json. Raises UserError about `out` if there are no frames."""
-        if not self._rows["frames"]:
+    def finish(self, out: Address) -> None:
+        """Write buffered rows, the index, then dataset.json. Raises UserError about `out` if there are no frames."""
+        counts = self._tables.counts
+        if not counts.frames:
             raise UserError(out, "frames", "none left", "conditions that select at least one frame")
-        for name in TABLES:
-            if self._buffered[name] or not self._n_whole[name]:
-                self._write_whole(name)
+        self._index.append(index_rows(self._tables.finish()))
         # One flight may occur twice: rendered, and developed again with another sensor.
         trajectory_in_two_splits = any(len(splits) > 1 for splits in self._splits_of_trajectory.values())
         terrain_in_two_splits = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
@@ -131,12 +110,9 @@ class DatasetWriter:
         exr_camera = self.info.exr_camera if self._has_exr else None
         recipes = {key: recipe for key, recipe in self.info.recipes.items() if key in self._recipes}
         info = self.info.model_copy(
-            update={"split_by": unit, "recipes": recipes, "exr_camera": exr_camera, "counts": Counts(**self._rows)}
+            update={"split_by": unit, "recipes": recipes, "exr_camera": exr_camera, "counts": counts}
         )
-        content = info_bytes(info, out)
-        self._hashes[INFO_NAME] = hashlib.sha256(content).hexdigest()
-        checksums.seal(self.store, progress, self._hashes)
-        self.store.replace(INFO_NAME, content)
+        seal(self.store, info, pa.concat_tables(self._index))
 
 
 @contextlib.contextmanager
@@ -145,7 +121,6 @@ def new_dataset(
     info: DatasetInfo,
     *,
     most_rows: int = MOST_ROWS_WRITTEN,
-    progress: Progress = NO_PROGRESS,
 ) -> Iterator[DatasetWriter]:
     """Yield a writer for a new dataset; it appears at `out` only when the block succeeds.
 
@@ -154,11 +129,11 @@ def new_dataset(
     """
     # Copies with replaced fields have not been validated.
     checked_info(json.loads(info.model_dump_json()), out)
-    claim = info_bytes(info.model_copy(update={"complete": False}), out)
+    claim = info_bytes(info.model_copy(update={"complete": False, "index": ()}), out)
     with new_store(out, INFO_NAME, claim) as store:
         writer = DatasetWriter(store, info, most_rows=most_rows)
         yield writer
-        writer.finish(out, progress)
+        writer.finish(out)
 
 
 def check_scene(where: object, tables: SceneTables) -> None:

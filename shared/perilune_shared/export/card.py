@@ -18,10 +18,10 @@ from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo, Recipe
 from perilune_shared.errors import UserError, one_line, shortened
-from perilune_shared.export.added_files import add_files, check_sums, default_path
+from perilune_shared.export.added_files import add_files, check_index, default_path
 from perilune_shared.export.card_head import head_of, table_configs
 from perilune_shared.export.card_pictures import TITLES, Gathered, draw, gather
-from perilune_shared.export.croissant import citation_of
+from perilune_shared.export.citation import citation_of
 from perilune_shared.export.stats import summary
 from perilune_shared.progress import Progress
 
@@ -41,10 +41,10 @@ _IMAGES = {
 
 
 def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[Path, Path]:
-    """Write the page and the picture beside it, and update the dataset's checksums; return both paths.
+    """Write the page and the picture beside it, and update the dataset's index; return both paths.
 
     `out` is by default README.md in the dataset. Raises UserError if a file that is not a card would be overwritten,
-    the dataset has no frames or its checksums are wrong.
+    the dataset has no frames or it differs from its index.
     """
     out = out or default_path(dataset, CARD_NAME)
     if out.suffix != ".md":
@@ -54,11 +54,12 @@ def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[
     for path in (out, picture):
         if path.exists() and not is_card:
             raise UserError(path, "--out", "a file that is not a card", "another path, or move that file away")
-    known = check_sums(dataset, (out, picture), progress)
+    info = check_index(dataset, (out, picture), progress)
     gathered = gather(dataset, progress)
     # Build the page first: this checks the keys and is much faster than drawing.
     page = card_of(dataset, gathered, picture.name).encode()
-    add_files(dataset, {picture: draw(dataset, gathered), out: page}, known)
+    # The page first: it marks the picture as one that may be overwritten.
+    add_files(dataset, {out: page, picture: draw(dataset, gathered)}, info)
     return out, picture
 
 
@@ -88,7 +89,8 @@ def card_of(dataset: Dataset, gathered: Gathered, picture_name: str) -> str:
         "## Reproduction\n\n" + "\n\n".join(_remake(key, recipe) for key, recipe in info.recipes.items()),
         "## History\n\n" + ("\n".join(f"- {code(line)}" for line in info.history) or "Not edited since rendering."),
         f"## Licence\n\n{code(info.licence)}",
-        f"## Citation\n\nThe hash identifies this dataset.\n\n```bibtex\n{citation_of(dataset)}\n```",
+        "## Citation\n\nThe hash identifies the tables, which contain the hashes of the frames.\n\n"
+        f"```bibtex\n{citation_of(dataset)}\n```",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -164,7 +166,8 @@ def _files(dataset: Dataset) -> str:
             f"- Camera: {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px, principal point "
             f"({camera.cx_px:.6g}, {camera.cy_px:.6g}) px from the outer corner of the top-left pixel, {lens}.",
             "- Tables: manifest/*/*.parquet; the metadata of the files has the unit and meaning of each column.",
-            f"- {INFO_NAME}: settings, random seeds and versions. `sha256sum -c SHA256SUMS` checks it and the tables.",
+            f"- {INFO_NAME}: settings, random seeds and versions; it contains the SHA-256 of index/*.parquet.",
+            "- index/*.parquet: path, size and SHA-256 of every other file.",
             f"- Schema version {code(info.schema_version)}.",
         ]
     )

@@ -11,7 +11,6 @@ dataset's folder, since its paths are relative. mlcroissant reads records from t
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import pyarrow as pa
@@ -21,9 +20,9 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import KEYS, MAY_BE_ABSENT, TABLES
 from perilune_shared.errors import UserError
-from perilune_shared.export.added_files import add_files, check_sums, default_path
+from perilune_shared.export.added_files import add_files, check_index, default_path
+from perilune_shared.export.citation import citation_of, table_hashes
 from perilune_shared.progress import NO_PROGRESS, Progress
-from perilune_shared.storage import checksums
 
 CROISSANT_NAME = "croissant.json"
 # mlcroissant does not support the registered media type, application/vnd.apache.parquet.
@@ -80,9 +79,9 @@ _DATA_TYPES = {
 
 
 def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progress = NO_PROGRESS) -> Path:
-    """Write croissant.json, or `out`, into the dataset's folder and update the checksums; return its path.
+    """Write croissant.json, or `out`, into the dataset's folder and update the index; return its path.
 
-    Raises UserError if `out` is elsewhere, the dataset is not complete or its checksums are wrong.
+    Raises UserError if `out` is elsewhere, the dataset is not complete or differs from its index.
     """
     out = out or default_path(dataset, CROISSANT_NAME)
     if out.resolve().parent != default_path(dataset, CROISSANT_NAME).resolve().parent or out.suffix != ".json":
@@ -96,33 +95,32 @@ def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progre
         raise UserError(out, "--out", INFO_NAME, "another name")
     if not dataset.info.complete:
         raise UserError(dataset.store, "complete", "false", "a finished dataset")
-    known = check_sums(dataset, [out], progress)
-    text = json.dumps(metadata_of(dataset, known or {}), indent=1, allow_nan=False) + "\n"
-    add_files(dataset, {out: text.encode()}, known)
+    info = check_index(dataset, [out], progress)
+    text = json.dumps(metadata_of(dataset), indent=1, allow_nan=False) + "\n"
+    add_files(dataset, {out: text.encode()}, info)
     return out
 
 
-def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({})) -> dict[str, Any]:
-    """Return the JSON-LD object; `known` contains hashes that are not computed again.
+def metadata_of(dataset: Dataset) -> dict[str, Any]:
+    """Return the JSON-LD object.
 
     A table with one part is a FileObject with its hash. A table with several parts is a FileSet; their hashes are in
-    SHA256SUMS.
+    the index. dataset.json is a FileSet too: it contains the hash of the index, which contains that of this file.
     """
-    info = dataset.info
-    distribution = [
+    info, hashes = dataset.info, table_hashes(dataset)
+    distribution: list[dict[str, Any]] = [
         {
-            "@type": "cr:FileObject",
+            "@type": "cr:FileSet",
             "@id": INFO_NAME,
             "name": INFO_NAME,
-            "description": "metadata of the dataset: camera, splits, recipes, edits since rendering",
-            "contentUrl": INFO_NAME,
+            "description": "metadata: camera, splits, recipes, edits since rendering, hash of the index of files",
             "encodingFormat": "application/json",
-            "sha256": checksums.sha256_of(dataset.store, INFO_NAME),
+            "includes": INFO_NAME,
         }
     ]
     record_sets = []
     for table, schema in TABLES.items():
-        distribution.append(_distribution(dataset, table, known))
+        distribution.append(_distribution(dataset, table, hashes))
         # Omit optional columns that a file lacks: mlcroissant would not find them.
         missing = {
             name
@@ -158,14 +156,6 @@ def metadata_of(dataset: Dataset, known: Mapping[str, str] = MappingProxyType({}
     }
 
 
-def citation_of(dataset: Dataset) -> str:
-    """Return a BibTeX entry that identifies this dataset by a hash."""
-    sha256 = checksums.sha256_of(dataset.store, INFO_NAME)
-    key = "".join(c if c.isascii() and c.isalnum() else "-" for c in dataset.info.name).strip("-")
-    note = f"Rendered images of lunar landing trajectories. SHA-256 of {INFO_NAME}: {sha256}"
-    return f"@misc{{{key}, title = {{{dataset.info.name}}}, howpublished = {{perilune dataset}}, note = {{{note}}}}}"
-
-
 def _description(dataset: Dataset) -> str:
     counts = dataset.info.counts
     return (
@@ -180,7 +170,7 @@ def _licence(expression: str) -> str:
     return f"https://spdx.org/licenses/{expression}.html" if " " not in expression else expression
 
 
-def _distribution(dataset: Dataset, table: str, known: Mapping[str, str]) -> dict[str, Any]:
+def _distribution(dataset: Dataset, table: str, hashes: Mapping[str, str]) -> dict[str, Any]:
     parts = dataset.parts(table)
     common = {"name": f"{table}-parquet", "encodingFormat": _PARQUET}
     if len(parts) == 1:
@@ -190,13 +180,13 @@ def _distribution(dataset: Dataset, table: str, known: Mapping[str, str]) -> dic
             "@id": f"{table}-parquet",
             **common,
             "contentUrl": url,
-            "sha256": known.get(url) or checksums.sha256_of(dataset.store, url),
+            "sha256": hashes[url],
         }
     return {
         "@type": "cr:FileSet",
         "@id": f"{table}-parquet",
         **common,
-        "description": "parts, each with the rows of one scene or trajectory; SHA256SUMS has their hashes",
+        "description": "parts of the table; the index (index/*.parquet) has their hashes",
         "includes": f"manifest/{table}/*.parquet",
     }
 

@@ -19,9 +19,8 @@ from perilune_shared.dataset.schema import KEYS, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
 from perilune_shared.progress import NO_PROGRESS, Progress
-from perilune_shared.storage import checksums
-from perilune_shared.validation.expected_files import unexpected
 from perilune_shared.validation.faults import Fault, part_faults
+from perilune_shared.validation.files import file_faults
 from perilune_shared.validation.images import image_faults
 from perilune_shared.validation.shards import shard_faults
 from perilune_shared.validation.trajectory import trajectory_faults
@@ -42,17 +41,7 @@ def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
 
 
 def _faults(dataset: Dataset, progress: Progress) -> list[Fault]:
-    faults = [
-        Fault.of(file, None, "SHA-256", found, expected)
-        for file, found, expected in checksums.faults_of(dataset.store, progress)
-    ]
-    try:
-        expected = "only files of the dataset format (docs/reference/validation.md)"
-        faults += [
-            Fault.of(path, None, "file", "an unexpected file or folder", expected) for path in unexpected(dataset)
-        ]
-    except UserError as error:
-        faults.append(Fault.from_error("manifest/frames", None, error))
+    faults = list(file_faults(dataset, progress))
     if not dataset.info.complete:
         expected = "a finished dataset; run `make dataset` again to resume"
         faults.append(Fault.of("dataset.json", None, "complete", "False", expected))

@@ -12,7 +12,7 @@ from perilune_render.config import KindConfig
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.develop import develop_dataset
-from perilune_render.dataset.folder import begin_or_resume, check_begun, new_info, open_finished
+from perilune_render.dataset.folder import begin_or_resume, check_begun, new_info
 from perilune_render.dataset.regenerate import png_outlier_share, regenerate
 from perilune_render.flight.plan import make_plan
 from perilune_render.jobs.here import Here
@@ -25,9 +25,7 @@ from perilune_shared.dataset.parts import write_part
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import sun_direction
-from perilune_shared.storage.checksums import SUMS_NAME
 from perilune_shared.storage.locks import locked
-from perilune_shared.validation.validate import validate
 
 
 @pytest.fixture
@@ -69,11 +67,6 @@ def test_a_manifest_is_not_rendered_into_itself(tmp_path):
     write_info(tmp_path, info.model_copy(update={"images": "planned", "complete": True}))
     with pytest.raises(UserError, match="planned"):
         begin_or_resume(tmp_path, info)
-
-
-def test_checksums_that_a_stop_left_out_are_written(drawn):
-    (drawn / SUMS_NAME).unlink()
-    assert validate(open_finished(drawn)) == []
 
 
 def test_a_folder_that_another_process_writes_is_left_alone(begun):

@@ -1,6 +1,7 @@
 """Every command refuses a dataset with broken keys, with a message of one line."""
 
 import pytest
+from tests.helpers.drawn_dataset import seal
 from tests.helpers.hostile import rewrite
 from typer.testing import CliRunner
 
@@ -15,7 +16,6 @@ from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
 from perilune_shared.export.stats import summary
 from perilune_shared.labels.selection import read_labels
-from perilune_shared.storage.checksums import seal
 
 BROKEN = {
     "a label of no crater": ("labels", lambda rows: rows[3].update(crater_id=12345), "labels: crater_id"),

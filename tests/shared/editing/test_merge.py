@@ -5,7 +5,7 @@ import shutil
 import pyarrow.compute as pc
 import pytest
 from license_expression import get_spdx_licensing
-from tests.helpers.drawn_dataset import build_dataset
+from tests.helpers.drawn_dataset import build_dataset, seal
 from tests.helpers.hostile import edit, rewrite
 
 from perilune_shared.dataset.manifest import open_dataset
@@ -16,7 +16,6 @@ from perilune_shared.editing.split import split_dataset
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
 from perilune_shared.export.stats import summary
-from perilune_shared.storage.checksums import seal
 from perilune_shared.validation.validate import validate
 
 

@@ -35,7 +35,7 @@ def packed(drawn, tmp_path_factory):
 def test_unpacking_restores_the_dataset(drawn, packed, tmp_path):
     source, made = open_dataset(drawn), open_dataset(packed)
     assert validate(made) == [] and made.info.images == "packed" and len(made.shards()) > 1
-    assert not (packed / "frames").exists() and len(list(packed.rglob("*.parquet"))) == 6 + len(made.shards())
+    assert not (packed / "frames").exists() and len(list(packed.rglob("*.parquet"))) == 7 + len(made.shards())
     unpack(made, tmp_path / "u")
     again = open_dataset(tmp_path / "u")
     assert validate(again) == []

@@ -3,14 +3,13 @@
 import shutil
 
 import pytest
-from tests.helpers.drawn_dataset import build_dataset
+from tests.helpers.drawn_dataset import build_dataset, seal
 from tests.helpers.hostile import edit, rewrite
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.split import split_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.storage.checksums import seal
 from perilune_shared.validation.validate import validate
 
 

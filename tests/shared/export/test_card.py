@@ -18,7 +18,7 @@ from huggingface_hub import DatasetCard
 from markdown_it import MarkdownIt
 from PIL import Image
 from rich.progress import Progress
-from tests.helpers.drawn_dataset import build_dataset
+from tests.helpers.drawn_dataset import build_dataset, seal
 from typer.testing import CliRunner
 
 from perilune_shared.cli.main import app
@@ -28,7 +28,6 @@ from perilune_shared.dataset.parts import read_part
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.card import code, write_card
-from perilune_shared.storage import checksums
 from perilune_shared.validation.validate import validate
 
 EVIL = '`</code><script>alert(1)</script> ![x](http://evil) [y](javascript:z) | $(rm) &lt; "\n# owned\n<img src=x>'
@@ -116,7 +115,7 @@ def test_text_from_a_dataset_is_escaped(crowded, card, tmp_path):
     dataset = open_dataset(root)
     info = dataset.info.changed("merged " + EVIL).changed("[y](javascript:z) ![x](http://evil) | **b**")
     write_info(root, info)
-    checksums.seal(root)
+    seal(root)
     clean, hostile = html_of(card / "README.md"), html_of(card_files(root)[0])
     tags = [re.findall(r"<(\w+)", html) for html in (clean, hostile)]
     history = ["ul", "li", "code", "li", "code"]

@@ -87,10 +87,11 @@ def test_the_dataset_stays_valid(described):
     assert validate(described[0]) == []
 
 
-def test_a_wrong_checksum_is_not_overwritten(crowded, tmp_path):
+def test_a_wrong_hash_is_not_overwritten(crowded, tmp_path):
     root = Path(shutil.copytree(crowded, tmp_path / "set"))
-    sums = (root / "SHA256SUMS").read_text()
-    (root / "SHA256SUMS").write_text(sums.replace(sums[:8], "00000000"))
+    part = root / "manifest/labels/all.parquet"
+    content = part.read_bytes()
+    part.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
     with pytest.raises(UserError, match="different SHA-256"):
         export_croissant(open_dataset(root))
     assert not (root / "croissant.json").exists()

@@ -5,7 +5,8 @@ import shutil
 import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
-from tests.helpers.hostile import digest, edit, part_of
+from tests.helpers.drawn_dataset import seal
+from tests.helpers.hostile import edit, part_of
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.merge import merge
@@ -13,9 +14,8 @@ from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
 from perilune_shared.export.card import write_card
 from perilune_shared.export.croissant import export_croissant
-from perilune_shared.storage import checksums
-from perilune_shared.storage.checksums import SUMS_NAME, seal
 from perilune_shared.storage.locks import locked
+from perilune_shared.storage.store import LocalStore
 from perilune_shared.validation.validate import validate
 
 UNEXPECTED = {
@@ -36,20 +36,15 @@ UNEXPECTED = {
 
 
 @pytest.mark.parametrize("name", UNEXPECTED)
-def test_unexpected_files_are_faults_even_with_checksums(name, victim):
+@pytest.mark.parametrize("indexed", [False, True])
+def test_unexpected_files_are_faults_even_in_the_index(name, indexed, victim):
     path, reported = UNEXPECTED[name]
     (victim / path).parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(part_of(victim, "labels"), victim / path)
-    seal(victim)
-    add_checksum(victim, path)
-    assert (reported or path, "file") in [(fault.file, fault.column) for fault in validate(open_dataset(victim))]
-
-
-def add_checksum(root, path):
-    """Add a file to the checksums."""
-    sums = root / SUMS_NAME
-    lines = set(sums.read_text().splitlines()) | {f"{digest((root / path).read_bytes())}  {path}"}
-    sums.write_text("".join(f"{line}\n" for line in sorted(lines, key=lambda line: line[66:])))
+    if indexed:
+        seal(victim)
+    faults = [(fault.file, fault.column) for fault in validate(open_dataset(victim))]
+    assert ((path, "file") in faults) or (reported or path, "file") in faults
 
 
 def test_a_frame_row_does_not_make_a_table_expected(victim):
@@ -82,7 +77,7 @@ def test_a_broken_link_is_a_fault(victim):
 def test_known_files_and_the_lock_of_a_writer_are_expected(victim):
     for name in ("LICENSE", "CITATION.cff"):
         (victim / name).write_text("text")
-    assert [fault.file for fault in validate(open_dataset(victim))] == ["CITATION.cff", "LICENSE"]  # not in SHA256SUMS
+    assert [fault.file for fault in validate(open_dataset(victim))] == ["CITATION.cff", "LICENSE"]  # not in the index
     seal(victim)
     with locked(victim):
         assert validate(open_dataset(victim)) == []
@@ -110,15 +105,15 @@ def test_cards_and_metadata_have_fixed_names_in_a_dataset(crowded, tmp_path):
 
 def test_each_file_is_hashed_once(crowded_packed, tmp_path, monkeypatch):
     root = shutil.copytree(crowded_packed, tmp_path / "set")
-    read, whole = [], checksums.sha256_of
+    read, whole = [], LocalStore.sha256
 
     def counted(store, path, *rest):
         if store.folder == root:
             read.append(path)
         return whole(store, path, *rest)
 
-    monkeypatch.setattr(checksums, "sha256_of", counted)
-    large = {path.relative_to(root).as_posix() for path in root.rglob("*.parquet")}
+    monkeypatch.setattr(LocalStore, "sha256", counted)
+    large = {path.relative_to(root).as_posix() for path in root.rglob("*.parquet") if path.parent.name != "index"}
     with Progress(disable=True) as progress:
         for work in (
             lambda: write_card(open_dataset(root), None, progress),

@@ -1,19 +1,22 @@
-"""A dataset is untrusted: its dataset.json, its checksums, its files and links."""
+"""A dataset is untrusted: its dataset.json, its index, its files and links."""
 
 import json
 import os
 import shutil
+from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from tests.helpers.hostile import assert_refused, edit, sealed
 
-from perilune_shared.dataset.info_file import write_info
+from perilune_shared.dataset.index import read_index, write_index
+from perilune_shared.dataset.info_file import read_info, write_info
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import recipes_of
 from perilune_shared.dataset.parts import write_part
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
-from perilune_shared.storage.checksums import SUMS_NAME
+from perilune_shared.storage.store import open_store
 
 
 def raw(content):
@@ -128,9 +131,29 @@ def test_unreadable_settings_are_not_written(victim):
     assert (victim / "dataset.json").read_bytes() == before
 
 
-def sums(change):
-    """Change the text of SHA256SUMS."""
-    return lambda root: (root / SUMS_NAME).write_bytes(change((root / SUMS_NAME).read_bytes()))
+def reindexed(change):
+    """Apply `change` to the path of the index."""
+
+    def damage(root):
+        (path,) = (root / "index").glob("*.parquet")
+        change(path)
+
+    return damage
+
+
+def named(path):
+    """Add a row to the index, which has valid hashes."""
+
+    def damage(root):
+        info = read_info(root)
+        rows = read_index(open_store(root), info)
+        row = pa.table([[path], [0], ["0" * 64]], schema=rows.schema)
+        (old,) = (root / "index").glob("*.parquet")
+        old.unlink()
+        parts = write_index(open_store(root), pa.concat_tables([rows, row]))
+        write_info(root, info.model_copy(update={"index": parts}))
+
+    return damage
 
 
 def linked(name, target):
@@ -191,22 +214,31 @@ def sparse(name):
 
 _PNG = "frames/s000/t000/000000.png"
 _FRAMES = "manifest/frames/all.parquet"
-_LINE = b"0" * 64 + b"  "
 FILES = {
-    "no checksums": (lambda root: (root / SUMS_NAME).unlink(), SUMS_NAME, "SHA-256"),
-    "checksums of nothing": (sums(lambda _: b""), SUMS_NAME, "SHA-256"),
-    "a climbing path": (sums(lambda text: _LINE + b"../canary/secret.txt\n" + text), SUMS_NAME, "SHA-256"),
-    "an absolute path": (sums(lambda text: _LINE + b"/etc/passwd\n" + text), SUMS_NAME, "SHA-256"),
-    "a path of 10 kB": (sums(lambda text: text + _LINE + b"z" * 10_000 + b"\n"), SUMS_NAME, "SHA-256"),
-    "a path with NUL": (sums(lambda text: text + _LINE + b"z\0z\n"), SUMS_NAME, "SHA-256"),
-    "a path that steers a terminal": (sums(lambda text: text + _LINE + b"z\x1b[2J\n"), SUMS_NAME, "SHA-256"),
-    "a path twice": (sums(lambda text: text + text), SUMS_NAME, "SHA-256"),
-    "no line break at the end": (sums(lambda text: text[:-1]), SUMS_NAME, "SHA-256"),
-    "no text": (sums(lambda text: bytes(range(256))), SUMS_NAME, "SHA-256"),
-    "checksums of 100 MB": (sums(lambda text: b"0" * 100_000_000), SUMS_NAME, "SHA-256"),
-    "checksums by a link": (linked(SUMS_NAME, "canary/secret.txt"), SUMS_NAME, "SHA-256"),
-    "checksums through a pipe": (piped(SUMS_NAME), SUMS_NAME, "SHA-256"),
-    "a checksum less": (sums(lambda text: b"".join(text.splitlines(True)[1:])), "dataset.json", "SHA-256"),
+    "no index": (reindexed(Path.unlink), "index", "file"),
+    "an empty index": (reindexed(lambda path: path.write_bytes(b"")), "index", "bytes"),
+    "an index of 1 TiB": (reindexed(lambda path: os.truncate(path, 2**40)), "index", "bytes"),
+    "an index by a link": (
+        reindexed(lambda path: linked(f"index/{path.name}", "canary/secret.txt")(path.parents[1])),
+        "index",
+        "file",
+    ),
+    "an index through a pipe": (reindexed(lambda path: piped(f"index/{path.name}")(path.parents[1])), "index", "file"),
+    "another index": (added("index/0123456789abcdef.parquet"), "index/0123456789abcdef.parquet", "file"),
+    "a climbing path in the index": (named("../canary/secret.txt"), "index", "path"),
+    "an absolute path in the index": (named("/etc/passwd"), "index", "path"),
+    "a path of 10 kB in the index": (named("z" * 10_000), "index", "path"),
+    "a path with NUL in the index": (named("z\0z"), "index", "path"),
+    "a path that steers a terminal in the index": (named("z\x1b[2J"), "index", "path"),
+    "a path twice in the index": (named(_FRAMES), "index", "path"),
+    "a missing file in the index": (named("LICENSE"), "LICENSE", "SHA-256"),
+    "a program in the index": (sealed(added("setup.py")), "setup.py", "file"),
+    "dataset.json without its hash": (edit(lambda content: content.pop("sha256")), "dataset.json", "SHA-256"),
+    "an index in another folder": (
+        edit(lambda content: content["index"][0].update(path="../index/0123456789abcdef.parquet")),
+        "dataset.json",
+        "index.0.path",
+    ),
     "dataset.json by a link": (sealed(linked("dataset.json", "canary/secret.txt")), "dataset.json", "link"),
     "dataset.json by a link to itself": (linked("dataset.json", "dataset/dataset.json"), "dataset.json", "link"),
     "dataset.json through a pipe": (sealed(piped("dataset.json")), "dataset.json", "pipe"),
@@ -226,8 +258,8 @@ FILES = {
     "a part named with a blank": (sealed(added("manifest/frames/a b.parquet")), "a b.parquet", "part"),
     "a part named with a line break": (sealed(added("manifest/frames/a\nb.parquet")), "a b.parquet", "part"),
     "a part of three names": (sealed(added("manifest/frames/a.b.c.parquet")), "a.b.c.parquet", "part"),
-    "a part without a checksum": (added("manifest/frames/z.parquet"), "z.parquet", "SHA-256"),
-    "a script in the manifest": (added("manifest/setup.py"), "manifest/setup.py", "SHA-256"),
+    "a part that is not in the index": (added("manifest/frames/z.parquet"), "z.parquet", "file"),
+    "a script in the manifest": (added("manifest/setup.py"), "manifest/setup.py", "file"),
     "frames by a link": (moved("frames"), _FRAMES, "png_path"),
     "a frame by a link": (linked(_PNG, "canary/frame.png"), _FRAMES, "png_path"),
     "a frame by a link to itself": (linked(_PNG, f"dataset/{_PNG}"), _FRAMES, "png_path"),
@@ -251,8 +283,8 @@ def test_a_folder_name_with_markup(victim, capsys, monkeypatch):
     odd = victim.parent / "[" / "red]"
     odd.parent.mkdir()
     victim.rename(odd)
-    (odd / SUMS_NAME).unlink()
-    assert_refused(odd, SUMS_NAME, "SHA-256", capsys, monkeypatch)
+    (odd / _FRAMES).unlink()
+    assert_refused(odd, _FRAMES, "SHA-256", capsys, monkeypatch)
 
 
 @pytest.mark.parametrize("name", ["../../canary/x", "/tmp/x", "a b", "", "a/b", "a.b.c", "a\n", "-rf", ".x", "a" * 300])

@@ -8,11 +8,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from tests.helpers import hostile_parquet as forged
+from tests.helpers.drawn_dataset import seal
 from tests.helpers.hostile import assert_refused, part_of, sealed
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.storage.checksums import seal
 from perilune_shared.validation.validate import validate
 
 

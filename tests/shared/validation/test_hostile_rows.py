@@ -1,4 +1,4 @@
-"""A dataset is untrusted: hostile names, paths, poses, labels and frames under valid checksums."""
+"""A dataset is untrusted: hostile names, paths, poses, labels and frames under a valid index."""
 
 import struct
 import zlib

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
+from tests.helpers.drawn_dataset import seal
 
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
@@ -22,13 +23,12 @@ from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.export.card import write_card
 from perilune_shared.export.coco import export_coco
-from perilune_shared.storage.checksums import seal
 from perilune_shared.storage.files import new_folder
 from perilune_shared.validation.validate import validate
 
 
 def replaced(root, table, rows):
-    """Write a table of a drawn dataset again, with valid checksums."""
+    """Write a table of a drawn dataset again, with a valid index."""
     root.joinpath("manifest", table, "all.parquet").unlink()
     write_part(root, table, "all", rows)
     seal(root)
@@ -159,7 +159,7 @@ def test_scenes_over_one_elevation_model_are_one_terrain(victim, tmp_path):
 
 
 def test_a_damaged_table_is_not_copied(drawn, tmp_path):
-    """New checksums would hide the damage."""
+    """A new index would hide the damage."""
     broken = shutil.copytree(drawn, tmp_path / "broken")
     part = broken / "manifest/labels/all.parquet"
     rows = pq.read_table(part).to_pandas()

@@ -71,8 +71,8 @@ def test_the_same_command_resumes_and_needs_the_same_settings_and_dataset(tmp_pa
             begin(tmp_path, Settings())
 
 
-def test_a_dataset_is_known_by_its_checksums(dataset_detect, tmp_path):
-    hashes = hashes_of({"dataset": dataset_detect, "file": dataset_detect / "SHA256SUMS", "absent": tmp_path / "x"})
+def test_a_dataset_is_known_by_its_dataset_json(dataset_detect, tmp_path):
+    hashes = hashes_of({"dataset": dataset_detect, "file": dataset_detect / "dataset.json", "absent": tmp_path / "x"})
     assert hashes["dataset"] == hashes["file"] and len(hashes["file"]) == 64 and hashes["absent"] is None
 
 

@@ -10,10 +10,9 @@ from typing import Any, Literal
 import torch
 
 from perilune_shared.config import Section, read_config_file, to_yaml
+from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
-from perilune_shared.storage.checksums import SUMS_NAME
-from perilune_shared.storage.checksums import sha256_of as sha256_in
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_shared.storage.store import open_store
 from perilune_shared.terminal import console
@@ -30,15 +29,15 @@ _STATE_KEY = "perilune/run"
 
 
 def hashes_of(inputs: Mapping[str, str | Path | None]) -> dict[str, str | None]:
-    """Hash of each input: of the SHA256SUMS of a dataset (a folder or an address), or of the file itself."""
+    """Hash of each input: of the dataset.json of a dataset (a folder or an address), or of the file itself."""
     return {name: None if place is None else _hash_of(place) for name, place in inputs.items()}
 
 
 def _hash_of(place: str | Path) -> str | None:
     store = open_store(place)
     if store.folder is None:
-        return sha256_in(store, SUMS_NAME) if store.exists(SUMS_NAME) else None
-    file = store.folder / SUMS_NAME if store.folder.is_dir() else store.folder
+        return store.sha256(INFO_NAME) if store.exists(INFO_NAME) else None
+    file = store.folder / INFO_NAME if store.folder.is_dir() else store.folder
     return sha256_of(file) if file.is_file() else None
 
 

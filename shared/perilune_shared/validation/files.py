@@ -1,0 +1,186 @@
+"""Compare the files of a dataset with its index, and find files that do not belong to it.
+
+Other tools may read files that this package ignores: any file below manifest/, any Parquet file or image in the folder.
+So every unknown file is a fault, and so is every file that is not of the dataset format, even if the index names it.
+"""
+
+from collections.abc import Container, Iterator
+from pathlib import PurePosixPath
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from perilune_shared.dataset import index
+from perilune_shared.dataset.index import INDEX, read_index
+from perilune_shared.dataset.info_file import INFO_NAME, has_own_hash, read_info
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.names import IMAGE_KINDS
+from perilune_shared.dataset.schema import TABLES
+from perilune_shared.errors import UserError
+from perilune_shared.progress import NO_PROGRESS, Progress
+from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE
+from perilune_shared.validation.faults import Fault
+
+EXTRA_NAMES = frozenset(
+    {
+        "README.md",
+        "card.png",
+        "overview.png",
+        "croissant.json",
+        "LICENSE",
+        "LICENSE.md",
+        "LICENSE.txt",
+        "CITATION.cff",
+    }
+)
+"""Files that tools or users may add directly in the dataset; `perilune-manifest card` adds them to the index."""
+_RECORDS = "work"
+"""Folder of the records of a rendering in progress."""
+_LOCKS = (LOCK_NAME, f"{LOCK_NAME}.json")
+_READ_FOLDERS = ("manifest/", "shards/")
+"""Folders whose files are read without being named by a row."""
+_MAX_REPORTED = 1000
+_IN_INDEX = "as in the index"
+_HASH = "SHA-256"
+
+
+def check_files(dataset: Dataset, progress: Progress = NO_PROGRESS, replaced: Container[str] = ()) -> None:
+    """Raise UserError about the first fault of the files; a new index would hide it.
+
+    Files that will be `replaced`, frames, and unknown files that nothing reads may have faults.
+    """
+    for fault in file_faults(dataset, progress):
+        unread = fault.column == "file" and not fault.file.startswith(_READ_FOLDERS)
+        is_of_frames = fault.file == index.FOLDER
+        if not unread and not is_of_frames and fault.file not in replaced:
+            expected = f"{fault.expected}; see `perilune-manifest validate`"
+            raise UserError(dataset.store.at(fault.file), fault.column, fault.found, expected)
+
+
+def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[Fault]:
+    """Yield faults of dataset.json, of the index and of all files. The content of frames is not read.
+
+    The lock of a writer is accepted. In a dataset that is not complete, which has no index, so are its temporary files
+    and the records of its rendering.
+    """
+    try:
+        frames = _frame_files(dataset)
+    except UserError as error:
+        yield Fault.from_error("manifest/frames", None, error)
+        frames = None
+    sizes = {item.path: item.size_bytes for item in dataset.store.list()}
+    if not dataset.info.complete:
+        known = [*_named_by_format(dataset), *(frames["path"].to_pylist() if frames is not None else ())]
+        yield from _strays(dataset.info, sizes, known)
+        return
+    if not has_own_hash(dataset.store):
+        expected = "the SHA-256 that is its last member, of the text before it"
+        yield Fault.of(INFO_NAME, None, _HASH, "a different SHA-256", expected)
+    try:
+        # Read again: a card may have been added since the dataset was opened.
+        info = read_info(dataset.store)
+        rows = read_index(dataset.store, info)
+    except UserError as error:
+        yield Fault.from_error(error.where.removeprefix(f"{dataset.store.address}/"), None, error)
+        return
+    yield from _strays(info, sizes, rows["path"].to_pylist())
+    if frames is not None:
+        yield from _frame_faults(rows, frames)
+        rows = rows.filter(pc.invert(pc.is_in(rows["path"], frames["path"].combine_chunks())))
+        by_format = _named_by_format(dataset)
+        for path in [path for path in rows["path"].to_pylist() if path not in by_format][:_MAX_REPORTED]:
+            yield Fault.of(path, None, "file", "an unexpected file", "only files of the dataset format")
+    yield from _hash_faults(dataset, rows, sizes, progress)
+
+
+def _frame_files(dataset: Dataset) -> pa.Table:
+    """Return path, bytes and sha256 of the frames that are files, as in the table frames."""
+    pieces = [pa.schema([field.with_nullable(True) for field in INDEX]).empty_table()]
+    if dataset.info.images == "files":
+        columns = [f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "bytes", "sha256")]
+        frames = dataset.table("frames", columns)
+        for kind in IMAGE_KINDS:
+            own = frames.select([name for name in columns if name.startswith(kind)]).rename_columns(INDEX.names)
+            # Files of other types stay unexpected, even if a row of `frames` names them.
+            fits = pc.and_(
+                pc.ends_with(own["path"], f".{kind}"),
+                pc.invert(pc.match_substring_regex(own["path"], "^(manifest|shards|index)/")),
+            )
+            pieces.append(own.filter(pc.fill_null(fits, False)))
+    return pa.concat_tables([piece.replace_schema_metadata() for piece in pieces], promote_options="permissive")
+
+
+def _named_by_format(dataset: Dataset) -> set[str]:
+    """Return the paths of all files that a dataset may have, except frames."""
+    parts = {path for table in TABLES for path in dataset.parts(table)}
+    shards = set(dataset.shards()) if dataset.info.images == "packed" else set()
+    return parts | shards | EXTRA_NAMES
+
+
+def _strays(info: DatasetInfo, sizes: dict[str, int], known: list[str]) -> Iterator[Fault]:
+    """Yield the files that are not known, at most 1000; an unknown folder only once."""
+    own = {*known, INFO_NAME, *_LOCKS, *(part.path for part in info.index)}
+    strays = [path for path in sizes if path not in own]
+    if not info.complete:
+        strays = [path for path in strays if path.split("/")[0] != _RECORDS]
+        strays = [path for path in strays if not TEMPORARY_FILE.fullmatch(PurePosixPath(path).name)]
+    if not strays:
+        return
+    folders = {path.rpartition("/")[0] for path in own} | {index.FOLDER, *(f"manifest/{table}" for table in TABLES)}
+    folders |= {str(parent) for folder in folders for parent in PurePosixPath(folder).parents}
+    reported: dict[str, None] = {}
+    for path in strays:
+        above = [str(parent) for parent in reversed(PurePosixPath(path).parents)][1:]
+        reported.setdefault(next((folder for folder in above if folder not in folders), path))
+    for path in list(reported)[:_MAX_REPORTED]:
+        yield Fault.of(path, None, "file", "a file or folder that is not in the index", _cure(path))
+
+
+def _cure(path: str) -> str:
+    """Return what should be done about an unknown file."""
+    name = PurePosixPath(path).name
+    if path in EXTRA_NAMES:
+        return "a file in the index; `perilune-manifest card` on the dataset adds it, or delete it"
+    if path.startswith(f"{index.FOLDER}/") or TEMPORARY_FILE.fullmatch(name):
+        return "none: a stopped command left it; `perilune-manifest card` on the dataset removes it, or delete it"
+    return "only files of the dataset format (docs/reference/validation.md)"
+
+
+def _frame_faults(rows: pa.Table, frames: pa.Table) -> Iterator[Fault]:
+    """Compare the index with path, size and hash in the table frames; yield the first difference of each kind.
+
+    The file of these faults is the folder of the index.
+    """
+    place = pc.index_in(frames["path"], rows["path"].combine_chunks())
+    if place.null_count:
+        missing = frames["path"].filter(pc.is_null(place))[0].as_py()
+        yield Fault.of(index.FOLDER, None, "path", f"no {missing}", "every frame of the table frames")
+    frames, place = frames.filter(pc.is_valid(place)), place.drop_null()
+    for name in ("bytes", "sha256"):
+        found = rows[name].take(place)
+        equal = pc.fill_null(pc.equal(found, frames[name]), False)
+        row = pc.index(equal, False).as_py()
+        if row >= 0:
+            path, expected = frames["path"][row].as_py(), frames[name][row].as_py()
+            yield Fault.of(index.FOLDER, None, name, f"{found[row].as_py()} for {path}", f"{expected}, as in frames")
+
+
+def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progress: Progress) -> Iterator[Fault]:
+    """Compare size and hash of files with the index."""
+    store, total = dataset.store, (pc.sum(rows["bytes"]).as_py() or 0) / 1e6
+    task = progress.add_task("hashing", total=total, unit="MB")
+    for path, n_bytes, sha256 in zip(*(rows[name].to_pylist() for name in INDEX.names), strict=True):
+        if path not in sizes:
+            yield Fault.of(path, None, _HASH, "no such file", f"the file with SHA-256 {sha256}, {_IN_INDEX}")
+            continue
+        try:
+            if store.is_local:
+                store.plain_size(path)
+            if sizes[path] != n_bytes:
+                yield Fault.of(path, None, _HASH, f"{sizes[path]} bytes", f"{n_bytes} bytes, {_IN_INDEX}")
+            elif store.sha256(path, lambda n: progress.advance(task, n / 1e6)) != sha256:
+                yield Fault.of(path, None, _HASH, "a different SHA-256", f"SHA-256 {sha256}, {_IN_INDEX}")
+        except UserError as error:
+            yield Fault.of(path, None, _HASH, error.found, error.expected)
+    progress.update(task, completed=total)
