@@ -23,7 +23,7 @@ ROOMS = {
         "level_ground cache export"
     ),
     "render/perilune_render/jobs": (
-        "job records steps work_list report scene_renderer worker local here ray_actors run status estimate"
+        "job records identity steps work_list report scene_renderer worker local here ray_actors run status estimate"
     ),
     "train/perilune_train": "config cli_options data evaluation models training detect navigate explain cli",
     "train/perilune_train/detect": (

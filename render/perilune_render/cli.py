@@ -56,8 +56,8 @@ app.command()(status)
 
 @app.command()
 def develop(
-    dataset: Annotated[Path, typer.Option(help="Folder of a dataset with EXRs (dataset.render.exr=true).")],
-    out: Annotated[Path, typer.Option(help="Folder of the new dataset.")],
+    dataset: Annotated[str, typer.Option(help="Folder or address of a dataset with EXRs (dataset.render.exr=true).")],
+    out: Annotated[str, typer.Option(help="Folder or address of the new dataset.")],
     config: Annotated[
         Path | None, typer.Option(help="YAML file whose dataset.sensor and dataset.camera override the source's.")
     ] = None,
@@ -70,13 +70,14 @@ def develop(
         made = develop_dataset(ps.open_dataset(dataset), out, progress, config, tuple(setting or ()))
     counts = made.info.counts
     Console().print(
-        f"{out}: {counts.frames} frames, {counts.labels} labels; look at {out / 'overview.png'}", soft_wrap=True
+        f"{out}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}",
+        soft_wrap=True,
     )
 
 
 @app.command()
 def plan(
-    out: Annotated[Path, typer.Option(help="New folder of the manifest.")],
+    out: Annotated[str, typer.Option(help="New folder or address of the manifest.")],
     preset: Preset = "small",
     config: Config = None,
     setting: Setting = None,
@@ -100,7 +101,7 @@ def plan(
 
 @app.command()
 def regenerate(
-    manifest: Annotated[Path, typer.Option(help="Folder of a dataset or of its manifest alone.")],
+    manifest: Annotated[str, typer.Option(help="Folder or address of a dataset or of its manifest alone.")],
     frames: Annotated[
         list[str] | None, typer.Option(help="A frame_id such as scene-0000/trajectory-0000/000003; may be repeated.")
     ] = None,
@@ -110,7 +111,7 @@ def regenerate(
     ] = False,
     sample: Annotated[int, typer.Option(min=1, help="Number of frames in the sample, evenly spread.")] = 12,
     everything: Annotated[bool, typer.Option("--all", help="All frames of the manifest.")] = False,
-    out: Annotated[Path | None, typer.Option(help="Folder for the frames; optional with --verify.")] = None,
+    out: Annotated[str | None, typer.Option(help="Folder or address for the frames; optional with --verify.")] = None,
     dem: Annotated[Path | None, typer.Option(help="Local copy of the elevation model that the recipe names.")] = None,
     catalogue: Annotated[
         Path | None, typer.Option(help="Local copy of the crater catalogue that the recipe names.")
@@ -127,7 +128,7 @@ def regenerate(
         raise UserError("regenerate", "options", "--frames and --all", "one of them")
     ids = list(dict.fromkeys(frames or ())) or spread(dataset, dataset.info.counts.frames if everything else sample)
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
-        outcomes = regenerate_frames(dataset, ids, out or Path(folder), progress, dem, catalogue)
+        outcomes = regenerate_frames(dataset, ids, out or folder, progress, dem, catalogue)
     counts = {state: sum(o.state == state for o in outcomes) for state in get_args(State)}
     for outcome in outcomes:
         if outcome.state != "identical" and not verify:

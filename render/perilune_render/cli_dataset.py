@@ -23,6 +23,7 @@ from perilune_render.cli_options import (
 from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import UserError
 from perilune_shared.interrupts import ended_by_interrupt
+from perilune_shared.storage.store import Store, open_store
 from perilune_shared.terminal import console, progress_bar
 
 if TYPE_CHECKING:
@@ -90,12 +91,14 @@ def dataset(
     catalogue: Catalogue = None,
     kind: Annotated[KindChoice, typer.Option(help="Crater detection, navigation, or both.")] = "both",
     out: Annotated[
-        Path | None,
-        typer.Option(help="Folder for the datasets `detect` and `nav`; default: data/<preset>."),
+        str | None,
+        typer.Option(
+            help="Folder or address (s3://, gs://) of the datasets `detect` and `nav`; default: data/<preset>."
+        ),
     ] = None,
     manifest: Annotated[
-        Path | None,
-        typer.Option(help="Manifest or plan to render into --out, in place of a preset."),
+        str | None,
+        typer.Option(help="Folder or address of a manifest or plan to render into --out, in place of a preset."),
     ] = None,
     executor: Annotated[
         Literal["local", "ray"], typer.Option(help="Processes on this machine, or Ray (extra `ray`).")
@@ -136,14 +139,14 @@ def dataset(
     resolved = resolved_config(preset, config, setting, dem, catalogue)
     if kind != "nav":
         warn_of_size(resolved)
-    folder, failed = out or Path("data") / preset, False
+    store, failed = open_store(out if out is not None else f"data/{preset}"), False
     # Importing pyarrow and Numba takes seconds; check the settings first.
     from perilune_render.jobs.job import Job
     from perilune_render.jobs.run import RenderingFailed
 
     for name in KINDS if kind == "both" else (kind,):
         try:
-            made = _made(Job.planned(resolved, name, preset), folder / name, how)
+            made = _made(Job.planned(resolved, name, preset), store.sub(name), how)
         except RenderingFailed as error:
             _print_failures(error)
             failed = True
@@ -151,15 +154,15 @@ def dataset(
         if made is not None:
             counts = made.info.counts
             Console().print(
-                f"{folder / name}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
-                f"look at {folder / name / 'overview.png'}",
+                f"{made.store}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
+                f"look at {made.store.at('overview.png')}",
                 soft_wrap=True,
             )
     if failed:
         raise typer.Exit(1)
 
 
-def _made(job: "Job", out: Path, how: _How) -> "Dataset | None":
+def _made(job: "Job", out: Store, how: _How) -> "Dataset | None":
     """Do what the options ask for; the dataset if it is finished. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
@@ -181,7 +184,7 @@ def _made(job: "Job", out: Path, how: _How) -> "Dataset | None":
     return None
 
 
-def _print_estimate(job: "Job", out: Path, how: _How) -> None:
+def _print_estimate(job: "Job", out: Store, how: _How) -> None:
     from perilune_render.jobs.estimate import estimate
 
     with progress_bar() as progress:
@@ -221,7 +224,7 @@ def _was_given(context: typer.Context, name: str) -> bool:
 
 
 def _render_manifest(
-    manifest: Path, out: Path | None, dem: Path | None, catalogue: Path | None, others: list[str], how: _How
+    manifest: str, out: str | None, dem: Path | None, catalogue: Path | None, others: list[str], how: _How
 ) -> None:
     if out is None or others:
         found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
@@ -229,13 +232,13 @@ def _render_manifest(
             "--out, and --dem and --catalogue if the recipe names them; all other settings come from the manifest"
         )
         raise UserError("--manifest", "options", found, expected)
-    given = ps.open_dataset(manifest)
+    given, store = ps.open_dataset(manifest), open_store(out)
     from perilune_render.dataset.from_manifest import compare_hashes, plan_from_manifest
     from perilune_render.jobs.job import Job
     from perilune_render.jobs.run import RenderingFailed
 
     try:
-        made = _made(Job(*plan_from_manifest(given, dem, catalogue), str(manifest)), out, how)
+        made = _made(Job(*plan_from_manifest(given, dem, catalogue), manifest), store, how)
     except RenderingFailed as error:
         _print_failures(error)
         raise typer.Exit(1) from None
@@ -245,5 +248,5 @@ def _render_manifest(
     comparison = f"; {same} of {known} frames are byte-identical to the manifest's" if known else ""
     comparison += f"; terrain hash mismatch in {other_scenes} scenes" if other_scenes else "; terrain hashes match"
     Console().print(
-        f"{out}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{comparison}", soft_wrap=True
+        f"{store}: {made.info.counts.frames} frames, {made.info.counts.labels} labels{comparison}", soft_wrap=True
     )

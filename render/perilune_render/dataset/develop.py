@@ -1,7 +1,7 @@
 """Develop a dataset's frames again from their EXRs, with another sensor or another camera at the same place.
 
 Nothing is rendered, so Blender is not needed. An interrupted run is resumed as in rendering: a trajectory is finished
-once its part of `frames` is written, which comes last.
+once its commit is written, which comes last.
 """
 
 from dataclasses import asdict, dataclass
@@ -13,26 +13,27 @@ import pyarrow.compute as pc
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
-from perilune_render.dataset.folder import begin_or_resume, finish, first_difference, writing
+from perilune_render.dataset.begin import begin_or_resume, first_difference, open_finished, writing
+from perilune_render.dataset.finish import finish
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import recorded_shot
-from perilune_render.dataset.trajectory_parts import finish_trajectory, is_finished
+from perilune_render.dataset.work import OF_SCENE, commit, committed, write_scene
 from perilune_render.flight.plan import camera_of
 from perilune_render.frame_source import FrameSource
-from perilune_render.imaging.exr import read_radiance
+from perilune_render.imaging.exr import local_exr, read_radiance
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.provenance.recipe import recorded_settings, settings_of
 from perilune_render.provenance.versions import imaging_versions
 from perilune_shared.config import resolve_over
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
-from perilune_shared.dataset.parts import write_part
 from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_shared.progress import Progress
+from perilune_shared.storage.store import Address, Store, open_store
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,25 +44,28 @@ class Renderings:
     """Camera of the EXRs."""
     sun: Array
     """Unit vector towards the Sun, O_L (3,)."""
-    paths: dict[int, Path]
+    store: Store
+    """Dataset of the EXRs."""
+    paths: dict[int, str]
     """EXR of each frame, by the random seed with which it was rendered."""
 
     @classmethod
     def of(cls, source: Dataset, frames: pa.Table, seed: int, camera: Camera) -> "Renderings":
         """The EXRs of one trajectory: its rows of the table frames and its random seed."""
         rows = frames.to_pylist()
-        paths = {recorded_shot(row, seed).render_seed: source.file(row["exr_path"]) for row in rows}
-        return cls(camera, np.array(rows[0]["sun_direction"]), paths)
+        paths = {recorded_shot(row, seed).render_seed: row["exr_path"] for row in rows}
+        return cls(camera, np.array(rows[0]["sun_direction"]), source.store, paths)
 
     def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int, approach_deg: int = 0) -> Radiance:
         """Read the rendering of a random seed. Raises UserError if the file is damaged or of another size."""
-        return read_radiance(self.paths[seed], (self.camera.width_px, self.camera.height_px))
+        with local_exr(self.store, self.paths[seed]) as path:
+            return read_radiance(path, (self.camera.width_px, self.camera.height_px))
 
 
 def develop_dataset(
-    source: Dataset, out: Path, progress: Progress, config_file: Path | None = None, settings: tuple[str, ...] = ()
+    source: Dataset, out: Address, progress: Progress, config_file: Path | None = None, settings: tuple[str, ...] = ()
 ) -> Dataset:
-    """Make a dataset in `out` from the EXRs of `source`, with changes to its settings.
+    """Make a dataset at `out` from the EXRs of `source`, with changes to its settings.
 
     `config_file` and `settings` may change `dataset.sensor` and `dataset.camera` only. Scenes, craters, boulders and
     trajectories are copied. With the same camera the labels are copied and only their contrast is measured again; with
@@ -95,14 +99,16 @@ def develop_dataset(
             "recipes": recipes_of(recipe),
             "history": (),
             "counts": Counts(),
+            "index": (),
         }
     )
     if source.table("frames", ["exr_path"])["exr_path"].null_count:
         raise UserError(source.store, "exr_path", "null", "a dataset rendered with dataset.render.exr=true")
     if source.info.images != "files":
         raise UserError(source.store, "images", source.info.images, "a dataset with its EXRs")
-    with writing(out):
-        return _develop(source, config, info, (camera, exr_camera), out, progress)
+    store = open_store(out)
+    with writing(store):
+        return _develop(source, config, info, (camera, exr_camera), store, progress)
 
 
 def _develop(
@@ -110,26 +116,29 @@ def _develop(
     config: DatasetConfig,
     info: DatasetInfo,
     cameras: tuple[Camera, Camera],
-    out: Path,
+    out: Store,
     progress: Progress,
 ) -> Dataset:
-    """Begin or resume the dataset in `out`; `cameras`: the camera of its PNGs, then that of the source's EXRs."""
+    """Begin or resume the dataset at `out`; `cameras`: the camera of its PNGs, then that of the source's EXRs."""
     camera, exr_camera = cameras
     info = begin_or_resume(out, info)
     if info.complete:
-        return open_dataset(out)
+        return open_finished(out)
+    done, scenes = committed(out), []
     task = progress.add_task("develop", total=source.info.counts.frames, unit="frames")
     for scene_id in source.scene_ids():
         _copy_scene(source, out, scene_id, info.recipe())
         circles = RimCircles.from_table(source.table("craters", scene_id=scene_id).to_pandas())
-        for trajectory in source.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pylist():
+        trajectories = source.table("trajectories", ["trajectory_id", "seed"], scene_id=scene_id).to_pylist()
+        scenes.append((scene_id, [trajectory["trajectory_id"] for trajectory in trajectories]))
+        for trajectory in trajectories:
             frames = source.table("frames", scene_id=scene_id, trajectory_id=trajectory["trajectory_id"])
-            if not is_finished(out, scene_id, trajectory["trajectory_id"]):
+            if f"{scene_id}.{trajectory['trajectory_id']}" not in done:
                 renderings = Renderings.of(source, frames, trajectory["seed"], exr_camera)
                 frame_source = FrameSource.of(renderings, config, camera, circles)
                 _develop_trajectory(source, out, frame_source, frames, trajectory["seed"])
             progress.advance(task, len(frames))
-    return finish(out, info)
+    return finish(out, info, scenes)
 
 
 def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...]) -> DatasetConfig:
@@ -167,7 +176,7 @@ def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
     return camera, exr_camera
 
 
-def _develop_trajectory(source: Dataset, out: Path, frame_source: FrameSource, frames: pa.Table, seed: int) -> None:
+def _develop_trajectory(source: Dataset, out: Store, frame_source: FrameSource, frames: pa.Table, seed: int) -> None:
     """Develop one trajectory, given its rows of the source's table `frames` and its random seed."""
     scene_id, trajectory_id = (frames[name][0].as_py() for name in ("scene_id", "trajectory_id"))
     known = None
@@ -187,14 +196,11 @@ def _develop_trajectory(source: Dataset, out: Path, frame_source: FrameSource, f
             found = frame_source.with_contrast(Labels.from_table(own.to_pandas()), frame)
             labels.append(with_column(own, "contrast", found.contrast))
     rows = tables.developed_frame_table(frames, frame_source.camera, written)
-    finish_trajectory(out, scene_id, trajectory_id, labels, rows)
+    commit(out, scene_id, trajectory_id, labels, rows)
 
 
-def _copy_scene(source: Dataset, out: Path, scene_id: str, recipe: Recipe) -> None:
-    """Copy the missing parts of a scene; the scene's row gets the new recipe."""
-    for name in ("scenes", "craters", "boulders", "trajectories"):
-        if not (out / "manifest" / name / f"{scene_id}.parquet").exists():
-            rows = source.table(name, scene_id=scene_id)
-            if name == "scenes":
-                rows = with_column(rows, "recipe", [recipe.key] * len(rows))
-            write_part(out, name, scene_id, rows)
+def _copy_scene(source: Dataset, out: Store, scene_id: str, recipe: Recipe) -> None:
+    """Copy the rows of a scene; the scene's row gets the new recipe."""
+    rows = {name: source.table(name, scene_id=scene_id) for name in OF_SCENE}
+    rows["scenes"] = with_column(rows["scenes"], "recipe", [recipe.key] * len(rows["scenes"]))
+    write_scene(out, scene_id, rows)

@@ -1,7 +1,6 @@
 """Write a frame's files: PNG, and EXR on request."""
 
 import hashlib
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,17 +8,17 @@ import numpy as np
 from perilune_render.frame_source import Frame, FrameSource
 from perilune_render.imaging.exr import exr_bytes
 from perilune_shared.dataset.names import ImageKind, frame_path
-from perilune_shared.storage import files
+from perilune_shared.storage.store import Store
 
 
-def write_frame(root: Path, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool) -> dict[str, str | int]:
+def write_frame(store: Store, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool) -> dict[str, str | int]:
     """Write a frame's PNG, and with `exr` its EXR; returns its columns png_* and exr_* of the manifest.
 
     Does not wait until the files are on the disk.
     """
-    columns = _write(root, frame_id, "png", png_bytes(frame.image, source.sensor.bits))
+    columns = _write(store, frame_id, "png", png_bytes(frame.image, source.sensor.bits))
     if exr:
-        columns |= _write(root, frame_id, "exr", exr_bytes(frame.radiance, source.crater_index(frame)))
+        columns |= _write(store, frame_id, "exr", exr_bytes(frame.radiance, source.crater_index(frame)))
     return columns
 
 
@@ -29,10 +28,10 @@ def png_bytes(image: np.ndarray, bits: int) -> bytes:
     return cv2.imencode(".png", stored)[1].tobytes()
 
 
-def _write(root: Path, frame_id: str, kind: ImageKind, content: bytes) -> dict[str, str | int]:
+def _write(store: Store, frame_id: str, kind: ImageKind, content: bytes) -> dict[str, str | int]:
     """Write a file of a frame; returns its columns png_* or exr_* (by `kind`)."""
     path = frame_path(frame_id, kind)
-    files.write_bytes(files.inside(root, path), content, durable=False)
+    store.replace(path, content, durable=False)
     return {
         f"{kind}_path": path,
         f"{kind}_bytes": len(content),

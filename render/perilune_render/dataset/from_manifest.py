@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_render.config import DatasetConfig
-from perilune_render.dataset.folder import new_info
+from perilune_render.dataset.begin import new_info
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import view_envelope
@@ -52,7 +52,7 @@ def plan_from_manifest(
         ScenePlan(row["scene_id"], row["seed"], row["sun_azimuth_deg"], row["sun_elevation_deg"])
         for row in manifest.table("scenes").sort_by("scene_id").to_pylist()
     ]
-    recorded = _Recorded.of(manifest, [scene.scene_id for scene in scenes])
+    recorded = Recorded.of(manifest, [scene.scene_id for scene in scenes])
     of_scene = [row["scene_id"] for row in recorded.rows]
     places = {
         scene.scene_id: range(bisect_left(of_scene, scene.scene_id), bisect_right(of_scene, scene.scene_id))
@@ -77,7 +77,7 @@ def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Recorded(Sequence[TrajectoryPlan]):
+class Recorded(Sequence[TrajectoryPlan]):
     """The trajectories of a manifest, ordered by scene and name."""
 
     rows: list[dict[str, Any]]
@@ -88,7 +88,7 @@ class _Recorded(Sequence[TrajectoryPlan]):
     """Columns of the table `frames`, in the order of trajectories and of `frame_index`, each (n_frames, ...)."""
 
     @classmethod
-    def of(cls, manifest: Dataset, scene_ids: list[str]) -> "_Recorded":
+    def of(cls, manifest: Dataset, scene_ids: list[str]) -> "Recorded":
         """Read the trajectories and poses of some scenes of a manifest."""
         keys = ["scene_id", "trajectory_id"]
         trajectories = manifest.table("trajectories").sort_by([(key, "ascending") for key in keys])
@@ -115,7 +115,7 @@ class _Recorded(Sequence[TrajectoryPlan]):
         columns = {name: values[own] for name, values in self.columns.items()}
         flight = partial(_flight, row, columns)
         index, splits = tuple(columns["frame_index"].tolist()), tuple(columns["split"].tolist())
-        return TrajectoryPlan(row["scene_id"], row["trajectory_id"], row["seed"], index, splits, flight)
+        return TrajectoryPlan(row["scene_id"], row["trajectory_id"], row["seed"], index, splits, flight, is_drawn=False)
 
 
 def _values(column: pa.ChunkedArray) -> np.ndarray:

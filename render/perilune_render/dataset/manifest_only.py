@@ -1,12 +1,10 @@
 """Write the manifest of a planned dataset, without frames, to render it later: scenes, trajectories and poses."""
 
-from pathlib import Path
-
 import pyarrow as pa
 
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
-from perilune_render.dataset.folder import new_info
+from perilune_render.dataset.begin import new_info
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
 from perilune_render.provenance.recipe import recipe_of
@@ -17,9 +15,10 @@ from perilune_shared.dataset.schema import TABLES
 from perilune_shared.editing.writer import new_dataset
 from perilune_shared.interrupts import interrupts_held
 from perilune_shared.progress import Progress
+from perilune_shared.storage.store import Address
 
 
-def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Path, progress: Progress) -> None:
+def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Address, progress: Progress) -> None:
     """Write the manifest of the dataset `detect` or `nav`, as planned, into the new folder `out`.
 
     Every scene is generated once, for the hash of its content; nothing is rendered. Raises UserError on invalid

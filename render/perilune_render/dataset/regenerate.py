@@ -5,9 +5,10 @@ the ground and so change single pixels: frames are then compared within a tolera
 """
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.flight.view import view_envelope
 from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
-from perilune_render.imaging.exr import read_exr
+from perilune_render.imaging.exr import local_exr, read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.provenance.recipe import config_of, same_source
 from perilune_render.terrain.cache import cached_scene
@@ -32,14 +33,14 @@ from perilune_shared.config import resolve_over
 from perilune_shared.content import content_sha256
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Recipe
-from perilune_shared.dataset.names import ImageKind, frame_path
+from perilune_shared.dataset.names import ImageKind
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.nominal_trajectory import approach_deg
 from perilune_shared.interrupts import interrupts_held
 from perilune_shared.progress import Progress
-from perilune_shared.storage.files import sha256_of
 from perilune_shared.storage.locks import locked
 from perilune_shared.storage.png import png_header
+from perilune_shared.storage.store import Address, Store, open_store
 
 GREY_TOLERANCE = 2
 """Largest difference of a pixel within tolerance, grey levels of 255."""
@@ -63,8 +64,8 @@ class Outcome:
     """The same comparison for the EXR; None if the frame has none."""
     same_ground: bool
     """Whether the content hash of craters and boulders equals that of the scene's row."""
-    png_path: Path
-    """Path of the new PNG."""
+    png_path: str
+    """Address of the new PNG."""
 
     @property
     def state(self) -> State:
@@ -75,7 +76,7 @@ class Outcome:
 def regenerate(
     dataset: Dataset,
     frame_ids: Sequence[str],
-    out: Path,
+    out: Address,
     progress: Progress,
     dem: Path | None = None,
     catalogue: Path | None = None,
@@ -86,8 +87,9 @@ def regenerate(
     Raises UserError on frames that are not in the manifest, on recipes that this version does not support, and if `out`
     holds a dataset.
     """
-    if (out / "dataset.json").exists():
-        raise UserError(out, "--out", "a dataset; its frames would be replaced", "another folder")
+    store = open_store(out)
+    if store.exists("dataset.json"):
+        raise UserError(store, "--out", "a dataset; its frames would be replaced", "another folder")
     frames = dataset.table("frames")
     known = set(frames["frame_id"].to_pylist())
     for frame_id in frame_ids:
@@ -96,12 +98,12 @@ def regenerate(
     frames = frames.filter(pc.is_in(frames["frame_id"], pa.array(list(frame_ids), pa.string())))
     task = progress.add_task("regenerate", total=len(frames), unit="frames")
     outcomes = []
-    with locked(out):
+    with nullcontext() if store.folder is None else locked(store.folder):
         for scene in dataset.table("scenes").sort_by("scene_id").to_pylist():
             own = frames.filter(pc.equal(frames["scene_id"], scene["scene_id"])).sort_by("frame_id").to_pylist()
             if own:
                 progress.update(task, note=f"{scene['scene_id']}: generating ground")
-                outcomes += _of_scene(dataset, scene, own, out, dem, catalogue, lambda: progress.advance(task))
+                outcomes += _of_scene(dataset, scene, own, store, dem, catalogue, lambda: progress.advance(task))
     return outcomes
 
 
@@ -112,7 +114,7 @@ def spread(dataset: Dataset, n_frames: int) -> list[str]:
 
 
 def _of_scene(
-    dataset: Dataset, scene: dict, rows: list[dict], out: Path, dem: Path | None, catalogue: Path | None, advance
+    dataset: Dataset, scene: dict, rows: list[dict], out: Store, dem: Path | None, catalogue: Path | None, advance
 ) -> list[Outcome]:
     where = dataset.store.at("dataset.json")
     recipe = dataset.info.recipes.get(scene["recipe"])
@@ -147,10 +149,10 @@ def _of_scene(
             frame = source.take(recorded_shot(row, trajectory["seed"], approach))
             # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
             has_exr = row["exr_path"] is not None
-            write_frame(out, frame_id, source, frame, exr=has_exr)
-            png = _compared(dataset, row, "png", out)
-            exr = _compared(dataset, row, "exr", out) if has_exr else None
-            outcomes.append(Outcome(frame_id, png, exr, same_ground, out / frame_path(frame_id, "png")))
+            new = write_frame(out, frame_id, source, frame, exr=has_exr)
+            png = _compared(dataset, row, "png", out, new)
+            exr = _compared(dataset, row, "exr", out, new) if has_exr else None
+            outcomes.append(Outcome(frame_id, png, exr, same_ground, out.at(str(new["png_path"]))))
             if is_dark(frame.radiance):
                 dark.append(frame_id)
             advance()
@@ -169,20 +171,20 @@ def _ground_config(recipe: Recipe, config: DatasetConfig, where: object) -> Data
     return config.model_copy(update={"camera": camera})
 
 
-def _compared(dataset: Dataset, row: dict, kind: ImageKind, out: Path) -> State:
+def _compared(dataset: Dataset, row: dict, kind: ImageKind, out: Store, new: dict[str, Any]) -> State:
     """Compare a new file with the recorded hash and, if they differ, with the old file's pixels if it is present."""
-    new = out / frame_path(row["frame_id"], kind)
     if row[f"{kind}_sha256"] is None:
         return "new"
-    if sha256_of(new) == row[f"{kind}_sha256"]:
+    if new[f"{kind}_sha256"] == row[f"{kind}_sha256"]:
         return "identical"
     try:
         if kind == "png" and dataset.info.images in ("files", "packed"):
             frames = dataset.table("frames", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
             old = dict(dataset.pngs(frames.filter(pc.equal(frames["frame_id"], row["frame_id"]))))[row["frame_id"]]
-            return _state(png_outlier_share(old, new.read_bytes()))
+            return _state(png_outlier_share(old, out.read(new["png_path"])))
         if kind == "exr" and dataset.info.images == "files":
-            return _state(exr_outlier_share(read_exr(dataset.file(row["exr_path"])), read_exr(new)))
+            with local_exr(dataset.store, row["exr_path"]) as before, local_exr(out, new["exr_path"]) as after:
+                return _state(exr_outlier_share(read_exr(before), read_exr(after)))
     except UserError:
         pass  # the old file is missing or damaged, and the hash differs
     return "different"

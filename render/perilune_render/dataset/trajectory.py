@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import pyarrow as pa
 
@@ -12,12 +11,13 @@ from perilune_render.dataset import tables
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.real_ground import real_ground_share
 from perilune_render.dataset.shots import planned_shot
-from perilune_render.dataset.trajectory_parts import finish_trajectory
+from perilune_render.dataset.work import commit
 from perilune_render.flight.plan import TrajectoryPlan
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.imaging.darkness import is_dark
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.terrain.scene import Scene
+from perilune_shared.storage.store import Store
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,14 +33,14 @@ class _Written:
 
 
 def render_trajectory(
-    out: Path,
+    out: Store,
     source: FrameSource,
     trajectory: TrajectoryPlan,
     scene: Scene,
     config: DatasetConfig,
     advance: Callable[[], object] = lambda: None,
 ) -> list[str]:
-    """Render and write one trajectory of `scene` into the dataset's folder `out`; returns the ids of its dark frames.
+    """Render and write one trajectory of `scene` into the dataset at `out`; returns the ids of its dark frames.
 
     `source` renders the scene. A second thread develops, labels and writes each frame while the next one is rendered.
     `advance` is called after each frame, in order. The same arguments give the same bytes; a trajectory whose rendering
@@ -52,12 +52,12 @@ def render_trajectory(
         advance()
     rows = tables.frame_table(trajectory, source.camera, source.engine.sun, [frame.row for frame in frames])
     labels = [frame.labels for frame in frames]
-    finish_trajectory(out, trajectory.scene_id, trajectory.trajectory_id, labels, rows)
+    commit(out, trajectory.scene_id, trajectory.trajectory_id, labels, rows)
     return [trajectory.frame_id(place) for place, frame in enumerate(frames) if frame.is_dark]
 
 
 def _frames(
-    out: Path, source: FrameSource, trajectory: TrajectoryPlan, scene: Scene, config: DatasetConfig
+    out: Store, source: FrameSource, trajectory: TrajectoryPlan, scene: Scene, config: DatasetConfig
 ) -> Iterator[_Written]:
     """Render and write the frames of a trajectory, in order; rendering is one frame ahead of writing."""
 
@@ -77,7 +77,7 @@ def _frames(
             yield last.result()
 
 
-def _write(out: Path, frame_id: str, source: FrameSource, frame: Frame, scene: Scene, *, exr: bool) -> _Written:
+def _write(out: Store, frame_id: str, source: FrameSource, frame: Frame, scene: Scene, *, exr: bool) -> _Written:
     """Write the files of a frame and label it."""
     files = write_frame(out, frame_id, source, frame, exr=exr)
     share = real_ground_share(scene, source.engine.camera, *frame.shot.pose, frame.radiance.depth_m)

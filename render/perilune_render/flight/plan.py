@@ -61,6 +61,8 @@ class TrajectoryPlan:
     """Split of each frame."""
     draw_flight: Callable[[], Flight]
     """Returns the flight."""
+    is_drawn: bool = True
+    """Whether the flight follows from the seed; otherwise it is recorded in a manifest."""
 
     @cached_property
     def flight(self) -> Flight:

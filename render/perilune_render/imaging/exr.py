@@ -1,6 +1,9 @@
 """Read the EXR files that Blender writes; make and read the EXR files of datasets."""
 
+import contextlib
 import io
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +12,11 @@ import OpenEXR
 from perilune_render.imaging.radiance import Radiance
 from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
 from perilune_shared.errors import UserError
+from perilune_shared.storage import files
+from perilune_shared.storage.store import Store
 
 _MOST_CHANNELS = 64
+_LARGEST_BYTES = 2**30
 CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 
@@ -22,6 +28,18 @@ def exr_bytes(radiance: Radiance, crater: np.ndarray) -> bytes:
     stream = io.BytesIO()
     OpenEXR.File(header, channels).write(stream)
     return stream.getvalue()
+
+
+@contextlib.contextmanager
+def local_exr(store: Store, path: str) -> Iterator[Path]:
+    """Yield the path of an EXR of a dataset: OpenEXR reads files only, so an object is copied for the block."""
+    if store.folder is not None:
+        yield files.inside(store.folder, path)
+        return
+    with tempfile.NamedTemporaryFile(prefix="perilune-", suffix=".exr") as copy:
+        copy.write(store.read(path, most_bytes=_LARGEST_BYTES))
+        copy.flush()
+        yield Path(copy.name)
 
 
 def read_exr(path: Path, size_px: tuple[int, int] | None = None) -> dict[str, np.ndarray]:

@@ -5,7 +5,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from statistics import fmean
 
 import numpy as np
@@ -19,8 +18,10 @@ from perilune_render.jobs.job import Job
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.run import MakeExecutor, RenderingFailed
 from perilune_render.jobs.work_list import WorkList
-from perilune_shared.dataset.parts import read_part
+from perilune_shared.dataset.index import INDEX
+from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.progress import Progress
+from perilune_shared.storage.store import Address, open_store
 
 _N_FRAMES = 10
 """Number of frames rendered of each trajectory of the sample."""
@@ -59,13 +60,14 @@ class _Times(Report):
         self.end[place] = time.perf_counter()
 
 
-def estimate(job: Job, out: Path, progress: Progress, executor: MakeExecutor, n_workers: int) -> Estimate:
-    """Estimate a job in `out`, where some trajectories may be finished, with an executor of `n_workers` processes.
+def estimate(job: Job, address: Address, progress: Progress, executor: MakeExecutor, n_workers: int) -> Estimate:
+    """Estimate the rest of a job at an address, with an executor of `n_workers` processes.
 
     Renders ten frames for each process at the same time, from its own scene if there are as many. Writes nothing to
-    `out`. Raises UserError as `steps.check` and if a pose does not fit the ground, RenderingFailed if frames cannot be
-    rendered.
+    the address. Raises UserError as `steps.check` and if a pose does not fit the ground, RenderingFailed if frames
+    cannot be rendered.
     """
+    out = open_store(address)
     steps.check(job)
     left = steps.unfinished(job, out)
     if not left:
@@ -73,17 +75,17 @@ def estimate(job: Job, out: Path, progress: Progress, executor: MakeExecutor, n_
     sample = _sample(job, left, max(n_workers, 1))
     places = list(range(len(sample.plan.trajectories)))
     with tempfile.TemporaryDirectory(prefix="perilune-") as folder:
-        begin = time.perf_counter()
-        with executor(sample, Path(folder)) as own:
-            info = steps.prepare(sample, Path(folder), lambda scene_id: None)
+        begin, scratch = time.perf_counter(), open_store(folder)
+        with executor(sample, scratch) as own:
+            info = steps.prepare(sample, scratch, lambda scene_id: None)
             work, times = WorkList(sample.plan, places), _Times(sample, places, progress)
             own.render(work, times)
         if work.failures:
             raise RenderingFailed(out, {sample.name(place): error for place, error in work.failures.items()})
         finish_begin = time.perf_counter()
-        steps.finish(sample, Path(folder), info)
+        made = steps.finish(sample, scratch, info)
         finish_s = time.perf_counter() - finish_begin
-        bytes_of = _Bytes.of(Path(folder), sample)
+        bytes_of = _Bytes.of(made)
     frame_s = fmean((times.frames[p][-1] - times.frames[p][0]) / max(len(times.frames[p]) - 1, 1) for p in places)
     scene_s = max(fmean(times.frames[p][0] - times.begin[p] for p in places) - frame_s, 0.0)
     parts_s = fmean(times.end[p] - times.frames[p][-1] for p in places)
@@ -91,7 +93,7 @@ def estimate(job: Job, out: Path, progress: Progress, executor: MakeExecutor, n_
     n_parallel = min(max(n_workers, 1), len(left))
     work_s = n_frames * frame_s + len(left) * parts_s + max(n_scenes, n_parallel) * scene_s
     start_s = min(times.begin.values()) - begin
-    n_bytes = n_frames * bytes_of.frame + len(left) * bytes_of.trajectory + n_scenes * bytes_of.scene
+    n_bytes = bytes_of.fixed + n_frames * bytes_of.frame + n_scenes * bytes_of.scene
     return Estimate(n_frames, start_s + work_s / n_parallel + finish_s, n_bytes)
 
 
@@ -135,30 +137,27 @@ class _Bytes:
 
     frame: float
     """Of a frame's files and rows."""
-    trajectory: float
-    """Of a trajectory's parts, whatever the number of their rows."""
     scene: float
-    """Of a scene's parts."""
+    """Of a scene's rows."""
+    fixed: float
+    """Of the tables of frames and labels and of the index, whatever the number of their rows."""
 
     @classmethod
-    def of(cls, root: Path, sample: Job) -> "_Bytes":
-        """Those of a finished sample in the folder `root`."""
-        n_frames = sum(map(sample.n_frames, range(len(sample.plan.trajectories))))
-        n_trajectories, n_scenes = len(sample.plan.trajectories), len(sample.plan.scenes)
-        images = sum(path.stat().st_size for path in root.joinpath("frames").rglob("*") if path.is_file())
+    def of(cls, made: Dataset) -> "_Bytes":
+        """Those of a finished sample."""
+        images = sum(item.size_bytes for item in made.store.list("frames"))
+        index = pa.concat_tables(pq.read_table(pa.BufferReader(made.store.read(part.path))) for part in made.info.index)
         rows = fixed = 0.0
-        for name in ("frames", "labels"):
-            for path in root.joinpath("manifest", name).glob("*.parquet"):
-                part = read_part(path, name)
-                whole, half = (_parquet_bytes(part.slice(0, n)) for n in (len(part), len(part) // 2))
-                rows += 2 * (whole - half)
-                fixed += max(2 * half - whole, 0)
+        for table in (made.table("frames"), made.table("labels"), index.cast(INDEX)):
+            whole, half = (_parquet_bytes(table.slice(0, n)) for n in (len(table), len(table) // 2))
+            rows += 2 * (whole - half)
+            fixed += max(2 * half - whole, 0)
         ground = sum(
-            path.stat().st_size
+            item.size_bytes
             for name in ("scenes", "craters", "boulders", "trajectories")
-            for path in root.joinpath("manifest", name).glob("*.parquet")
+            for item in made.store.list(f"manifest/{name}")
         )
-        return cls((images + rows) / n_frames, fixed / n_trajectories, ground / n_scenes)
+        return cls((images + rows) / made.info.counts.frames, ground / made.info.counts.scenes, fixed)
 
 
 def _parquet_bytes(rows: pa.Table) -> int:

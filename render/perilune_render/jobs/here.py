@@ -1,7 +1,6 @@
 """Render a job in this process."""
 
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 
 from perilune_render.jobs.job import Job
@@ -9,12 +8,13 @@ from perilune_render.jobs.report import Report
 from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.work_list import WorkList
 from perilune_shared.errors import ends_run
+from perilune_shared.storage.store import Store
 
 
 class Here:
     """The executor that renders in this process, one trajectory after another."""
 
-    def __init__(self, job: Job, out: Path):
+    def __init__(self, job: Job, out: Store):
         self._renderer = SceneRenderer(job, out)
 
     def __enter__(self) -> "Here":

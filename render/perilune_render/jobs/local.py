@@ -22,6 +22,7 @@ from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
 from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Store
 
 RECYCLED_AFTER = 64
 """Number of trajectories after which a worker is replaced, so that its memory cannot grow without limit."""
@@ -69,8 +70,8 @@ class _Worker:
 class LocalWorkers:
     """The executor that renders in `n_workers` processes. Its workers end with the block, or with this process."""
 
-    def __init__(self, job: Job, out: Path, n_workers: int):
-        self._job, self._out, self._n_workers = job, out.absolute(), n_workers
+    def __init__(self, job: Job, out: Store, n_workers: int):
+        self._job, self._out, self._n_workers = job, out, n_workers
         self._workers: dict[Connection, _Worker] = {}
         self._lost_starts = 0
         self._scratch = tempfile.TemporaryDirectory(prefix="perilune-", ignore_cleanup_errors=True)

@@ -7,7 +7,6 @@ as to local workers (`WorkList`), so that an actor stays with its scene.
 import logging
 import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import ray
@@ -20,12 +19,13 @@ from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.work_list import WorkList
 from perilune_render.processor import SETTINGS
 from perilune_shared.errors import UserError, ends_run
+from perilune_shared.storage.store import Store, open_store
 
 
 class _Renderer:
     """The actor: a scene renderer in a process of Ray."""
 
-    def start(self, job: Job, out: Path) -> None:
+    def start(self, job: Job, out: Store) -> None:
         """Receive the job. Raises UserError if the code of this process is not that of the job."""
         self._renderer = SceneRenderer(job, out)
 
@@ -57,12 +57,14 @@ class _Actor:
 class RayActors:
     """The executor that renders with Ray, in `n_workers` actors, by default as many as the cluster has cores for.
 
-    `address` is that of a running cluster; None starts Ray on this machine for the duration of the block. `out` must be
-    at the same path on all machines.
+    `address` is that of a running cluster; None starts Ray on this machine for the duration of the block. A local
+    folder `out` must be at the same path on all machines.
     """
 
-    def __init__(self, job: Job, out: Path, n_workers: int | None, address: str | None):
-        self._job, self._out, self._address = job, out.absolute(), address
+    def __init__(self, job: Job, out: Store, n_workers: int | None, address: str | None):
+        self._job, self._address = job, address
+        # The processes of Ray have a working directory of their own.
+        self._out = out if out.folder is None else open_store(out.folder.absolute())
         self._n_workers = n_workers
         self._n_threads = job.config.render.threads or 1
         self._actors: list[_Actor] = []

@@ -1,10 +1,11 @@
 """Records of a rendering in progress, below work/ in the dataset, for `perilune-render status`.
 
-    work/plan.json                 number of trajectories and frames
+    work/plan.json                 number of trajectories and frames, identity of the plan
     work/running/<process>.json    one process: what it renders, and how many frames it has rendered
     work/failed/<trajectory>.json  the error of a trajectory that failed repeatedly
 
-No record affects what is rendered. They are removed when the dataset is finished.
+No record affects what is rendered, except that a dataset is resumed with its own plan alone. The records are removed
+with the rest of work/ when the dataset is finished.
 """
 
 import contextlib
@@ -12,31 +13,27 @@ import json
 import os
 import platform
 import secrets
-import shutil
 import time
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from perilune_render.jobs.job import Job
+from perilune_render.dataset.work import FOLDER
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Store
 
-FOLDER = "work"
 _INTERVAL_S = 10.0
 _LARGEST_BYTES = 100_000
 _RUNNING = frozenset({"trajectory", "frames", "since", "updated"})
 _FAILURE = frozenset({"trajectory", "error"})
 
 
-def write_plan(store: Store, job: Job) -> None:
-    """Record the size of a job, unless it is recorded."""
-    places = range(len(job.plan.trajectories))
-    if not store.exists(f"{FOLDER}/plan.json"):
-        _write(store, "plan", {"trajectories": len(places), "frames": sum(map(job.n_frames, places))})
+def write_plan(store: Store, plan: dict[str, Any]) -> None:
+    """Record the `trajectories` and `frames` of a job, and the identity of its `plan`."""
+    store.replace(f"{FOLDER}/plan.json", json.dumps(plan).encode())
 
 
 def read_plan(store: Store) -> dict[str, Any] | None:
-    """The recorded size of a job: `trajectories` and `frames`; None if there is no record."""
+    """The record of a job (`write_plan`); None if there is none."""
     return _read(store, f"{FOLDER}/plan.json") if store.exists(f"{FOLDER}/plan.json") else None
 
 
@@ -62,8 +59,10 @@ class RunningRecord:
 
     def remove(self) -> None:
         """Remove the record, if it was written."""
-        if self._updated:
-            self._store.delete(f"{FOLDER}/{self._name}.json")
+        # A store that does not answer is reported by what was written there before.
+        with contextlib.suppress(OSError, UserError):
+            if self._updated:
+                self._store.delete(f"{FOLDER}/{self._name}.json")
 
     def _write(self) -> None:
         self._updated = time.time()
@@ -98,14 +97,6 @@ def remove_running(store: Store) -> None:
 def failures(store: Store) -> dict[str, str]:
     """The error of each trajectory that failed repeatedly."""
     return {content["trajectory"]: content["error"] for _, content in _listed(store, "failed", _FAILURE)}
-
-
-def remove_all(store: Store) -> None:
-    """Remove all records."""
-    for item in list(store.list(FOLDER)):
-        store.delete(item.path)
-    if store.folder is not None:
-        shutil.rmtree(store.folder / FOLDER, ignore_errors=True)
 
 
 def _write(store: Store, name: str, content: dict[str, Any]) -> None:

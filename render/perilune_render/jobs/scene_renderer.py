@@ -1,16 +1,14 @@
-"""Render one trajectory of a job: the unit of work, which any process can do that has the job and the folder."""
+"""Render one trajectory of a job: the unit of work, which any process can do that has the job and the store."""
 
 import contextlib
 from collections.abc import Callable
-from pathlib import Path
 from types import TracebackType
 
 from perilune_render.blender.renderer import Renderer
-from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
-from perilune_render.dataset.folder import check_code
+from perilune_render.dataset.begin import check_code
 from perilune_render.dataset.trajectory import render_trajectory
-from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
+from perilune_render.dataset.work import write_scene
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.frame_source import FrameSource
 from perilune_render.jobs.job import Job
@@ -18,13 +16,8 @@ from perilune_render.jobs.records import RunningRecord
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene
-from perilune_shared.content import content_sha256
-from perilune_shared.dataset.parts import read_part, write_part
-from perilune_shared.errors import UserError
 from perilune_shared.interrupts import interrupts_held
-from perilune_shared.storage.store import open_store
-
-_GROUND = ("craters", "boulders")
+from perilune_shared.storage.store import Store
 
 
 class SceneRenderer:
@@ -34,10 +27,10 @@ class SceneRenderer:
     if the code of this process is not that of the job.
     """
 
-    def __init__(self, job: Job, out: Path):
+    def __init__(self, job: Job, out: Store):
         check_code(job.info.recipe(), with_dem=job.config.terrain.dem is not None)
         self._job, self._out = job, out
-        self._record = RunningRecord(open_store(out))
+        self._record = RunningRecord(out)
         self._grown: tuple[str, Scene] | None = None
         self._opened: tuple[str, Scene, FrameSource] | None = None
         self._closing = contextlib.ExitStack()
@@ -84,8 +77,9 @@ class SceneRenderer:
         if self._opened is None or self._opened[0] != scene_id:
             note(f"{scene_id}: generating ground")
             scene, plan, config = self.grow(scene_id), self._job.scene(scene_id), self._job.config
-            trajectories = self._job.plan.of_scene(scene_id)
-            write_scene(self._out, plan, scene, config, self._job.info.recipe().key, trajectories)
+            rows = tables.scene_tables(plan, scene, config, self._job.info.recipe().key)
+            trajectories = tables.trajectory_table(self._job.plan.of_scene(scene_id))
+            write_scene(self._out, scene_id, {**rows, "trajectories": trajectories})
             engine = self._closing.enter_context(Renderer(scene, config, self._job.plan.exr_camera, plan.sun))
             source = FrameSource.of(engine, config, self._job.plan.camera, RimCircles.of_scene(scene))
             self._opened = scene_id, scene, source
@@ -105,26 +99,3 @@ class SceneRenderer:
         """Release Blender and the memory of the scene."""
         self._opened = self._grown = None
         self._closing.close()
-
-
-def write_scene(
-    out: Path, plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str, trajectories: list[TrajectoryPlan]
-) -> None:
-    """Write the parts of a scene that are missing; `recipe` is the key of its recipe, `trajectories` holds all of it.
-
-    Raises UserError if the dataset has other craters or boulders in this scene.
-    """
-    parts = {
-        **tables.scene_tables(plan, scene, config, recipe),
-        "trajectories": tables.trajectory_table(trajectories),
-    }
-    paths = {name: out / "manifest" / name / f"{plan.scene_id}.parquet" for name in parts}
-    existing = {name: read_part(paths[name], name) if paths[name].exists() else parts[name] for name in _GROUND}
-    # Compared by content hash, since craters computed on another processor may differ in the last digits.
-    if content_sha256(*existing.values()) != content_sha256(*(parts[name] for name in _GROUND)):
-        expected = "the elevation model and catalogue that the dataset was started with"
-        raise UserError(paths["craters"], "craters", "other craters or boulders", expected)
-    for name, rows in parts.items():
-        # Another process may write the same scene at the same time, with the same content.
-        with contextlib.suppress(FileExistsError):
-            write_part(out, name, plan.scene_id, rows)

@@ -4,6 +4,7 @@ import json
 import time
 from dataclasses import dataclass
 
+from perilune_render.dataset.work import committed
 from perilune_render.jobs import records
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.names import KINDS
@@ -61,7 +62,7 @@ def status_of(store: Store) -> Status:
     if plan is None:
         expected = "the record of its plan: run its `perilune-render dataset` command again"
         raise UserError(store.at(f"{records.FOLDER}/plan.json"), "plan", "no such record", expected)
-    n_done = sum(item.path.endswith(".parquet") for item in store.list("manifest/frames"))
+    n_done = len(committed(store))
     processes, now = records.running(store), time.time()
     alive = [process for process in processes if now - process["updated"] < SILENT_S]
     return Status(

@@ -33,9 +33,14 @@ def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
 
 def write_sheet(path: Path, pictures: list[np.ndarray], columns: int) -> None:
     """Write pictures of one size, grey or colour, row by row with a thin gap, as one PNG."""
+    write_bytes(path, sheet_png(pictures, columns))
+
+
+def sheet_png(pictures: list[np.ndarray], columns: int) -> bytes:
+    """Pictures of one size, grey or colour, row by row with a thin gap, as the bytes of a PNG."""
     colour = [p if p.ndim == 3 else cv2.cvtColor(p, cv2.COLOR_GRAY2BGR) for p in pictures]
     padded = [cv2.copyMakeBorder(p, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=(40, 40, 40)) for p in colour]
     while len(padded) % columns:
         padded.append(np.full_like(padded[0], 40))
     rows = [np.hstack(padded[i : i + columns]) for i in range(0, len(padded), columns)]
-    write_bytes(path, cv2.imencode(".png", np.vstack(rows))[1].tobytes())
+    return cv2.imencode(".png", np.vstack(rows))[1].tobytes()

@@ -79,8 +79,11 @@ def _write(path: Path, scene: Scene) -> None:
         elif field.name != "view":
             arrays[field.name] = value
     path.parent.mkdir(parents=True, exist_ok=True)
-    with written_aside(path) as aside, aside.open("wb") as file:
-        np.savez(file, **arrays)
+    # np.savez closes its archive a second time, with a traceback, if the disk is full.
+    with written_aside(path) as aside, aside.open("wb") as file, zipfile.ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
 
 
 def _read(path: Path, view: ViewEnvelope) -> Scene | None:

@@ -15,7 +15,7 @@ import functools
 import hashlib
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -107,8 +107,15 @@ class Store(abc.ABC):
         """
 
     @abc.abstractmethod
-    def replace(self, path: str, content: bytes) -> None:
-        """Write a file: all of it or nothing; replaces a file of that path."""
+    def replace(self, path: str, content: bytes, *, durable: bool = True) -> None:
+        """Write a file: all of it or nothing; replaces a file of that path.
+
+        With `durable`, a local file is synchronised to disk.
+        """
+
+    @abc.abstractmethod
+    def sync(self, paths: Iterable[str]) -> None:
+        """Synchronise files that were written without `durable` to disk; objects are durable once written."""
 
     @abc.abstractmethod
     def delete(self, path: str) -> None:
@@ -179,8 +186,11 @@ class LocalStore(Store):
         elif size != len(content) or self.read(path) != content:
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), self.at(path))
 
-    def replace(self, path: str, content: bytes) -> None:
-        files.write_bytes(files.inside(self.folder, path), content)
+    def replace(self, path: str, content: bytes, *, durable: bool = True) -> None:
+        files.write_bytes(files.inside(self.folder, path), content, durable=durable)
+
+    def sync(self, paths: Iterable[str]) -> None:
+        files.sync_all(files.inside(self.folder, path) for path in paths)
 
     def delete(self, path: str) -> None:
         files.inside(self.folder, path).unlink(missing_ok=True)
@@ -264,9 +274,12 @@ class ObjectStore(Store):
                 if found != len(content) or self.read(path) != content:
                     raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), self.at(path)) from None
 
-    def replace(self, path: str, content: bytes) -> None:
+    def replace(self, path: str, content: bytes, *, durable: bool = True) -> None:
         with store_faults(self.at(path)):
             self._system.pipe_file(self._key(path), content)
+
+    def sync(self, paths: Iterable[str]) -> None:
+        return
 
     def delete(self, path: str) -> None:
         with store_faults(self.at(path)):

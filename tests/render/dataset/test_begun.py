@@ -10,22 +10,21 @@ from tests.helpers.scenes import config_with
 
 from perilune_render.config import KindConfig
 from perilune_render.config_terrain import TerrainConfig
-from perilune_render.dataset import tables
+from perilune_render.dataset.begin import begin_or_resume, new_info
 from perilune_render.dataset.develop import develop_dataset
-from perilune_render.dataset.folder import begin_or_resume, check_begun, new_info
 from perilune_render.dataset.regenerate import png_outlier_share, regenerate
 from perilune_render.flight.plan import make_plan
+from perilune_render.jobs import steps
 from perilune_render.jobs.here import Here
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
 from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.parts import write_part
 from perilune_shared.editing.subset import subset
 from perilune_shared.errors import UserError
-from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.storage.locks import locked
+from perilune_shared.storage.store import open_store
 
 
 @pytest.fixture
@@ -35,20 +34,19 @@ def drawn(tmp_path):
 
 @pytest.fixture
 def begun(tmp_path):
-    """A plan of one descent, and a folder in which it is rendered, but for pictures."""
-    plan = make_plan(config_with(), "detect")
-    (descent,) = plan.trajectories
-    paths = [{"png_path": f"frames/{descent.frame_id(i)}.png"} for i in range(len(descent.splits))]
-    frames = tables.frame_table(descent, plan.camera, sun_direction(0.0, 30.0), paths)
-    write_part(tmp_path, "frames", f"{descent.scene_id}.{descent.trajectory_id}", frames)
-    write_part(tmp_path, "trajectories", descent.scene_id, tables.trajectory_table([descent]))
-    return plan, tmp_path
+    """A job of one recorded descent, and the folder in which its dataset is begun."""
+    config = config_with()
+    plan = make_plan(config, "detect")
+    plan = replace(plan, trajectories=tuple(replace(descent, is_drawn=False) for descent in plan.trajectories))
+    job = Job(plan, config, new_info(config, plan, recipe_of(config, "detect", "tiny")), "configuration")
+    steps.prepare(job, open_store(tmp_path), lambda scene_id: None)
+    return job, tmp_path
 
 
 def test_a_rendering_goes_on_with_its_own_plan_alone(begun):
-    plan, out = begun
-    check_begun(out, plan)
-    (descent,) = plan.trajectories
+    job, out = begun
+    steps.prepare(job, open_store(out), lambda scene_id: None)
+    (descent,) = job.plan.trajectories
     moved = replace(descent.flight, position_m=descent.flight.position_m + 1.0)
     for other in (
         replace(descent, draw_flight=lambda: moved),
@@ -57,8 +55,9 @@ def test_a_rendering_goes_on_with_its_own_plan_alone(begun):
         replace(descent, trajectory_id="trajectory-0009"),
         replace(descent, seed=descent.seed + 1),
     ):
-        with pytest.raises(UserError, match="another plan"):
-            check_begun(out, replace(plan, trajectories=(other,)))
+        changed = replace(job, plan=replace(job.plan, trajectories=(other,)))
+        with pytest.raises(UserError, match=r"plan\.json: plan: got that of another dataset"):
+            steps.prepare(changed, open_store(out), lambda scene_id: None)
 
 
 def test_a_manifest_is_not_rendered_into_itself(tmp_path):
@@ -66,16 +65,14 @@ def test_a_manifest_is_not_rendered_into_itself(tmp_path):
     info = new_info(config, make_plan(config, "detect"), recipe_of(config, "detect", "tiny"))
     write_info(tmp_path, info.model_copy(update={"images": "planned", "complete": True}))
     with pytest.raises(UserError, match="planned"):
-        begin_or_resume(tmp_path, info)
+        begin_or_resume(open_store(tmp_path), info)
 
 
 def test_a_folder_that_another_process_writes_is_left_alone(begun):
-    plan, out = begun
-    config = config_with()
-    info = new_info(config, plan, recipe_of(config, "detect", "tiny"))
+    job, out = begun
     before = sorted(out.rglob("*"))
     with locked(out), pytest.raises(UserError, match=f"locked by PID {os.getpid()} "):
-        render_job(Job(plan, config, info, "configuration"), out, Progress(), Here)
+        render_job(job, out, Progress(), Here)
     assert sorted(out.rglob("*")) == before
 
 
@@ -107,10 +104,10 @@ def test_another_release_with_the_same_code_resumes(tmp_path):
     old = recipe.model_copy(update={"versions": {**recipe.versions, "perilune_render": "0.0.1"}})
     plan = make_plan(config, "detect")
     write_info(tmp_path, new_info(config, plan, old))
-    assert begin_or_resume(tmp_path, new_info(config, plan, recipe)).recipe() == old
+    assert begin_or_resume(open_store(tmp_path), new_info(config, plan, recipe)).recipe() == old
     other = recipe.model_copy(update={"versions": {**recipe.versions, "opencv": "0.0.1"}})
     with pytest.raises(UserError, match="opencv"):
-        begin_or_resume(tmp_path, new_info(config, plan, other))
+        begin_or_resume(open_store(tmp_path), new_info(config, plan, other))
 
 
 def test_settings_that_are_none_are_refused(drawn):

@@ -143,7 +143,7 @@ def test_verify_counts_what_is_the_same(tiny_detect):
 
 def test_a_frame_from_elsewhere_is_compared_and_reported(tiny_detect, tmp_path):
     """As another machine would have rendered it: a few grey levels off, or another picture."""
-    part = sorted((tiny_detect / "manifest/frames").glob("scene-0000*"))[0]
+    part = tiny_detect / "manifest/frames/all.parquet"
     rows = pq.read_table(part).to_pandas()
     for row, shift in ((0, 1), (1, 40)):
         path = tiny_detect / rows.at[row, "png_path"]
@@ -161,7 +161,7 @@ def test_a_frame_from_elsewhere_is_compared_and_reported(tiny_detect, tmp_path):
 
 
 def test_another_ground_is_reported(tiny_detect):
-    part = tiny_detect / "manifest/scenes/scene-0001.parquet"
+    part = tiny_detect / "manifest/scenes/all.parquet"
     rows = pq.read_table(part).to_pandas()
     rows["content_sha256"] = "0" * 64
     pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["scenes"], preserve_index=False), part)

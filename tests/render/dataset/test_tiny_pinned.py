@@ -60,7 +60,7 @@ def holds_floats(kind):
 def bytes_of(folder):
     """Per dataset: hashes of the tables' values, and of the files by folder and kind.
 
-    The recipe's key in the table scenes and dataset.json hold the hash of the code, which may change.
+    The recipe's key in the table scenes, the index and dataset.json hold the hash of the code, which may change.
     """
     found = {}
     for kind in KINDS:
@@ -71,7 +71,7 @@ def bytes_of(folder):
         groups = {}
         for path in sorted(path for path in root.rglob("*") if path.suffix in (".png", ".exr", ".parquet")):
             name = path.relative_to(root).as_posix()
-            if not name.startswith("manifest/scenes/"):
+            if not name.startswith(("manifest/scenes/", "index/")):
                 group = path.name if path.parent == root else f"{name.partition('/')[0]}/*{path.suffix}"
                 groups.setdefault(group, []).append([name, hashlib.sha256(path.read_bytes()).hexdigest()])
         found[kind] = {name: hash_of(table.to_pylist()) for name, table in tables.items()}

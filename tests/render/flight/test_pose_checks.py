@@ -133,7 +133,7 @@ def test_an_impossible_configuration_ends_the_command_with_one_line(
 
 
 def test_an_edited_pose_of_a_manifest_is_refused(tiny_detect, tmp_path, monkeypatch, capsys):
-    part = tiny_detect / "manifest" / "frames" / "scene-0000.trajectory-0000.parquet"
+    part = tiny_detect / "manifest" / "frames" / "all.parquet"
     rows = pq.read_table(part)
     positions = rows["position_m"].to_pylist()
     positions[3] = [positions[3][0], positions[3][1], -500.0]

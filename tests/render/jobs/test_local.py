@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 from rich.progress import Progress
 
+from perilune_render.dataset.work import committed
 from perilune_render.jobs import local
 from perilune_render.jobs.here import Here
 from perilune_render.jobs.local import LocalWorkers
@@ -14,6 +15,7 @@ from perilune_render.jobs.run import RenderingFailed, render_job
 from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
+from perilune_shared.storage.store import open_store
 from perilune_shared.validation.validate import validate
 
 
@@ -56,7 +58,7 @@ def test_a_trajectory_that_always_fails_is_named_and_all_others_are_rendered(job
         render_job(job, tmp_path, Progress(disable=True), AlwaysKilledWorkers)
     assert failed.value.errors == {"scene-0000/trajectory-0001": "worker killed by SIGKILL"}
     dataset = open_dataset(tmp_path)
-    assert not dataset.info.complete and dataset.table("frames").num_rows == 36
+    assert not dataset.info.complete and len(committed(dataset.store)) == 3
     render_job(job, tmp_path, Progress(disable=True), Here)
     assert files_of(tmp_path) == whole and validate(open_dataset(tmp_path)) == []
 
@@ -66,7 +68,7 @@ def test_code_that_changed_since_the_beginning_is_refused(job, tmp_path):
     other = recipe.model_copy(update={"versions": {**recipe.versions, "imaging": "0" * 16}})
     changed = replace(job, info=job.info.model_copy(update={"recipes": {other.key: other}}))
     with pytest.raises(UserError, match=r"perilune_render: versions: got imaging .* expected the code that"):
-        SceneRenderer(changed, tmp_path)
+        SceneRenderer(changed, open_store(tmp_path))
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 from rich.progress import Progress
 
 from perilune_render.jobs.run import render_job
+from perilune_shared.storage.store import open_store
 
 pytest.importorskip("ray", reason="needs Ray (extra `ray`)")
 
@@ -59,7 +60,7 @@ def test_a_process_that_is_lost_while_it_generates_the_first_scene_is_replaced(j
                 self.lost = True
                 ray.kill(self._actors[0].handle)
 
-    with Loses(job, tmp_path, n_workers=1, address=None) as actors:
+    with Loses(job, open_store(tmp_path), n_workers=1, address=None) as actors:
         actors.check_scene("scene-0000")
         assert actors.lost and [actor.scene_id for actor in actors._actors] == ["scene-0000"]
 

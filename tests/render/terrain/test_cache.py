@@ -1,4 +1,7 @@
 import dataclasses
+import os
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -90,3 +93,27 @@ def test_a_folder_that_cannot_be_written_is_no_failure(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("PERILUNE_CACHE", str(tmp_path / "file" / "scenes"))
     assert cache.cached_scene(config_with(), VIEW, 3).seed == 3
+
+
+WRITE = """
+import resource, signal, sys
+import numpy as np
+from pathlib import Path
+from tests.helpers.scenes import config_with, flat_scene, round_craters
+from perilune_render.terrain import cache
+scene = flat_scene(3000, 201, round_craters([(10, 0, 60, 0.1)]))
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
+try:
+    cache._write(Path(sys.argv[1]), scene)
+except OSError:
+    print("full")
+"""
+
+
+def test_a_full_disk_is_one_error_and_leaves_no_file(tmp_path):
+    """A file size limit stands in for a full disk."""
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
+    command = [sys.executable, "-c", WRITE, str(tmp_path / "scene.npz")]
+    done = subprocess.run(command, capture_output=True, text=True, env=plain)
+    assert (done.stdout, done.stderr) == ("full\n", "") and not list(tmp_path.iterdir())

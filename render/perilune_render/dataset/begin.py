@@ -1,0 +1,136 @@
+"""Begin a dataset that is rendered or developed, or resume it; who may write to it."""
+
+import contextlib
+from collections.abc import Iterator
+
+from perilune_render.config import DatasetConfig
+from perilune_render.dataset.finish import remove_work
+from perilune_render.dataset.work import FOLDER
+from perilune_render.flight.plan import Plan
+from perilune_render.provenance.versions import all_versions
+from perilune_shared.dataset.info_file import INFO_NAME, info_bytes
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
+from perilune_shared.dataset.schema import SCHEMA_VERSION
+from perilune_shared.errors import UserError
+from perilune_shared.storage.claims import claimed
+from perilune_shared.storage.locks import LOCK_NAME, TEMPORARY_FILE, locked
+from perilune_shared.storage.store import Store
+
+LICENCE = "CC-BY-4.0"
+
+
+def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
+    """The dataset.json of a new dataset."""
+    settings = config.kind(recipe.kind)
+    split_by = settings.split_by
+    if split_by == "scene" and config.terrain.dem is not None and settings.n_scenes > 1:
+        split_by = "trajectory"  # all scenes show the same elevation model
+    return DatasetInfo(
+        name=f"perilune-{config.name}-{recipe.kind}",
+        kind=recipe.kind,
+        schema_version=SCHEMA_VERSION,
+        complete=False,
+        images="files",
+        split_by=split_by,
+        camera=CameraRecord.of(plan.camera),
+        exr_camera=CameraRecord.of(plan.exr_camera) if config.render.exr else None,
+        recipes=recipes_of(recipe),
+        counts=Counts(),
+        licence=LICENCE,
+    )
+
+
+@contextlib.contextmanager
+def writing(store: Store) -> Iterator[None]:
+    """Keep other runs from writing a dataset: the lock of a folder, a claim in an object store.
+
+    A finished dataset needs none: it may be on a read-only disk. Raises UserError if another run is writing.
+    """
+    if is_begun(store) and open_dataset(store).info.complete:
+        yield
+    elif store.folder is not None:
+        with locked(store.folder):
+            yield
+    else:
+        with claimed(store, f"{FOLDER}/claims"):
+            yield
+
+
+def is_begun(store: Store) -> bool:
+    """Whether an address holds a dataset. Raises UserError if it holds something else."""
+    if store.folder is not None:
+        others = [p.name for p in (store.folder.iterdir() if store.folder.exists() else ()) if not _is_own(p.name)]
+    else:
+        begun = store.exists(INFO_NAME)
+        others = [] if begun else [item.path for item in store.list() if not _is_own(item.path.partition("/")[0])]
+    # Checked last, since another process may be beginning the same dataset; it writes dataset.json first.
+    begun = store.exists(INFO_NAME)
+    if others and not begun:
+        expected = "an empty or new folder or address, or a dataset to resume"
+        raise UserError(store, "--out", "a folder with other content", expected)
+    return begun
+
+
+def _is_own(name: str) -> bool:
+    """Whether a name is of a file that may be there before dataset.json is."""
+    return name == FOLDER or name.startswith(LOCK_NAME) or TEMPORARY_FILE.fullmatch(name) is not None
+
+
+def begin_or_resume(store: Store, info: DatasetInfo) -> DatasetInfo:
+    """Write the dataset.json of a new dataset, or read that of an existing one with the same settings.
+
+    Raises UserError if the address holds anything else.
+    """
+    if not is_begun(store):
+        # Another process may begin the same dataset at the same time.
+        with contextlib.suppress(FileExistsError):
+            store.write(INFO_NAME, info_bytes(info, store.at(INFO_NAME)))
+    existing = open_dataset(store).info
+    if len(existing.recipes) != 1 or existing.history != info.history:
+        raise UserError(store, "--out", f"a dataset with other recipes or history: {existing.name}", "another folder")
+    if existing.images != info.images:
+        raise UserError(store, "--out", f"a dataset whose frames are {existing.images}", "another folder")
+    for name in ("kind", "config", "versions", "developed_from"):
+        recorded, requested = (_compared(each.recipe(), name) for each in (existing, info))
+        if recorded != requested:
+            raise UserError(
+                store.at(INFO_NAME),
+                name,
+                first_difference(recorded, requested),
+                "the settings that this dataset was started with, or another --out",
+            )
+    return existing
+
+
+def open_finished(store: Store) -> Dataset:
+    """Open a complete dataset; remove what a run that was killed left below work/."""
+    remove_work(store)
+    return open_dataset(store)
+
+
+def check_code(recipe: Recipe, *, with_dem: bool) -> None:
+    """Raises UserError if code or libraries of this process are not those of a recipe."""
+    recorded, found = (_without_releases(versions) for versions in (recipe.versions, all_versions(with_dem=with_dem)))
+    if recorded != found:
+        expected = "the code that the rendering began with: render with one version from start to end"
+        raise UserError("perilune_render", "versions", first_difference(recorded, found), expected)
+
+
+def _compared(recipe: Recipe, name: str) -> object:
+    """One field of a recipe as it is compared on resuming."""
+    return _without_releases(recipe.versions) if name == "versions" else getattr(recipe, name)
+
+
+def _without_releases(versions: dict[str, str]) -> dict[str, str]:
+    """Versions without perilune's release numbers, since hashes identify its code."""
+    return {name: version for name, version in versions.items() if not name.startswith("perilune")}
+
+
+def first_difference(recorded: object, requested: object, path: str = "") -> str:
+    """The first setting, in order of names, in which two trees of plain data differ, with both values."""
+    if isinstance(recorded, dict) and isinstance(requested, dict):
+        for key in sorted({*recorded, *requested}):
+            if recorded.get(key) != requested.get(key):
+                return first_difference(recorded.get(key), requested.get(key), f"{path}.{key}".lstrip("."))
+    return f"{path} {requested!r} in place of the recorded {recorded!r}".strip()

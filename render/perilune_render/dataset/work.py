@@ -1,0 +1,113 @@
+"""The finished trajectories of a dataset in progress, below work/.
+
+    work/<table>/<scene>.parquet               scenes, craters, boulders, trajectories: the rows of a scene
+    work/<table>/<scene>.<trajectory>.parquet  frames, labels: the rows of a trajectory
+    work/index/<scene>.<trajectory>.parquet    commit of a trajectory: its files and rows, with sizes and hashes
+
+The commit is written last: a trajectory is finished once it exists. Until then all is written again, since an attempt
+that was killed may have left any part of it. `finish` merges these files into the tables of the dataset.
+"""
+
+import hashlib
+from collections.abc import Mapping
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from perilune_shared.dataset.index import INDEX, frame_rows, index_rows
+from perilune_shared.dataset.label_rows import with_frame_columns
+from perilune_shared.dataset.names import stem_of
+from perilune_shared.dataset.parts import Part, Written
+from perilune_shared.dataset.schema import complete
+from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Store
+
+FOLDER = "work"
+OF_SCENE = ("scenes", "craters", "boulders", "trajectories")
+"""Tables with a file for each scene."""
+OF_TRAJECTORY = ("frames", "labels")
+"""Tables with a file for each trajectory."""
+
+
+def committed(store: Store) -> set[str]:
+    """Names of all finished trajectories, as scene-0000.trajectory-0000, by one listing."""
+    listed = (item.path for item in store.list(f"{FOLDER}/index"))
+    return {stem_of(path) for path in listed if path.endswith(".parquet") and not stem_of(path).startswith(".")}
+
+
+def is_committed(store: Store, scene_id: str, trajectory_id: str) -> bool:
+    """Whether a trajectory is finished."""
+    return store.exists(_path("index", f"{scene_id}.{trajectory_id}"))
+
+
+def commit(store: Store, scene_id: str, trajectory_id: str, labels: list[pa.Table], frames: pa.Table) -> None:
+    """Write the rows of a trajectory whose files are written, then its commit.
+
+    `labels` holds the labels of each frame, `frames` the rows of all frames.
+    """
+    name = f"{scene_id}.{trajectory_id}"
+    tables = {"frames": frames, "labels": with_frame_columns(pa.concat_tables(labels), frames)}
+    rows = index_rows(_write(store, table, name, tables[table]) for table in OF_TRAJECTORY)
+    files = frame_rows(frames)
+    store.sync([*files["path"].to_pylist(), *rows["path"].to_pylist()])
+    store.replace(_path("index", name), _parquet(pa.concat_tables([rows, files])))
+
+
+def write_scene(store: Store, scene_id: str, tables: Mapping[str, pa.Table]) -> None:
+    """Write the rows of a scene unless they are written; the table `scenes` comes last.
+
+    Raises UserError if the dataset has other craters or boulders in this scene.
+    """
+    path = _path("scenes", scene_id)
+    if store.exists(path):
+        # Compared by content hash, since craters computed on another processor may differ in the last digits.
+        recorded, found = (
+            rows["content_sha256"].to_pylist() for rows in (Part(store, path, "scenes").read(), tables["scenes"])
+        )
+        if recorded != found:
+            expected = "the elevation model and catalogue that the dataset was started with"
+            raise UserError(store.at(path), "craters", "other craters or boulders", expected)
+        return
+    written = [_write(store, table, scene_id, tables[table]) for table in OF_SCENE[::-1]]
+    store.sync(file.path for file in written)
+
+
+def scene_rows(store: Store, scene_id: str) -> dict[str, pa.Table]:
+    """The rows of a scene. Raises UserError if they cannot be read."""
+    return {table: Part(store, _path(table, scene_id), table).read() for table in OF_SCENE}
+
+
+def trajectory_rows(store: Store, name: str) -> tuple[dict[str, pa.Table], pa.Table]:
+    """The rows of a finished trajectory by table, and those of its frames' files in the index.
+
+    Raises UserError if its rows are not those of its commit.
+    """
+    committed = Part(store, _path("index", name), "index", INDEX).read()
+    listed = {row["path"]: row for row in committed.slice(0, len(OF_TRAJECTORY)).to_pylist()}
+    found = {}
+    for table in OF_TRAJECTORY:
+        path = _path(table, name)
+        recorded = listed.get(path, {"bytes": 0, "sha256": ""})
+        content = store.read(path, most_bytes=recorded["bytes"])
+        if hashlib.sha256(content).hexdigest() != recorded["sha256"]:
+            expected = f"SHA-256 {recorded['sha256']}; delete {_path('index', name)} to render the trajectory again"
+            raise UserError(store.at(path), "SHA-256", "a different SHA-256", expected)
+        found[table] = pq.read_table(pa.BufferReader(content))
+    return found, committed.slice(len(OF_TRAJECTORY))
+
+
+def _path(table: str, name: str) -> str:
+    return f"{FOLDER}/{table}/{name}.parquet"
+
+
+def _write(store: Store, table: str, name: str, rows: pa.Table) -> Written:
+    """Write rows of a table; does not wait until they are on the disk."""
+    content = _parquet(complete(table, rows))
+    store.replace(_path(table, name), content, durable=False)
+    return Written.of(_path(table, name), content)
+
+
+def _parquet(rows: pa.Table) -> bytes:
+    sink = pa.BufferOutputStream()
+    pq.write_table(rows, sink, compression="zstd")
+    return sink.getvalue().to_pybytes()
