@@ -47,7 +47,7 @@ def writing(store: Store) -> Iterator[None]:
 
     A finished dataset needs none: it may be on a read-only disk. Raises UserError if another run is writing.
     """
-    if is_begun(store) and open_dataset(store).info.complete:
+    if is_complete(store):
         yield
     elif store.folder is not None:
         with locked(store.folder):
@@ -55,6 +55,11 @@ def writing(store: Store) -> Iterator[None]:
     else:
         with claimed(store, f"{FOLDER}/claims"):
             yield
+
+
+def is_complete(store: Store) -> bool:
+    """Whether an address holds a finished dataset. Raises UserError if its dataset.json is damaged."""
+    return store.exists(INFO_NAME) and open_dataset(store).info.complete
 
 
 def is_begun(store: Store) -> bool:

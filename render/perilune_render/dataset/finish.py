@@ -4,7 +4,6 @@ Killed at any moment, the same command finishes it with the same bytes: dataset.
 that it names, and work/ is removed last.
 """
 
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -54,10 +53,7 @@ def finish(store: Store, info: DatasetInfo, scenes: Iterable[tuple[str, list[str
 
 def remove_work(store: Store) -> None:
     """Remove what is left below work/ in a complete dataset."""
-    for item in [*store.list(work.FOLDER)]:
-        store.delete(item.path)
-    if store.folder is not None:
-        shutil.rmtree(store.folder / work.FOLDER, ignore_errors=True)
+    store.delete_below(work.FOLDER)
 
 
 def _read_ahead(read: Callable[[_Given], _Found], given: Iterable[_Given]) -> Iterator[tuple[_Given, _Found]]:

@@ -16,10 +16,18 @@ def write_frame(store: Store, frame_id: str, source: FrameSource, frame: Frame, 
 
     Does not wait until the files are on the disk.
     """
-    columns = _write(store, frame_id, "png", png_bytes(frame.image, source.sensor.bits))
-    if exr:
-        columns |= _write(store, frame_id, "exr", exr_bytes(frame.radiance, source.crater_index(frame)))
+    columns: dict[str, str | int] = {}
+    for kind, content in frame_contents(source, frame, exr=exr).items():
+        columns |= _write(store, frame_id, kind, content)
     return columns
+
+
+def frame_contents(source: FrameSource, frame: Frame, *, exr: bool) -> dict[ImageKind, bytes]:
+    """The content of a frame's PNG, and with `exr` of its EXR."""
+    contents: dict[ImageKind, bytes] = {"png": png_bytes(frame.image, source.sensor.bits)}
+    if exr:
+        contents["exr"] = exr_bytes(frame.radiance, source.crater_index(frame))
+    return contents
 
 
 def png_bytes(image: np.ndarray, bits: int) -> bytes:

@@ -22,7 +22,7 @@ from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
 from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
-from perilune_shared.storage.store import Store
+from perilune_shared.storage.store import Store, open_store
 
 RECYCLED_AFTER = 64
 """Number of trajectories after which a worker is replaced, so that its memory cannot grow without limit."""
@@ -71,7 +71,7 @@ class LocalWorkers:
     """The executor that renders in `n_workers` processes. Its workers end with the block, or with this process."""
 
     def __init__(self, job: Job, out: Store, n_workers: int):
-        self._job, self._out, self._n_workers = job, out, n_workers
+        self._job, self._out, self._n_workers = job, for_other_processes(out), n_workers
         self._workers: dict[Connection, _Worker] = {}
         self._lost_starts = 0
         self._scratch = tempfile.TemporaryDirectory(prefix="perilune-", ignore_cleanup_errors=True)
@@ -191,6 +191,13 @@ class LocalWorkers:
         except subprocess.TimeoutExpired:
             worker.process.kill()
             worker.process.wait()
+
+
+def for_other_processes(out: Store) -> Store:
+    """A store as other processes can open it, with other working directories. Raises UserError if they cannot."""
+    if out.address.startswith("memory://"):
+        raise UserError(out, "--out", "memory of this process", "--workers 0, or an address that workers can open")
+    return out if out.folder is None else open_store(out.folder.absolute())
 
 
 def default_workers(job: Job, n_threads: int | None) -> int:

@@ -13,13 +13,13 @@ import ray
 from ray.exceptions import RayActorError, RayTaskError
 
 from perilune_render.jobs.job import Job
-from perilune_render.jobs.local import LOST_STARTS, ONE_THREAD, RECYCLED_AFTER
+from perilune_render.jobs.local import LOST_STARTS, ONE_THREAD, RECYCLED_AFTER, for_other_processes
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.work_list import WorkList
 from perilune_render.processor import SETTINGS
 from perilune_shared.errors import UserError, ends_run
-from perilune_shared.storage.store import Store, open_store
+from perilune_shared.storage.store import Store
 
 
 class _Renderer:
@@ -62,9 +62,7 @@ class RayActors:
     """
 
     def __init__(self, job: Job, out: Store, n_workers: int | None, address: str | None):
-        self._job, self._address = job, address
-        # The processes of Ray have a working directory of their own.
-        self._out = out if out.folder is None else open_store(out.folder.absolute())
+        self._job, self._address, self._out = job, address, for_other_processes(out)
         self._n_workers = n_workers
         self._n_threads = job.config.render.threads or 1
         self._actors: list[_Actor] = []

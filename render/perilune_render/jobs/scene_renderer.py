@@ -8,7 +8,7 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.dataset import tables
 from perilune_render.dataset.begin import check_code
 from perilune_render.dataset.trajectory import render_trajectory
-from perilune_render.dataset.work import write_scene
+from perilune_render.dataset.work import FOLDER, write_scene
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.frame_source import FrameSource
 from perilune_render.jobs.job import Job
@@ -31,6 +31,7 @@ class SceneRenderer:
         check_code(job.info.recipe(), with_dem=job.config.terrain.dem is not None)
         self._job, self._out = job, out
         self._record = RunningRecord(out)
+        self._shared = None if out.is_local else out.sub(f"{FOLDER}/scenes")
         self._grown: tuple[str, Scene] | None = None
         self._opened: tuple[str, Scene, FrameSource] | None = None
         self._closing = contextlib.ExitStack()
@@ -47,7 +48,7 @@ class SceneRenderer:
             self.close()  # frees the ground of the last scene first
             job = self._job
             with interrupts_held():
-                scene = cached_scene(job.config, job.plan.view, job.scene(scene_id).seed)
+                scene = cached_scene(job.config, job.plan.view, job.scene(scene_id).seed, self._shared)
             trajectories = job.plan.of_scene(scene_id)
             if trajectories:
                 check_poses(Poses.planned(trajectories), job.plan.exr_camera, scene, job.where)

@@ -5,7 +5,7 @@
 
 from collections.abc import Callable
 
-from perilune_render.dataset.begin import begin_or_resume, is_begun
+from perilune_render.dataset.begin import begin_or_resume, is_begun, is_complete
 from perilune_render.dataset.finish import finish as finish_dataset
 from perilune_render.dataset.work import committed
 from perilune_render.flight.pose_checks import check_plan
@@ -43,6 +43,8 @@ def prepare(job: Job, out: Store, check_scene: Callable[[str], object]) -> Datas
 
 def unfinished(job: Job, out: Store) -> list[int]:
     """Places of the trajectories that are still to be rendered, in the order of the plan."""
+    if is_complete(out):
+        return []
     finished = committed(out)
     return [
         place

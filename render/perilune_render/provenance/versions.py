@@ -17,7 +17,7 @@ IMAGING = (
     _SETTINGS,
     "perilune_render.frame_source:",
     "perilune_render.dataset.shots:",
-    "perilune_render.dataset.frame_files:write_frame",
+    "perilune_render.dataset.frame_files:frame_contents",
     "perilune_render.dataset.tables:",
     "perilune_render.dataset.real_ground:real_ground_share",
 )

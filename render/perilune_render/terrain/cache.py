@@ -25,7 +25,8 @@ from perilune_render.terrain.craters.rims import Rims
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import Scene, grow_scene
-from perilune_shared.storage.files import sha256_of, written_aside
+from perilune_shared.storage.files import sha256_of, write_bytes, written_aside
+from perilune_shared.storage.store import Store
 
 _PARTS: dict[str, type] = {"grid": Grid, "craters": Craters, "rims": Rims, "boulders": Boulders}
 
@@ -55,16 +56,25 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
-def cached_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
-    """The scene of a seed, read from the cache, or generated and stored there."""
+def cached_scene(config: DatasetConfig, view: ViewEnvelope, seed: int, shared: Store | None = None) -> Scene:
+    """The scene of a seed, read from the cache, or generated and stored there.
+
+    The files of the cache are also read from and written to `shared`, which other machines use too.
+    """
     if config.render.cache_gib == 0:
         return grow_scene(config, view, seed)
     path = cache_folder() / f"{scene_key(config, view, seed)}.npz"
     scene = _read(path, view)
+    if scene is None and shared is not None and shared.exists(path.name):
+        with contextlib.suppress(OSError):
+            write_bytes(path, shared.read(path.name))
+        scene = _read(path, view)
     if scene is None:
         scene = grow_scene(config, view, seed)
         with contextlib.suppress(OSError):
             _write(path, scene)
+            if shared is not None:
+                shared.write(path.name, path.read_bytes())  # another machine may have been faster: FileExistsError
             _make_room(path.parent, config.render.cache_gib * 2**30)
     return scene
 

@@ -14,6 +14,7 @@ import errno
 import functools
 import hashlib
 import os
+import shutil
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -121,6 +122,10 @@ class Store(abc.ABC):
     def delete(self, path: str) -> None:
         """Delete a file if it exists."""
 
+    @abc.abstractmethod
+    def delete_below(self, prefix: str) -> None:
+        """Delete all files below a prefix."""
+
 
 Address = str | os.PathLike[str] | Store
 """A local path, the address of a prefix of an object store, or an open store."""
@@ -194,6 +199,9 @@ class LocalStore(Store):
 
     def delete(self, path: str) -> None:
         files.inside(self.folder, path).unlink(missing_ok=True)
+
+    def delete_below(self, prefix: str) -> None:
+        shutil.rmtree(files.inside(self.folder, prefix), ignore_errors=True)
 
 
 class ObjectStore(Store):
@@ -287,6 +295,12 @@ class ObjectStore(Store):
                 self._system.rm_file(self._key(path))
             except FileNotFoundError:
                 return
+
+    def delete_below(self, prefix: str) -> None:
+        found = [self._key(item.path) for item in self.list(prefix)]
+        with store_faults(self.at(prefix)):
+            if found:  # many in one request, where the store allows it
+                self._system.rm(found)
 
 
 def open_store(address: Address) -> Store:

@@ -16,6 +16,7 @@ from perilune_render.dataset.trajectory import render_trajectory
 from perilune_render.dataset.work import write_scene
 from perilune_render.frame_source import FrameSource
 from perilune_render.jobs.job import Job
+from perilune_render.jobs.local import LocalWorkers
 from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_shared.dataset.manifest import open_dataset
@@ -85,6 +86,10 @@ class StoppingStore(ObjectStore):
     def delete(self, path):
         self._change()
         super().delete(path)
+
+    def delete_below(self, prefix):
+        for item in [*self.list(prefix)]:
+            self.delete(item.path)
 
 
 @pytest.fixture(scope="module")
@@ -190,6 +195,7 @@ def test_changed_rows_of_a_finished_trajectory_are_found(flat_job):
 @pytest.mark.parametrize(
     ("variables", "out", "message"),
     [
+        ({}, "ftp://host/moon", "expected a path, s3://"),
         ({}, "s3://no-such-bucket-here/moon", "bucket: got no such bucket"),
         ({"AWS_ENDPOINT_URL": "http://127.0.0.1:9", "AWS_MAX_ATTEMPTS": "1"}, "s3://b/moon", "again to resume"),
     ],
@@ -206,3 +212,10 @@ def test_two_workers_on_s3_give_the_same_bytes_as_a_folder(options, whole, s3_bu
     done = in_process.call(main, "dataset", *options, "--workers", "2", "--out", f"{s3_bucket}/moon")
     assert done.returncode == 0, done.stderr
     assert objects(f"{s3_bucket}/moon/detect") == whole
+    again = in_process.call(main, "dataset", *options, "--out", f"{s3_bucket}/moon", "--dry-run")
+    assert again.stdout.startswith(f"{s3_bucket}/moon/detect: 0 frames left"), again.stderr
+
+
+def test_workers_cannot_share_the_memory_of_a_process(job):
+    with pytest.raises(UserError, match="--workers 0"):
+        LocalWorkers(job, open_store("memory://moon"), 2)

@@ -13,6 +13,7 @@ from perilune_render.flight.view import view_envelope
 from perilune_render.terrain import cache
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.geometry.camera import Camera
+from perilune_shared.storage.store import open_store
 
 CAMERA = Camera.from_field_of_view(32, 32, 50.0)
 FLIGHT = FlightConfig()
@@ -117,3 +118,22 @@ def test_a_full_disk_is_one_error_and_leaves_no_file(tmp_path):
     command = [sys.executable, "-c", WRITE, str(tmp_path / "scene.npz")]
     done = subprocess.run(command, capture_output=True, text=True, env=plain)
     assert (done.stdout, done.stderr) == ("full\n", "") and not list(tmp_path.iterdir())
+
+
+def test_a_scene_is_shared_with_machines_that_have_another_cache(folder, monkeypatch):
+    shared = open_store("memory://shared-scenes")
+    grown = cache.cached_scene(config_with(), VIEW, 3, shared)
+    (kept,) = folder.iterdir()
+    assert shared.read(kept.name) == kept.read_bytes()
+    kept.unlink()
+    monkeypatch.setattr(cache, "grow_scene", None)  # not called
+    same(cache.cached_scene(config_with(), VIEW, 3, shared), grown)
+    assert [path.name for path in folder.iterdir()] == [kept.name]
+
+
+def test_a_scene_that_another_machine_has_shared_meanwhile_is_left_alone(folder, monkeypatch):
+    shared = open_store("memory://shared-meanwhile")
+    shared.write(f"{cache.scene_key(config_with(), VIEW, 3)}.npz", b"of another machine")
+    grown = cache.cached_scene(config_with(), VIEW, 3, shared)
+    same(cache.cached_scene(config_with(), VIEW, 3), grown)
+    assert [shared.read(item.path) for item in shared.list()] == [b"of another machine"]
