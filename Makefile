@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -132,8 +132,11 @@ bench-kill: setup ## renderings disturbed at random moments (SIGKILL, Ctrl-C, fu
 bench-scale: setup ## frames per second by executor, number of processes and threads; writes runs/bench/scale.json
 	@$(BIN)/python -m benchmarks.dataset.scale
 
-bench-requests: setup ## requests and bytes of a frame in an S3 store; writes runs/bench/requests.json
+bench-requests: setup ## requests of a frame, trajectory, scene and dataset in an S3 store; writes runs/bench/requests.json
 	@$(BIN)/python -m benchmarks.dataset.requests
+
+bench-scaling: setup ## core hours and bytes of up to 100 million frames, estimated; writes runs/bench/scaling.json
+	@$(BIN)/python -m benchmarks.dataset.scaling
 
 compare-nac: setup ## compare rendered frames with real NAC crops (NAC=folder); writes runs/nac/
 	@$(BIN)/python -m benchmarks.nac.compare "$(NAC)" $(COMMON) --out "$(RUNS)/nac"
