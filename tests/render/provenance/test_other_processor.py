@@ -10,13 +10,15 @@ import pytest
 from tests.helpers.other_processor import OTHER_PROCESSOR
 from tests.helpers.scenes import config_with
 
+from perilune_render.dataset import tables
+from perilune_render.dataset.work import write_scene
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.view import view_envelope
-from perilune_render.jobs.scene_renderer import write_scene
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
+from perilune_shared.storage.store import open_store
 
 CAMERA = Camera.from_field_of_view(32, 32, 50.0)
 CONFIG = config_with(terrain={"spacing_px": 2.0})
@@ -71,11 +73,17 @@ def test_a_recipe_says_if_numpy_came_before_perilune(first, arithmetic):
 
 
 def test_a_scene_with_other_last_digits_is_resumed(tmp_path):
-    plan = make_plan(CONFIG, "detect")
+    (planned,) = (plan := make_plan(CONFIG, "detect")).scenes
     scene = grow_scene(CONFIG, view_envelope(CAMERA, CONFIG.detect.flight), 3)
-    write_scene(tmp_path, plan.scenes[0], scene, CONFIG, "0" * 16, plan.trajectories)
+
+    def write(ground):
+        rows = tables.scene_tables(planned, ground, CONFIG, "0" * 16)
+        trajectories = tables.trajectory_table(plan.of_scene(planned.scene_id))
+        write_scene(open_store(tmp_path), planned.scene_id, {**rows, "trajectories": trajectories})
+
+    write(scene)
     rims = replace(scene.rims, z_m=scene.rims.z_m * (1 + 1e-15), depth_m=scene.rims.depth_m * (1 - 1e-15))
-    write_scene(tmp_path, plan.scenes[0], replace(scene, rims=rims), CONFIG, "0" * 16, plan.trajectories)
+    write(replace(scene, rims=rims))
     other = replace(scene.rims, depth_m=scene.rims.depth_m + 0.01)
     with pytest.raises(UserError, match="other craters"):
-        write_scene(tmp_path, plan.scenes[0], replace(scene, rims=other), CONFIG, "0" * 16, plan.trajectories)
+        write(replace(scene, rims=other))

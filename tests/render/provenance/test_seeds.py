@@ -8,7 +8,7 @@ from tests.helpers.scenes import config_with
 
 from perilune_render.config import CameraConfig, DatasetConfig, FlightConfig, KindConfig, SunConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
-from perilune_render.dataset.folder import new_info
+from perilune_render.dataset.begin import new_info
 from perilune_render.dataset.from_manifest import plan_from_manifest
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.flight.plan import make_plan

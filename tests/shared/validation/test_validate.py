@@ -102,7 +102,7 @@ def test_a_truncated_part_is_found(tiny_detect, table):
 
 
 def test_a_missing_part_is_found(tiny_detect):
-    sorted((tiny_detect / "manifest/labels").glob("*.parquet"))[1].unlink()
+    sorted((tiny_detect / "manifest/labels").glob("*.parquet"))[0].unlink()
     assert any(fault.column == "counts.labels" for fault in validate(open_dataset(tiny_detect)))
 
 
@@ -125,7 +125,7 @@ def test_a_column_may_have_another_meaning_but_no_other_unit(tiny_detect, key, c
     pq.write_table(rows.cast(rows.schema.set(place, changed)), path)
     dataset = open_dataset(tiny_detect)
     assert {fault.column for fault in part_faults(dataset, dataset.parts("frames")[0], "frames")} == columns
-    assert dataset.table("frames").num_rows > rows.num_rows
+    assert dataset.table("frames").num_rows == 24
 
 
 def test_another_schema_version_is_refused(tiny_detect):
@@ -139,8 +139,8 @@ def test_another_schema_version_is_refused(tiny_detect):
 def test_parts_are_never_rewritten(tiny_detect):
     rows = read_part(sorted((tiny_detect / "manifest/scenes").glob("*.parquet"))[0], "scenes")
     with pytest.raises(FileExistsError):
-        write_part(tiny_detect, "scenes", "scene-0000", rows)
-    write_part(tiny_detect, "scenes", "scene-0009", rows)
+        write_part(tiny_detect, "scenes", "all", rows)
+    write_part(tiny_detect, "scenes", "scene-0009", rows[:1])
     assert count_rows(open_dataset(tiny_detect)).scenes == 4
 
 
