@@ -9,6 +9,7 @@ import pytest
 from rich.progress import Progress
 
 from perilune_render.jobs.run import render_job
+from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
 
 pytest.importorskip("ray", reason="needs Ray (extra `ray`)")
@@ -81,6 +82,10 @@ def test_a_lost_node_is_replaced_by_one_that_joins(job, whole, files_of, tmp_pat
                 cluster.add()
 
     with LocalCluster(1) as cluster:
+        two_threads = job.with_threads(2, 1)
+        refused = pytest.raises(UserError, match="machines with 0 and 1 cores, expected a machine with 2")
+        with refused, RayActors(two_threads, open_store(tmp_path), n_workers=None, address=cluster.address):
+            pass
         progress = LosesNode(disable=True)
         render_job(job, tmp_path, progress, partial(RayActors, n_workers=1, address=cluster.address))
     # The node's raylet and agent, and the process that renders.
