@@ -17,7 +17,8 @@ import numpy as np
 from benchmarks.figures import write_figures
 from perilune_render.config import DatasetConfig
 from perilune_render.jobs.here import Here
-from perilune_render.jobs.run import make_dataset
+from perilune_render.jobs.job import Job
+from perilune_render.jobs.run import render_job
 from perilune_shared.config import resolve
 
 WARM_UP = 200
@@ -72,7 +73,7 @@ def main(n_frames: int) -> None:
     config = resolve(DatasetConfig, "dataset", "perilune_render", "tiny", None, chosen)
     measured = Measured()
     with tempfile.TemporaryDirectory() as folder:
-        make_dataset(config, "detect", "tiny", Path(folder) / "made", measured, Here)
+        render_job(Job.planned(config, "detect", "tiny"), Path(folder) / "made", measured, Here)
     frames, mib = np.array(list(measured.mib)), np.array(list(measured.mib.values()))
     first = mib[(frames >= WARM_UP) & (frames <= 100 * PER_SCENE)].mean()
     last = mib[frames > n_frames - 100 * PER_SCENE].mean()

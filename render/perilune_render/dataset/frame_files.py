@@ -8,15 +8,15 @@ import numpy as np
 from perilune_render.frame_source import Frame, FrameSource
 from perilune_render.imaging.exr import exr_bytes
 from perilune_shared.dataset.names import ImageKind, frame_path
-from perilune_shared.storage.store import Store
+from perilune_shared.storage.store import Address, Store, open_store
 
 
-def write_frame(store: Store, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool) -> dict[str, str | int]:
+def write_frame(out: Address, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool) -> dict[str, str | int]:
     """Write a frame's PNG, and with `exr` its EXR; returns its columns png_* and exr_* of the manifest.
 
     Does not wait until the files are on the disk.
     """
-    columns: dict[str, str | int] = {}
+    store, columns = open_store(out), dict[str, str | int]()
     for kind, content in frame_contents(source, frame, exr=exr).items():
         columns |= _write(store, frame_id, kind, content)
     return columns

@@ -22,6 +22,7 @@ class WholeTables:
     def __init__(self, store: Store, *, most_rows: int = MOST_ROWS_WRITTEN, replace: bool = False):
         self._store, self._most_rows, self._replace = store, most_rows, replace
         self._buffered: dict[str, list[pa.Table]] = defaultdict(list)
+        self._n_buffered = dict.fromkeys(TABLES, 0)
         self._n_parts = dict.fromkeys(TABLES, 0)
         self._n_rows = dict.fromkeys(TABLES, 0)
         self._written: list[Written] = []
@@ -36,11 +37,12 @@ class WholeTables:
         rows = complete(name, rows)
         self._n_rows[name] += len(rows)
         while len(rows):
-            free = self._most_rows - sum(map(len, self._buffered[name]))
+            free = self._most_rows - self._n_buffered[name]
             if not free:
                 self._write(name)
                 continue
             self._buffered[name].append(rows[:free])
+            self._n_buffered[name] += len(self._buffered[name][-1])
             rows = rows[free:]
 
     def finish(self) -> list[Written]:
@@ -52,6 +54,7 @@ class WholeTables:
 
     def _write(self, name: str) -> None:
         rows = pa.concat_tables([TABLES[name].empty_table(), *self._buffered.pop(name, [])])
+        self._n_buffered[name] = 0
         stem = f"{WHOLE_TABLE}.{self._n_parts[name]:04d}" if self._n_parts[name] else WHOLE_TABLE
         per_group = max(_FEWEST_ROWS_PER_GROUP, len(rows) // _MOST_GROUPS)
         self._written.append(write_part(self._store, name, stem, rows, per_group, replace=self._replace))
