@@ -62,7 +62,7 @@ def test_a_frame_is_made_again(name, tmp_path):
     with Progress(disable=True) as progress:
         (outcome,) = regenerate(open_dataset(FOLDER / name), [frame_id], tmp_path, progress, dem)
     assert outcome.same_ground
-    again = outcome.png_path.read_bytes()
+    again = Path(outcome.png_path).read_bytes()
     assert png_outlier_share(reference.read_bytes(), again) <= OUTLIERS
     image = cv2.imdecode(np.frombuffer(again, np.uint8), cv2.IMREAD_UNCHANGED)
     assert image.shape == (256, 256) and image.std() > 5
