@@ -6,6 +6,7 @@ each ten seconds of a process, are left out. Writes runs/bench/requests.json.
 """
 
 import os
+import tempfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from tests.helpers.s3_server import new_bucket, s3_server
 
 from benchmarks.figures import write_figures
 
-FEW, MANY = 4, 8
-"""Numbers of frames of a trajectory."""
+FEW, MANY = 16, 24
+"""Numbers of frames of a trajectory; the overview shows 12."""
 DATASETS = {"base": (1, 1, FEW), "frames": (1, 1, MANY), "trajectories": (1, 2, FEW), "scenes": (2, 1, FEW)}
 """Numbers of scenes, of trajectories of each, and of frames of each."""
 METHODS = ("GET", "HEAD", "PUT", "POST", "DELETE")
@@ -30,8 +31,8 @@ def settings(n_scenes: int, n_trajectories: int, n_frames: int) -> tuple[str, ..
     return (*camera, *split, *(f"dataset.detect.{name}={number}" for name, number in numbers.items()))
 
 
-def counted(n_scenes: int, n_trajectories: int, n_frames: int) -> Counter[str]:
-    """Render one dataset; returns the number of requests by method."""
+def counted(cache: str, n_scenes: int, n_trajectories: int, n_frames: int) -> Counter[str]:
+    """Render one dataset with a new cache of scenes; returns the number of requests by method."""
     from aiobotocore.endpoint import AioEndpoint
 
     from perilune_render.config import DatasetConfig
@@ -53,6 +54,7 @@ def counted(n_scenes: int, n_trajectories: int, n_frames: int) -> Counter[str]:
     AioEndpoint._send = counting
     chosen = settings(n_scenes, n_trajectories, n_frames)
     job = Job.planned(resolve(DatasetConfig, "dataset", "perilune_render", "tiny", None, chosen), "detect", "tiny")
+    os.environ["PERILUNE_CACHE"] = cache
     try:
         render_job(job, f"{new_bucket()}/moon", Progress(disable=True), Here)
     finally:
@@ -64,7 +66,10 @@ def main() -> None:
     """Render, count and write the figures."""
     with s3_server() as environment:
         os.environ.update(environment)
-        found = {name: counted(*numbers) for name, numbers in DATASETS.items()}
+        found = {}
+        for name, numbers in DATASETS.items():
+            with tempfile.TemporaryDirectory() as cache:
+                found[name] = counted(cache, *numbers)
     figures: dict[str, object] = {}
     for method in METHODS:
         base = found["base"][method]
