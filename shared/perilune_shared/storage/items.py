@@ -18,15 +18,25 @@ class Item:
 
 
 def local_items(folder: Path, prefix: str) -> Iterator[Item]:
-    """Yield the files below a folder in the order of their paths; links are not followed."""
-    with os.scandir(folder) as scanned:
-        # "a-b" comes before "a/b", as in the listing of an object store.
-        found = sorted(scanned, key=lambda entry: entry.name + ("/" if entry.is_dir(follow_symlinks=False) else ""))
+    """Yield the files below a folder in the order of their paths; links are not followed.
+
+    Files and folders that another process deletes meanwhile are left out.
+    """
+    try:
+        with os.scandir(folder) as scanned:
+            # "a-b" comes before "a/b", as in the listing of an object store.
+            found = sorted(scanned, key=lambda entry: entry.name + ("/" if entry.is_dir(follow_symlinks=False) else ""))
+    except FileNotFoundError:
+        return
     for entry in found:
         if entry.is_dir(follow_symlinks=False):
             yield from local_items(Path(entry.path), f"{prefix}{entry.name}/")
-        else:
-            yield Item(prefix + entry.name, entry.stat(follow_symlinks=False).st_size)
+            continue
+        try:
+            size_bytes = entry.stat(follow_symlinks=False).st_size
+        except FileNotFoundError:
+            continue
+        yield Item(prefix + entry.name, size_bytes)
 
 
 def object_items(found: Mapping[str, Any], prefix: str) -> Iterator[Item]:

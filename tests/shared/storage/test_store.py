@@ -196,3 +196,14 @@ def test_faults_of_a_store_are_errors_of_one_line(change, expected, s3_bucket, t
     done = subprocess.run([sys.executable, "-c", _READ, s3_bucket], capture_output=True, text=True, env=environment)
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith(f"error: {s3_bucket}/a.txt: {expected}") and done.stderr.count("\n") == 1
+
+
+def test_files_that_vanish_while_they_are_listed_are_left_out(tmp_path):
+    store = open_store(tmp_path)
+    for name in ("a", "b", "c/d", "e"):
+        store.write(name, b"")
+    listed = store.list()
+    assert next(listed).path == "a"
+    store.delete("b")
+    store.delete_below("c")
+    assert [item.path for item in listed] == ["e"]
