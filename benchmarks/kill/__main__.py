@@ -16,6 +16,7 @@ import contextlib
 import json
 import random
 import shutil
+import signal
 import tempfile
 import time
 from collections import Counter
@@ -64,6 +65,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="random seed of the moments")
     parser.add_argument("--minutes", type=float, default=1e6, help="time after which no trial starts")
     options = parser.parse_args()
+    # A shell that starts this in the background lets it, and all that it starts, ignore Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     end_s = time.monotonic() + 60 * options.minutes
     done = [record for record in _logged() if record["commit"] == run_record().commit]
     wanted = [(kind, k) for k in range(options.n) for kind in options.kind or KINDS]
