@@ -1,5 +1,6 @@
 """The command `perilune-render dataset`."""
 
+import contextlib
 import re
 from dataclasses import dataclass, replace
 from functools import partial
@@ -176,12 +177,21 @@ def _made(job: "Job", out: Store, how: _How) -> "Dataset | None":
     if how.dry_run:
         _print_estimate(job, out, how)
         return None
-    with ended_by_interrupt(after_s=_ENDED_S), progress_bar() as progress:
+    with ended_by_interrupt(after_s=_ENDED_S, at_end=_kill_processes), progress_bar() as progress:
         if how.shard is None:
             return render_job(job, out, progress, _executor(how))
         n_rendered = render_shard(job, out, Shard(*how.shard), progress, _executor(how))
     Console().print(f"{out}: {n_rendered} trajectories rendered; after all shards, --finish", soft_wrap=True)
     return None
+
+
+def _kill_processes() -> None:
+    """Kill all processes that this one has started; those of Ray would go on for a minute."""
+    import psutil
+
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            process.kill()
 
 
 def _print_estimate(job: "Job", out: Store, how: _How) -> None:

@@ -5,7 +5,7 @@ import os
 import select
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from perilune_shared.errors import EXIT_INTERRUPTED, STOPPED
 
@@ -45,8 +45,10 @@ def interrupts_held() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def ended_by_interrupt(*, after_s: float) -> Iterator[None]:
+def ended_by_interrupt(*, after_s: float, at_end: Callable[[], object] = lambda: None) -> Iterator[None]:
     """End the process `after_s` seconds after Ctrl-C, if the block has not ended by then: with one line and code 130.
+
+    `at_end` is called before that, in another thread; it may end the processes that the block has started.
 
     For commands whose output survives SIGKILL. Python raises KeyboardInterrupt only between two steps of its own, and
     one call of Blender or NumPy may take longer. Without effect if Ctrl-C is ignored, and outside the main thread.
@@ -58,7 +60,7 @@ def ended_by_interrupt(*, after_s: float) -> Iterator[None]:
     (asked, signalled), (ended, end) = os.pipe(), os.pipe()
     os.set_blocking(signalled, False)
     before = signal.set_wakeup_fd(signalled, warn_on_full_buffer=False)
-    watcher = threading.Thread(target=_end_late, args=(asked, ended, after_s), daemon=True)
+    watcher = threading.Thread(target=_end_late, args=(asked, ended, after_s, at_end), daemon=True)
     watcher.start()
     try:
         yield
@@ -70,13 +72,15 @@ def ended_by_interrupt(*, after_s: float) -> Iterator[None]:
             os.close(descriptor)
 
 
-def _end_late(asked: int, ended: int, after_s: float) -> None:
+def _end_late(asked: int, ended: int, after_s: float, at_end: Callable[[], object]) -> None:
     """Wait for Ctrl-C in the pipe `asked`, then for the end of the block, which closes the other end of `ended`."""
     while True:
         ready, _, _ = select.select([asked, ended], [], [])
         if ended in ready:
             return
         if signal.SIGINT in os.read(asked, 100) and not select.select([ended], [], [], after_s)[0]:
+            with contextlib.suppress(Exception):
+                at_end()
             with contextlib.suppress(OSError):
                 # A progress bar hides the cursor.
                 os.write(2, f"{_BELOW_BAR if os.isatty(2) else ''}{STOPPED}\n".encode())
