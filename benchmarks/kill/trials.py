@@ -109,8 +109,7 @@ def _killed(run: Rendering) -> Record:
     below = run.below()
     record["disturbed"] = run.send(signal.SIGKILL)
     run.wait()
-    _, alive = psutil.wait_procs(below, timeout=30)
-    return {**record, "orphans": len(alive)}
+    return {**record, "orphans": _wait(below, 30)}
 
 
 def _interrupted(run: Rendering) -> Record:
@@ -120,13 +119,28 @@ def _interrupted(run: Rendering) -> Record:
     if not run.send(signal.SIGINT):
         return {**record, "disturbed": False}
     code = run.wait()
-    psutil.wait_procs(below, timeout=60)
+    _wait(below, 60)
     record |= {"seconds": time.monotonic() - asked_s, "disturbed": code != 0}
     # The progress bar takes several lines; a finished command may be at the end of its own process.
     lines = run.stderr.splitlines()
     stopped = code == 130 and lines[-1].endswith("the same command again to resume") and "Traceback" not in run.stderr
     one_line = code == 0 or stopped or (code == -signal.SIGINT and record["phase"] == "complete")
     return {**record, "one_line": one_line, **({} if one_line else {"code": code, "stderr": run.stderr[-1500:]})}
+
+
+def _wait(processes: list[psutil.Process], longest_s: float) -> int:
+    """Wait until processes have ended; returns the number of those that run on. Zombies have ended."""
+    end_s = time.monotonic() + longest_s
+    while (n_running := sum(map(_runs, processes))) and time.monotonic() < end_s:
+        time.sleep(0.05)
+    return n_running
+
+
+def _runs(process: psutil.Process) -> bool:
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def _sleep(run: Rendering, seconds: float) -> None:
