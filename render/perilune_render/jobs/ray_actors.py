@@ -82,7 +82,7 @@ class RayActors:
             )
         except ConnectionError as error:
             raise UserError("--address", "Ray", error, "the address of a running Ray cluster, as host:6379") from None
-        n_cores = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
+        n_cores = sorted(int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"])
         n_fitting = sum(each // self._n_threads for each in n_cores)
         if not n_fitting:
             ray.shutdown()
