@@ -38,7 +38,7 @@ class LocalCluster:
         pids = [info.process.pid for infos in node.all_processes.values() for info in infos]
         below = [process for pid in pids for process in psutil.Process(pid).children(recursive=True)]
         for pid in pids:
-            psutil.Process(pid).suspend()  # so that no raylet replaces a worker
+            psutil.Process(pid).suspend()  # otherwise a raylet would replace its killed workers
         for process in below:
             process.kill()
         self._cluster.remove_node(node, allow_graceful=False)

@@ -49,7 +49,8 @@ class Rendering:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._stderr,
-            env={**os.environ, **(environment or {})},
+            # A wide terminal: the progress bar is one line.
+            env={**os.environ, "COLUMNS": "200", **(environment or {})},
         )
 
     @property

@@ -121,10 +121,8 @@ def _interrupted(run: Rendering) -> Record:
     code = run.wait()
     _wait(below, 60)
     record |= {"seconds": time.monotonic() - asked_s, "disturbed": code != 0}
-    # The progress bar takes several lines; a finished command may be at the end of its own process.
-    lines = run.stderr.splitlines()
-    stopped = code == 130 and lines[-1].endswith("the same command again to resume") and "Traceback" not in run.stderr
-    one_line = code == 0 or stopped or (code == -signal.SIGINT and record["phase"] == "complete")
+    lines = [line for line in run.stderr.splitlines() if line and "frames" not in line and "stopping after" not in line]
+    one_line = code == 0 or (code == 130 and len(lines) == 1 and lines[0].endswith("the same command again to resume"))
     return {**record, "one_line": one_line, **({} if one_line else {"code": code, "stderr": run.stderr[-1500:]})}
 
 

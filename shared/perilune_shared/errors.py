@@ -1,7 +1,9 @@
 """Errors that a user can cause, printed in one line, and their exit code."""
 
+import atexit
 import errno
 import os
+import signal
 import sys
 from collections.abc import Callable
 
@@ -60,7 +62,10 @@ def shortened(value: object, max_length: int = 120) -> str:
 
 
 def run_command_line(app: Callable[[], object]) -> None:
-    """Run a command line; print user errors and disk errors in one line and exit with code 2."""
+    """Run a command line; print user errors and disk errors in one line and exit with code 2.
+
+    Ctrl-C at the end of the process, when all work is done, is ignored.
+    """
     try:
         app()
     except UserError as error:
@@ -72,10 +77,12 @@ def run_command_line(app: Callable[[], object]) -> None:
     except (KeyboardInterrupt, SystemExit) as stop:
         # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
         if isinstance(stop, SystemExit) and stop.code != EXIT_INTERRUPTED:
+            atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
             raise
         print(STOPPED, file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
     else:
+        atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
         return
     print(message, file=sys.stderr)
     sys.exit(EXIT_USER_ERROR)

@@ -80,3 +80,27 @@ def test_ctrl_c_ends_a_command_that_is_in_native_code(ignored):
     else:
         assert time.monotonic() - asked_s < 3 and process.returncode == 130 and out == "at end\n"
         assert error == "stopped; finished files stay valid; run the same command again to resume\n"
+
+
+LATE = """
+import signal, sys, time
+from perilune_shared.errors import run_command_line
+class Slow:
+    def __del__(self, sleep=time.sleep, write=sys.stdout.write, flush=sys.stdout.flush):
+        write("ending\\n"), flush(), sleep(1.0)
+def command():
+    sys.modules["slow"] = Slow()
+    if sys.argv[1:]:
+        sys.exit(0)
+run_command_line(command)
+"""
+
+
+@pytest.mark.parametrize("exits", [[], ["by SystemExit, as typer does"]])
+def test_ctrl_c_after_the_work_is_done_changes_nothing(exits):
+    process = subprocess.Popen(
+        [sys.executable, "-c", LATE, *exits], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "ending\n"
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60) == ("", "") and process.returncode == 0

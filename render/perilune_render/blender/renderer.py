@@ -66,7 +66,8 @@ class Renderer:
         self._exact = config.render.exr
         self._levels: tuple[int, tuple[Level, ...]] | None = None
         self._shown: tuple[int, int] | None = None
-        if scene.view is None or scene.grid.n_vertices <= config.terrain.max_vertices:
+        self._in_levels = scene.view is not None and scene.grid.n_vertices > config.terrain.max_vertices
+        if not self._in_levels:
             self._stage_with(scene)
         self._folder = tempfile.TemporaryDirectory(prefix="perilune-")
 
@@ -112,7 +113,7 @@ class Renderer:
         """
         if self not in _open:
             raise RuntimeError("this Renderer is closed")
-        if self._scene.view is not None and self._scene.grid.n_vertices > self._config.terrain.max_vertices:
+        if self._in_levels and self._scene.view is not None:
             self._show_level(self._scene.view, approach_deg, float(position_m[2]))
         blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
         path = Path(self._folder.name) / "frame.exr"

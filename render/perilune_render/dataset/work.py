@@ -68,8 +68,9 @@ def write_scene(store: Store, scene_id: str, tables: Mapping[str, pa.Table]) -> 
             expected = "the elevation model and catalogue that the dataset was started with"
             raise UserError(store.at(path), "craters", "other craters or boulders", expected)
         return
-    written = [_write(store, table, scene_id, tables[table]) for table in OF_SCENE[::-1]]
-    store.sync(file.path for file in written)
+    # The scenes row says that a scene is whole, so the other tables must be on the disk before it.
+    store.sync([_write(store, table, scene_id, tables[table]).path for table in OF_SCENE[1:]])
+    store.sync([_write(store, OF_SCENE[0], scene_id, tables[OF_SCENE[0]]).path])
 
 
 def scene_rows(store: Store, scene_id: str) -> dict[str, pa.Table]:

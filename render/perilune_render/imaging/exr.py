@@ -10,13 +10,13 @@ import numpy as np
 import OpenEXR
 
 from perilune_render.imaging.radiance import Radiance
+from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES
 from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
 from perilune_shared.storage.store import Store
 
 _MOST_CHANNELS = 64
-_LARGEST_BYTES = 2**30
 CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 
@@ -37,7 +37,7 @@ def local_exr(store: Store, path: str) -> Iterator[Path]:
         yield files.inside(store.folder, path)
         return
     with tempfile.NamedTemporaryFile(prefix="perilune-", suffix=".exr") as copy:
-        copy.write(store.read(path, most_bytes=_LARGEST_BYTES))
+        copy.write(store.read(path, most_bytes=LARGEST_FRAME_BYTES))
         copy.flush()
         yield Path(copy.name)
 

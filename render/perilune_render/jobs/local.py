@@ -201,10 +201,10 @@ def for_other_processes(out: Store) -> Store:
 
 
 def default_workers(job: Job, n_threads: int | None) -> int:
-    """The number of workers that renders a job fastest here: one for each core, or for each `n_threads` cores.
+    """The number of workers that render a job here by default: one for each core, or for each `n_threads` cores.
 
-    It is limited by the trajectories and by free memory. On two cores, two workers of one thread rendered 1.28 times as
-    many frames a second as one worker of two (docs/notebook/2026-11-22-cores.md).
+    It is limited by the trajectories and by free memory. On two cores, two processes of one thread rendered 1.28 times
+    as many frames a second as one process of two (docs/notebook/2026-11-22-cores.md). More cores were not measured.
     """
     n_cores = len(os.sched_getaffinity(0)) // (n_threads or job.config.render.threads or 1)
     n_ground = graded_grid(job.config.terrain, job.plan.view).n_vertices

@@ -26,7 +26,7 @@ def check(job: Job) -> None:
 
 
 def prepare(job: Job, out: Store, check_scene: Callable[[str], object]) -> DatasetInfo:
-    """Begin the dataset at `out`, or check that it is the job's; returns its dataset.json.
+    """Begin the dataset at `out`, or check that it belongs to the job; returns its dataset.json.
 
     Before a dataset is begun, `check_scene` generates its first scene and checks all poses over it. Raises UserError if
     a pose does not fit the ground, or if `out` holds something else or a dataset of other settings, code or plan.

@@ -74,7 +74,8 @@ def cached_scene(config: DatasetConfig, view: ViewEnvelope, seed: int, shared: S
         with contextlib.suppress(OSError):
             _write(path, scene)
             if shared is not None:
-                shared.write(path.name, path.read_bytes())  # another machine may have been faster: FileExistsError
+                with contextlib.suppress(FileExistsError):  # another machine was faster
+                    shared.write(path.name, path.read_bytes())
             _make_room(path.parent, config.render.cache_gib * 2**30)
     return scene
 

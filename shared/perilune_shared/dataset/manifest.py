@@ -150,8 +150,8 @@ class Dataset:
 
         A trajectory_id needs its scene_id. `where` selects rows by a condition on columns of this table; row groups
         whose statistics exclude it are skipped. Only the parts, row groups and columns needed are read. Craters and
-        boulders belong to no split. Raises UserError if a part is truncated or
-        of another schema, or if the table or a column is unknown.
+        boulders belong to no split. Raises UserError if a part is truncated or of another schema, or if the table or a
+        column is unknown.
         """
         _check_names(table, columns)
         if split is not None and split not in SPLITS:
