@@ -1,4 +1,4 @@
-"""A real S3 server on this machine, moto's, in a process of its own.
+"""A real S3 server on this machine, moto's, in a process of its own; and copies of datasets on it.
 
 Clients find it by the standard variables AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and
 AWS_DEFAULT_REGION. `python -m tests.helpers.s3_server` serves until it is killed, and prints its port.
@@ -12,6 +12,8 @@ import sys
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+
+from perilune_shared.storage.store import open_store
 
 ROOT = Path(__file__).parents[2]
 _numbers = itertools.count()
@@ -55,6 +57,14 @@ def new_bucket() -> str:
     request = urllib.request.Request(f"{os.environ['AWS_ENDPOINT_URL']}/{name}", method="PUT")
     with urllib.request.urlopen(request, timeout=30):
         return f"s3://{name}"
+
+
+def uploaded(folder: Path, address: str) -> str:
+    """Copy all files of a folder to an address; return the address."""
+    source, target = open_store(folder), open_store(address)
+    for item in source.list():
+        target.write(item.path, source.read(item.path))
+    return address
 
 
 def main() -> None:

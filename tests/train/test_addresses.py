@@ -7,6 +7,7 @@ import pytest
 import torch
 from tests.helpers import in_process
 from tests.helpers.faulty_proxy import FaultyProxy
+from tests.helpers.s3_server import uploaded
 from tests.helpers.stored_run import store_run
 from tests.helpers.terrain_record import store_record
 
@@ -15,7 +16,6 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing import pack as packing
 from perilune_shared.editing.pack import pack
 from perilune_shared.errors import UserError
-from perilune_shared.storage.store import open_store
 from perilune_train.cli import main
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.train.run import run_detect
@@ -45,14 +45,6 @@ COMMANDS = {
     "explain": "explain --name a --out {out} --detector {run}/checkpoints/best.ckpt --navigator {stack} "
     "--dataset {address}",
 }
-
-
-def uploaded(folder, address):
-    """Copy a dataset from a folder to an address."""
-    source, target = open_store(folder), open_store(address)
-    for item in source.list():
-        target.write(item.path, source.read(item.path))
-    return address
 
 
 @pytest.fixture(scope="module")

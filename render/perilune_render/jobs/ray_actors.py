@@ -57,14 +57,15 @@ class _Actor:
 class RayActors:
     """The executor that renders with Ray, in `n_workers` actors, by default as many as the cluster has cores for.
 
+    Each has the configured number of threads, or one if that is 0; Ray reserves a core for each thread.
     `address` is that of a running cluster; None starts Ray on this machine for the duration of the block. A local
     folder `out` must be at the same path on all machines.
     """
 
     def __init__(self, job: Job, out: Store, n_workers: int | None, address: str | None):
-        self._job, self._address, self._out = job, address, for_other_processes(out)
-        self._n_workers = n_workers
+        self._address, self._out, self._n_workers = address, for_other_processes(out), n_workers
         self._n_threads = job.config.render.threads or 1
+        self._job = job.with_threads(self._n_threads, 1)
         self._actors: list[_Actor] = []
         self._pending: dict[Any, _Actor] = {}
         self._lost_starts = 0

@@ -13,12 +13,14 @@ import cv2
 import numpy as np
 import pytest
 from tests.helpers import in_process
+from tests.helpers.s3_server import uploaded
 
 from perilune_render.cli import main
 from perilune_render.dataset.work import committed
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import matrix_from_quaternion
+from perilune_shared.storage.store import open_store
 from perilune_shared.validation.validate import validate
 
 RENDER = str(Path(sys.executable).parent / "perilune-render")
@@ -78,6 +80,18 @@ def test_developed_alike_the_frames_are_the_same_bytes(tiny, developed):
     assert new.info.exr_camera is None and recipe.developed_from.name == old.info.name
     assert recipe.config == old.info.recipe().config and new.info.camera == old.info.camera
     assert not list(developed[0].rglob("*.exr"))
+
+
+def test_an_object_store_gets_the_same_bytes_and_its_frames_are_verified(tiny, developed, s3_bucket):
+    source, out = uploaded(tiny / "detect", f"{s3_bucket}/moon"), f"{s3_bucket}/developed"
+    done = develop(source, out)
+    assert done.returncode == 0, done.stderr
+    store, folder = open_store(out), open_store(developed[0])
+    assert [(item.path, store.read(item.path)) for item in store.list()] == [
+        (item.path, folder.read(item.path)) for item in folder.list()
+    ]
+    verified = in_process.call(main, "regenerate", "--manifest", source, "--verify", "--sample", "1")
+    assert verified.returncode == 0 and "1 frames: 1 identical" in verified.stdout, verified.stderr
 
 
 def test_another_sensor_changes_the_pixels_and_of_the_labels_their_contrast(tiny, tmp_path):

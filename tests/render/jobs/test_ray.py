@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 from rich.progress import Progress
+from tests.helpers import in_process
 
+from perilune_render.cli import main
 from perilune_render.jobs.run import render_job
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
@@ -38,13 +40,33 @@ class KillsOnce(Progress):
             self.killed = [os.kill(pid, signal.SIGKILL) for pid in processes_named("ray::_Renderer")] != []
 
 
-def test_ray_gives_the_same_bytes_although_its_processes_are_killed(job, whole, files_of, tmp_path, capsys):
+def test_ray_gives_the_same_bytes_on_s3_although_its_processes_are_killed(job, whole, s3_bucket, capsys):
     from perilune_render.jobs.ray_actors import RayActors
 
-    progress = KillsOnce(disable=True)
-    render_job(job, tmp_path, progress, partial(RayActors, n_workers=2, address=None))
-    assert files_of(tmp_path) == whole
+    progress, out = KillsOnce(disable=True), open_store(f"{s3_bucket}/moon")
+    render_job(job, out, progress, partial(RayActors, n_workers=2, address=None))
+    assert {item.path: out.read(item.path) for item in out.list()} == whole
     assert progress.killed and "a process of Ray was lost (ActorDiedError); trying again" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("configured", "given", "n_threads"),
+    [(0, [], 1), (0, ["--workers", "2"], 1), (3, [], 3), (3, ["--threads", "2"], 2)],
+)
+def test_a_process_has_one_thread_unless_more_are_given(configured, given, n_threads, options, monkeypatch, tmp_path):
+    """Those of the other machines' cores that Ray reserves for it; the cores of this machine do not matter."""
+    from perilune_render.jobs import ray_actors
+
+    class Stops(ray_actors.RayActors):
+        def __enter__(self):
+            assert self._n_threads == self._job.config.render.threads
+            raise UserError("Ray", "threads", self._n_threads, "nothing else")
+
+    monkeypatch.setattr(ray_actors, "RayActors", Stops)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(8)))
+    chosen = [*options, "--set", f"dataset.render.threads={configured}", "--executor", "ray", *given]
+    done = in_process.call(main, "dataset", *chosen, "--out", tmp_path / "moon")
+    assert f"Ray: threads: got {n_threads}," in done.stderr
 
 
 def test_a_process_that_is_lost_while_it_generates_the_first_scene_is_replaced(job, tmp_path):

@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 
 import pytest
+import s3fs
 from rich.progress import Progress
 from tests.helpers import in_process
 from tests.helpers.flat_engine import FlatEngine
@@ -206,6 +207,20 @@ def test_faults_of_a_store_end_with_one_line(variables, out, message, options, s
     done = in_process.call(main, "dataset", *options, "--workers", "0", "--out", out)
     lines = [line for line in done.stderr.splitlines() if line.startswith("error")]
     assert done.returncode == 2 and len(lines) == 1 and out in lines[0] and message in lines[0], done.stderr
+
+
+def test_missing_credentials_end_with_one_line(options, s3_bucket, monkeypatch, tmp_path):
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    s3fs.S3FileSystem.clear_instance_cache()
+    try:
+        done = in_process.call(main, "dataset", *options, "--workers", "0", "--out", f"{s3_bucket}/moon")
+    finally:
+        s3fs.S3FileSystem.clear_instance_cache()
+    lines = [line for line in done.stderr.splitlines() if line.startswith("error")]
+    assert done.returncode == 2 and len(lines) == 1 and f"{s3_bucket}/moon" in lines[0]
+    assert "expected credentials with access to it: AWS_ACCESS_KEY_ID" in lines[0]
 
 
 def test_two_workers_on_s3_give_the_same_bytes_as_a_folder(options, whole, s3_bucket):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from tests.helpers import in_process
+from tests.helpers.s3_server import uploaded
 
 from perilune_shared.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
@@ -12,14 +13,6 @@ from perilune_shared.errors import UserError
 from perilune_shared.export.stats import summary
 from perilune_shared.storage.store import open_store
 from perilune_shared.validation.validate import validate
-
-
-def uploaded(root, address: str) -> str:
-    """Copy all files of a dataset to an address."""
-    store, source = open_store(address), open_store(root)
-    for item in source.list():
-        store.write(item.path, source.read(item.path))
-    return address
 
 
 @pytest.fixture(params=["memory", "s3"])
