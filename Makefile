@@ -115,7 +115,7 @@ coverage: setup ## run all tests and print their line coverage, which has no tar
 lint: setup ## ruff (rules and format) and mypy
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train
+	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train benchmarks
 
 docs: docs-build ## build and serve the documentation (http://127.0.0.1:8000)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs serve

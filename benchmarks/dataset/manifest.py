@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -115,7 +116,7 @@ def _fill(root: Path, progress) -> None:
             "width_px": 256,
             "height_px": 256,
         }
-        own = {
+        own: dict[str, dict[str, Any]] = {
             "frames": {
                 "frame_id": ids,
                 "frame_index": np.arange(N_FRAMES),

@@ -8,7 +8,7 @@ brightness, counts) and sheet.png, which contains real pixels and must not be pu
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -209,7 +209,7 @@ def count_distances(ours: list[float], real: list[float]) -> dict[str, float | N
 
 def compare(crops: list[Picture], frames: list[list[Picture]]) -> dict:
     """All figures: each crop and the frames under its Sun, medians of their differences, counts of all craters."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for crop, taken in zip(crops, frames, strict=True):
         ours, real = figures_of(taken), figures_of([crop])
         sun = {"azimuth_deg": crop.azimuth_deg, "elevation_deg": crop.elevation_deg}

@@ -25,20 +25,27 @@ def draw_curves(out: Path, figures: dict, real: list[np.ndarray], ours: list[np.
     _draw_histograms(
         out / "gradients.png",
         middles,
-        *(
-            [st.histogram(np.log10(np.maximum(st.gradients(i), 1e-6)), st.GRADIENT_EDGES) for i in images]
-            for images in (real, ours)
-        ),
+        [_gradient_histogram(image) for image in real],
+        [_gradient_histogram(image) for image in ours],
         "log10 of the gradient over mean brightness, per pixel",
     )
     middles = (st.BRIGHTNESS_EDGES[1:] + st.BRIGHTNESS_EDGES[:-1]) / 2
     _draw_histograms(
         out / "brightness.png",
         middles,
-        *([st.histogram(i / i.mean(), st.BRIGHTNESS_EDGES) for i in images] for images in (real, ours)),
+        [_brightness_histogram(image) for image in real],
+        [_brightness_histogram(image) for image in ours],
         "brightness over its mean",
     )
     _draw_counts(out / "counts.png", figures)
+
+
+def _gradient_histogram(image: np.ndarray) -> st.Array:
+    return st.histogram(np.log10(np.maximum(st.gradients(image), 1e-6)), st.GRADIENT_EDGES)
+
+
+def _brightness_histogram(image: np.ndarray) -> st.Array:
+    return st.histogram(image / image.mean(), st.BRIGHTNESS_EDGES)
 
 
 def _save(figure, path: Path) -> None:

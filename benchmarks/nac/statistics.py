@@ -1,5 +1,6 @@
 """Statistics of grey images of the Moon and of their craters. Each image is first divided by its own mean."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -59,9 +60,9 @@ def crater_contrast(image: np.ndarray, circles: Array) -> Array:
     return contrast
 
 
-def cumulative_counts(diameters_px: Array, area_px: float, thresholds_px: Array) -> Array:
+def cumulative_counts(diameters_px: Array, area_px: float, thresholds_px: Sequence[float]) -> Array:
     """Number per million pixels of craters of at least each threshold."""
-    return (diameters_px[:, None] >= np.asarray(thresholds_px)).sum(axis=0) * 1e6 / area_px
+    return (diameters_px[:, None] >= np.array(thresholds_px)).sum(axis=0) * 1e6 / area_px
 
 
 def power_spectrum(image: np.ndarray, tile_px: int = 200) -> Array:

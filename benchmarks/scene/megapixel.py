@@ -83,7 +83,9 @@ def main() -> None:
     cut = cut_levels(config.terrain, plan.view, trajectory.flight.nominal.approach_deg)
     level = np.array([level_index(cut, z) for z in trajectory.flight.position_m[:, 2]])
     chosen = [k for k in sorted(set(level.tolist()), reverse=True) if levels is None or k in levels]
-    changes, ours, bares, within, across = [], [], [], [], []
+    changes, ours, bares = [], [], []
+    within: list[np.ndarray] = []
+    across: list[np.ndarray] = []
     last: tuple[int, Frame] | None = None
     with (
         tempfile.TemporaryDirectory() as folder,

@@ -87,7 +87,7 @@ def render_planes(
     folder: Path, law: str, camera: Camera, sun: Array, normals: Array, centres_m: Array, half_m: float
 ) -> np.ndarray:
     """Radiance factor (h, w) of the planes."""
-    light = LightConfig(photometry=law, sun_angular_diameter_deg=0.0)
+    light = LightConfig.model_validate({"photometry": law, "sun_angular_diameter_deg": 0.0})
     stage = sunlit_stage(light, camera, sun)
     points = corners(normals, centres_m, half_m).reshape(-1, 3)
     mesh = mesh_from_arrays("planes", points, np.arange(len(points)).reshape(-1, 4))

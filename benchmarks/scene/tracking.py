@@ -26,7 +26,8 @@ def klt_residuals_px(
     seen = camera.rays(corner + 0.5) * before.depth_m[row, column][:, None]
     expected = camera.project(camera_from_site(seen @ pose_before[1] + pose_before[0], *pose_after)) - 0.5
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        *grey,
+        grey[0],
+        grey[1],
         corner[:, None],
         expected.astype(np.float32)[:, None].copy(),
         winSize=(_WINDOW_PX, _WINDOW_PX),

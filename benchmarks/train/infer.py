@@ -44,9 +44,15 @@ class Eager(torch.nn.Module):
         return self.network.detect(images)
 
 
+def _n_channels(network: YOLOv3) -> int:
+    first = network.backbone.stem[0]
+    assert isinstance(first, torch.nn.Conv2d)
+    return first.in_channels
+
+
 def engines(network: YOLOv3, folder: Path) -> dict[str, Engine]:
     """All engines for one network; writes their files into `folder`."""
-    channels = network.backbone.stem[0].in_channels
+    channels = _n_channels(network)
     flight = FlightDetector(network, SIZE_PX)
     plain, small = folder / "network.onnx", folder / "network-int8.onnx"
     write_onnx(flight, plain, {}, channels, SIZE_PX)
@@ -87,7 +93,7 @@ def cpu_seconds(engine: Engine, image: np.ndarray, rounds: int) -> float:
 
 def measure(network: YOLOv3, rounds: int) -> dict:
     """Minimum and median time of every engine, processor time on one thread, and the best engines."""
-    channels = network.backbone.stem[0].in_channels
+    channels = _n_channels(network)
     image = np.random.default_rng(1).standard_normal((1, channels, SIZE_PX, SIZE_PX), np.float32)
     with tempfile.TemporaryDirectory() as folder:
         seconds = interleaved(engines(network, Path(folder)), image, rounds, WARM_UP)

@@ -19,6 +19,7 @@ import itertools
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,7 +47,7 @@ _LAST = 20
 
 def batches(split: DetectSplit, config: DetectConfig, anchors: Tensor) -> Iterator[Batch]:
     """Network input and assignments of one epoch after another, without end."""
-    loaded = training_loader(split, config, anchors)
+    loaded: Any = training_loader(split, config, anchors)
     for epoch in itertools.count():
         loaded.batch_sampler.set_epoch(epoch)
         for grey, targets in loaded:
