@@ -35,11 +35,6 @@ def committed(store: Store) -> set[str]:
     return {stem_of(path) for path in listed if path.endswith(".parquet") and not stem_of(path).startswith(".")}
 
 
-def is_committed(store: Store, scene_id: str, trajectory_id: str) -> bool:
-    """Whether a trajectory is finished."""
-    return store.exists(_path("index", f"{scene_id}.{trajectory_id}"))
-
-
 def commit(store: Store, scene_id: str, trajectory_id: str, labels: list[pa.Table], frames: pa.Table) -> None:
     """Write the rows of a trajectory whose files are written, then its commit.
 

@@ -8,7 +8,7 @@ from tests.helpers.scenes import config_with, flat_scene, round_craters
 
 from perilune_render.config import CameraConfig, KindConfig
 from perilune_render.dataset.trajectory import render_trajectory
-from perilune_render.dataset.work import is_committed
+from perilune_render.dataset.work import committed
 from perilune_render.flight.plan import make_plan
 from perilune_render.frame_source import FrameSource
 from perilune_render.labels.frame_labels import RimCircles
@@ -54,7 +54,7 @@ def test_a_frame_is_written_while_the_next_one_is_rendered(tmp_path):
     # In turn, each rendering would find the files of all frames before it.
     assert any(n_files < place for place, n_files in enumerate(engine.n_files))
     assert len(done) == N_FRAMES and all(n_files > place for place, n_files in enumerate(done))
-    assert is_committed(open_store(tmp_path), "scene-0000", "trajectory-0000")
+    assert committed(open_store(tmp_path)) == {"scene-0000.trajectory-0000"}
     rows = read_part(frames_part(tmp_path), "frames")
     assert rows["frame_index"].to_pylist() == list(range(N_FRAMES))
     assert rows["png_bytes"].to_pylist() == [(tmp_path / path).stat().st_size for path in rows["png_path"].to_pylist()]
@@ -63,9 +63,7 @@ def test_a_frame_is_written_while_the_next_one_is_rendered(tmp_path):
 def test_a_failed_rendering_ends_the_trajectory(tmp_path):
     with pytest.raises(OSError, match="no frame"):
         render(tmp_path, fails_at=3)
-    assert len(list(tmp_path.rglob("*.png"))) == 3 and not is_committed(
-        open_store(tmp_path), "scene-0000", "trajectory-0000"
-    )
+    assert len(list(tmp_path.rglob("*.png"))) == 3 and not committed(open_store(tmp_path))
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("develop")]
 
 
@@ -75,7 +73,7 @@ def test_a_failed_write_ends_the_trajectory(tmp_path):
     with pytest.raises(OSError, match=r"000002\.png"):
         render(tmp_path)
     assert len([path for path in tmp_path.rglob("*.png") if path.is_file()]) == 2
-    assert not is_committed(open_store(tmp_path), "scene-0000", "trajectory-0000")
+    assert not committed(open_store(tmp_path))
 
 
 def test_ctrl_c_between_frames_ends_the_trajectory(tmp_path):
@@ -84,5 +82,5 @@ def test_ctrl_c_between_frames_ends_the_trajectory(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         render(tmp_path, advance=interrupt)
-    assert not is_committed(open_store(tmp_path), "scene-0000", "trajectory-0000")
+    assert not committed(open_store(tmp_path))
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("develop")]
