@@ -1,6 +1,5 @@
 """`perilune-manifest export` and `card`: convert a dataset to other formats, and write its dataset card."""
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -32,8 +31,10 @@ def export(
         ),
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(help="New folder; for croissant a .json file in the dataset, by default croissant.json."),
+        str | None,
+        typer.Option(
+            help="New folder or address; for croissant a .json file in the dataset, by default croissant.json."
+        ),
     ] = None,
     split: Annotated[str | None, typer.Option(help="Only this split: train, val or test (not for croissant).")] = None,
     selection: Annotated[
@@ -56,7 +57,7 @@ def export(
     from perilune_shared.export.trajectory import export_kitti, export_tum
     from perilune_shared.export.yolo import export_yolo
     from perilune_shared.labels.thresholds import SELECTIONS
-    from perilune_shared.storage.files import check_free
+    from perilune_shared.storage.new_store import check_empty
 
     opened = ps.open_dataset(dataset)
     check_keys(opened)
@@ -80,7 +81,7 @@ def export(
         return
     if out is None:
         raise UserError("--out", "folder", "none", f"a new folder for the {format} files")
-    check_free(out)
+    check_empty(out)
     with progress_bar() as progress:
         match format:
             case "coco":
@@ -99,7 +100,8 @@ def export(
 def card(
     dataset: DatasetArgument,
     out: Annotated[
-        Path | None, typer.Option(help="Markdown file beside its picture, by default README.md in the dataset.")
+        str | None,
+        typer.Option(help="Path or address of the Markdown file; by default README.md in the dataset."),
     ] = None,
 ) -> None:
     """Write a dataset card: counts, histograms, labelled frames, licence and the command to reproduce the data."""

@@ -1,6 +1,9 @@
 """Add files to a complete dataset (a card, metadata for search engines) and to its index."""
 
+import contextlib
+import os
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
@@ -15,25 +18,67 @@ from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage import files
 from perilune_shared.storage.locks import locked
+from perilune_shared.storage.store import Store, open_store
 from perilune_shared.validation.files import EXTRA_NAMES, check_files
 
 _LARGEST_BYTES = 2**26
 
 
-def check_index(dataset: Dataset, paths: Iterable[Path], progress: Progress = NO_PROGRESS) -> DatasetInfo | None:
-    """Check that `paths` may be written; return dataset.json, or None if index and dataset.json stay the same.
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A file to be written, directly in a dataset or elsewhere."""
 
-    The index changes if one of `paths` is directly in the folder of a complete dataset; an incomplete dataset has none
-    yet. Raises UserError if another file differs from the index, since a new index would hide it, or if a name is not
-    allowed in a dataset (perilune_shared.validation.files).
+    store: Store
+    """The folder or prefix that directly contains it; the dataset's own store if it is in the dataset."""
+    name: str
+    """File name."""
+
+    @classmethod
+    def of(cls, dataset: Dataset, out: str | os.PathLike[str] | None, name: str) -> "Target":
+        """The file at the path or address `out`; without it, the file `name` in the dataset."""
+        if out is None:
+            return cls(dataset.store, name)
+        prefix, _, last = os.fspath(out).rpartition("/")
+        store = open_store(prefix) if "://" in os.fspath(out) else open_store(Path(out).parent)
+        return cls(dataset.store if _is_same(store, dataset.store) else store, last or Path(out).name)
+
+    @property
+    def address(self) -> str:
+        """Path or address."""
+        return self.store.at(self.name) if self.store.folder is None else str(self.store.folder / self.name)
+
+    def sibling(self, name: str) -> "Target":
+        """Another file in the same place."""
+        return Target(self.store, name)
+
+    def content(self) -> bytes | None:
+        """Its present content; None if there is no file. Raises UserError if it is too large, or is no regular file."""
+        if self.store.folder is not None and not (self.store.folder / self.name).exists():
+            return None
+        if self.store.folder is None and not self.store.exists(self.name):
+            return None
+        return self.store.read(self.name, most_bytes=_LARGEST_BYTES)
+
+    def write(self, content: bytes) -> None:
+        """Write it, or replace it."""
+        if self.store.folder is None:
+            self.store.replace(self.name, content)
+        else:
+            files.write_bytes(self.store.folder / self.name, content)
+
+
+def check_index(dataset: Dataset, targets: Iterable[Target], progress: Progress = NO_PROGRESS) -> DatasetInfo | None:
+    """Check that files may be written; return dataset.json, or None if index and dataset.json stay the same.
+
+    The index changes if one of the files is directly in a complete dataset; an incomplete dataset has none yet. Raises
+    UserError if another file differs from the index, since a new index would hide it, or if a name is not allowed in a
+    dataset (perilune_shared.validation.files).
     """
-    root = dataset.store.folder
-    if root is None:
-        return None
-    for path in paths:
-        if any(path.resolve().is_relative_to((root / folder).resolve()) for folder in ("manifest", "images")):
-            raise UserError(path, "--out", "a file in manifest/ or images/", "a path outside these folders")
-    own = _names_in(dataset, paths)
+    for target in targets:
+        if _is_below(target.store, dataset.store):
+            expected = "a file directly in the dataset, or outside of it"
+            raise UserError(target.address, "--out", "a file in a folder of the dataset", expected)
+    own = _own_names(dataset, targets)
     for name in sorted(own - EXTRA_NAMES):
         raise UserError(dataset.store.at(name), "--out", name, f"{', '.join(sorted(EXTRA_NAMES))}, or another folder")
     if not own or not dataset.info.complete:
@@ -43,46 +88,55 @@ def check_index(dataset: Dataset, paths: Iterable[Path], progress: Progress = NO
     return info
 
 
-def default_path(dataset: Dataset, name: str) -> Path:
-    """Return the path of a file directly in a local dataset. Raises UserError if the dataset is not local."""
-    if dataset.store.folder is None:
-        raise UserError(dataset.store, "--out", "none", "a local file, since the dataset is in an object store")
-    return dataset.store.folder / name
-
-
-def add_files(dataset: Dataset, contents: Mapping[Path, bytes], info: DatasetInfo | None) -> None:
+def add_files(dataset: Dataset, contents: Mapping[Target, bytes], info: DatasetInfo | None) -> None:
     """Write files atomically, and the index unless `info`, the result of `check_index`, is None.
 
     If the process is killed, `validate` finds the old dataset, the new one, or files that are not in the index; the
-    next call adds or removes these. Raises UserError if the dataset changed since it was checked.
+    next call adds or removes these. Two calls at the same time exclude each other in a local folder only. Raises
+    UserError if the dataset changed since it was checked.
     """
-    root, store = dataset.store.folder, dataset.store
-    if info is None or root is None:
-        for path, content in contents.items():
-            files.write_bytes(path, content)
+    store = dataset.store
+    if info is None:
+        for target, content in contents.items():
+            target.write(content)
         return
-    with locked(root):
+    with locked(store.folder) if store.folder is not None else contextlib.nullcontext():
         if read_info(store) != info:
             raise UserError(store.at(INFO_NAME), "content", "changed meanwhile", "no other writer; run it again")
-        own = _names_in(dataset, contents)
+        own = _own_names(dataset, contents)
         rows = read_index(store, info)
         others = rows.filter(pc.invert(pc.is_in(rows["path"], pa.array(sorted(own), pa.string()))))
         # No file that an index names is overwritten: take the old ones out first.
         info = info if len(others) == len(rows) else seal(store, info, others)
-        for path, content in contents.items():
-            if path.name in own:
-                store.replace(path.name, content)
+        for target, content in contents.items():
+            if target.store is store:
+                store.replace(target.name, content)
             else:
-                files.write_bytes(path, content)
+                target.write(content)
         known = {*others["path"].to_pylist(), *own}
         extra = sorted(name for name in EXTRA_NAMES - known if store.exists(name))
-        added = {path.name: content for path, content in contents.items() if path.name in own}
+        added = {target.name: content for target, content in contents.items() if target.name in own}
         added |= {name: store.read(name, most_bytes=_LARGEST_BYTES) for name in extra}
         written = index_rows(Written.of(name, content) for name, content in added.items())
         seal(store, info, pa.concat_tables([others, written]))
 
 
-def _names_in(dataset: Dataset, paths: Iterable[Path]) -> set[str]:
-    """Return the names of the paths that are directly in the folder of a local dataset."""
-    root = dataset.store.folder
-    return {path.name for path in paths if root is not None and path.resolve().parent == root.resolve()}
+def _own_names(dataset: Dataset, targets: Iterable[Target]) -> set[str]:
+    """Return the names of the files that are directly in the dataset."""
+    return {target.name for target in targets if target.store is dataset.store}
+
+
+def _is_same(store: Store, other: Store) -> bool:
+    """Whether two stores are the same place."""
+    if store.folder is None or other.folder is None:
+        return store == other
+    return store.folder.resolve() == other.folder.resolve()
+
+
+def _is_below(store: Store, other: Store) -> bool:
+    """Whether a store is within a folder of another one."""
+    if _is_same(store, other):
+        return False
+    if store.folder is None or other.folder is None:
+        return store.address.startswith(f"{other.address}/")
+    return store.folder.resolve().is_relative_to(other.folder.resolve())

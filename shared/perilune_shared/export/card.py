@@ -4,10 +4,10 @@ The page is Markdown with a YAML head in Hugging Face's format (https://huggingf
 Datasets are untrusted: each text from a dataset is put in a code span, with only letters, digits and safe punctuation.
 """
 
+import os
 import shlex
 import string
 from collections.abc import Iterable
-from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
@@ -18,7 +18,7 @@ from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo, Recipe
 from perilune_shared.errors import UserError, one_line, shortened
-from perilune_shared.export.added_files import add_files, check_index, default_path
+from perilune_shared.export.added_files import Target, add_files, check_index
 from perilune_shared.export.card_head import head_of, table_configs
 from perilune_shared.export.card_pictures import TITLES, Gathered, draw, gather
 from perilune_shared.export.citation import citation_of
@@ -40,27 +40,29 @@ _IMAGES = {
 }
 
 
-def write_card(dataset: Dataset, out: Path | None, progress: Progress) -> tuple[Path, Path]:
-    """Write the page and the picture beside it, and update the dataset's index; return both paths.
+def write_card(dataset: Dataset, out: str | os.PathLike[str] | None, progress: Progress) -> tuple[str, str]:
+    """Write the page and the picture beside it, and update the dataset's index; return their paths or addresses.
 
     `out` is by default README.md in the dataset. Raises UserError if a file that is not a card would be overwritten,
     the dataset has no frames or it differs from its index.
     """
-    out = out or default_path(dataset, CARD_NAME)
-    if out.suffix != ".md":
-        raise UserError(out, "--out", out.name, "a name that ends in .md")
-    picture = out.with_name(_PICTURE_NAME) if out.name == CARD_NAME else out.with_suffix(".png")
-    is_card = out.is_file() and _MARK_START in out.read_text(encoding="utf-8", errors="replace")
-    for path in (out, picture):
-        if path.exists() and not is_card:
-            raise UserError(path, "--out", "a file that is not a card", "another path, or move that file away")
-    info = check_index(dataset, (out, picture), progress)
+    page = Target.of(dataset, out, CARD_NAME)
+    if not page.name.endswith(".md"):
+        raise UserError(page.address, "--out", page.name, "a name that ends in .md")
+    picture = page.sibling(_PICTURE_NAME if page.name == CARD_NAME else f"{page.name.removesuffix('.md')}.png")
+    present = page.content()
+    if present is None or _MARK_START.encode() not in present:
+        for target in (page, picture):
+            if target.content() is not None:
+                expected = "another path, or move that file away"
+                raise UserError(target.address, "--out", "a file that is not a card", expected)
+    info = check_index(dataset, (page, picture), progress)
     gathered = gather(dataset, progress)
     # Build the page first: this checks the keys and is much faster than drawing.
-    page = card_of(dataset, gathered, picture.name).encode()
+    text = card_of(dataset, gathered, picture.name).encode()
     # The page first: it marks the picture as one that may be overwritten.
-    add_files(dataset, {out: page, picture: draw(dataset, gathered)}, info)
-    return out, picture
+    add_files(dataset, {page: text, picture: draw(dataset, gathered)}, info)
+    return page.address, picture.address
 
 
 def code(value: object) -> str:

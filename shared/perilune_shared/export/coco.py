@@ -17,7 +17,8 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_shared.export.rows import LABEL_MEASURES, Choice, SceneRows, clipped_boxes, frame_sizes, scenes_of
 from perilune_shared.progress import Progress
-from perilune_shared.storage import files
+from perilune_shared.storage.new_store import new_files
+from perilune_shared.storage.store import Address
 
 CATEGORY = {"id": 1, "name": "crater", "supercategory": "crater"}
 _N_CORNERS = 32
@@ -30,7 +31,7 @@ _POLYGON *= np.sqrt(2 * np.pi / _N_CORNERS / np.sin(2 * np.pi / _N_CORNERS))
 
 
 def export_coco(
-    dataset: Dataset, out: Path, progress: Progress, split: str | None = None, choose: Choice | None = None
+    dataset: Dataset, out: Address, progress: Progress, split: str | None = None, choose: Choice | None = None
 ) -> int:
     """Write `out`/instances_<split>.json for each split, or for one; return the number of annotations.
 
@@ -41,7 +42,7 @@ def export_coco(
         raise UserError(dataset.store, "images", "planned", "a rendered dataset: a plan has no labels")
     task = progress.add_task("coco", total=len(dataset.scene_ids()), unit="scenes")
     opened: dict[str, _SplitFile] = {}
-    with files.new_folder(out) as folder:
+    with new_files(out) as folder:
         try:
             for scene in scenes_of(dataset, split, choose):
                 annotations = _annotations(scene)
@@ -153,7 +154,7 @@ class _SplitFile:
         """Add frames of this split and their annotations."""
         for row in frames.to_dict("records"):
             # Readers append the name to a folder: check that the path stays inside it.
-            self._dataset.file(row["png_path"])
+            self._dataset.store.sub(row["png_path"])
             self._images.append(
                 {
                     "id": row["image_id"],

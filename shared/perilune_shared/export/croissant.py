@@ -9,8 +9,8 @@ dataset's folder, since its paths are relative. mlcroissant reads records from t
 """
 
 import json
+import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -20,7 +20,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.parts import Part
 from perilune_shared.dataset.schema import KEYS, MAY_BE_ABSENT, TABLES
 from perilune_shared.errors import UserError
-from perilune_shared.export.added_files import add_files, check_index, default_path
+from perilune_shared.export.added_files import Target, add_files, check_index
 from perilune_shared.export.citation import citation_of, table_hashes
 from perilune_shared.progress import NO_PROGRESS, Progress
 
@@ -78,27 +78,29 @@ _DATA_TYPES = {
 }
 
 
-def export_croissant(dataset: Dataset, out: Path | None = None, progress: Progress = NO_PROGRESS) -> Path:
-    """Write croissant.json, or `out`, into the dataset's folder and update the index; return its path.
+def export_croissant(
+    dataset: Dataset, out: str | os.PathLike[str] | None = None, progress: Progress = NO_PROGRESS
+) -> str:
+    """Write croissant.json, or `out`, into the dataset and update the index; return its path or address.
 
     Raises UserError if `out` is elsewhere, the dataset is not complete or differs from its index.
     """
-    out = out or default_path(dataset, CROISSANT_NAME)
-    if out.resolve().parent != default_path(dataset, CROISSANT_NAME).resolve().parent or out.suffix != ".json":
+    target = Target.of(dataset, out, CROISSANT_NAME)
+    if target.store is not dataset.store or not target.name.endswith(".json"):
         raise UserError(
-            out,
+            target.address,
             "--out",
             "a file in another folder or of another type",
             f"a .json file in {dataset.store}, since its paths are relative",
         )
-    if out.name == INFO_NAME:
-        raise UserError(out, "--out", INFO_NAME, "another name")
+    if target.name == INFO_NAME:
+        raise UserError(target.address, "--out", INFO_NAME, "another name")
     if not dataset.info.complete:
         raise UserError(dataset.store, "complete", "false", "a finished dataset")
-    info = check_index(dataset, [out], progress)
+    info = check_index(dataset, [target], progress)
     text = json.dumps(metadata_of(dataset), indent=1, allow_nan=False) + "\n"
-    add_files(dataset, {out: text.encode()}, info)
-    return out
+    add_files(dataset, {target: text.encode()}, info)
+    return target.address
 
 
 def metadata_of(dataset: Dataset) -> dict[str, Any]:

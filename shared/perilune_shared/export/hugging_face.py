@@ -21,6 +21,8 @@ from perilune_shared.export.card_head import head_of
 from perilune_shared.export.rows import Choice, SceneRows, scenes_of
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
+from perilune_shared.storage.new_store import new_files
+from perilune_shared.storage.store import Address
 
 _OMITTED = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
 _LABEL = pa.struct([*(pa.field(field.name, field.type) for field in LABEL), pa.field("chosen", pa.bool_())])
@@ -29,7 +31,7 @@ _FRAMES_PER_GROUP = 128
 
 def export_hugging_face(
     dataset: Dataset,
-    out: Path,
+    out: Address,
     progress: Progress,
     split: str | None = None,
     choose: Choice | None = None,
@@ -43,7 +45,7 @@ def export_hugging_face(
     task = progress.add_task("hugging face", total=dataset.info.counts.frames, unit="frames")
     writers: dict[str, _Shards] = {}
     n_frames = 0
-    with files.new_folder(out) as folder:
+    with new_files(out) as folder:
         try:
             for scene in scenes_of(dataset, split, choose):
                 for name, rows in _tables(dataset, scene):

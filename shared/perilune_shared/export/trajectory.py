@@ -9,7 +9,6 @@ the viewing direction) to the reference frame, e.g. rotation_site_from_camera fo
 """
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -19,6 +18,8 @@ from perilune_shared.export.rows import scenes_of
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
+from perilune_shared.storage.new_store import new_files
+from perilune_shared.storage.store import Address
 
 _TUM_HEADER = (
     "# camera poses of one trajectory: centre of projection in O_L (X west, Y south, Z up), metres;\n"
@@ -27,13 +28,13 @@ _TUM_HEADER = (
 )
 
 
-def export_tum(dataset: Dataset, out: Path, progress: Progress, split: str | None = None) -> int:
+def export_tum(dataset: Dataset, out: Address, progress: Progress, split: str | None = None) -> int:
     """Write `out`/<scene_id>/<trajectory_id>.txt for each trajectory, in TUM's format; return their number.
 
     With `split`, writes only frames of that split. Raises UserError if `out` is not empty or the split has no frames.
     """
     n_trajectories = 0
-    with files.new_folder(out) as folder:
+    with new_files(out) as folder:
         for scene_id, trajectory_id, frames in _trajectories(dataset, progress, "tum", split):
             # Conjugate: the manifest contains rotation_camera_from_site.
             w, x, y, z = np.stack(frames["rotation_wxyz"].to_list()).T
@@ -44,14 +45,14 @@ def export_tum(dataset: Dataset, out: Path, progress: Progress, split: str | Non
     return n_trajectories
 
 
-def export_kitti(dataset: Dataset, out: Path, progress: Progress, split: str | None = None) -> int:
+def export_kitti(dataset: Dataset, out: Address, progress: Progress, split: str | None = None) -> int:
     """Write the poses and times of each trajectory in KITTI's format; return the number of trajectories.
 
     Files: `out`/<scene_id>/<trajectory_id>.txt and <trajectory_id>.times.txt. With `split`, writes only frames of that
     split. Raises UserError if `out` is not empty or the split has no frames.
     """
     n_trajectories = 0
-    with files.new_folder(out) as folder:
+    with new_files(out) as folder:
         for scene_id, trajectory_id, frames in _trajectories(dataset, progress, "kitti", split):
             poses = poses_site_from_camera(frames)
             relative = np.linalg.inv(poses[0]) @ poses

@@ -17,13 +17,15 @@ from perilune_shared.dataset.names import SPLITS
 from perilune_shared.export.rows import Choice, clipped_boxes, frame_sizes, scenes_of
 from perilune_shared.progress import Progress
 from perilune_shared.storage import files
+from perilune_shared.storage.new_store import new_files
+from perilune_shared.storage.store import Address
 
 CRATER_CLASS = 0
 
 
 def export_yolo(
     dataset: Dataset,
-    out: Path,
+    out: Address,
     progress: Progress,
     split: str | None = None,
     choose: Choice | None = None,
@@ -38,7 +40,7 @@ def export_yolo(
     task = progress.add_task("yolo", total=len(dataset.scene_ids()), unit="scenes")
     lists: dict[str, list[str]] = defaultdict(list)
     n_boxes = 0
-    with files.new_folder(out) as folder:
+    with new_files(out) as folder:
         for scene in scenes_of(dataset, split, choose):
             labels = scene.labels[scene.labels["chosen"]]
             boxes = clipped_boxes(labels, scene.frames) / np.tile(frame_sizes(labels, scene.frames), 2)
@@ -69,7 +71,7 @@ def export_yolo(
 def _write_images(dataset: Dataset, frames: pd.DataFrame, folder: Path, *, link: bool) -> None:
     """Write the PNGs of frames as images/<frame_id>.png."""
     rows = frames[["frame_id", "png_path"]]
-    if dataset.info.images == "files":
+    if dataset.info.images == "files" and dataset.store.is_local:
         for row in rows.to_dict("records"):
             to = files.inside(folder, f"images/{row['frame_id']}.png")
             files.copy_or_link(dataset.file(row["png_path"]), to, link=link)

@@ -2,7 +2,9 @@
 
 import contextlib
 import secrets
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
@@ -24,8 +26,7 @@ def new_store(out: Address, claim: str, content: bytes) -> Iterator[Store]:
         with files.new_folder(store.folder) as aside:
             yield LocalStore(aside)
         return
-    if next(iter(store.list()), None) is not None:
-        raise _occupied(store)
+    check_empty(store)
     # Blanks at the end of JSON mean nothing; they tell the claims of two writers apart.
     nonce = "".join(" \t"[int(bit)] for bit in f"{secrets.randbits(_NONCE_BITS):0{_NONCE_BITS}b}")
     try:
@@ -40,6 +41,43 @@ def new_store(out: Address, claim: str, content: bytes) -> Iterator[Store]:
                 store.delete(item.path)
         store.delete(claim)
         raise
+
+
+@contextlib.contextmanager
+def new_files(out: Address) -> Iterator[Path]:
+    """Yield a local folder for new files, which become the files at `out` when the block ends without an error.
+
+    They are renamed to a local folder, or copied into an object store: create-only, and removed there on any failure.
+    Raises UserError if `out` is not empty or another process is writing it.
+    """
+    store = open_store(out)
+    if store.folder is not None:
+        with files.new_folder(store.folder) as aside:
+            yield aside
+        return
+    check_empty(store)
+    with tempfile.TemporaryDirectory(prefix="perilune-") as folder:
+        yield Path(folder)
+        written = []
+        try:
+            for item in LocalStore(Path(folder)).list():
+                store.write(item.path, Path(folder, item.path).read_bytes())
+                written.append(item.path)
+        except FileExistsError:
+            raise _occupied(store) from None
+        except BaseException:
+            for path in written:
+                store.delete(path)
+            raise
+
+
+def check_empty(out: Address) -> None:
+    """Raise UserError if there are files at an address where new ones are to be written."""
+    store = open_store(out)
+    if store.folder is not None:
+        files.check_free(store.folder)
+    elif next(iter(store.list()), None) is not None:
+        raise _occupied(store)
 
 
 def _occupied(store: Store) -> UserError:

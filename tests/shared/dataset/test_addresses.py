@@ -68,3 +68,35 @@ def test_an_empty_address_is_no_dataset(address):
 def test_commands_take_an_address(command, little, s3_bucket):
     done = in_process.call(main, command, uploaded(little, f"{s3_bucket}/moon"))
     assert done.returncode == 0 and ("no fault" if command == "validate" else "6 frames") in done.stdout
+
+
+def test_card_and_croissant_become_files_of_a_dataset_at_an_address(little, s3_bucket):
+    address = uploaded(little, f"{s3_bucket}/moon")
+    done = in_process.call(main, "card", address)
+    assert done.returncode == 0 and f"{address}/README.md, {address}/card.png: written" in done.stdout, done.stderr
+    done = in_process.call(main, "export", address, "--format", "croissant")
+    assert done.returncode == 0 and f"{address}/croissant.json: written" in done.stdout
+    assert in_process.call(main, "card", address).returncode == 0  # again, over the old one
+    dataset, local = open_dataset(address), open_dataset(little)
+    assert validate(dataset) == [] and differences(dataset, local) == []
+    assert {"README.md", "card.png", "croissant.json"} <= {item.path for item in dataset.store.list()}
+    within = in_process.call(main, "card", address, "--out", f"{address}/manifest/card.md")
+    assert within.returncode == 2 and "expected a file directly in the dataset" in within.stderr
+    outside = in_process.call(main, "card", address, "--out", f"{s3_bucket}/pages/moon.md")
+    assert outside.returncode == 0, outside.stderr
+    assert {item.path for item in open_store(f"{s3_bucket}/pages").list()} == {"moon.md", "moon.png"}
+
+
+@pytest.mark.parametrize("format", ["coco", "yolo", "tum", "kitti", "huggingface"])
+def test_exports_are_written_to_an_address(format, little, s3_bucket, tmp_path):
+    source, out = uploaded(little, f"{s3_bucket}/moon"), f"{s3_bucket}/{format}"
+    for dataset, to in ((source, out), (little, tmp_path / "local")):
+        done = in_process.call(main, "export", dataset, "--format", format, "--out", to)
+        assert done.returncode == 0, done.stderr
+    remote, local = (
+        {item.path: store.read(item.path) for item in store.list()}
+        for store in map(open_store, (out, tmp_path / "local"))
+    )
+    assert remote and remote == local
+    again = in_process.call(main, "export", source, "--format", format, "--out", out)
+    assert again.returncode == 2 and f"error: {out}: --out: got an address that is not empty" in again.stderr

@@ -35,7 +35,7 @@ EVIL = '`</code><script>alert(1)</script> ![x](http://evil) [y](javascript:z) | 
 
 def card_files(root, out=None):
     with Progress(disable=True) as progress:
-        return write_card(open_dataset(root), out, progress)
+        return [Path(written) for written in write_card(open_dataset(root), out, progress)]
 
 
 def html_of(page: Path) -> str:
@@ -158,7 +158,7 @@ def test_packed_and_absent_frames(crowded_packed, crowded, card, tmp_path):
     dataset = open_dataset(crowded)
     dataset.info = dataset.info.model_copy(update={"images": "absent"})
     with Progress(disable=True) as progress:
-        page, picture = write_card(dataset, tmp_path / "absent.md", progress)
+        page, picture = map(Path, write_card(dataset, tmp_path / "absent.md", progress))
     assert Image.open(picture).height < 500 and "not included (only the manifest)" in page.read_text()
 
 

@@ -9,6 +9,7 @@ import pandas as pd
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import written_aside
+from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console, progress_bar
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
@@ -39,8 +40,8 @@ _PICTURES = {
 
 def explain_run(
     settings: ExplainConfig,
-    detect_data: str | Path,
-    nav_data: str | Path,
+    detect_data: Address,
+    nav_data: Address,
     detector: Path,
     navigator: Path,
     runs: Path,
@@ -123,9 +124,7 @@ def explain_run(
     return run
 
 
-def _check_terrain(
-    networks: Mapping[str, tuple[Path, str | Path]], allow_overlap: bool
-) -> tuple[dict[str, str], Metrics]:
+def _check_terrain(networks: Mapping[str, tuple[Path, Address]], allow_overlap: bool) -> tuple[dict[str, str], Metrics]:
     """Marks and entries of metrics.json by network, from each network's checkpoint and dataset.
 
     Raises UserError if a network was fitted to terrain of its dataset's test frames, unless `allow_overlap`.
@@ -142,7 +141,7 @@ def _check_terrain(
 
 
 def detect_frames(
-    settings: ExplainConfig, detector: DetectConfig, address: str | Path
+    settings: ExplainConfig, detector: DetectConfig, address: Address
 ) -> tuple[np.ndarray, np.ndarray, Metrics]:
     """Test frames (N, height, width), the paper's masks G of them, float32 (N, height, width), and their selection.
 

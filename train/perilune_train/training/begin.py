@@ -4,7 +4,6 @@ import functools
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -14,7 +13,7 @@ from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import sha256_of, write_text
-from perilune_shared.storage.store import open_store
+from perilune_shared.storage.store import Address, open_store
 from perilune_shared.terminal import console
 from perilune_train.training.runs import RunFolder, is_first_process
 
@@ -28,12 +27,12 @@ _REPLACE = "; --overwrite replaces the run"
 _STATE_KEY = "perilune/run"
 
 
-def hashes_of(inputs: Mapping[str, str | Path | None]) -> dict[str, str | None]:
+def hashes_of(inputs: Mapping[str, Address | None]) -> dict[str, str | None]:
     """Hash of each input: of the dataset.json of a dataset (a folder or an address), or of the file itself."""
     return {name: None if place is None else _hash_of(place) for name, place in inputs.items()}
 
 
-def _hash_of(place: str | Path) -> str | None:
+def _hash_of(place: Address) -> str | None:
     store = open_store(place)
     if store.folder is None:
         return store.sha256(INFO_NAME) if store.exists(INFO_NAME) else None

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
 from perilune_train.data.shares import ALONE
 from perilune_train.detect.config import DetectConfig
@@ -44,7 +45,7 @@ from perilune_train.training.fit import fit, own_share
 
 def run_detect(
     config: DetectConfig,
-    dataset_address: str | Path,
+    dataset_address: Address,
     runs_root: Path,
     name: str,
     overwrite: bool = False,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.storage.files import written_aside
+from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console, progress_bar
 from perilune_train.data.shares import Share
 from perilune_train.evaluation.marks import mark_files
@@ -45,7 +46,7 @@ _WRITTEN = ("navigation.parquet", "errors.parquet", "descent.png", "errors.png")
 
 def navigate_run(
     settings: NavigateConfig,
-    dataset_address: str | Path,
+    dataset_address: Address,
     runs: Path,
     name: str,
     detector: Path | None,
