@@ -5,9 +5,13 @@ Renders 160 frames of `tiny` with EXRs, 16 trajectories over two scenes whose gr
 nodes of one core each, which are started before. The own process is also restricted to one core, since it develops each
 frame in a second thread. Each split is rendered twice, in turn; the faster one counts. The control is a loop in Python
 without data: two processes against one give the most that two cores of this machine can gain. Writes
-runs/bench/scale.json. `python -m benchmarks.dataset.scale 1` renders each split once.
+runs/bench/scale.json.
+
+    python -m benchmarks.dataset.scale                                              # two rounds of all splits
+    python -m benchmarks.dataset.scale --rounds 5 --split two_workers --split ray_two_nodes
 """
 
+import argparse
 import os
 import subprocess
 import sys
@@ -124,16 +128,21 @@ def control_s(n_processes: int) -> float:
     return time.monotonic() - start_s
 
 
-def main(n_rounds: int) -> None:
-    """Measure all splits and write the figures."""
+def main() -> None:
+    """Measure the splits and write the figures."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.dataset.scale")
+    parser.add_argument("--rounds", type=int, default=2, help="number of renderings of each split")
+    parser.add_argument("--split", action="append", choices=SPLITS, help="split to measure, by default all; repeatable")
+    options = parser.parse_args()
+    chosen = {name: split for name, split in SPLITS.items() if name in (options.split or SPLITS)}
     with tempfile.TemporaryDirectory() as folder:  # fills the caches of scenes and compiled code
         measured(SPLITS["one_worker"], Path(folder))
     best: dict[str, Run] = {}
     loops_s: dict[int, list[float]] = {1: [], 2: []}
-    for _ in range(n_rounds):
+    for _ in range(options.rounds):
         for n_processes, times_s in loops_s.items():
             times_s.append(control_s(n_processes))
-        for name, split in SPLITS.items():
+        for name, split in chosen.items():
             with tempfile.TemporaryDirectory() as folder:
                 run = measured(split, Path(folder))
             print(name, run, file=sys.stderr, flush=True)
@@ -143,10 +152,12 @@ def main(n_rounds: int) -> None:
         figures |= {f"{name}_{field}": getattr(run, field) for field in Run.__slots__}
     pairs = [(name, base) for base in ("one_core", "one_thread") for name in ("two_threads", "two_workers")]
     for name, base in [*pairs, ("ray_one_node", "one_worker"), ("ray_two_nodes", "two_workers")]:
+        if name not in best or base not in best:
+            continue
         figures[f"{name}_over_{base}"] = best[base].total_s / best[name].total_s
         figures[f"{name}_over_{base}_steady"] = best[name].steady_frames_per_s / best[base].steady_frames_per_s
     write_figures(Path("runs/bench/scale.json"), figures)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2)
+    main()
