@@ -38,12 +38,12 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset train-detect train-detect-baseline ablate-detect train-nav explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset benchmark benchmark-frames train-detect train-detect-baseline ablate-detect train-nav explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
 	@echo
-	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port'
+	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port  RUN=folder  SCENES=number  ELEVATION=folder'
 	@echo
 	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""
@@ -86,6 +86,16 @@ train-detect: detect-frames ## train and evaluate crater detection; run again to
 
 train-detect-baseline: detect-frames ## the same network without attention, into <name>-none
 	@$(BIN)/perilune-train detect train $(COMMON) --set detect.attention=none --out "$(RUNS)" --name $(NAME)-none --dataset "$(DATA)/detect" $(OVER)
+
+# A part of the benchmark is in a folder of its own.
+BENCHMARK := data/benchmark$(if $(SCENES),-$(SCENES)-scenes)
+benchmark-frames: setup ## render the locked benchmark (SCENES=2 for a part of it, ELEVATION=folder of the elevation models)
+	@scripts/render-benchmark $(BENCHMARK) $(or $(SCENES),0) $(if $(ELEVATION),$(call quoted,$(ELEVATION)))
+
+benchmark: setup ## score a run on the locked benchmark (RUN=folder); writes runs/benchmark/<name of the run>
+	@$(if $(RUN),,echo "RUN: not given, expected the folder of a detect run: make benchmark RUN=runs/detect/small" >&2; exit 2)
+	@$(MAKE) --no-print-directory benchmark-frames
+	@$(BIN)/perilune-train detect benchmark --run $(call quoted,$(RUN)) --data $(BENCHMARK)
 
 # Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
 ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0

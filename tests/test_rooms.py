@@ -27,7 +27,7 @@ ROOMS = {
     ),
     "train/perilune_train": "config cli_options data evaluation models training detect navigate explain cli",
     "train/perilune_train/detect": (
-        "config finished_run data evaluate inference train evaluate_run compare_runs images deploy cli"
+        "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
     ),
     "train/perilune_train/navigate": "config geometry data network evaluate train command",
 }

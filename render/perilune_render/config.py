@@ -101,7 +101,7 @@ class KindConfig(Section):
     val_share: Share = 0.1
     """Share of the units of the split that are in the validation split."""
     test_share: Share = 0.1
-    """Share of the units of the split that are in the test split."""
+    """Share of the units of the split that are in the test split; with 1 there is no other split."""
     flight: FlightConfig = FlightConfig()
     """Trajectories."""
     sun: SunConfig = SunConfig()
@@ -109,8 +109,8 @@ class KindConfig(Section):
 
     @model_validator(mode="after")
     def _shares_below_one(self) -> "KindConfig":
-        if self.val_share + self.test_share >= 1:
-            raise ValueError("val_share + test_share below 1")
+        if self.val_share + self.test_share >= 1 and (self.val_share, self.test_share) != (0, 1):
+            raise ValueError("val_share + test_share below 1, or test_share 1 and val_share 0 for a test set")
         return self
 
 

@@ -196,7 +196,8 @@ def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:
     shape = (settings.n_scenes, settings.trajectories_per_scene, settings.n_frames)
     n_axes = ("scene", "trajectory", "frame").index(settings.split_by) + 1
     n_units = int(np.prod(shape[:n_axes]))
-    n_test = min(int(np.ceil(settings.test_share * n_units)), max(n_units - 2, 0))
+    largest = n_units if settings.test_share == 1 else max(n_units - 2, 0)
+    n_test = min(int(np.ceil(settings.test_share * n_units)), largest)
     n_val = min(int(np.ceil(settings.val_share * n_units)), max(n_units - n_test - 1, 0))
     counts = {"train": n_units - n_val - n_test, "val": n_val, "test": n_test}
     codes = np.repeat(np.array([SPLITS.index(name) for name in counts], np.int8), list(counts.values()))

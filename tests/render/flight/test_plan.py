@@ -33,6 +33,15 @@ def test_units_are_never_shared_between_splits(unit):
     assert counts == pytest.approx({"train": 0.7, "val": 0.1, "test": 0.2}, abs=0.01)
 
 
+@pytest.mark.parametrize("unit", ["scene", "trajectory", "frame"])
+def test_a_test_set_has_no_other_split(unit):
+    counts = {"n_scenes": 2, "trajectories_per_scene": 2, "n_frames": 4, "split_by": unit, "test_share": 1.0}
+    made = make_plan(config_with(detect=KindConfig(**counts, val_share=0.0)), "detect")
+    assert {split for t in made.trajectories for split in t.splits} == {"test"}
+    with pytest.raises(ValueError, match="test_share 1 and val_share 0"):
+        KindConfig(**counts, val_share=0.1)
+
+
 def test_frames_split_at_random_have_no_split_of_their_descent():
     assert plan("frame").trajectories[0].split is None and plan("scene").trajectories[0].split in (
         "train",

@@ -14,8 +14,8 @@ METRICS_FILE = "metrics.json"
 Metrics = dict[str, float | int | str | None]
 
 
-def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None]) -> None:
-    """Write metrics.json; values that are not finite become null. Adds commit, versions and hardware (run/...)."""
+def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None], name: str = METRICS_FILE) -> None:
+    """Write metrics.json, or `name`; values that are not finite become null. Adds run/... (commit, hardware)."""
     # Imported here, so that reading metrics does not need torch.
     import torch
 
@@ -24,7 +24,7 @@ def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None])
     }
     plain |= {f"run/{key}": value for key, value in asdict(run_record()).items()}
     plain["run/gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
-    write_text(folder / METRICS_FILE, json.dumps(plain, indent=2, allow_nan=False) + "\n")
+    write_text(folder / name, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 
 def read_metrics(folder: Path) -> Metrics:

@@ -2,6 +2,7 @@
 
 import typer
 
+from perilune_train.detect.cli.benchmark import benchmark
 from perilune_train.detect.cli.compare import compare
 from perilune_train.detect.cli.evaluate import evaluate
 from perilune_train.detect.cli.export import export
@@ -16,6 +17,7 @@ app = typer.Typer(
 )
 app.command("train")(train)
 app.command("evaluate")(evaluate)
+app.command("benchmark")(benchmark)
 app.command("compare")(compare)
 app.command("predict")(predict)
 app.command("export")(export)

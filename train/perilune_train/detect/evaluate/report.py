@@ -101,9 +101,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     ]
     lines += [*table(["", "usual", "edge", "strict"], rows), ""]
     lines += ["AP alone means the paper's AP: the sum of (R_n - R_(n-1)) P_n over all thresholds.", ""]
-    for by, title in (("radius", "Radius"), ("altitude", "Altitude"), ("sun", "Sun elevation")):
-        lines += _bins(title, [part for part in evaluation.bins if part.by == by])
-    lines += _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
+    lines += bin_tables(evaluation)
     lines += ["## Errors of detected craters", ""]
     errors = evaluation.errors
     rows = [
@@ -118,6 +116,14 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     ]
     lines += [*table(["", "px", "relative to the radius"], rows), ""]
     return "\n".join(lines)
+
+
+def bin_tables(evaluation: Evaluation) -> list[str]:
+    """Lines of the tables by radius, altitude, Sun elevation and freshness, each below its heading."""
+    lines = []
+    for by, title in (("radius", "Radius"), ("altitude", "Altitude"), ("sun", "Sun elevation")):
+        lines += _bins(title, [part for part in evaluation.bins if part.by == by])
+    return lines + _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
 
 
 def _cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], key: str) -> str:

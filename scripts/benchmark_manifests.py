@@ -1,0 +1,70 @@
+"""Plan the scenes of the locked benchmark, as data_manifests/benchmark-*.
+
+    python scripts/benchmark_manifests.py --elevation-models FOLDER --out data_manifests
+
+Nine scenes of highland and nine of mare ground, two scenes with another camera, and one scene on each of two elevation
+models (NPB_1km.tif and NPC_2km.tif of the repository nasa-jpl/lunasynth), for detection and for navigation. All frames
+are test frames. Names, and with them all seeds, are those of no preset.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+REGIONS = ("highland", "mare")
+"""Regions, named as their files in configs/."""
+OF_KIND = {
+    "detect": {"trajectories_per_scene": 2, "n_frames": 20, "flight.attitude_sigma_deg": 1.0},
+    "nav": {"trajectories_per_scene": 1, "n_frames": 40},
+}
+"""Settings of each kind; each scene has 40 frames."""
+OF_ALL = {
+    "split_by": "scene",
+    "val_share": 0,
+    "test_share": 1,
+    "flight.azimuth_deg": "{low: 0, high: 360}",
+    "sun.elevation_deg": "{low: 8, high: 65}",
+}
+OTHER_CAMERA = {
+    "dataset.camera.horizontal_fov_deg": 35,
+    "dataset.camera.distortion": "{k1: -0.12, k2: 0.03}",
+    "dataset.sensor.read_noise_e": 40,
+    "dataset.sensor.psf_sigma_px": 0.7,
+}
+"""A narrower field of view with a distorting lens and a noisier sensor."""
+ELEVATION_MODELS = {"npb": "NPB_1km.tif", "npc": "NPC_2km.tif"}
+"""Files by the end of the manifest's name."""
+
+
+def plan(kind: str, part: str, n_scenes: int, out: Path, settings: dict[str, object], *options: str) -> None:
+    """Plan one manifest; `settings` are in addition to those above, by their whole names."""
+    chosen = {
+        "dataset.name": f"benchmark-{part}",
+        f"dataset.{kind}.n_scenes": n_scenes,
+        **{f"dataset.{kind}.{key}": value for key, value in (OF_ALL | OF_KIND[kind]).items()},
+        **settings,
+    }
+    pairs = [text for key, value in chosen.items() for text in ("--set", f"{key}={value}")]
+    program, place = Path(sys.executable).with_name("perilune-render"), out / f"benchmark-{kind}-{part}"
+    command = [program, "plan", "--preset", "large", "--kind", kind, *options, *pairs, "--out", place]
+    subprocess.run(list(map(str, command)), check=True)
+
+
+def main(
+    elevation_models: Annotated[Path, typer.Option(help="Folder with the two GeoTIFF files.")],
+    out: Annotated[Path, typer.Option(help="Folder of the manifests.")],
+) -> None:
+    """Write ten manifests."""
+    for kind in OF_KIND:
+        for region in REGIONS:
+            plan(kind, region, 9, out, {}, "--config", f"configs/{region}.yaml")
+        plan(kind, "camera", 2, out, OTHER_CAMERA)
+        for part, file in ELEVATION_MODELS.items():
+            plan(kind, part, 1, out, {}, "--dem", str(elevation_models / file))
+
+
+if __name__ == "__main__":
+    typer.run(main)

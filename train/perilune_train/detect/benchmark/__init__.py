@@ -1,0 +1,1 @@
+"""The locked benchmark of crater detection: its parts, submissions of other detectors, scores, page."""

@@ -1,0 +1,81 @@
+"""The page of a benchmark result."""
+
+from collections.abc import Sequence
+
+from perilune_train.detect.benchmark.score import ACCOUNTS, RULES, Score
+from perilune_train.detect.evaluate.matching import EDGE
+from perilune_train.detect.evaluate.report import bin_tables, number, table
+
+_COLUMNS = {"ap50_paper": "AP", "precision": "precision", "recall": "recall", "f1": "F1"}
+_RULES = {
+    "visible": "`visible`: craters that a person can see in the frame",
+    "paper": "`paper`: all craters with a radius of 2 to 50 px, however faint",
+}
+
+
+def page_of(score: Score, about: Sequence[str]) -> str:
+    """The page as Markdown: headline, all accounts, regions, bins. `about` says what was scored, in Markdown."""
+    ap_rule, ap_account, ap = score.least("ap50_paper")
+    f1_rule, f1_account, f1 = score.least("f1")
+    lines = [
+        "# Locked benchmark of crater detection",
+        "",
+        f"**AP {ap:.3f}, F1 {f1:.3f}** by the least favourable account "
+        f"(AP: labels by `{ap_rule}`, {ap_account} account; F1: `{f1_rule}`, {f1_account}).",
+        "",
+        *[f"- {line}" for line in about],
+        *[f"- {line}" for line in _coverage(score)],
+        "",
+        "## Accounts",
+        "",
+        *_accounts(score),
+        "",
+        *[f"- {text}" for text in _RULES.values()],
+        "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored",
+        f"- edge: detections down to {EDGE:g} of the smallest radius are false positives, unless they overlap a crater",
+        "- strict: every unmatched detection is a false positive",
+        "- in brackets: 95 % intervals over scenes; a match needs an IoU of 0.5",
+        "",
+    ]
+    for rule in RULES:
+        lines += [f"## By region, labels by `{rule}`", "", *_regions(score, rule), ""]
+        lines += [f"## By radius, altitude, Sun and freshness, labels by `{rule}`", ""]
+        lines += [line.replace("## ", "### ", 1) for line in bin_tables(score.evaluations[rule])]
+    return "\n".join(lines)
+
+
+def _coverage(score: Score) -> list[str]:
+    lines = []
+    for part, (n_frames, n_locked) in score.frames_of.items():
+        whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"
+        lines.append(f"`{part}`: {whole} of the shared manifest")
+    return lines
+
+
+def _accounts(score: Score) -> list[str]:
+    rows = []
+    for rule, evaluation in score.evaluations.items():
+        figures, spreads = evaluation.figures(), evaluation.spreads
+        for account, prefix in ACCOUNTS.items():
+            cells = [f"`{rule}`", account]
+            for key in _COLUMNS:
+                value, spread = figures[f"{prefix}{key}"], spreads.get(f"{prefix}{key}")
+                known = isinstance(value, int | float) and spread is not None
+                cells.append(spread.text(value) if known and spread is not None else number(value))  # type: ignore[arg-type]
+            rows.append([*cells, str(figures["labels"])])
+    return table(["labels", "account", *_COLUMNS.values(), "selected labels"], rows)
+
+
+def _regions(score: Score, rule: str) -> list[str]:
+    rows = [
+        [
+            region.name,
+            str(region.scenes),
+            str(region.labels),
+            region.spread.text(region.ap50_paper),
+            number(region.edge_ap50_paper),
+            number(region.f1),
+        ]
+        for region in score.regions[rule]
+    ]
+    return table(["region", "scenes", "labels", "AP", "edge AP", "F1"], rows)

@@ -1,0 +1,90 @@
+"""The datasets of the locked benchmark, and whether they are those of the shared manifests."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Address, open_store
+
+PARTS = {
+    "benchmark-detect-highland": "highland",
+    "benchmark-detect-mare": "mare",
+    "benchmark-detect-camera": "other camera",
+    "benchmark-detect-npb": "elevation model",
+    "benchmark-detect-npc": "elevation model",
+}
+"""Names of the datasets, and of their manifests, with their regions."""
+_POSE = ("position_m", "rotation_wxyz", "sun_direction")
+
+
+@dataclass(frozen=True)
+class Part:
+    """One rendered dataset of the benchmark."""
+
+    name: str
+    """One of PARTS."""
+    dataset: Dataset
+    """The rendered frames."""
+    n_locked: int
+    """Number of frames of the shared manifest; the dataset may have fewer."""
+
+    @property
+    def region(self) -> str:
+        """highland, mare, other camera or elevation model."""
+        return PARTS[self.name]
+
+
+def open_parts(data: Address, manifests: Address) -> list[Part]:
+    """Open the datasets below `data` that belong to the benchmark, and compare them with the shared manifests.
+
+    Raises UserError if there is none, or if a scene or a frame is not that of its manifest.
+    """
+    store, locked = open_store(data), open_store(manifests)
+    found = []
+    for name in PARTS:
+        if store.exists(f"{name}/dataset.json"):
+            dataset, manifest = open_dataset(store.sub(name)), open_dataset(locked.sub(name))
+            if not dataset.info.complete:
+                raise UserError(dataset.store, "complete", "false", "a finished dataset; resume its rendering")
+            _check_scenes(dataset, manifest)
+            _check_frames(dataset, manifest)
+            found.append(Part(name, dataset, manifest.info.counts.frames))
+    if not found:
+        raise UserError(store, "benchmark", "no dataset", f"one of {', '.join(PARTS)}; see docs/how-to/benchmark.md")
+    return found
+
+
+def _check_scenes(dataset: Dataset, manifest: Dataset) -> None:
+    columns = ["scene_id", "content_sha256", "sun_azimuth_deg", "sun_elevation_deg", "photometry"]
+    locked = {row["scene_id"]: row for row in manifest.table("scenes", columns).to_pylist()}
+    for row in dataset.table("scenes", columns).to_pylist():
+        expected = locked.get(row["scene_id"], {})
+        for column in columns:
+            if row[column] != expected.get(column):
+                expected_text = f"{expected.get(column, 'no such scene')}, as in {manifest.store}"
+                raise UserError(dataset.store, f"{row['scene_id']}: {column}", row[column], expected_text)
+
+
+def _check_frames(dataset: Dataset, manifest: Dataset) -> None:
+    columns = ["frame_id", "split", *_POSE]
+    locked = manifest.table("frames", columns).to_pandas().set_index("frame_id")
+    frames = dataset.table("frames", columns).to_pandas().set_index("frame_id")
+    unknown = frames.index.difference(locked.index)
+    if len(unknown):
+        raise UserError(dataset.store, "frame_id", unknown[0], f"a frame of {manifest.store}")
+    expected = locked.loc[frames.index]
+    for column in _POSE:
+        equal = np.isclose(_array(frames[column]), _array(expected[column]), rtol=0, atol=1e-9).all(axis=1)
+        if not equal.all():
+            raise UserError(
+                dataset.store, column, f"another one in {frames.index[int(equal.argmin())]}", "the manifest's"
+            )
+    if not (frames["split"] == "test").all():
+        raise UserError(dataset.store, "split", "train or val", "test frames only")
+
+
+def _array(column: pd.Series) -> np.ndarray:
+    return np.stack([np.asarray(value, np.float64) for value in column])

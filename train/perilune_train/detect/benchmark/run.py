@@ -1,0 +1,89 @@
+"""Score a run, or a table of detections, on the locked benchmark; writes page, figures and pictures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from perilune_shared.storage.files import write_text
+from perilune_shared.storage.store import Address
+from perilune_train.detect.benchmark.page import page_of
+from perilune_train.detect.benchmark.parts import Part, open_parts
+from perilune_train.detect.benchmark.score import Score, load_parts, score
+from perilune_train.detect.benchmark.submission import read_submission
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.evaluate.report import write_evaluation
+from perilune_train.detect.finished_run import chosen_threshold
+from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.metrics_file import Metrics, write_metrics
+from perilune_train.evaluation.provenance import TerrainCheck, check_terrain, read_provenance
+
+PAGE, FIGURES = "benchmark.md", "benchmark.json"
+_PICTURES = ("report.md", "precision_recall.png", "precision_recall.parquet", "bins.png", "detections.png")
+
+
+def score_run(
+    run: Path, config: DetectConfig, data: Address, manifests: Address, out: Path, allow_overlap: bool = False
+) -> Score:
+    """Score the best weights of a run at the run's own threshold.
+
+    Raises UserError if the benchmark is missing or changed, or if the network was fitted to its terrain, unless
+    `allow_overlap`.
+    """
+    # torch takes seconds to load, and a table of detections does not need it.
+    from perilune_train.detect.inference.detector import open_detector
+    from perilune_train.detect.inference.scales import detect_split
+    from perilune_train.training import runs
+
+    parts, threshold = open_parts(data, manifests), chosen_threshold(run)
+    best = runs.RunFolder(run).best
+    provenance = read_provenance(runs.load_weights(best), best)
+    checks = [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
+    detector, loaded = open_detector(best, config), load_parts(parts)
+    found, rates = {}, {}
+    for name, split in next(iter(loaded.values())).items():
+        found[name], rates[name] = detect_split(detector, split, name)
+    scales = " and ".join(f"{factor:g}" for factor in config.evaluation.scales)
+    about = [f"run `{run.resolve().name}`, best weights, frames evaluated at scale {scales}"]
+    about.append(f"threshold {threshold:.4f}, chosen on the validation split of the run's own dataset")
+    more: Metrics = {"scored": f"run {run.resolve().name}", "scales": scales}
+    more |= {f"images_per_s/{name}": round(rate, 2) for name, rate in rates.items()}
+    return _written(out, parts, loaded, found, threshold, about, more, checks)
+
+
+def score_submission(
+    detections: Path, name: str, threshold: float, data: Address, manifests: Address, out: Path
+) -> Score:
+    """Score a table of detections (submission.py) at a threshold.
+
+    Raises UserError if the benchmark is missing or changed, or the table is not valid.
+    """
+    parts = open_parts(data, manifests)
+    loaded = load_parts(parts)
+    ids = {name: split.frames.table["frame_id"].tolist() for name, split in next(iter(loaded.values())).items()}
+    found = read_submission(detections, ids)
+    about = [f"detections of `{name}`; training data and choices are as its authors state"]
+    about.append(f"threshold {threshold:g}, as given; it must be chosen on other frames")
+    return _written(out, parts, loaded, found, threshold, about, {"scored": f"detections of {name}"}, [])
+
+
+def _written(
+    out: Path,
+    parts: Sequence[Part],
+    loaded: dict[str, dict[str, DetectSplit]],
+    found: dict[str, list[Detections]],
+    threshold: float,
+    about: list[str],
+    more: Metrics,
+    checks: Sequence[TerrainCheck],
+) -> Score:
+    """Score detections and write all files; returns the score."""
+    made = score(parts, loaded, found, threshold)
+    mark = "; ".join(dict.fromkeys(check.mark for check in checks if check.mark))
+    for rule, evaluation in made.evaluations.items():
+        write_evaluation(out / rule, evaluation, made.images, [*about, f"labels: selection `{rule}`"])
+        mark_files(out / rule, _PICTURES, mark)
+    write_text(out / PAGE, page_of(made, about))
+    mark_files(out, [PAGE], mark)
+    write_metrics(out, made.figures() | more | {"threshold": threshold, "terrain/mark": mark}, FIGURES)
+    return made

@@ -1,0 +1,164 @@
+"""Score detections on all parts of the benchmark: every account, bins, regions, and the least favourable account."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.errors import UserError
+from perilune_train.detect.benchmark.parts import Part
+from perilune_train.detect.config import LabelSettings
+from perilune_train.detect.data.frame_facts import FrameFacts, facts_of
+from perilune_train.detect.data.labels import FrameLabels
+from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.detect.evaluate.bootstrap import average_precisions
+from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
+from perilune_train.detect.evaluate.matching import EDGE, Detections, Matches
+from perilune_train.detect.evaluate.metrics import at_threshold, curve
+from perilune_train.evaluation.metrics_file import Metrics
+from perilune_train.evaluation.spread import Spread, spreads
+
+RULES = ("visible", "paper")
+"""Selections of labels; the second is the paper's rule."""
+ACCOUNTS = {"usual": "", "edge": "edge/", "strict": "strict/"}
+"""Accounts of false positives (matching.py), and their prefix in the figures."""
+MATCH_IOU = 0.5
+SEED = 1
+"""Random seed of the intervals."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """Figures of one region by one rule, in the usual account."""
+
+    name: str
+    """See `Part.region`."""
+    scenes: int
+    """Number of scenes."""
+    labels: int
+    """Number of selected labels."""
+    ap50_paper: float
+    """AP as defined in the paper."""
+    spread: Spread
+    """Spread of it over the scenes."""
+    edge_ap50_paper: float
+    """AP in the edge account."""
+    f1: float
+    """F1 at the threshold."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """All figures of a set of detections."""
+
+    evaluations: dict[str, Evaluation]
+    """Evaluation of all frames, by rule."""
+    regions: dict[str, list[Region]]
+    """Figures by region, by rule."""
+    images: list[NDArray[np.uint8]]
+    """The frames (height, width), for pictures."""
+    frames_of: dict[str, tuple[int, int]]
+    """Number of frames scored and number of frames of the locked manifest, by part."""
+
+    def least(self, metric: str) -> tuple[str, str, float]:
+        """Rule, account and value of the lowest `metric` (ap50_paper, f1) of all accounts of all rules."""
+        values = {
+            (rule, account): float(evaluation.figures()[f"{prefix}{metric}"] or 0.0)
+            for rule, evaluation in self.evaluations.items()
+            for account, prefix in ACCOUNTS.items()
+        }
+        rule, account = min(values, key=lambda key: values[key])
+        return rule, account, values[rule, account]
+
+    def figures(self) -> Metrics:
+        """Flat keys for benchmark.json: headline/..., <rule>/<key of an evaluation>, <rule>/region/<name>/..."""
+        found: Metrics = {}
+        for metric in ("ap50_paper", "f1"):
+            rule, account, value = self.least(metric)
+            found |= {f"headline/{metric}": value, f"headline/{metric}_account": f"{rule}, {account}"}
+        for rule, evaluation in self.evaluations.items():
+            found |= {f"{rule}/{key}": value for key, value in evaluation.figures().items()}
+            for region in self.regions[rule]:
+                prefix = f"{rule}/region/{region.name.replace(' ', '_')}"
+                for name in ("scenes", "labels", "ap50_paper", "edge_ap50_paper", "f1"):
+                    found[f"{prefix}/{name}"] = getattr(region, name)
+                found |= region.spread.keys(f"{prefix}/ap50_paper")
+        for part, (n_frames, n_locked) in self.frames_of.items():
+            found |= {f"frames/{part}": n_frames, f"locked_frames/{part}": n_locked}
+        return found
+
+
+def load_parts(parts: Sequence[Part]) -> dict[str, dict[str, DetectSplit]]:
+    """Frames and labels of each part, by rule. Raises UserError if the parts have frames of different sizes."""
+    settings = {rule: LabelSettings(selection=rule) for rule in RULES}
+    loaded = {
+        rule: {part.name: load_split(part.dataset, "test", own, (1.0, 1 / EDGE)) for part in parts}
+        for rule, own in settings.items()
+    }
+    ranges = {split.radius_px for split in loaded["paper"].values()}
+    if len(ranges) > 1:
+        raise UserError(parts[0].dataset.store, "labels", sorted(ranges), "the same range of radii in all parts")
+    return loaded
+
+
+def score(
+    parts: Sequence[Part],
+    loaded: Mapping[str, Mapping[str, DetectSplit]],
+    found: Mapping[str, list[Detections]],
+    threshold: float,
+) -> Score:
+    """Score detections, by part one entry for each frame; `loaded` is from `load_parts`."""
+    evaluations, regions = {}, {}
+    splits = loaded[RULES[0]]
+    facts = _joined_facts({part.name: facts_of(splits[part.name].frames) for part in parts})
+    of_frame = [part.region for part in parts for _ in range(len(splits[part.name]))]
+    detections = [each for part in parts for each in found[part.name]]
+    for rule, by_part in loaded.items():
+        labels: list[FrameLabels] = [each for part in parts for each in by_part[part.name].labels]
+        radius_px = next(iter(by_part.values())).radius_px
+        evaluation = evaluate_detections(
+            detections, labels, facts, threshold, radius_px=radius_px, match_iou=MATCH_IOU, seed=SEED
+        )
+        evaluations[rule] = evaluation
+        regions[rule] = [_region(evaluation, name, of_frame) for name in dict.fromkeys(of_frame)]
+    images = [image for part in parts for image in splits[part.name].frames.images]
+    return Score(evaluations, regions, images, {part.name: (len(splits[part.name]), part.n_locked) for part in parts})
+
+
+def _region(evaluation: Evaluation, name: str, of_frame: list[str]) -> Region:
+    chosen = np.array([each == name for each in of_frame])
+
+    def own(matches: Matches) -> Matches:
+        return matches.of_frames(chosen)
+
+    matches = own(evaluation.matches)
+    spread = spreads(
+        lambda drawn: {"ap50_paper": average_precisions(matches, drawn)}, matches.selected_frame, evaluation.resamples
+    )
+    return Region(
+        name,
+        len({scene for scene, inside in zip(evaluation.facts.scene, chosen, strict=True) if inside}),
+        len(matches.selected_frame),
+        curve(matches).ap_paper(),
+        spread["ap50_paper"],
+        curve(own(evaluation.at_edge)).ap_paper(),
+        at_threshold(matches, evaluation.threshold)[2],
+    )
+
+
+def _joined_facts(parts: Mapping[str, FrameFacts]) -> FrameFacts:
+    """Facts of all frames; names of frames, scenes and trajectories begin with the name of the part."""
+
+    def renamed(part: str, names: list[str]) -> list[str]:
+        return [f"{part}/{name}" for name in names]
+
+    all_facts = parts.values()
+    return FrameFacts(
+        [name for part, facts in parts.items() for name in renamed(part, facts.name)],
+        np.concatenate([facts.sizes_px for facts in all_facts]),
+        [name for part, facts in parts.items() for name in renamed(part, facts.scene)],
+        [name for part, facts in parts.items() for name in renamed(part, facts.trajectory)],
+        np.concatenate([facts.altitude_m for facts in all_facts]),
+        np.concatenate([facts.sun_elevation_deg for facts in all_facts]),
+    )
