@@ -17,12 +17,16 @@ from perilune_shared.validation.validate import validate
 
 FOLDER = Path(__file__).parent.parent / "data_manifests"
 NAMES = sorted(path.parent.name for path in FOLDER.glob("*/dataset.json"))
+REFERENCES = sorted(path.name for path in (FOLDER / "reference_frames").iterdir())
+PARTS = ("highland", "mare", "camera", "npb", "npc")
 REAL = os.environ.get("PERILUNE_REAL_DEM")
 
 
 def test_all_are_here():
     kinds = ("detect", "nav")
-    assert sorted([f"{p}-{k}" for p in ("small", "paper", "large") for k in kinds] + ["south-pole-detect"]) == NAMES
+    of_presets = [f"{p}-{k}" for p in ("small", "paper", "large") for k in kinds]
+    benchmark = [f"benchmark-{k}-{part}" for k in kinds for part in PARTS]
+    assert sorted([*of_presets, *benchmark, "south-pole-detect"]) == NAMES
     counts = {name: open_dataset(FOLDER / name).info.counts for name in NAMES}
     assert [counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds] == [343, 49, 343, 49]
     assert all(
@@ -45,11 +49,22 @@ def test_no_two_manifests_share_terrain_but_the_papers():
     for name in NAMES:
         for content in open_dataset(FOLDER / name).table("scenes", ["content_sha256"])["content_sha256"].to_pylist():
             owners[content].add(name)
-    assert len(owners) == 343 + 49 + 10 + 1 + 1 + 1
+    assert len(owners) == 343 + 49 + 10 + 1 + 1 + 1 + 2 * 22
     assert [names for names in owners.values() if len(names) > 1] == [{"paper-detect", "paper-nav"}]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", ["detect", "nav"])
+def test_the_benchmark_has_test_frames_under_low_and_high_suns(kind):
+    parts = [open_dataset(FOLDER / f"benchmark-{kind}-{part}") for part in PARTS]
+    assert sum(part.info.counts.scenes for part in parts) == 22
+    assert all(part.table("frames", ["split"])["split"].unique().to_pylist() == ["test"] for part in parts)
+    sun = [angle for part in parts for angle in part.table("scenes")["sun_elevation_deg"].to_pylist()]
+    assert 8 <= min(sun) < 15 and 55 < max(sun) <= 65
+    altitude = [place[2] for part in parts for place in part.table("frames")["position_m"].to_pylist()]
+    assert min(altitude) < 220 and max(altitude) > 1480
+
+
+@pytest.mark.parametrize("name", REFERENCES)
 def test_a_frame_is_made_again(name, tmp_path):
     """The reference picture was rendered with the manifest; another kind of machine may differ in single pixels."""
     dem = None
