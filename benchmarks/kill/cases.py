@@ -17,6 +17,8 @@ from benchmarks.kill.rendering import Record, Rendering, Undisturbed, finished, 
 from benchmarks.kill.trials import killed
 
 _ONE = ("--workers", "1")
+_CONSTANT = "_STRETCH = 1.5"
+"""A constant of the sensor model. A version with another digit has another fingerprint."""
 _RENDER_PACKAGE = Path(perilune_render.__file__).parent
 
 
@@ -47,7 +49,9 @@ def other_code(out: str, whole: Undisturbed, draw: random.Random) -> Record:
     with tempfile.TemporaryDirectory() as folder:
         shutil.copytree(_RENDER_PACKAGE, Path(folder) / "perilune_render", ignore=shutil.ignore_patterns("__pycache__"))
         changed = Path(folder) / "perilune_render/imaging/sensor.py"
-        changed.write_text(changed.read_text(encoding="utf-8") + "\nCHANGED = True\n", encoding="utf-8")
+        text = changed.read_text(encoding="utf-8")
+        assert text.count(_CONSTANT) == 1
+        changed.write_text(text.replace(_CONSTANT, f"{_CONSTANT}1"), encoding="utf-8")
         path = os.pathsep.join([folder, *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
         # Before dataset.json is written, any code may begin.
         if moment["phase"] not in ("start", "complete"):

@@ -48,7 +48,8 @@ def interrupts_held() -> Iterator[None]:
 def ended_by_interrupt(*, after_s: float, at_end: Callable[[], object] = lambda: None) -> Iterator[None]:
     """End the process `after_s` seconds after Ctrl-C, if the block has not ended by then: with one line and code 130.
 
-    `at_end` is called before that, in another thread; it may end the processes that the block has started.
+    `at_end` may end the processes that the block has started. It is called before that, in another thread; or in this
+    one if the block itself ends with KeyboardInterrupt, which may have interrupted the code that ends them.
 
     For commands whose output survives SIGKILL. Python raises KeyboardInterrupt only between two steps of its own, and
     one call of Blender or NumPy may take longer. Without effect if Ctrl-C is ignored, and outside the main thread.
@@ -64,6 +65,9 @@ def ended_by_interrupt(*, after_s: float, at_end: Callable[[], object] = lambda:
     watcher.start()
     try:
         yield
+    except KeyboardInterrupt:
+        at_end()
+        raise
     finally:
         signal.set_wakeup_fd(before)
         os.close(end)

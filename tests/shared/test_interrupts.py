@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from perilune_shared.interrupts import interrupts_held
+from perilune_shared.interrupts import ended_by_interrupt, interrupts_held
 
 TWICE = """
 import os, signal, time
@@ -58,6 +58,16 @@ def test_ctrl_c_that_is_ignored_stays_ignored():
             assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_what_a_block_has_started_is_ended_although_the_block_ends_at_once():
+    """Ctrl-C may interrupt the code by which the block ends its processes."""
+    ended = []
+    with pytest.raises(KeyboardInterrupt), ended_by_interrupt(after_s=60, at_end=lambda: ended.append(True)):
+        raise KeyboardInterrupt
+    with ended_by_interrupt(after_s=60, at_end=lambda: ended.append(True)):
+        pass
+    assert ended == [True]
 
 
 @pytest.mark.parametrize("ignored", [False, True], ids=["heard", "ignored"])

@@ -19,6 +19,7 @@ from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.work_list import WorkList
 from perilune_render.processor import SETTINGS
 from perilune_shared.errors import UserError, ends_run
+from perilune_shared.interrupts import interrupts_held
 from perilune_shared.storage.store import Store
 
 
@@ -94,7 +95,8 @@ class RayActors:
         return self
 
     def __exit__(self, *_: object) -> None:
-        ray.shutdown()
+        with interrupts_held():  # half of a shutdown would leave processes
+            ray.shutdown()
 
     def check_scene(self, scene_id: str) -> None:
         """Generate a scene in an actor and check that its poses fit it. Raises UserError."""
