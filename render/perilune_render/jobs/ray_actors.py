@@ -75,13 +75,17 @@ class RayActors:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         local = {"num_cpus": self._n_workers * self._n_threads} if self._n_workers and self._address is None else {}
         try:
-            ray.init(
-                self._address or "local",
-                include_dashboard=None if self._address else False,
-                log_to_driver=False,
-                logging_level=logging.ERROR,
-                **local,
-            )
+            with interrupts_held():  # Python ignores an interrupt in a callback of a fork, and Ray forks
+                ray.init(
+                    self._address or "local",
+                    include_dashboard=None if self._address else False,
+                    log_to_driver=False,
+                    logging_level=logging.ERROR,
+                    **local,
+                )
+        except KeyboardInterrupt:
+            ray.shutdown()
+            raise
         except ConnectionError as error:
             raise UserError("--address", "Ray", error, "the address of a running Ray cluster, as host:6379") from None
         n_cores = sorted(int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"])

@@ -69,6 +69,23 @@ def test_a_process_has_one_thread_unless_more_are_given(configured, given, n_thr
     assert f"Ray: threads: got {n_threads}," in done.stderr
 
 
+def test_ctrl_c_while_ray_starts_ends_it_when_it_has_started(job, monkeypatch, tmp_path):
+    """Ray forks processes; in a callback of a fork, Python would print the interrupt and go on."""
+    from perilune_render.jobs import ray_actors
+
+    done = []
+
+    def init(*_, **__):
+        os.kill(os.getpid(), signal.SIGINT)
+        done.append("started")
+
+    monkeypatch.setattr(ray_actors.ray, "init", init)
+    monkeypatch.setattr(ray_actors.ray, "shutdown", lambda: done.append("ended"))
+    with pytest.raises(KeyboardInterrupt), ray_actors.RayActors(job, open_store(tmp_path), 1, None):
+        pass
+    assert done == ["started", "ended"]
+
+
 def test_a_process_that_is_lost_while_it_generates_the_first_scene_is_replaced(job, tmp_path):
     import ray
 
