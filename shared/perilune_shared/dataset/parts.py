@@ -104,6 +104,9 @@ class Part:
             texts = [field.name for field in self.schema if pa.types.is_string(field.type)]
             self.file = self._parquet(texts)
             self.found = self.file.metadata.schema.to_arrow_schema()
+            # Asked for once: each access of pyarrow's metadata makes new objects.
+            schema_of_file = self.file.metadata.schema
+            self._paths = [schema_of_file.column(place).path for place in range(len(schema_of_file))]
             self._check_size()
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(self.address, "content", error, "a complete Parquet file") from None
@@ -152,28 +155,29 @@ class Part:
         most_rows = min(_MAX_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_PER_ROW)
         n_bytes, n_rows = 0, 0
         n_nested: dict[str, int] = {}
+        places = self._places_of(self.schema.names)  # other columns are never read
         for group in range(footer.num_row_groups):
             rows = footer.row_group(group)
-            n_rows += rows.num_rows
-            if not 0 <= rows.num_rows <= min(_MAX_GROUP_ROWS, most_rows):
+            in_group = rows.num_rows
+            n_rows += in_group
+            if not 0 <= in_group <= min(_MAX_GROUP_ROWS, most_rows):
                 expected = f"at most {min(_MAX_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
-                raise UserError(self.address, "rows", f"{rows.num_rows} in a row group", expected)
-            for place in range(rows.num_columns):
+                raise UserError(self.address, "rows", f"{in_group} in a row group", expected)
+            if rows.num_columns != len(self._paths):
+                raise ValueError(f"a row group of {rows.num_columns} columns, expected {len(self._paths)}")
+            for place, path in places:
                 column = rows.column(place)
-                if column.path_in_schema.split(".")[0] not in self.schema.names:
-                    continue  # never read
+                n_values = column.num_values
                 n_bytes += max(column.total_uncompressed_size, 0)
-                if column.path_in_schema.startswith(_NESTED_ROWS):
+                if path.startswith(_NESTED_ROWS):
                     # Each is a row of a table, so the limit is that of rows.
-                    n_nested[column.path_in_schema] = n_nested.get(column.path_in_schema, 0) + column.num_values
-                    if column.num_values > _MAX_GROUP_ROWS or n_nested[column.path_in_schema] > most_rows:
+                    n_nested[path] = n_nested.get(path, 0) + n_values
+                    if n_values > _MAX_GROUP_ROWS or n_nested[path] > most_rows:
                         expected = f"at most {most_rows} for {self._n_bytes} bytes"
-                        raise UserError(self.address, column.path_in_schema, f"{column.num_values} values", expected)
+                        raise UserError(self.address, path, f"{n_values} values", expected)
                 # The longest other list is a quaternion.
-                elif column.num_values > 4 * rows.num_rows:
-                    raise UserError(
-                        self.address, column.path_in_schema, f"{column.num_values} values", "at most 4 per row"
-                    )
+                elif n_values > 4 * in_group:
+                    raise UserError(self.address, path, f"{n_values} values", "at most 4 per row")
         if footer.num_rows != n_rows or n_rows > most_rows:
             expected = f"{n_rows}, the sum of the row groups, at most {most_rows} for {self._n_bytes} bytes"
             raise UserError(self.address, "rows", footer.num_rows, expected)
@@ -185,6 +189,11 @@ class Part:
                 f"{n_bytes} bytes after decompression",
                 f"at most {most} for {self._n_bytes} bytes",
             )
+
+    def _places_of(self, names: Iterable[str]) -> list[tuple[int, str]]:
+        """Places and paths of the columns of the file that belong to fields of these names."""
+        wanted = set(names)
+        return [(place, path) for place, path in enumerate(self._paths) if path.split(".")[0] in wanted]
 
     def read(
         self, columns: Sequence[str] | None = None, groups: Iterable[int] | None = None, *, any_ids: bool = False
@@ -235,8 +244,7 @@ class Part:
         columns = [
             range_of(row_group.column(place))
             for row_group in map(self.file.metadata.row_group, groups)
-            for place in range(row_group.num_columns)
-            if row_group.column(place).path_in_schema.split(".")[0] in names
+            for place, _ in self._places_of(names)
         ]
         with self._ranges.fetched(columns):
             yield cast(BinaryIO, self._ranges)
@@ -244,10 +252,10 @@ class Part:
     def _check_pages(self, stream: BinaryIO, group: int, names: list[str]) -> None:
         """Check that the pages do not exceed the sizes in the footer, which have been checked."""
         metadata = self.file.metadata.row_group(group)
-        for column in map(metadata.column, range(metadata.num_columns)):
-            name = column.path_in_schema
-            if name.split(".")[0] not in names or (group, name) in self._checked:
+        for place, name in self._places_of(names):
+            if (group, name) in self._checked:
                 continue
+            column = metadata.column(place)
             pages = pages_of(stream, column)
             if pages.uncompressed_bytes > column.total_uncompressed_size or pages.n_values != column.num_values:
                 found = f"{pages.uncompressed_bytes} bytes after decompression and {pages.n_values} values"
