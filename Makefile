@@ -94,6 +94,7 @@ benchmark-frames: setup ## render the locked benchmark (SCENES=2 for a part of i
 
 benchmark: setup ## score a run on the locked benchmark (RUN=folder); writes runs/benchmark/<name of the run>
 	@$(if $(RUN),,echo "RUN: not given, expected the folder of a detect run: make benchmark RUN=runs/detect/small" >&2; exit 2)
+	@test -f $(call quoted,$(RUN))/config.yaml || { echo "RUN: "$(call quoted,$(RUN))": no config.yaml there, expected the folder of a detect run" >&2; exit 2; }
 	@$(MAKE) --no-print-directory benchmark-frames
 	@$(BIN)/perilune-train detect benchmark --run $(call quoted,$(RUN)) --data $(BENCHMARK)
 

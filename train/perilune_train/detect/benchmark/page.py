@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from perilune_train.detect.benchmark.parts import PARTS
 from perilune_train.detect.benchmark.score import ACCOUNTS, RULES, Score
 from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.report import bin_tables, number, table
@@ -49,7 +50,7 @@ def _coverage(score: Score) -> list[str]:
     for part, (n_frames, n_locked) in score.frames_of.items():
         whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"
         lines.append(f"`{part}`: {whole} of the shared manifest")
-    return lines
+    return lines + [f"`{part}`: **not scored**" for part in PARTS if part not in score.frames_of]
 
 
 def _accounts(score: Score) -> list[str]:
