@@ -116,6 +116,19 @@ def s3_bucket(s3_environment) -> str:
 
 
 @pytest.fixture
+def no_credentials(monkeypatch, tmp_path) -> Iterator[None]:
+    """No credentials for an object store in the environment, and none in the home folder."""
+    import s3fs
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    s3fs.S3FileSystem.clear_instance_cache()
+    yield
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+@pytest.fixture
 def tiny_detect(tiny, tmp_path) -> Path:
     """A copy of the tiny detection dataset that a test may damage."""
     return Path(shutil.copytree(tiny / "detect", tmp_path / "detect"))

@@ -33,7 +33,7 @@ def settings(n_scenes: int, n_trajectories: int, n_frames: int) -> tuple[str, ..
 
 def counted(cache: str, n_scenes: int, n_trajectories: int, n_frames: int) -> Counter[str]:
     """Render one dataset with a new cache of scenes; returns the number of requests by method."""
-    from aiobotocore.endpoint import AioEndpoint  # type: ignore[import-untyped]
+    from aiobotocore.endpoint import AioEndpoint
 
     from perilune_render.config import DatasetConfig
     from perilune_render.jobs import records

@@ -171,10 +171,8 @@ def _made(job: "Job", out: Store, how: _How) -> "Dataset | None":
         from perilune_render.jobs.local import default_workers
 
         how = replace(how, workers=default_workers(job, how.threads))
-    n_threads = how.threads
-    if how.executor == "ray":  # the machines of its processes may have other numbers of cores than this one
-        n_threads = n_threads or job.config.render.threads or 1
-    job = job.with_threads(n_threads, how.workers or 1)
+    if how.executor == "local" or how.threads is not None:  # the machines of Ray may have other numbers of cores
+        job = job.with_threads(how.threads, how.workers or 1)
     if how.finish:
         return finish_job(job, out)
     if how.dry_run:

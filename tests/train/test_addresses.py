@@ -116,17 +116,9 @@ def test_an_address_without_a_dataset_is_refused_in_one_line(command, networks, 
         assert not out.exists() or not list(out.rglob("*"))
 
 
-def test_missing_credentials_are_refused_in_one_line(networks, s3_bucket, monkeypatch, tmp_path):
-    import s3fs
-
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    s3fs.S3FileSystem.clear_instance_cache()
-    try:
-        done = in_process.call(main, "detect", "evaluate", "--run", networks[0], "--dataset", f"{s3_bucket}/detect")
-    finally:
-        s3fs.S3FileSystem.clear_instance_cache()
+@pytest.mark.usefixtures("no_credentials")
+def test_missing_credentials_are_refused_in_one_line(s3_bucket, networks):
+    done = in_process.call(main, "detect", "evaluate", "--run", networks[0], "--dataset", f"{s3_bucket}/detect")
     assert done.returncode == 2 and "expected credentials with access to it: AWS_ACCESS_KEY_ID" in done.stderr
     assert done.stderr.strip().count("\n") == 0
 

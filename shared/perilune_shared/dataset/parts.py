@@ -26,25 +26,18 @@ from pyarrow.fs import LocalFileSystem
 from perilune_shared.dataset.names import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, stem_of
 from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.errors import UserError
+from perilune_shared.storage.footers import check_footer
 from perilune_shared.storage.pages import pages_of, range_of
 from perilune_shared.storage.ranges import Ranges
 from perilune_shared.storage.store import Address, Store, open_store
 
 MOST_ROWS_WRITTEN = 2_000_000
 """Maximum number of rows of a written part; below the reader's limits for every table."""
-_MAX_ROWS = 50_000_000
-_MAX_GROUP_ROWS = 2**21
 _MAX_TEXT_BYTES = 1000
-_MAX_BYTES = 8 * 2**30
 # Maximum length of lists in a footer. It also limits the depth of the schema: deep nesting can crash the process.
 _MAX_LIST = 10_000
 _MAX_FOOTER_TEXT_BYTES = 10_000_000
-# Bounds on compression: no row of any table takes fewer bytes, and no data compresses by a larger factor.
-_SPARE_ROWS, _BYTES_PER_ROW = 10_000, 4
-_SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
 _SMALL_BYTES, _FEW_WORDS = 2**18, 200
-_NESTED_ROWS = "labels."
-"""Start of the columns of a shard that contain rows of another table, any number for each frame."""
 _PARQUET_FILE = re.compile(r"[A-Za-z0-9][^/]*\.parquet", re.DOTALL)
 _IDS = {"scene_id": ID_PATTERN, "trajectory_id": ID_PATTERN, "frame_id": FRAME_ID_PATTERN}
 
@@ -105,9 +98,9 @@ class Part:
             self.file = self._parquet(texts)
             self.found = self.file.metadata.schema.to_arrow_schema()
             # Asked for once: each access of pyarrow's metadata makes new objects.
-            schema_of_file = self.file.metadata.schema
-            self._paths = [schema_of_file.column(place).path for place in range(len(schema_of_file))]
-            self._check_size()
+            columns = self.file.metadata.schema
+            self._paths = [columns.column(place).path for place in range(len(columns))]
+            check_footer(self.file.metadata, self._places_of(self.schema.names), self._n_bytes, self.address)
         except (pa.ArrowException, OSError, ValueError, KeyError) as error:
             raise UserError(self.address, "content", error, "a complete Parquet file") from None
         metadata = self.found.metadata or {}
@@ -149,46 +142,6 @@ class Part:
     def n_groups(self) -> int:
         """Number of row groups."""
         return self.file.metadata.num_row_groups
-
-    def _check_size(self) -> None:
-        footer = self.file.metadata
-        most_rows = min(_MAX_ROWS, _SPARE_ROWS + self._n_bytes // _BYTES_PER_ROW)
-        n_bytes, n_rows = 0, 0
-        n_nested: dict[str, int] = {}
-        places = self._places_of(self.schema.names)  # other columns are never read
-        for group in range(footer.num_row_groups):
-            rows = footer.row_group(group)
-            in_group = rows.num_rows
-            n_rows += in_group
-            if not 0 <= in_group <= min(_MAX_GROUP_ROWS, most_rows):
-                expected = f"at most {min(_MAX_GROUP_ROWS, most_rows)} for {self._n_bytes} bytes"
-                raise UserError(self.address, "rows", f"{in_group} in a row group", expected)
-            if rows.num_columns != len(self._paths):
-                raise ValueError(f"a row group of {rows.num_columns} columns, expected {len(self._paths)}")
-            for place, path in places:
-                column = rows.column(place)
-                n_values = column.num_values
-                n_bytes += max(column.total_uncompressed_size, 0)
-                if path.startswith(_NESTED_ROWS):
-                    # Each is a row of a table, so the limit is that of rows.
-                    n_nested[path] = n_nested.get(path, 0) + n_values
-                    if n_values > _MAX_GROUP_ROWS or n_nested[path] > most_rows:
-                        expected = f"at most {most_rows} for {self._n_bytes} bytes"
-                        raise UserError(self.address, path, f"{n_values} values", expected)
-                # The longest other list is a quaternion.
-                elif n_values > 4 * in_group:
-                    raise UserError(self.address, path, f"{n_values} values", "at most 4 per row")
-        if footer.num_rows != n_rows or n_rows > most_rows:
-            expected = f"{n_rows}, the sum of the row groups, at most {most_rows} for {self._n_bytes} bytes"
-            raise UserError(self.address, "rows", footer.num_rows, expected)
-        most = min(_MAX_BYTES, _SPARE_BYTES + _MAX_COMPRESSION * self._n_bytes)
-        if n_bytes > most:
-            raise UserError(
-                self.address,
-                "size",
-                f"{n_bytes} bytes after decompression",
-                f"at most {most} for {self._n_bytes} bytes",
-            )
 
     def _places_of(self, names: Iterable[str]) -> list[tuple[int, str]]:
         """Places and paths of the columns of the file that belong to fields of these names."""

@@ -61,9 +61,9 @@ class Target:
 
     def write(self, content: bytes) -> None:
         """Write it, or replace it."""
-        if self.store.folder is None:
+        if self.store.folder is None or files.is_plain(self.name):
             self.store.replace(self.name, content)
-        else:
+        else:  # outside of datasets, names may have blanks and other letters
             files.write_bytes(self.store.folder / self.name, content)
 
 
@@ -109,10 +109,7 @@ def add_files(dataset: Dataset, contents: Mapping[Target, bytes], info: DatasetI
         # No file that an index names is overwritten: take the old ones out first.
         info = info if len(others) == len(rows) else seal(store, info, others)
         for target, content in contents.items():
-            if target.store is store:
-                store.replace(target.name, content)
-            else:
-                target.write(content)
+            target.write(content)
         known = {*others["path"].to_pylist(), *own}
         extra = sorted(name for name in EXTRA_NAMES - known if store.exists(name))
         added = {target.name: content for target, content in contents.items() if target.name in own}

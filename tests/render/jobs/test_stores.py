@@ -4,7 +4,6 @@ import re
 from dataclasses import replace
 
 import pytest
-import s3fs
 from rich.progress import Progress
 from tests.helpers import in_process
 from tests.helpers.flat_engine import FlatEngine
@@ -209,15 +208,9 @@ def test_faults_of_a_store_end_with_one_line(variables, out, message, options, s
     assert done.returncode == 2 and len(lines) == 1 and out in lines[0] and message in lines[0], done.stderr
 
 
-def test_missing_credentials_end_with_one_line(options, s3_bucket, monkeypatch, tmp_path):
-    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    s3fs.S3FileSystem.clear_instance_cache()
-    try:
-        done = in_process.call(main, "dataset", *options, "--workers", "0", "--out", f"{s3_bucket}/moon")
-    finally:
-        s3fs.S3FileSystem.clear_instance_cache()
+@pytest.mark.usefixtures("no_credentials")
+def test_missing_credentials_end_with_one_line(s3_bucket, options):
+    done = in_process.call(main, "dataset", *options, "--workers", "0", "--out", f"{s3_bucket}/moon")
     lines = [line for line in done.stderr.splitlines() if line.startswith("error")]
     assert done.returncode == 2 and len(lines) == 1 and f"{s3_bucket}/moon" in lines[0]
     assert "expected credentials with access to it: AWS_ACCESS_KEY_ID" in lines[0]

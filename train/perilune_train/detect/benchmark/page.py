@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from perilune_train.detect.benchmark.parts import PARTS
-from perilune_train.detect.benchmark.score import ACCOUNTS, RULES, Score
+from perilune_train.detect.benchmark.score import ACCOUNTS, MATCH_IOU, RULES, Score
 from perilune_train.detect.evaluate.matching import EDGE
-from perilune_train.detect.evaluate.report import bin_tables, number, table
+from perilune_train.detect.evaluate.report import bin_tables, number, spread_cell, spread_note, table
 
 _COLUMNS = {"ap50_paper": "AP", "precision": "precision", "recall": "recall", "f1": "F1"}
 _RULES = {
@@ -17,11 +17,12 @@ _RULES = {
 def page_of(score: Score, about: Sequence[str]) -> str:
     """The page as Markdown: headline, all accounts, regions, bins. `about` says what was scored, in Markdown."""
     ap_rule, ap_account, ap = score.least("ap50_paper")
+    spread = score.evaluations[ap_rule].spreads[f"{ACCOUNTS[ap_account]}ap50_paper"]
     f1_rule, f1_account, f1 = score.least("f1")
     lines = [
         "# Locked benchmark of crater detection",
         "",
-        f"**AP {ap:.3f}, F1 {f1:.3f}** by the least favourable account "
+        f"**AP {spread.text(ap)}, F1 {f1:.3f}** by the least favourable account "
         f"(AP: labels by `{ap_rule}`, {ap_account} account; F1: `{f1_rule}`, {f1_account}).",
         "",
         *[f"- {line}" for line in about],
@@ -35,7 +36,7 @@ def page_of(score: Score, about: Sequence[str]) -> str:
         "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored",
         f"- edge: detections down to {EDGE:g} of the smallest radius are false positives, unless they overlap a crater",
         "- strict: every unmatched detection is a false positive",
-        "- in brackets: 95 % intervals over scenes; a match needs an IoU of 0.5",
+        f"- {spread_note(score.evaluations[RULES[0]].resamples)}; a match needs an IoU of {MATCH_IOU:g}",
         "",
     ]
     for rule in RULES:
@@ -58,12 +59,8 @@ def _accounts(score: Score) -> list[str]:
     for rule, evaluation in score.evaluations.items():
         figures, spreads = evaluation.figures(), evaluation.spreads
         for account, prefix in ACCOUNTS.items():
-            cells = [f"`{rule}`", account]
-            for key in _COLUMNS:
-                value, spread = figures[f"{prefix}{key}"], spreads.get(f"{prefix}{key}")
-                known = isinstance(value, int | float) and spread is not None
-                cells.append(spread.text(value) if known and spread is not None else number(value))  # type: ignore[arg-type]
-            rows.append([*cells, str(figures["labels"])])
+            cells = [spread_cell(figures, spreads, f"{prefix}{key}") for key in _COLUMNS]
+            rows.append([f"`{rule}`", account, *cells, str(figures["labels"])])
     return table(["labels", "account", *_COLUMNS.values(), "selected labels"], rows)
 
 

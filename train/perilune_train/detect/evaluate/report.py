@@ -82,7 +82,7 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
     lines += [
         f"- {figures['frames']} frames, {figures['labels']} selected labels; most detections in one frame: {fullest}",
         f"- match at IoU {evaluation.match_iou:g}; precision, recall and F1 at a score of {evaluation.threshold:.4f}",
-        f"- {_of_brackets(evaluation.resamples)}",
+        f"- {spread_note(evaluation.resamples)}",
         "- usual: detections on ignored craters, outside the range of radii, or centred off the image are ignored; "
         f"edge: those down to {EDGE:g} of the smallest radius are false positives, unless they overlap a crater; "
         "strict: every unmatched detection is a false positive",
@@ -91,11 +91,11 @@ def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:
         "",
     ]
     rows = [
-        [title, *(_cell(figures, spreads, f"{account}{key}") for account in ("", "edge/", "strict/"))]
+        [title, *(spread_cell(figures, spreads, f"{account}{key}") for account in ("", "edge/", "strict/"))]
         for key, title in _ROWS.items()
     ]
     rows += [
-        ["AP over IoU 0.50:0.95", _cell(figures, spreads, "ap50_95_paper"), "", ""],
+        ["AP over IoU 0.50:0.95", spread_cell(figures, spreads, "ap50_95_paper"), "", ""],
         ["AP over IoU 0.50:0.95, COCO's 101 points", number(figures["ap50_95_coco101"]), "", ""],
         ["AP at IoU 0.75", number(figures["ap75_paper"]), "", ""],
     ]
@@ -126,13 +126,14 @@ def bin_tables(evaluation: Evaluation) -> list[str]:
     return lines + _freshness([part for part in evaluation.bins if part.by == "depth_ratio"])
 
 
-def _cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], key: str) -> str:
+def spread_cell(figures: Mapping[str, object], spreads: Mapping[str, Spread], key: str) -> str:
+    """A figure and, if known, its spread."""
     value = figures[key]
     known = key in spreads and isinstance(value, int | float)
     return spreads[key].text(value) if known else number(value)  # type: ignore[arg-type]
 
 
-def _of_brackets(resamples: Resamples) -> str:
+def spread_note(resamples: Resamples) -> str:
     """Explanation of the brackets after a number."""
     count, unit = resamples.count, resamples.unit
     if count < MIN_UNITS:

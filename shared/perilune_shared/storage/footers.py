@@ -1,0 +1,54 @@
+"""Check the sizes in the footer of a Parquet file, before anything is decompressed. The footer is untrusted."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from perilune_shared.errors import UserError
+
+_MAX_ROWS = 50_000_000
+_MAX_GROUP_ROWS = 2**21
+_MAX_BYTES = 8 * 2**30
+# Bounds on compression: no row of any table takes fewer bytes, and no data compresses by a larger factor.
+_SPARE_ROWS, _BYTES_PER_ROW = 10_000, 4
+_SPARE_BYTES, _MAX_COMPRESSION = 2**26, 200
+_NESTED_ROWS = "labels."
+"""Start of the columns of a shard that contain rows of another table, any number for each frame."""
+
+
+def check_footer(footer: Any, columns: Sequence[tuple[int, str]], n_bytes: int, address: str) -> None:
+    """Check the numbers of rows and values, and the bytes after decompression, of a file of `n_bytes` bytes.
+
+    `footer` is pyarrow's metadata of the file, `columns` has place and path of each column that will be read. Raises
+    UserError about `address` if a number exceeds its limit, ValueError if a row group has other columns than the file.
+    """
+    most_rows = min(_MAX_ROWS, _SPARE_ROWS + n_bytes // _BYTES_PER_ROW)
+    n_uncompressed, n_rows = 0, 0
+    n_nested: dict[str, int] = {}
+    for group in range(footer.num_row_groups):
+        rows = footer.row_group(group)
+        in_group = rows.num_rows
+        n_rows += in_group
+        if not 0 <= in_group <= min(_MAX_GROUP_ROWS, most_rows):
+            expected = f"at most {min(_MAX_GROUP_ROWS, most_rows)} for {n_bytes} bytes"
+            raise UserError(address, "rows", f"{in_group} in a row group", expected)
+        if rows.num_columns != footer.num_columns:
+            raise ValueError(f"a row group of {rows.num_columns} columns, expected {footer.num_columns}")
+        for place, path in columns:
+            column = rows.column(place)
+            n_values = column.num_values
+            n_uncompressed += max(column.total_uncompressed_size, 0)
+            if path.startswith(_NESTED_ROWS):
+                # Each is a row of a table, so the limit is that of rows.
+                n_nested[path] = n_nested.get(path, 0) + n_values
+                if n_values > _MAX_GROUP_ROWS or n_nested[path] > most_rows:
+                    raise UserError(address, path, f"{n_values} values", f"at most {most_rows} for {n_bytes} bytes")
+            # The longest other list is a quaternion.
+            elif n_values > 4 * in_group:
+                raise UserError(address, path, f"{n_values} values", "at most 4 per row")
+    if footer.num_rows != n_rows or n_rows > most_rows:
+        expected = f"{n_rows}, the sum of the row groups, at most {most_rows} for {n_bytes} bytes"
+        raise UserError(address, "rows", footer.num_rows, expected)
+    most = min(_MAX_BYTES, _SPARE_BYTES + _MAX_COMPRESSION * n_bytes)
+    if n_uncompressed > most:
+        found = f"{n_uncompressed} bytes after decompression"
+        raise UserError(address, "size", found, f"at most {most} for {n_bytes} bytes")
