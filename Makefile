@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-frames train-detect train-detect-baseline ablate-detect train-nav explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset benchmark benchmark-frames train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -92,11 +92,10 @@ BENCHMARK := data/benchmark$(if $(SCENES),-$(SCENES)-scenes)
 benchmark-frames: setup ## render the locked benchmark (SCENES=2 for a part of it, ELEVATION=folder of the elevation models)
 	@scripts/render-benchmark $(BENCHMARK) $(or $(SCENES),0) $(if $(ELEVATION),$(call quoted,$(ELEVATION)))
 
-benchmark: setup ## score a run on the locked benchmark (RUN=folder); writes runs/benchmark/<name of the run>
-	@$(if $(RUN),,echo "RUN: not given, expected the folder of a detect run: make benchmark RUN=runs/detect/small" >&2; exit 2)
-	@test -f $(call quoted,$(RUN))/config.yaml || { echo "RUN: "$(call quoted,$(RUN))": no config.yaml there, expected the folder of a detect run" >&2; exit 2; }
+benchmark: setup ## score the installed detector, or a run (RUN=folder), on the locked benchmark; writes runs/benchmark/
+	@test -z $(call quoted,$(RUN)) -o -f $(call quoted,$(RUN))/config.yaml || { echo "RUN: "$(call quoted,$(RUN))": no config.yaml there, expected the folder of a detect run" >&2; exit 2; }
 	@$(MAKE) --no-print-directory benchmark-frames
-	@$(BIN)/perilune-train detect benchmark --run $(call quoted,$(RUN)) --data $(BENCHMARK)
+	@$(BIN)/perilune-train detect benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
 
 # Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
 ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
@@ -109,7 +108,12 @@ ablate-detect: train-detect ## train with one change each (no attention, plain C
 
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect
-	@$(BIN)/perilune-train navigate $(TRAIN) --dataset "$(DATA)/nav" $(OVER)
+	@$(BIN)/perilune-train navigate train $(TRAIN) --dataset "$(DATA)/nav" $(OVER)
+
+# Each network without attention; the stack network starts from the detector without attention, if there is one.
+train-nav-baseline: nav-frames ## the same networks without attention, into <name>-none and <name>-none-stack
+	@$(BIN)/perilune-train navigate train $(COMMON) --set navigate.warp.attention=none --set navigate.stack.attention=none \
+	  --out $(call quoted,$(RUNS)) --name $(NAME)-none --dataset "$(DATA)/nav" $(OVER)
 
 explain: ## attention masks and correlations of the trained networks
 	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav

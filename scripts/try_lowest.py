@@ -44,7 +44,7 @@ def main(folder: Path) -> None:
     common = ["--preset", "tiny", "--out", str(folder / "runs")]
     for command in (
         ["detect", "train", *common, "--dataset", str(folder / "detect"), "--set", "detect.epochs=1"],
-        ["navigate", *common, "--dataset", str(folder / "nav"), "--set", "navigate.warp.fine_epochs=0"],
+        ["navigate", "train", *common, "--dataset", str(folder / "nav"), "--set", "navigate.warp.fine_epochs=0"],
     ):
         subprocess.run([program, *command], check=True)
     picture = next((folder / "detect" / "frames").rglob("*.png"))

@@ -9,7 +9,7 @@ from tests.helpers.drawn_dataset import build_dataset
 
 DRAWING = {
     "perilune_train.detect.evaluate.report": ("draw_bins", "draw_curves", "draw_frames"),
-    "perilune_train.navigate.train.run": ("draw_trajectory", "draw_errors"),
+    "perilune_train.navigate.evaluate.report": ("draw_trajectory", "draw_errors"),
 }
 """Functions that write pictures, by the module that calls them."""
 

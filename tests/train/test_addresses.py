@@ -41,7 +41,7 @@ COMMANDS = {
     "train": "detect train --preset tiny --name a --out {out} --dataset {address}/detect",
     "evaluate": "detect evaluate --run {run} --dataset {address}/detect",
     "export": "detect export --run {run} --out {out} --dataset {address}/detect",
-    "navigate": "navigate --preset tiny --name a --out {out} --dataset {address}/nav",
+    "navigate": "navigate train --preset tiny --name a --out {out} --dataset {address}/nav",
     "explain": "explain --name a --out {out} --detector {run}/checkpoints/best.ckpt --navigator {stack} "
     "--dataset {address}",
 }
@@ -82,7 +82,7 @@ def test_a_detector_is_evaluated_on_a_dataset_at_an_address(networks, few, bucke
 def test_a_navigator_is_trained_on_a_dataset_at_an_address(bucket, tmp_path):
     epochs = ("warp.coarse_epochs=0", "warp.fine_epochs=1", "warp.sequence_pairs=4")
     settings = [part for value in (*_NAVIGATE, *epochs) for part in ("--set", f"navigate.{value}")]
-    given = ("navigate", "--preset", "tiny", "--name", "a", "--out", tmp_path, "--dataset", f"{bucket}/nav")
+    given = ("navigate", "train", "--preset", "tiny", "--name", "a", "--out", tmp_path, "--dataset", f"{bucket}/nav")
     done = in_process.call(main, *given, *settings)
     assert done.returncode == 0, done.stderr
     assert len(pd.read_parquet(tmp_path / "navigate" / "a" / "navigation.parquet")) == 5

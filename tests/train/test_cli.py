@@ -31,7 +31,7 @@ def test_help_names_the_commands():
         assert command in result.output
 
 
-@pytest.mark.parametrize("command", ["detect train", "navigate", "explain"])
+@pytest.mark.parametrize("command", ["detect train", "navigate train", "explain"])
 def test_each_command_tells_its_options(command):
     result = CliRunner().invoke(app, [*command.split(), "--help"], env={"COLUMNS": "200"})
     assert result.exit_code == 0

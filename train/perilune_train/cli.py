@@ -12,7 +12,7 @@ from perilune_train.detect.cli.main import app as detect
 from perilune_train.detect.config import DetectConfig
 from perilune_train.explain.command import explain
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.navigate.command import navigate
+from perilune_train.navigate.cli.main import app as navigate
 from perilune_train.navigate.config import NavigateConfig
 
 SECTIONS: dict[str, type[Section]] = {"detect": DetectConfig, "navigate": NavigateConfig, "explain": ExplainConfig}
@@ -23,7 +23,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.add_typer(detect, name="detect")
-app.command("navigate")(navigate)
+app.add_typer(navigate, name="navigate")
 app.command("explain")(explain)
 
 

@@ -12,7 +12,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text
 from perilune_train.detect.evaluate.figures import draw_curves
 from perilune_train.detect.evaluate.metrics import Curve
-from perilune_train.detect.evaluate.report import CURVE_FILE, number, table
+from perilune_train.detect.evaluate.report import CURVE_FILE
+from perilune_train.evaluation.markdown import number, table
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.evaluation.provenance import Status, TerrainCheck

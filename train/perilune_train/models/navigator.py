@@ -9,6 +9,8 @@ from perilune_train.models.darknet import AttentionDarknet53, conv_block
 
 OUTPUTS = 9
 """3 of the translation and 6 of the continuous rotation (see navigate/geometry.py)."""
+State = tuple[Tensor, Tensor]
+"""Hidden and cell state of the LSTM, each (2 layers, batch, hidden)."""
 
 
 class Recurrent(nn.Module):
@@ -16,7 +18,8 @@ class Recurrent(nn.Module):
 
     The linear layer starts at zero, so that an untrained network outputs the reference motion.
 
-    Shape: features (batch, pairs, inputs) to (batch, pairs, 9).
+    Shape: features (batch, pairs, inputs) to (batch, pairs, 9) and the state after the last pair. `state` is that after
+    the pair before the first; None at the start of a trajectory.
     """
 
     def __init__(self, inputs: int, hidden: int):
@@ -26,15 +29,16 @@ class Recurrent(nn.Module):
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
-    def forward(self, features: Tensor) -> Tensor:
-        hidden, _ = self.lstm(features)
-        return self.output(hidden).float()
+    def forward(self, features: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+        hidden, state = self.lstm(features, state)
+        return self.output(hidden).float(), state
 
 
 class StackNavigator(nn.Module):
     """The paper's network: the pair stacked in height, attention-Darknet53, global average pool, LSTM.
 
-    Shape: earlier and later frames (batch, pairs, height, width), normalised, to (batch, pairs, 9).
+    Shape: earlier and later frames (batch, pairs, height, width), normalised, to (batch, pairs, 9) and the state of
+    the LSTM.
     """
 
     def __init__(self, in_channels: int, width: float, attention: Attention, hidden: int):
@@ -48,9 +52,12 @@ class StackNavigator(nn.Module):
         both = torch.cat([first, second], dim=2).flatten(0, 1)
         return both[:, None].expand(-1, self.in_channels, -1, -1).contiguous(memory_format=torch.channels_last)
 
-    def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        features = self.backbone(self.stacked(first, second))[-1]
-        return self.recurrent(features.mean((2, 3)).unflatten(0, first.shape[:2]))
+    def features(self, first: Tensor, second: Tensor) -> Tensor:
+        """The backbone's last features, averaged over the pair (batch, pairs, channels)."""
+        return self.backbone(self.stacked(first, second))[-1].mean((2, 3)).unflatten(0, first.shape[:2])
+
+    def forward(self, first: Tensor, second: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+        return self.recurrent(self.features(first, second), state)
 
 
 class WarpNavigator(nn.Module):
@@ -63,8 +70,8 @@ class WarpNavigator(nn.Module):
     motion that explains the flow over the ground plane. The LSTM's output is added as a correction.
 
     Shape: earlier and warped later frames (batch, pairs, height, width), normalised, and nominal altitudes (batch,
-    pairs) in metres, to the motion (batch, pairs, 9) in the units of navigate/network.py and the flow (batch, pairs,
-    height / 8, width / 8, 2), pixels.
+    pairs) in metres, to the motion (batch, pairs, 9) in the units of navigate/network.py, the flow (batch, pairs,
+    height / 8, width / 8, 2), pixels, and the LSTM's state.
     """
 
     BLURS_PX = (3, 5, 9)
@@ -101,7 +108,9 @@ class WarpNavigator(nn.Module):
         channels = [pair, *(local_shift(blurred(pair, size)) for size in self.BLURS_PX)]
         return torch.cat(channels, dim=1).contiguous(memory_format=torch.channels_last)
 
-    def forward(self, first: Tensor, second: Tensor, altitude_m: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, first: Tensor, second: Tensor, altitude_m: Tensor, state: State | None = None
+    ) -> tuple[Tensor, Tensor, State]:
         stacked = self.stacked(first, second)
         features = self.mix(self.backbone(stacked)[-1])
         with torch.autocast(features.device.type, enabled=False):
@@ -110,13 +119,13 @@ class WarpNavigator(nn.Module):
             flow_px, weight = estimates[..., :2], torch.exp(estimates[..., 2].clamp(-8, 8))
             fitted = self.fitted_motion(flow_px, weight, altitude_m.flatten(), first.shape[-1])
         summary = torch.cat([self.summary(features).float(), fitted], dim=-1)
-        correction = self.recurrent(summary.unflatten(0, first.shape[:2]))
+        correction, state = self.recurrent(summary.unflatten(0, first.shape[:2]), state)
         turn = fitted[:, 3:]
         zero = torch.zeros_like(turn[:, 0])
         # First two columns of a small rotation, minus (1, 0, 0) and (0, 1, 0).
         columns = torch.stack([zero, turn[:, 2], -turn[:, 1], -turn[:, 2], zero, turn[:, 0]], dim=-1)
         motion = torch.cat([fitted[:, :3], columns], dim=-1).unflatten(0, first.shape[:2])
-        return motion + correction, flow_px.unflatten(0, first.shape[:2])
+        return motion + correction, flow_px.unflatten(0, first.shape[:2]), state
 
     def fitted_motion(self, flow_px: Tensor, weight: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
         """Fit translation and rotation vector (N, 6), in units of their spreads, to flows (N, h, w, 2).

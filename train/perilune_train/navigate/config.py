@@ -1,4 +1,4 @@
-"""Settings of `perilune-train navigate`."""
+"""Settings of `perilune-train navigate train`."""
 
 from pathlib import Path
 from typing import Annotated, Literal

@@ -1,5 +1,6 @@
 """The navigation networks: build, load, batches of their input, and motions from their nine outputs."""
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from perilune_shared.geometry.frames import Array
-from perilune_train.models.navigator import StackNavigator, WarpNavigator
+from perilune_train.models.navigator import StackNavigator, State, WarpNavigator
 from perilune_train.navigate.data.sequences import Sequence, pair_sequence
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
 from perilune_train.navigate.geometry import euler_from_rotation, rotation_from_sixd, rotation_vectors
@@ -125,22 +126,52 @@ class Collate:
 def predict(network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory) -> Motion:
     """Motions of a whole trajectory, in one pass of the network in evaluation mode."""
     shrunk = trajectory.shrunk(architecture["size_px"])
-    sequence = pair_sequence(shrunk, 0, shrunk.n_pairs, warp=architecture["fusion"] == "warp")
-    device = next(network.parameters()).device
+    motion, _ = _predicted(network, architecture, shrunk, 0, shrunk.n_pairs, None)
+    return motion
+
+
+def predict_by_pairs(network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory) -> tuple[Motion, float]:
+    """Motions of a trajectory, pair by pair with the LSTM's state carried, as in flight; mean seconds per pair.
+
+    The time is from frames in memory to the motion, without shrinking the frames.
+    """
+    shrunk, state = trajectory.shrunk(architecture["size_px"]), None
+    translations, rotations = [], []
+    started = time.perf_counter()
+    for pair in range(shrunk.n_pairs):
+        (translation, rotation), state = _predicted(network, architecture, shrunk, pair, 1, state)
+        translations.append(translation)
+        rotations.append(rotation)
+    seconds = (time.perf_counter() - started) / shrunk.n_pairs
+    return (np.concatenate(translations), np.concatenate(rotations)), seconds
+
+
+def _predicted(
+    network: nn.Module,
+    architecture: dict[str, Any],
+    shrunk: Trajectory,
+    start: int,
+    n_pairs: int,
+    state: State | None,
+) -> tuple[Motion, State]:
+    """Motions of some pairs of a shrunk trajectory, and the LSTM's state after them."""
+    sequence = pair_sequence(shrunk, start, n_pairs, warp=architecture["fusion"] == "warp")
     scales = Scales(**architecture["scales"])
-    batch = Collate(scales, architecture["fusion"])([sequence]).to(device)
+    batch = Collate(scales, architecture["fusion"])([sequence]).to(next(network.parameters()).device)
     with torch.no_grad():
-        output, _ = network_output(network, batch)
+        output, _, state = network_output(network, batch, state)
     output = output[0].cpu()
     reference, unit = translation_units([sequence], scales, architecture["fusion"])
-    return (reference[0] + unit * output[:, :3]).double().numpy(), decoded_rotation(output, scales).double().numpy()
+    translation_m = (reference[0] + unit * output[:, :3]).double().numpy()
+    return (translation_m, decoded_rotation(output, scales).double().numpy()), state
 
 
-def network_output(network: nn.Module, batch: Batch) -> tuple[Tensor, Tensor | None]:
-    """Outputs (batch, pairs, 9), and of a warp network the flow (batch, pairs, height / 8, width / 8, 2), pixels."""
+def network_output(network: nn.Module, batch: Batch, state: State | None = None) -> tuple[Tensor, Tensor | None, State]:
+    """Outputs (batch, pairs, 9), of a warp network the flow (batch, pairs, height / 8, width / 8, 2), and the state."""
     if isinstance(network, WarpNavigator):
-        return network(batch.first, batch.second, batch.altitude_m)
-    return network(batch.first, batch.second), None
+        return network(batch.first, batch.second, batch.altitude_m, state)
+    output, state = network(batch.first, batch.second, state)
+    return output, None, state
 
 
 def translation_units(sequences: list[Sequence], scales: Scales, fusion: Fusion) -> tuple[Tensor, Tensor]:

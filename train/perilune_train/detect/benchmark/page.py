@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from perilune_train.detect.benchmark.parts import PARTS
 from perilune_train.detect.benchmark.score import ACCOUNTS, MATCH_IOU, RULES, Score
 from perilune_train.detect.evaluate.matching import EDGE
-from perilune_train.detect.evaluate.report import bin_tables, number, spread_cell, spread_note, table
+from perilune_train.detect.evaluate.report import bin_tables, spread_cell, spread_note
+from perilune_train.evaluation.markdown import number, table
 
 _COLUMNS = {"ap50_paper": "AP", "precision": "precision", "recall": "recall", "f1": "F1"}
 _RULES = {

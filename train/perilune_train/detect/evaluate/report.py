@@ -1,6 +1,5 @@
 """Output files of an evaluation: report.md, pictures, and the curve as a table. Works without a dataset."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from perilune_train.detect.evaluate.evaluation import Evaluation
 from perilune_train.detect.evaluate.figures import draw_bins, draw_curves, draw_frames
 from perilune_train.detect.evaluate.matching import COCO_IOUS, EDGE
 from perilune_train.detect.evaluate.metrics import Curve, curve
+from perilune_train.evaluation.markdown import number, table
 from perilune_train.evaluation.spread import MIN_UNITS, RESAMPLES, Resamples, Spread
 
 CURVE_FILE = "precision_recall.parquet"
@@ -60,18 +60,6 @@ def write_curve(path: Path, points: Curve) -> None:
 
 
 _CURVE_COLUMNS = {"score": "scores", "precision": "precision", "recall": "recall"}
-
-
-def number(value: object) -> str:
-    """A number with three decimals; a dash if undefined."""
-    return f"{value:.3f}" if isinstance(value, int | float) and math.isfinite(value) else "-"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table; escapes vertical bars within cells."""
-    lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
-    lines.insert(1, ["---"] * len(head))
-    return ["| " + " | ".join(row) + " |" for row in lines]
 
 
 def markdown(evaluation: Evaluation, about: Sequence[str]) -> str:

@@ -100,16 +100,21 @@ def load_trajectories(dataset: Dataset, share: Share = ALONE) -> list[Trajectory
     is of another kind, its images are distorted, a frame is missing or there are fewer training trajectories than
     processes.
     """
+    trajectories = [one for split in SPLITS for one in load_split(dataset, split, share)]
+    if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):
+        raise UserError(dataset.store, "split", "a trajectory in two splits", "one split for each trajectory")
+    return trajectories
+
+
+def load_split(dataset: Dataset, split: str, share: Share = ALONE) -> list[Trajectory]:
+    """Load the trajectories of one split in the order of their ids. Raises UserError like `load_trajectories`."""
     if dataset.info.kind != "nav":
         raise UserError(dataset.store, "kind", dataset.info.kind, "nav, a dataset of trajectories")
     if any(dataset.info.camera.distortion):
         raise UserError(dataset.store, "camera.distortion", dataset.info.camera.distortion, "zeros")
     rows = dataset.table("trajectories").to_pylist()
     curves = {(row["scene_id"], row["trajectory_id"]): row for row in rows}
-    trajectories = [trajectory for split in SPLITS for trajectory in _split_trajectories(dataset, split, curves, share)]
-    if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):
-        raise UserError(dataset.store, "split", "a trajectory in two splits", "one split for each trajectory")
-    return trajectories
+    return _split_trajectories(dataset, split, curves, share)
 
 
 def _split_trajectories(

@@ -1,9 +1,26 @@
-"""The baselines that use no image: mean motions of the training set."""
+"""The methods without training: KLT tracks, the nominal motion, and mean motions of the training set."""
 
 import numpy as np
 
 from perilune_shared.geometry.frames import Array
+from perilune_shared.terminal import progress_bar
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
+from perilune_train.navigate.evaluate.klt import klt_trajectory
+
+
+def baselines(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Motion]]:
+    """Motions of the test trajectories by each method; without training trajectories there are no mean motions."""
+    with progress_bar() as progress:
+        task = progress.add_task("KLT baseline", total=len(test), unit="trajectories", note="")
+        tracked = []
+        for trajectory in test:
+            tracked.append(klt_trajectory(trajectory))
+            progress.advance(task)
+    found = {"klt": tracked, "nominal": [trajectory.nominal_motion for trajectory in test]}
+    if training:
+        found["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]
+        found["mean"] = [mean_motion(training, trajectory) for trajectory in test]
+    return found
 
 
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:

@@ -2,19 +2,14 @@
 
 import time
 from pathlib import Path
-from typing import Any
 
 import lightning
-import pandas as pd
 from torch import Tensor
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.storage.files import written_aside
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console, progress_bar
+from perilune_shared.terminal import console
 from perilune_train.data.shares import Share
-from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import (
     Provenance,
     check_terrain,
@@ -23,12 +18,10 @@ from perilune_train.evaluation.provenance import (
     training_provenance,
 )
 from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.data.trajectories import Motion, Trajectory, load_trajectories
-from perilune_train.navigate.evaluate.baselines import mean_motion, mean_motion_at_step
-from perilune_train.navigate.evaluate.figures import draw_errors, draw_trajectory
-from perilune_train.navigate.evaluate.klt import klt_trajectory
-from perilune_train.navigate.evaluate.metrics import motion_errors, summary, summary_spreads
-from perilune_train.navigate.network import Fusion, load_navigator, predict
+from perilune_train.navigate.data.trajectories import Trajectory, load_trajectories
+from perilune_train.navigate.evaluate.baselines import baselines
+from perilune_train.navigate.evaluate.report import write_evaluation
+from perilune_train.navigate.network import Fusion, load_navigator, predict, predict_by_pairs
 from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.fit import fit, own_share
@@ -41,7 +34,6 @@ from perilune_train.training.runs import (
 )
 
 _PREFIX = "backbone."
-_WRITTEN = ("navigation.parquet", "errors.parquet", "descent.png", "errors.png")
 
 
 def navigate_run(
@@ -92,7 +84,7 @@ def navigate_run(
     if not is_first_process():
         return list(folders.values())
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
-    motions = _baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
+    motions = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
     # stack comes first, so that the table of the warp run, which finishes last, has both.
     for fusion, run in folders.items():
         network, architecture = load_navigator(run.best, fusion)
@@ -105,12 +97,14 @@ def navigate_run(
             "train/seconds": round(seconds[fusion], 1),
             "test/pairs": pairs,
             "test/ms_per_pair": round(1e3 * (time.monotonic() - started) / pairs, 2),
+            "test/ms_per_single_pair": round(1e3 * predict_by_pairs(network, architecture, test[0])[1], 2),
+            "dataset/name": opened.info.name,
             "network/parameters": sum(p.numel() for p in network.parameters()),
             "network/backbone": source if fusion == "stack" else "from scratch",
             "dataset/protocol": protocol_of(opened.info),
             **terrain_check.metrics(),
         }
-        _write(run, fusion, test, motions, details)
+        write_evaluation(run.root, fusion, "test", test, motions, details)
     return list(folders.values())
 
 
@@ -174,45 +168,3 @@ def _detector_backbone(
     source = f"stages 1 to {stages} of 5 from {path}"
     console.print(f"stack: backbone {source}")
     return state, source, [read_provenance(content, path)]
-
-
-def _baselines(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Motion]]:
-    with progress_bar() as progress:
-        task = progress.add_task("KLT baseline", total=len(test), unit="trajectories", note="")
-        tracked = []
-        for trajectory in test:
-            tracked.append(klt_trajectory(trajectory))
-            progress.advance(task)
-    return {
-        "klt": tracked,
-        "nominal": [trajectory.nominal_motion for trajectory in test],
-        "mean_at_step": [mean_motion_at_step(training, trajectory) for trajectory in test],
-        "mean": [mean_motion(training, trajectory) for trajectory in test],
-    }
-
-
-def _write(
-    run: RunFolder, fusion: Fusion, test: list[Trajectory], motions: dict[str, list[Motion]], details: dict[str, Any]
-) -> None:
-    errors = {method: motion_errors(test, found) for method, found in motions.items()}
-    rows = {method: summary(table) for method, table in errors.items()}
-    _write_table(run.root / "navigation.parquet", pd.DataFrame([{"method": m, **row} for m, row in rows.items()]))
-    pairs = pd.concat([table.assign(method=method) for method, table in errors.items()], ignore_index=True)
-    _write_table(run.root / "errors.parquet", pairs)
-    drawn = {method: found[0] for method, found in motions.items() if method != "mean"}
-    draw_trajectory(run.root / "descent.png", test[0], drawn, errors)
-    draw_errors(run.root / "errors.png", errors)
-    metrics: Metrics = {}
-    for method, row in rows.items():
-        prefix = method if method in ("stack", "warp") else f"baseline/{method}"
-        prefix = "test" if method == fusion else prefix
-        metrics |= {f"{prefix}/{key}": value for key, value in row.items()}
-        for key, spread in summary_spreads(errors[method]).items():
-            metrics |= spread.keys(f"{prefix}/{key}")
-    mark_files(run.root, _WRITTEN, str(details["terrain/mark"]))
-    write_metrics(run.root, metrics | details)
-
-
-def _write_table(path: Path, table: pd.DataFrame) -> None:
-    with written_aside(path) as aside:
-        table.to_parquet(aside, index=False)

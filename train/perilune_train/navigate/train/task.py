@@ -122,7 +122,7 @@ class NavigationTask(lightning.LightningModule):
                 module.train(not (self.coarse and f"{name}.weight" in self.pretrained))
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        output, flow_px = network_output(self.network, batch)
+        output, flow_px, _ = network_output(self.network, batch)
         found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
         position = (output[..., :3] - batch.translation).square().sum(-1).mean()
         orientation = (found - batch.angles).square().sum(-1).mean()

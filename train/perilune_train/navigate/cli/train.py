@@ -1,4 +1,4 @@
-"""`perilune-train navigate`."""
+"""`perilune-train navigate train`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +11,7 @@ from perilune_train.cli_options import AllowOverlap, ConfigFile, Overwrite, Pres
 from perilune_train.navigate.config import NavigateConfig
 
 
-def navigate(
+def train(
     preset: Preset = "small",
     config: ConfigFile = None,
     set_: Settings = None,

@@ -1,0 +1,32 @@
+"""`perilune-train navigate evaluate`: evaluate a finished navigation run on a split of any dataset."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.dataset.names import SPLITS
+from perilune_shared.errors import UserError
+from perilune_shared.terminal import console
+from perilune_train.cli_options import AllowOverlap
+
+
+def evaluate(
+    run: Annotated[Path, typer.Option(help="Folder of a finished navigate run, for example runs/navigate/small.")],
+    dataset: Annotated[str, typer.Option(help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix.")],
+    split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
+    out: Annotated[Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation]")] = None,
+    allow_overlap: AllowOverlap = False,
+) -> None:
+    """Evaluate a run's best weights together with KLT tracks and the nominal motion.
+
+    Writes metrics.json, navigation.parquet (one row per method), errors.parquet (one row per pair), descent.png and
+    errors.png.
+    """
+    if split not in SPLITS:
+        raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
+    # torch takes seconds to load.
+    from perilune_train.navigate.evaluate_run import evaluate_navigator
+
+    folder = evaluate_navigator(run, dataset, split, out or run / "evaluation", allow_overlap)
+    console.print(f"{folder}: metrics.json, navigation.parquet, errors.parquet, descent.png, errors.png")

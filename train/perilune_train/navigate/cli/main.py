@@ -1,0 +1,16 @@
+"""`perilune-train navigate`: its subcommands."""
+
+import typer
+
+from perilune_train.navigate.cli.compare import compare
+from perilune_train.navigate.cli.evaluate import evaluate
+from perilune_train.navigate.cli.train import train
+
+app = typer.Typer(
+    help="Landing navigation: train the networks, evaluate a run on any dataset, compare runs.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+app.command("train")(train)
+app.command("evaluate")(evaluate)
+app.command("compare")(compare)

@@ -1,0 +1,70 @@
+"""Evaluate a finished navigation run on a split of any dataset."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.errors import UserError
+from perilune_shared.storage.store import Address
+from perilune_shared.terminal import progress_bar
+from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
+from perilune_train.navigate.data.trajectories import Motion, Trajectory, load_split
+from perilune_train.navigate.evaluate.baselines import baselines
+from perilune_train.navigate.evaluate.report import write_evaluation
+from perilune_train.navigate.network import Fusion, load_navigator, predict, predict_by_pairs
+from perilune_train.training.runs import RunFolder, load_weights
+
+
+def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Path, allow_overlap: bool = False) -> Path:
+    """Evaluate a run's best weights, KLT tracks and the nominal motion on a split; returns `out`, which has all output.
+
+    Raises UserError if `run` is no navigation run, if `out` is the run's own folder, or on test terrain that the
+    network was fitted to (unless `allow_overlap`).
+    """
+    if out.resolve() == run.resolve():
+        expected = "another folder; a run keeps the metrics of its training"
+        raise UserError(out, "--out", "the run's own folder", expected)
+    best = RunFolder(run).best
+    content = load_weights(best)
+    fusion = fusion_of(best, content["architecture"])
+    dataset = open_dataset(dataset_address)
+    terrain_check = check_terrain(read_provenance(content, best), dataset, split, allow_overlap)
+    trajectories = load_split(dataset, split)
+    network, architecture = load_navigator(best, fusion)
+    found, seconds = _predicted(network, architecture, trajectories)
+    pairs = sum(trajectory.n_pairs for trajectory in trajectories)
+    details = {
+        f"{split}/pairs": pairs,
+        f"{split}/ms_per_pair": round(1e3 * seconds / pairs, 2),
+        f"{split}/ms_per_single_pair": round(1e3 * predict_by_pairs(network, architecture, trajectories[0])[1], 2),
+        "network/parameters": sum(p.numel() for p in network.parameters()),
+        "dataset/name": dataset.info.name,
+        "dataset/protocol": protocol_of(dataset.info),
+        **terrain_check.metrics(),
+    }
+    # Mean motions are those of the training set, which this dataset may not have.
+    write_evaluation(out, fusion, split, trajectories, {fusion: found, **baselines([], trajectories)}, details)
+    return out
+
+
+def fusion_of(path: Path, architecture: dict[str, Any]) -> Fusion:
+    """Which network a checkpoint holds. Raises UserError if it is no navigator's."""
+    fusion = architecture.get("fusion")
+    if fusion not in ("warp", "stack"):
+        raise UserError(path, "architecture", sorted(architecture), "a navigate run's checkpoint")
+    return fusion
+
+
+def _predicted(
+    network: Any, architecture: dict[str, Any], trajectories: list[Trajectory]
+) -> tuple[list[Motion], float]:
+    """Motions of all trajectories, and seconds."""
+    started = time.monotonic()
+    with progress_bar() as progress:
+        task = progress.add_task("evaluate", total=len(trajectories), unit="trajectories", note="")
+        found = []
+        for trajectory in trajectories:
+            found.append(predict(network, architecture, trajectory))
+            progress.advance(task)
+    return found, time.monotonic() - started
