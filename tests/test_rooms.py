@@ -25,11 +25,11 @@ ROOMS = {
     "render/perilune_render/jobs": (
         "job records identity steps work_list report scene_renderer worker local here ray_actors run status estimate"
     ),
-    "train/perilune_train": "config cli_options data evaluation models training detect navigate explain cli",
+    "train/perilune_train": "config cli_options data evaluation models training shipped detect navigate explain cli",
     "train/perilune_train/detect": (
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
     ),
-    "train/perilune_train/navigate": "config geometry data network evaluate train command",
+    "train/perilune_train/navigate": "config geometry data network evaluate train evaluate_run compare_runs cli",
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""
 MOST_FILES = 15

@@ -14,6 +14,7 @@ from perilune_train.explain.command import explain
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.navigate.cli.main import app as navigate
 from perilune_train.navigate.config import NavigateConfig
+from perilune_train.shipped.models import shipped_models
 
 SECTIONS: dict[str, type[Section]] = {"detect": DetectConfig, "navigate": NavigateConfig, "explain": ExplainConfig}
 app = typer.Typer(
@@ -40,6 +41,16 @@ def config(
     for section, model in SECTIONS.items():
         resolved = resolve(model, section, "perilune_train", preset, config, tuple(settings or ()))
         typer.echo(annotated_yaml(section, resolved) if show else to_yaml(section, resolved), nl=False)
+
+
+@app.command()
+def models() -> None:
+    """List the trained networks that are installed, with size, figure on the locked benchmark and folder.
+
+    The folder can be given as --run; its card.md states training data, figures and limits.
+    """
+    for model in shipped_models():
+        typer.echo(f"{model.name}  {model.task}  {model.megabytes:.1f} MB  {model.headline}  {model.folder}")
 
 
 def main() -> None:

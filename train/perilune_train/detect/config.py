@@ -134,6 +134,11 @@ class DetectConfig(Section):
     """Weights to start from. best.ckpt of a detect run of equal width and in_channels: all weights if the strides are
     equal, else the backbone. Or a Darknet file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads
     too); Darknet files need width 1 and in_channels 3."""
+    init_layers: Literal["all", "from_second"] = "all"
+    """Layers that `init_from` gives: all, or all but the first convolution (the paper)."""
+    plain_gates_before_frozen_layers: bool = False
+    """Allow attention=cbam with frozen_epochs if `init_from` has no gates (the paper). New plain gates scale their
+    input by about 0.25, so the frozen layers get features that they were not trained on."""
     teacher: str | None = None
     """best.ckpt of a detect run, usually wider, to distil from in addition to the labels. The strides and in_channels
     must be the same; its anchors are used."""
@@ -150,6 +155,9 @@ class DetectConfig(Section):
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
     """Decay per step of the moving average of the weights; the average is evaluated and saved. At step s the decay is
     at most (1 + s) / (10 + s), so that 0.998 holds from step 4490 on."""
+    assignment: Literal["several", "one"] = "several"
+    """Predictors that learn a label. several: every anchor within anchor_ratio, in the cell of the label's centre and
+    in the two nearest cells. one: the anchor of highest IoU in the cell of the centre, as in YOLOv3 (the paper)."""
     anchor_ratio: Annotated[float, Field(gt=1)] = 2.0
     """An anchor is assigned to a label if width and height are both within this factor."""
     labels: LabelSettings = LabelSettings()

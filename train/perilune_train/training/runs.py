@@ -15,6 +15,7 @@ from perilune_shared.storage.files import write_bytes
 from perilune_train.config import Precision
 from perilune_train.evaluation.metrics_file import METRICS_FILE
 from perilune_train.evaluation.provenance import RECORD
+from perilune_train.training.half_weights import SUFFIX, read_half
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,9 @@ class RunFolder:
 
     @property
     def best(self) -> Path:
-        """Weights with the best validation metric, as `save_weights` writes them."""
-        return self.root / "checkpoints" / "best.ckpt"
+        """Weights with the best validation metric, from `save_weights`; weights.safetensors of a shipped model."""
+        shipped = self.root / ("weights" + SUFFIX)
+        return shipped if shipped.is_file() else self.root / "checkpoints" / "best.ckpt"
 
     @property
     def last(self) -> Path:
@@ -81,12 +83,16 @@ def save_weights(
 
 
 def load_weights(path: Path) -> dict[str, Any]:
-    """`{"architecture": settings, "state_dict": tensors}` of a file that `save_weights` wrote, on the CPU.
+    """`{"architecture": settings, "state_dict": tensors}` of a file that `save_weights` or `write_half` wrote.
+
+    The tensors are on the CPU.
 
     Raises UserError if the file is missing, is damaged or has other content.
     """
     if not path.is_file():
         raise UserError(path, "checkpoint", "no such file", "checkpoints/best.ckpt of a finished run")
+    if path.suffix == SUFFIX:
+        return read_half(path)
     return read_saved(path, "checkpoint", {"architecture", "state_dict"}, "checkpoints/best.ckpt of a run")
 
 

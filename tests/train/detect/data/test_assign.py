@@ -39,6 +39,14 @@ def test_centre_cell_and_two_neighbours():
     assert not (first.positive & first.ignored).any()
 
 
+def test_one_predictor_as_in_yolov3():
+    """The anchor of highest IoU of all scales, in the cell of the centre."""
+    made = assign(labels([9.0, 18.0, 17.0, 26.0], [20.0, 20.0, 60.0, 60.0]), ANCHORS, (8, 16), SHAPES, None)
+    assert made[0].places.tolist() == [[0], [1], [2], [1]]
+    # 40 px: 32 px fits better than 64 px; centre (40, 40) px is in cell (2, 2) of stride 16.
+    assert made[1].places.tolist() == [[0], [0], [2], [2]]
+
+
 def test_neighbours_off_the_grid_are_left_out():
     # Centre (1, 1) px: the nearest neighbours of cell (0, 0) are left of and above the image.
     made = assign(labels([-2.0, -2.0, 4.0, 4.0]), ANCHORS, (8, 16), SHAPES, 1.4)

@@ -295,3 +295,17 @@ def test_new_plain_gates_before_a_frozen_backbone_are_refused(tmp_path):
     begin("cbam", attention="cbam")
     begin("none", attention="cbam_identity")
     begin("none", attention="cbam", frozen_epochs=0)
+    begin("none", attention="cbam", plain_gates_before_frozen_layers=True)
+
+
+def test_the_first_layer_can_be_left_out(tmp_path):
+    """The paper takes its backbone from the second layer on."""
+    config = DetectConfig(width=0.125, in_channels=1, strides=(4, 8, 16), attention="none", init_layers="from_second")
+    architecture = {"in_channels": 1, "width": 0.125, "attention": "none", "strides": [4, 8, 16]}
+    given, network = (YOLOv3(None, 1, 0.125, "none", (4, 8, 16)) for _ in range(2))
+    runs.save_weights(tmp_path / "a.ckpt", architecture, given)
+    stem = network.backbone.stem.conv.weight.clone()
+    start_from(network, tmp_path / "a.ckpt", config)
+    assert torch.equal(network.backbone.stem.conv.weight, stem)
+    rest = [key for key in given.state_dict() if not key.startswith("backbone.stem.")]
+    assert all(torch.equal(given.state_dict()[key], network.state_dict()[key]) for key in rest)

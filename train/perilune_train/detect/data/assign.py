@@ -56,15 +56,15 @@ Targets = list[Assignment]
 """The assignments of a batch, one per scale."""
 
 
-def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float) -> Tensor:
+def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float | None) -> Tensor:
     """Whether anchors (K, 2) are assigned to boxes (T, 4): (T, K) bool.
 
     True for every anchor whose width and height are within the factor `ratio`, and always for the one of highest IoU
-    (all boxes centred on one point).
+    (all boxes centred on one point). Without `ratio` only for that one.
     """
     size = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)[:, None]
     quotient = size / anchors
-    near = torch.maximum(quotient, 1 / quotient).amax(2) < ratio
+    near = torch.maximum(quotient, 1 / quotient).amax(2) < (0.0 if ratio is None else ratio)
     best = torch.zeros_like(near)
     if len(boxes):
         overlap = iou(torch.cat([-size, size], -1) / 2, torch.cat([-anchors, anchors], -1) / 2)
@@ -73,14 +73,18 @@ def matching_anchors(boxes: Tensor, anchors: Tensor, ratio: float) -> Tensor:
 
 
 def assign(
-    labels: BatchLabels, anchors: Tensor, strides: tuple[int, ...], shapes: list[tuple[int, int, int]], ratio: float
+    labels: BatchLabels,
+    anchors: Tensor,
+    strides: tuple[int, ...],
+    shapes: list[tuple[int, int, int]],
+    ratio: float | None,
 ) -> Targets:
     """Positive and ignored predictors of every scale, for anchors (scales, 3, 2) and grids (N, h, w).
 
     A predictor is positive if its anchor is within the factor `ratio` of a selected label and its cell contains the
     label's centre or is the nearest neighbour of that cell along x or y (as in later YOLO versions). Deviation: YOLOv3
     makes one predictor of one scale positive for each label. This gives about nine times as many positives, so that a
-    short training suffices.
+    short training suffices. Without `ratio`, one predictor is positive, as in YOLOv3.
 
     A predictor is ignored if its anchor matches and its cell touches the middle half of an ignored label's box. All
     others are negative, including those around a selected label. YOLOv3 ignores those if their boxes overlap the label
@@ -108,8 +112,9 @@ def assign(
         steps = torch.stack(
             [torch.stack([zero, zero], 1), torch.stack([side[:, 0], zero], 1), torch.stack([zero, side[:, 1]], 1)]
         )
+        steps = steps[:1] if ratio is None else steps
         cells = (cell + steps).flatten(0, 1)
-        label, anchor = label.repeat(3), anchor.repeat(3)
+        label, anchor = label.repeat(len(steps)), anchor.repeat(len(steps))
         inside = ((cells >= 0) & (cells < limit)).all(1)
         cells, label, anchor = cells[inside].long(), label[inside], anchor[inside]
         places = torch.stack([labels.frame[label], anchor, cells[:, 1], cells[:, 0]])

@@ -75,8 +75,8 @@ class Collate:
     """Widths and heights of the anchors in pixels (scales, 3, 2), on the CPU; None without assignment."""
     strides: tuple[int, ...]
     """Strides of the scales, pixels."""
-    ratio: float
-    """Factor within which an anchor fits a label."""
+    ratio: float | None
+    """Factor within which an anchor fits a label; None assigns one predictor to each label."""
 
     def __call__(self, samples: list[Sample]) -> Batch:
         images, boxes, selected = zip(*samples, strict=True)
@@ -116,7 +116,8 @@ def evaluation_loader(split: DetectSplit, config: DetectConfig, anchors: Tensor 
 
 def collate_of(config: DetectConfig, anchors: Tensor | None) -> Collate:
     """Make batches with assignments to anchors (scales, 3, 2); without, if they are None."""
-    return Collate(None if anchors is None else anchors.cpu(), config.strides, config.anchor_ratio)
+    ratio = config.anchor_ratio if config.assignment == "several" else None
+    return Collate(None if anchors is None else anchors.cpu(), config.strides, ratio)
 
 
 def pinned(config: DetectConfig) -> bool:

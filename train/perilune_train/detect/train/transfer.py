@@ -54,9 +54,17 @@ def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     """Fill the network with weights of an earlier detect run or of a Darknet file.
 
     A run of the same strides gives all weights and its anchors; a run of other strides gives the backbone. If the
-    attention differs, the gates are not changed. Raises UserError if width or in_channels differ, or if the backbone is
-    to be frozen with new plain gates.
+    attention differs, the gates are not changed; with `detect.init_layers=from_second`, nor is the first convolution
+    with its norm. Raises UserError if width or in_channels differ, or if the backbone is to be frozen with new plain
+    gates.
     """
+    stem = {key: value.clone() for key, value in network.backbone.stem.state_dict().items()}
+    _fill(network, path, config)
+    if config.init_layers == "from_second":
+        network.backbone.stem.load_state_dict(stem)
+
+
+def _fill(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     if is_darknet(path):
         check_gates(path, config)
         start_from_darknet(network, path, config)
@@ -82,7 +90,7 @@ def check_gates(path: Path, config: DetectConfig) -> None:
     Each such module scales its input by about 0.25, so that the frozen layers get features they were not trained on:
     their cosine similarity to those of the plain backbone falls to about 0.5 (`make bench-transfer`).
     """
-    if config.frozen_epochs and config.attention == "cbam":
+    if config.frozen_epochs and config.attention == "cbam" and not config.plain_gates_before_frozen_layers:
         expected = (
             "cbam_identity, whose gates start at 1 and keep the features of the frozen backbone, or frozen_epochs=0"
         )

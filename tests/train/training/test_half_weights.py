@@ -1,0 +1,75 @@
+"""Weights in half precision: what is kept, and files that are refused."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from perilune_shared.errors import UserError
+from perilune_train.detect.inference.detector import load_detector
+from perilune_train.models.yolo import YOLOv3
+from perilune_train.training.half_weights import write_half
+from perilune_train.training.runs import RunFolder, load_weights, save_weights
+
+ARCHITECTURE = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [4, 8, 16]}
+
+
+@pytest.fixture
+def network():
+    torch.manual_seed(1)
+    return YOLOv3(torch.rand(3, 3, 2) * 20 + 4, **ARCHITECTURE).eval()
+
+
+def test_it_detects_nearly_the_same(network, tmp_path):
+    save_weights(tmp_path / "best.ckpt", ARCHITECTURE, network, {"known": True, "uses": []})
+    content = load_weights(tmp_path / "best.ckpt")
+    write_half(tmp_path / "weights.safetensors", content)
+    again = load_weights(tmp_path / "weights.safetensors")
+    assert again["architecture"] == ARCHITECTURE and again["terrain"] == {"known": True, "uses": []}
+    images = torch.randn(2, 1, 64, 64)
+    boxes, scores = network.detect(images)
+    found_boxes, found_scores = load_detector(tmp_path / "weights.safetensors").detect(images)
+    assert float((boxes - found_boxes).abs().max()) < 0.05 and float((scores - found_scores).abs().max()) < 1e-3
+    assert not torch.equal(boxes, found_boxes), "half precision rounds"
+    sizes = [(tmp_path / name).stat().st_size for name in ("best.ckpt", "weights.safetensors")]
+    assert 0.45 < sizes[1] / sizes[0] < 0.6
+
+
+def test_vectors_and_buffers_keep_their_precision(network, tmp_path):
+    content = {"architecture": ARCHITECTURE, "state_dict": network.state_dict()}
+    write_half(tmp_path / "weights.safetensors", content)
+    again = load_weights(tmp_path / "weights.safetensors")["state_dict"]
+    exact = [key for key in again if key == "anchors" or "running" in key or key.endswith("bias")]
+    assert len(exact) > 100 and all(torch.equal(network.state_dict()[key], again[key]) for key in exact)
+    assert all(again[key].dtype == value.dtype for key, value in network.state_dict().items())
+
+
+def test_a_folder_with_weights_is_a_run(tmp_path):
+    assert RunFolder(tmp_path).best.name == "best.ckpt"
+    (tmp_path / "weights.safetensors").write_bytes(b"")
+    assert RunFolder(tmp_path).best.name == "weights.safetensors"
+
+
+def test_weights_out_of_range_are_refused(network, tmp_path):
+    state = network.state_dict()
+    name = next(key for key, value in state.items() if value.ndim == 4)
+    state[name] = state[name] + 1e6
+    with pytest.raises(UserError, match="65504"):
+        write_half(tmp_path / "weights.safetensors", {"architecture": ARCHITECTURE, "state_dict": state})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", ["truncated", "text", "no architecture", "not JSON", "missing"])
+def test_other_files_are_refused(network, tmp_path, damage):
+    path = tmp_path / "weights.safetensors"
+    if damage == "truncated":
+        write_half(path, {"architecture": ARCHITECTURE, "state_dict": network.state_dict()})
+        path.write_bytes(path.read_bytes()[:5000])
+    elif damage == "text":
+        path.write_text("no weights")
+    elif damage != "missing":
+        tensors = {key: value.contiguous() for key, value in network.state_dict().items()}
+        save_file(tensors, path, {"architecture": "[" * 9999 if damage == "not JSON" else json.dumps([1])})
+    with pytest.raises(UserError, match=r"weights\.safetensors"):
+        load_detector(path)

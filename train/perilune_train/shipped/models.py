@@ -1,0 +1,46 @@
+"""The networks that are installed with this package. The folder of each is a run: every `--run` takes it."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+Task = Literal["detect", "navigate"]
+WEIGHTS = "weights.safetensors"
+BENCHMARK = "benchmark.json"
+CARD = "card.md"
+_FOLDER = Path(__file__).parent
+
+
+@dataclass(frozen=True)
+class ShippedModel:
+    """A trained network that is installed with this package."""
+
+    name: str
+    """Name of its folder."""
+    task: Task
+    """What it does: detect (craters) or navigate."""
+    folder: Path
+    """Its folder: config.yaml, metrics.json, weights.safetensors, benchmark.json, card.md."""
+
+    @property
+    def megabytes(self) -> float:
+        """Size of its weights, MB."""
+        return (self.folder / WEIGHTS).stat().st_size / 1e6
+
+    @property
+    def headline(self) -> str:
+        """Its least favourable figure on the locked benchmark, as text."""
+        figures = json.loads((self.folder / BENCHMARK).read_text(encoding="utf-8"))
+        return f"AP {figures['headline/ap50_paper']:.3f} ({figures['headline/ap50_paper_account']})"
+
+
+def shipped_models() -> list[ShippedModel]:
+    """All installed networks, by name."""
+    tasks: dict[str, Task] = {"crater-detector": "detect", "lander-navigator": "navigate"}
+    return [ShippedModel(n, t, _FOLDER / n) for n, t in tasks.items() if (_FOLDER / n / WEIGHTS).is_file()]
+
+
+def shipped_run(task: Task) -> Path:
+    """Folder of the installed network of a task."""
+    return next(model.folder for model in shipped_models() if model.task == task)
