@@ -24,12 +24,18 @@ class FusionConfig(Section):
     """Pairs of frames in a training sequence; the paper's value."""
     batch_sequences: Count = 8
     """Sequences in a batch; the paper's value."""
+    accumulate: Count = 1
+    """Batches whose gradients are summed for a step. On little memory, batch_sequences=1 with accumulate=8 is the
+    paper's batch, except that batch norms see one sequence at a time."""
     coarse_epochs: Annotated[int, Field(ge=0)]
     """Epochs with the loss L^(S1). A backbone from a detector is frozen in them."""
     fine_epochs: Annotated[int, Field(ge=0)]
     """Epochs with the loss L^(S2), all weights trained."""
     learning_rate: Positive
     """Peak learning rate; the paper uses 1e-4."""
+    cycles: Count = 1
+    """Cosines of the learning rate. 1: one over both stages. More (the paper: 5): constant in the coarse stage, then
+    this number of cosines, each from the peak down to 0, in the fine stage."""
     jitter: Annotated[float, Field(ge=0)] = 0.0
     """Standard deviation of a random extra motion of each training pair, as a fraction of the spread of the residuals
     in the training set."""
@@ -56,6 +62,9 @@ class NavigateConfig(Section):
     """Arithmetic: auto (bfloat16 if the hardware supports it), bf16 or float32."""
     device: Device = "auto"
     """Where to compute: auto (the GPU if there is one), cpu or cuda."""
+    checkpoint_minutes: Annotated[float, Field(ge=0)] = 10.0
+    """Minutes between saves of the training state within an epoch; 0: after every step. It is always saved after an
+    epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0
     """Worker processes that prepare sequences; 0 prepares them in the training process, which is best on few cores."""
     warp: FusionConfig

@@ -84,6 +84,8 @@ class Batch:
     """True translations in the network's units, see Scales (batch, pairs, 3)."""
     angles: Tensor
     """True rotations as Euler angles, divided by `rotation_rad` of Scales (batch, pairs, 3)."""
+    place: Tensor
+    """Number of the trajectory and first pair of each sequence (batch, 2)."""
     flow_px: Tensor | None
     """For warp: true flow, pixels (batch, pairs, height / 8, width / 8, 2)."""
 
@@ -119,14 +121,20 @@ class Collate:
             stacked([sequence.altitude_m for sequence in sequences]),
             (stacked([sequence.translation_m for sequence in sequences]) - reference) / unit,
             euler_from_rotation(rotation) / self.scales.rotation_rad,
+            torch.tensor([sequence.place for sequence in sequences]),
             stacked(flows) if flows else None,
         )
 
 
-def predict(network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory) -> Motion:
-    """Motions of a whole trajectory, in one pass of the network in evaluation mode."""
+def predict(
+    network: nn.Module, architecture: dict[str, Any], trajectory: Trajectory, features: Tensor | None = None
+) -> Motion:
+    """Motions of a whole trajectory, in one pass of the network in evaluation mode.
+
+    `features` (pairs, channels) are those of the backbone of a stack network, if they are known.
+    """
     shrunk = trajectory.shrunk(architecture["size_px"])
-    motion, _ = _predicted(network, architecture, shrunk, 0, shrunk.n_pairs, None)
+    motion, _ = _predicted(network, architecture, shrunk, 0, shrunk.n_pairs, None, features)
     return motion
 
 
@@ -147,19 +155,23 @@ def predict_by_pairs(network: nn.Module, architecture: dict[str, Any], trajector
 
 
 def _predicted(
-    network: nn.Module,
+    network: Any,
     architecture: dict[str, Any],
     shrunk: Trajectory,
     start: int,
     n_pairs: int,
     state: State | None,
+    features: Tensor | None = None,
 ) -> tuple[Motion, State]:
     """Motions of some pairs of a shrunk trajectory, and the LSTM's state after them."""
     sequence = pair_sequence(shrunk, start, n_pairs, warp=architecture["fusion"] == "warp")
     scales = Scales(**architecture["scales"])
     batch = Collate(scales, architecture["fusion"])([sequence]).to(next(network.parameters()).device)
     with torch.no_grad():
-        output, _, state = network_output(network, batch, state)
+        if features is None:
+            output, _, state = network_output(network, batch, state)
+        else:
+            output, state = network.recurrent(features[None].to(batch.first.device), state)
     output = output[0].cpu()
     reference, unit = translation_units([sequence], scales, architecture["fusion"])
     translation_m = (reference[0] + unit * output[:, :3]).double().numpy()

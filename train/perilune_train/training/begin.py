@@ -21,7 +21,9 @@ State = Literal["new", "resume", "finished"]
 Hashes = Mapping[str, str | None]
 """SHA-256 of each input of a run; None if it is missing."""
 
-_NO_EFFECT_ON_RESULT = {"detect.workers", "detect.checkpoint_minutes", "navigate.workers"}
+_NO_EFFECT_ON_RESULT = {
+    f"{task}.{setting}" for task in ("detect", "navigate") for setting in ("workers", "checkpoint_minutes")
+}
 """Settings that change how a run proceeds, but not its result."""
 _REPLACE = "; --overwrite replaces the run"
 _STATE_KEY = "perilune/run"

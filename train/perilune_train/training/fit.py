@@ -88,8 +88,10 @@ class KeepLast(Callback):
             pl_module.on_train_epoch_start()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        # The last batch is followed by validation and the checkpoint of the epoch.
-        if self.minutes is None or trainer.is_last_batch:
+        # The last batch is followed by validation and the checkpoint of the epoch. A state between the batches of one
+        # step would lack the gradients that are summed so far.
+        between = (batch_idx + 1) % trainer.accumulate_grad_batches != 0
+        if self.minutes is None or trainer.is_last_batch or between:
             return
         # Several processes use the clock of the first. Asking it makes them wait, so do it rarely.
         if trainer.world_size == 1 or trainer.global_step % _STEPS_BETWEEN_CHECKS == 0:
@@ -124,7 +126,7 @@ class Bar(Callback):
         self.progress.start()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        self.progress.advance(self.task)
+        self.progress.update(self.task, completed=trainer.global_step)
         # Reading the loss makes the GPU wait, so do it rarely.
         if batch_idx % _STEPS_BETWEEN_CHECKS == 0:
             note = f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, loss {float(outputs['loss']):.3f}"
@@ -167,10 +169,13 @@ def fit(
     num_nodes: int = 1,
     strategy: str = "auto",
     checkpoint_minutes: float | None = None,
+    accumulate: int = 1,
 ) -> float:
     """Train `task` for a fixed number of epochs; keep the best weights and the last state in the run's folder.
 
     Returns the training time in seconds, including the time before a resume.
+
+    A step sums the gradients of `accumulate` batches.
 
     The task provides its own loaders, once; a batch sampler with an attribute `sampler` is told each epoch by
     `set_epoch` (see data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several
@@ -210,6 +215,7 @@ def fit(
             precision="bf16-mixed" if choose_bf16(precision, device) else "32-true",
             deterministic="warn",
             gradient_clip_val=gradient_clip,
+            accumulate_grad_batches=accumulate,
             num_sanity_val_steps=0,
             logger=TensorBoardLogger(run.root, name="", version=""),
             log_every_n_steps=10,

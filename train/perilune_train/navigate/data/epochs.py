@@ -1,5 +1,7 @@
 """Order and augmentation of the sequences of every epoch of navigation training."""
 
+from dataclasses import replace
+
 import numpy as np
 from torch.utils import data as torch_data
 
@@ -56,6 +58,7 @@ class TrainingSequences(torch_data.Dataset):
     def __getitem__(self, key: Key) -> Sequence:
         epoch, place, number, start = key
         rng = np.random.default_rng([self.seed, epoch, place]) if self.augmented else None
-        return pair_sequence(
+        sequence = pair_sequence(
             self.trajectories[number], start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter
         )
+        return replace(sequence, place=(number, start))

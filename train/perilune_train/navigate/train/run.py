@@ -135,6 +135,8 @@ def _train(
         device=choose_device(settings.device),
         # In coarse epochs some weights have no gradient.
         strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
+        checkpoint_minutes=settings.checkpoint_minutes,
+        accumulate=own.accumulate,
     )
 
 

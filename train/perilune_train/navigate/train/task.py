@@ -28,7 +28,19 @@ from perilune_train.navigate.network import (
     network_output,
     predict,
 )
-from perilune_train.training.runs import choose_device
+from perilune_train.navigate.train.stored import stored_features
+from perilune_train.training.runs import choose_bf16, choose_device
+
+
+def learning_rate_factor(step: int, coarse_steps: int, fine_steps: int, cycles: int) -> float:
+    """Factor on the learning rate: a short warm-up, then the cosines that `FusionConfig.cycles` describes."""
+    total = max(1, coarse_steps + fine_steps)
+    warm = (step + 1) / max(1, min(50, total // 10))
+    done = min(step / total, 1.0)
+    if cycles > 1:
+        turns = cycles * (step - coarse_steps) / max(1, fine_steps)
+        done = 0.0 if turns < 0 else 1.0 if turns >= cycles else turns % 1.0
+    return min(warm, 0.5 * (1 + math.cos(math.pi * done)))
 
 
 class NavigationTask(lightning.LightningModule):
@@ -36,8 +48,10 @@ class NavigationTask(lightning.LightningModule):
 
     Errors are standardised: P by the unit of the translation, phi (Euler angles) by the spread of the rotation.
     Coarse: L^(S1) = |dP|^2 + kappa |dphi|^2. Fine: L^(S2) = e^-s_p |dP|^2 + e^-s_phi |dphi|^2 + s_p + s_phi with learnt
-    s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles; warp's pairs are
-    mirrored and jittered (see data/sequences.py).
+    s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles, unless
+    `cycles` is 5; warp's pairs are mirrored and jittered (see data/sequences.py).
+
+    In the coarse stage a stack network whose whole backbone is given computes the backbone's features once.
     """
 
     def __init__(
@@ -76,6 +90,10 @@ class NavigationTask(lightning.LightningModule):
         self.share = share
         self.training_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "train"]
         self.validation_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "val"]
+        given = {name for name, _ in self.network.backbone.named_parameters()} <= self.pretrained
+        self.stores = fusion == "stack" and given and self.own.coarse_epochs > 0
+        self.stored: dict[str, list[Tensor]] = {}
+        self.resumed = (0, 0)
         self.validated = own_trajectories("val", len(self.validation_trajectories), share)
         jitter, scales = self.own.jitter, self.scales
         self.jitter = Jitter(jitter * np.array(scales.spread_m), jitter * scales.rotation_rad) if jitter else None
@@ -102,7 +120,9 @@ class NavigationTask(lightning.LightningModule):
         )
         # The current epoch is one too low here if the run is resumed.
         epoch = self._trainer.fit_loop.epoch_progress.current.processed if self._trainer else 0
-        batches = EpochBatches(sequences.keys, sequences.fewest, self.own.batch_sequences, epoch)
+        resumed_epoch, done = self.resumed
+        start = done if epoch == resumed_epoch else 0
+        batches = EpochBatches(sequences.keys, sequences.fewest, self.own.batch_sequences, epoch, start)
         pinned = choose_device(self.settings.device) == "cuda"
         return batch_loader(sequences, batches, Collate(self.scales, self.fusion), self.settings.workers, pinned)
 
@@ -114,15 +134,36 @@ class NavigationTask(lightning.LightningModule):
         # In validation a batch is a trajectory; `predict` moves it.
         return batch.to(device) if isinstance(batch, Batch) else batch
 
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        done = self.trainer.fit_loop.epoch_loop.batch_progress.current.processed
+        checkpoint["epoch_and_batches"] = [self.current_epoch, done]
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        epoch, done = checkpoint.get("epoch_and_batches", (0, 0))
+        self.resumed = (epoch, done)
+
     def on_train_epoch_start(self) -> None:
         for name, parameter in self.network.backbone.named_parameters():
             parameter.requires_grad_(not (self.coarse and name in self.pretrained))
         for name, module in self.network.backbone.named_modules():
             if isinstance(module, nn.BatchNorm2d):
                 module.train(not (self.coarse and f"{name}.weight" in self.pretrained))
+        if self.coarse and self.stores and not self.stored:
+            own = [self.validation_trajectories[number] for number in self.validated]
+            for split, trajectories in (("train", self.training_trajectories), ("val", own)):
+                bf16 = choose_bf16(self.settings.precision, self.device.type)
+                self.stored[split] = stored_features(self.network, trajectories, self.device, bf16)
+
+    def _output(self, batch: Batch) -> tuple[Tensor, Tensor | None]:
+        if self.coarse and self.stores:
+            n_pairs, stored = batch.first.shape[1], self.stored["train"]
+            places = batch.place.tolist()
+            features = torch.stack([stored[number][start : start + n_pairs] for number, start in places])
+            return self.network.recurrent(features.to(self.device))[0], None
+        return network_output(self.network, batch)[:2]
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        output, flow_px, _ = network_output(self.network, batch)
+        output, flow_px = self._output(batch)
         found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
         position = (output[..., :3] - batch.translation).square().sum(-1).mean()
         orientation = (found - batch.angles).square().sum(-1).mean()
@@ -149,7 +190,8 @@ class NavigationTask(lightning.LightningModule):
                 torch.distributed.broadcast(value, 0)
 
     def validation_step(self, batch: Trajectory, batch_idx: int) -> None:
-        self.validation_motions.append(predict(self.network, self.architecture, batch))
+        features = self.stored["val"][batch_idx] if self.coarse and self.stores else None
+        self.validation_motions.append(predict(self.network, self.architecture, batch, features))
 
     def on_validation_epoch_end(self) -> None:
         motions, processes, count = self.validation_motions, self.share.processes, len(self.validation_trajectories)
@@ -163,8 +205,7 @@ class NavigationTask(lightning.LightningModule):
             self.log(f"val/{key}", figures[key], batch_size=1)
 
     def configure_optimizers(self) -> Any:
-        total = max(1, (self.own.coarse_epochs + self.own.fine_epochs) * len(self.train_dataloader()))
-        warm = max(1, min(50, total // 10))
+        steps = -(-len(self.train_dataloader()) // self.own.accumulate)
         # The two loss weights must change by about 1 during the run, whatever the learning rate of the network is.
         optimizer = torch.optim.AdamW(
             [
@@ -173,6 +214,9 @@ class NavigationTask(lightning.LightningModule):
             ]
         )
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: min((step + 1) / warm, 0.5 * (1 + math.cos(math.pi * min(step / total, 1))))
+            optimizer,
+            lambda step: learning_rate_factor(
+                step, self.own.coarse_epochs * steps, self.own.fine_epochs * steps, self.own.cycles
+            ),
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
