@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-frames train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -89,13 +89,23 @@ train-detect-baseline: detect-frames ## the same network without attention, into
 
 # A part of the benchmark is in a folder of its own.
 BENCHMARK := data/benchmark$(if $(SCENES),-$(SCENES)-scenes)
-benchmark-frames: setup ## render the locked benchmark (SCENES=2 for a part of it, ELEVATION=folder of the elevation models)
-	@scripts/render-benchmark $(BENCHMARK) $(or $(SCENES),0) $(if $(ELEVATION),$(call quoted,$(ELEVATION)))
+benchmark-frames: setup ## render the locked benchmark (KIND=nav for navigation, SCENES=2 for a part of it, ELEVATION=folder of the elevation models)
+	@scripts/render-benchmark $(if $(filter nav,$(KIND)),nav,detect) $(BENCHMARK) $(or $(SCENES),0) $(if $(ELEVATION),$(call quoted,$(ELEVATION)))
+
+# $(1): what kind of run RUN must be.
+define checked_run
+test -f $(call quoted,$(RUN))/config.yaml || { echo "RUN: "$(call quoted,$(RUN))": no config.yaml there, expected the folder of a $(1) run" >&2; exit 2; }
+endef
 
 benchmark: setup ## score the installed detector, or a run (RUN=folder), on the locked benchmark; writes runs/benchmark/
-	@test -z $(call quoted,$(RUN)) -o -f $(call quoted,$(RUN))/config.yaml || { echo "RUN: "$(call quoted,$(RUN))": no config.yaml there, expected the folder of a detect run" >&2; exit 2; }
-	@$(MAKE) --no-print-directory benchmark-frames
+	@$(if $(RUN),$(call checked_run,detect))
+	@$(MAKE) --no-print-directory benchmark-frames KIND=detect
 	@$(BIN)/perilune-train detect benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
+
+benchmark-nav: setup ## score a navigate run (RUN=folder) on the locked benchmark of navigation; writes runs/benchmark/<name>-navigate
+	@$(call checked_run,navigate)
+	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
+	@$(BIN)/perilune-train navigate benchmark --run $(call quoted,$(RUN)) --data $(BENCHMARK)
 
 # Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
 ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0

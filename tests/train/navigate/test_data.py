@@ -1,7 +1,4 @@
-import json
-import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,7 +6,7 @@ import pytest
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.camera import NO_DISTORTION, Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.data import frames
 from perilune_train.data.shares import ALONE, Share
@@ -17,6 +14,7 @@ from perilune_train.navigate.data import sequences
 from perilune_train.navigate.data.epochs import TrainingSequences
 from perilune_train.navigate.data.sequences import Jitter, mirrored, pair_sequence
 from perilune_train.navigate.data.trajectories import load_trajectories
+from perilune_train.navigate.data.undistort import undistorted
 from perilune_train.navigate.geometry import apply_homography, pixel_index_homography, plane_homography
 
 PINNED_SEQUENCES = [(3, 0), (1, 2), (0, 4), (2, 3), (3, 2), (0, 1), (1, 2), (2, 1)]
@@ -48,14 +46,22 @@ def _misfit(sequence, trajectory, pair):
     return float(np.sqrt(np.mean((laid - sequence.first[pair])[middle] ** 2)))
 
 
-def test_distorted_images_are_refused(dataset_nav, tmp_path):
-    """Its warp is a homography, which distorted images do not follow."""
-    root = Path(shutil.copytree(dataset_nav, tmp_path / "nav"))
-    info = json.loads((root / "dataset.json").read_text())
-    info["camera"]["distortion"][0] = -0.1
-    (root / "dataset.json").write_text(json.dumps(info))
-    with pytest.raises(UserError, match=r"camera\.distortion.*expected zeros"):
-        load_trajectories(open_dataset(root))
+def test_frames_of_a_distorting_lens_are_undistorted():
+    """A pattern that depends on the direction of the ray only, seen by a distorting and by a plain camera."""
+    bent = replace(Camera.from_field_of_view(96, 96, 50), distortion=(-0.12, 0.03, 0.001, -0.002, 0.0))
+    plain = replace(bent, distortion=NO_DISTORTION)
+
+    def seen(camera):
+        rays = camera.rays(camera.pixel_centres())
+        return np.rint(127 + 60 * np.sin(40 * rays[..., 0]) + 60 * np.cos(30 * rays[..., 1])).astype(np.uint8)
+
+    (found,), camera = undistorted(seen(bent)[None], bent)
+    assert camera == plain
+    difference = np.abs(found.astype(int) - seen(plain))[4:-4, 4:-4]
+    assert difference.max() <= 3
+    assert np.abs(seen(bent).astype(int) - seen(plain)).max() > 20, "the distortion matters"
+    images = seen(plain)[None]
+    assert undistorted(images, plain)[0] is images
 
 
 def test_trajectories_hold_poses_and_nominal_motion(trajectories):

@@ -166,6 +166,9 @@ def _predicted(
     """Motions of some pairs of a shrunk trajectory, and the LSTM's state after them."""
     sequence = pair_sequence(shrunk, start, n_pairs, warp=architecture["fusion"] == "warp")
     scales = Scales(**architecture["scales"])
+    if architecture["fusion"] == "warp":
+        # The fit of the motion is for the camera of these frames, which may differ from that of the training.
+        network.focal_over_width = shrunk.camera.fx_px / shrunk.camera.width_px
     batch = Collate(scales, architecture["fusion"])([sequence]).to(next(network.parameters()).device)
     with torch.no_grad():
         if features is None:

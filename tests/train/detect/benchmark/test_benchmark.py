@@ -14,7 +14,7 @@ from tests.helpers.terrain_record import store_record, uses_of
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.subset import subset
 from perilune_train.cli import main
-from perilune_train.detect.benchmark.parts import PARTS
+from perilune_train.evaluation.benchmark_parts import part_names
 
 BOX = ("x0_px", "y0_px", "x1_px", "y1_px")
 
@@ -32,7 +32,7 @@ def places(make_dataset, tmp_path_factory):
 def truth(data, selected=lambda labels: labels):
     """Detections of a detector that finds every label; `selected` changes the rows."""
     rows = []
-    for name in PARTS:
+    for name in part_names("detect"):
         if (data / name).exists():
             labels = selected(open_dataset(data / name).table("labels").to_pandas())
             columns = {"dataset": [name] * len(labels), "frame_id": labels["frame_id"].tolist()}

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from perilune_train.detect.benchmark.parts import PARTS
 from perilune_train.detect.benchmark.score import ACCOUNTS, MATCH_IOU, RULES, Score
 from perilune_train.detect.evaluate.matching import EDGE
 from perilune_train.detect.evaluate.report import bin_tables, spread_cell, spread_note
+from perilune_train.evaluation.benchmark_parts import part_names
 from perilune_train.evaluation.markdown import number, table
 
 _COLUMNS = {"ap50_paper": "AP", "precision": "precision", "recall": "recall", "f1": "F1"}
@@ -52,7 +52,7 @@ def _coverage(score: Score) -> list[str]:
     for part, (n_frames, n_locked) in score.frames_of.items():
         whole = "all frames" if n_frames == n_locked else f"**a part: {n_frames} of {n_locked} frames**"
         lines.append(f"`{part}`: {whole} of the shared manifest")
-    return lines + [f"`{part}`: **not scored**" for part in PARTS if part not in score.frames_of]
+    return lines + [f"`{part}`: **not scored**" for part in part_names("detect") if part not in score.frames_of]
 
 
 def _accounts(score: Score) -> list[str]:

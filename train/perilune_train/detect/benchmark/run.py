@@ -6,7 +6,6 @@ from pathlib import Path
 from perilune_shared.storage.files import write_text
 from perilune_shared.storage.store import Address
 from perilune_train.detect.benchmark.page import page_of
-from perilune_train.detect.benchmark.parts import Part, open_parts
 from perilune_train.detect.benchmark.score import Score, load_parts, score
 from perilune_train.detect.benchmark.submission import read_submission
 from perilune_train.detect.config import DetectConfig
@@ -14,6 +13,7 @@ from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.finished_run import chosen_threshold
+from perilune_train.evaluation.benchmark_parts import Part, open_parts
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import TerrainCheck, check_terrain, read_provenance
@@ -35,7 +35,7 @@ def score_run(
     from perilune_train.detect.inference.scales import detect_split
     from perilune_train.training import runs
 
-    parts, threshold = open_parts(data, manifests), chosen_threshold(run)
+    parts, threshold = open_parts("detect", data, manifests), chosen_threshold(run)
     best = runs.RunFolder(run).best
     provenance = read_provenance(runs.load_weights(best), best)
     checks = [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
@@ -58,7 +58,7 @@ def score_submission(
 
     Raises UserError if the benchmark is missing or changed, or the table is not valid.
     """
-    parts = open_parts(data, manifests)
+    parts = open_parts("detect", data, manifests)
     loaded = load_parts(parts)
     ids = {name: split.frames.table["frame_id"].tolist() for name, split in next(iter(loaded.values())).items()}
     found = read_submission(detections, ids)

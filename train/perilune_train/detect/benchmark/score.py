@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.errors import UserError
-from perilune_train.detect.benchmark.parts import Part
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.frame_facts import FrameFacts, facts_of
 from perilune_train.detect.data.labels import FrameLabels
@@ -16,6 +15,7 @@ from perilune_train.detect.evaluate.bootstrap import average_precisions
 from perilune_train.detect.evaluate.evaluation import Evaluation, evaluate_detections
 from perilune_train.detect.evaluate.matching import EDGE, Detections, Matches
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
+from perilune_train.evaluation.benchmark_parts import Part
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.spread import Spread, spreads
 

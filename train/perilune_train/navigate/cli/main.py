@@ -2,6 +2,7 @@
 
 import typer
 
+from perilune_train.navigate.cli.benchmark import benchmark
 from perilune_train.navigate.cli.compare import compare
 from perilune_train.navigate.cli.evaluate import evaluate
 from perilune_train.navigate.cli.train import train
@@ -13,4 +14,5 @@ app = typer.Typer(
 )
 app.command("train")(train)
 app.command("evaluate")(evaluate)
+app.command("benchmark")(benchmark)
 app.command("compare")(compare)

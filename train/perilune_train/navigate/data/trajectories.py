@@ -13,6 +13,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_train.data.frames import frame_table, load_images
 from perilune_train.data.shares import ALONE, Share
+from perilune_train.navigate.data.undistort import undistorted
 from perilune_train.navigate.geometry import relative_poses
 
 Motion = tuple[Array, Array]
@@ -97,8 +98,8 @@ def load_trajectories(dataset: Dataset, share: Share = ALONE) -> list[Trajectory
     """Load all trajectories of a navigation dataset: train, then val, then test, each in the order of their ids.
 
     One of several processes loads only the frames that it needs (`own_trajectories`). Raises UserError if the dataset
-    is of another kind, its images are distorted, a frame is missing or there are fewer training trajectories than
-    processes.
+    is of another kind, a frame is missing or there are fewer training trajectories than processes. Frames of a
+    distorting lens are undistorted.
     """
     trajectories = [one for split in SPLITS for one in load_split(dataset, split, share)]
     if len({trajectory.ids for trajectory in trajectories}) < len(trajectories):
@@ -110,8 +111,6 @@ def load_split(dataset: Dataset, split: str, share: Share = ALONE) -> list[Traje
     """Load the trajectories of one split in the order of their ids. Raises UserError like `load_trajectories`."""
     if dataset.info.kind != "nav":
         raise UserError(dataset.store, "kind", dataset.info.kind, "nav, a dataset of trajectories")
-    if any(dataset.info.camera.distortion):
-        raise UserError(dataset.store, "camera.distortion", dataset.info.camera.distortion, "zeros")
     rows = dataset.table("trajectories").to_pylist()
     curves = {(row["scene_id"], row["trajectory_id"]): row for row in rows}
     return _split_trajectories(dataset, split, curves, share)
@@ -127,7 +126,7 @@ def _split_trajectories(
         raise UserError(dataset.store, "train trajectories", len(groups), expected)
     own = set(own_trajectories(split, len(groups), share))
     loaded = table.iloc[np.concatenate([[], *(groups[number][1].index for number in sorted(own))]).astype(int)]
-    images, start = load_images(dataset, loaded, split), 0
+    (images, camera), start = undistorted(load_images(dataset, loaded, split), dataset.camera), 0
     trajectories = []
     for number, (key, rows) in enumerate(groups):
         stop = start + (len(rows) if number in own else 0)
@@ -148,7 +147,7 @@ def _split_trajectories(
                 (scene_id, trajectory_id),
                 split,
                 images[start:stop],
-                dataset.camera,
+                camera,
                 np.array(rows["position_m"].tolist()),
                 matrix_from_quaternion(rows["rotation_wxyz"].tolist()),
                 nominal.position_at(rows["time_s"].to_numpy()),

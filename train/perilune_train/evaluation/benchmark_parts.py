@@ -9,14 +9,14 @@ from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address, open_store
 
-PARTS = {
-    "benchmark-detect-highland": "highland",
-    "benchmark-detect-mare": "mare",
-    "benchmark-detect-camera": "other camera",
-    "benchmark-detect-npb": "elevation model",
-    "benchmark-detect-npc": "elevation model",
+REGIONS = {
+    "highland": "highland",
+    "mare": "mare",
+    "camera": "other camera",
+    "npb": "elevation model",
+    "npc": "elevation model",
 }
-"""Names of the datasets, and of their manifests, with their regions."""
+"""Regions of the parts, by the end of their names."""
 _POSE = ("position_m", "rotation_wxyz", "sun_direction")
 
 
@@ -25,7 +25,7 @@ class Part:
     """One rendered dataset of the benchmark."""
 
     name: str
-    """One of PARTS."""
+    """Name of the dataset and of its manifest: benchmark-<kind>-<part>."""
     dataset: Dataset
     """The rendered frames."""
     n_locked: int
@@ -34,17 +34,22 @@ class Part:
     @property
     def region(self) -> str:
         """highland, mare, other camera or elevation model."""
-        return PARTS[self.name]
+        return REGIONS[self.name.rpartition("-")[2]]
 
 
-def open_parts(data: Address, manifests: Address) -> list[Part]:
-    """Open the datasets below `data` that belong to the benchmark, and compare them with the shared manifests.
+def part_names(kind: str) -> list[str]:
+    """Names of the datasets of a kind, `detect` or `nav`."""
+    return [f"benchmark-{kind}-{part}" for part in REGIONS]
+
+
+def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
+    """Open the datasets of a kind below `data` that belong to the benchmark; compare them with the shared manifests.
 
     Raises UserError if there is none, or if a scene or a frame is not that of its manifest.
     """
     store, locked = open_store(data), open_store(manifests)
     found = []
-    for name in PARTS:
+    for name in part_names(kind):
         if store.exists(f"{name}/dataset.json"):
             dataset, manifest = open_dataset(store.sub(name)), open_dataset(locked.sub(name))
             if not dataset.info.complete:
@@ -53,7 +58,8 @@ def open_parts(data: Address, manifests: Address) -> list[Part]:
             _check_frames(dataset, manifest)
             found.append(Part(name, dataset, manifest.info.counts.frames))
     if not found:
-        raise UserError(store, "benchmark", "no dataset", f"one of {', '.join(PARTS)}; see docs/how-to/benchmark.md")
+        expected = f"one of {', '.join(part_names(kind))}; see docs/how-to/benchmark.md"
+        raise UserError(store, "benchmark", "no dataset", expected)
     return found
 
 
