@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -106,6 +106,11 @@ benchmark-nav: setup ## score a navigate run (RUN=folder) on the locked benchmar
 	@$(call checked_run,navigate)
 	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
 	@$(BIN)/perilune-train navigate benchmark --run $(call quoted,$(RUN)) --data $(BENCHMARK)
+
+# The experiment has presets of its own: PRESET=paper unless one is given.
+paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=quarter for two cores, ATTITUDE=1, DARKNET=yolov3.weights)
+	@$(BIN)/python scripts/paper.py --preset $(if $(filter file,$(origin PRESET)),paper,$(PRESET)) $(if $(PART),--part $(PART)) \
+	  $(if $(ATTITUDE),--attitude) $(if $(DARKNET),--darknet $(call quoted,$(DARKNET)))
 
 # Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
 ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0

@@ -25,7 +25,9 @@ ROOMS = {
     "render/perilune_render/jobs": (
         "job records identity steps work_list report scene_renderer worker local here ray_actors run status estimate"
     ),
-    "train/perilune_train": "config cli_options data evaluation models training shipped detect navigate explain cli",
+    "train/perilune_train": (
+        "config cli_options data evaluation models training shipped detect navigate explain paper cli"
+    ),
     "train/perilune_train/detect": (
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
     ),

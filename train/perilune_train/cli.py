@@ -14,6 +14,7 @@ from perilune_train.explain.command import explain
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.navigate.cli.main import app as navigate
 from perilune_train.navigate.config import NavigateConfig
+from perilune_train.paper.command import paper
 from perilune_train.shipped.models import shipped_models
 
 SECTIONS: dict[str, type[Section]] = {"detect": DetectConfig, "navigate": NavigateConfig, "explain": ExplainConfig}
@@ -26,6 +27,7 @@ app = typer.Typer(
 app.add_typer(detect, name="detect")
 app.add_typer(navigate, name="navigate")
 app.command("explain")(explain)
+app.command("paper")(paper)
 
 
 @app.command()

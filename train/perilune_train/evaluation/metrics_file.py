@@ -27,9 +27,12 @@ def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None],
     write_text(folder / name, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 
-def read_metrics(folder: Path) -> Metrics:
-    """Read metrics.json of a run or of an evaluation. Raises UserError if it is missing or not a flat JSON object."""
-    path = folder / METRICS_FILE
+def read_metrics(folder: Path, name: str = METRICS_FILE) -> Metrics:
+    """Read metrics.json, or `name`, of a run or of an evaluation.
+
+    Raises UserError if it is missing or not a flat JSON object.
+    """
+    path = folder / name
     if not path.is_file():
         expected = "the metrics of a finished run; resume it with the command that started it"
         raise UserError(path, "metrics", "no such file", expected)

@@ -1,0 +1,1 @@
+"""The page of the paper's experiment: its tables, figures and claims beside those of our runs."""

@@ -1,0 +1,27 @@
+"""`perilune-train paper`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.terminal import console
+
+
+def paper(
+    runs: Annotated[Path, typer.Option(help="Folder of the experiment's runs, as `make paper` makes them.")] = Path(
+        "runs/paper"
+    ),
+    dataset: Annotated[str, typer.Option(help="Detection dataset of the runs: a folder or an address.")] = (
+        "data/paper/detect"
+    ),
+    about: Annotated[
+        list[str] | None, typer.Option(help="A line of the page on how the experiment was made. Repeatable.")
+    ] = None,
+) -> None:
+    """Write the page of the paper's experiment: its tables and figures beside ours, and a verdict on each claim."""
+    # torch and matplotlib take seconds to load.
+    from perilune_train.paper.page import write_page
+
+    page = write_page(runs, dataset, tuple(about or ()))
+    console.print(f"{page}: tables, figures and verdicts; paper.json has the figures")
