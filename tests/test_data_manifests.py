@@ -17,7 +17,6 @@ from perilune_shared.validation.validate import validate
 
 FOLDER = Path(__file__).parent.parent / "data_manifests"
 NAMES = sorted(path.parent.name for path in FOLDER.glob("*/dataset.json"))
-REFERENCES = sorted(path.name for path in (FOLDER / "reference_frames").iterdir())
 PARTS = ("highland", "mare", "camera", "npb", "npc")
 REAL = os.environ.get("PERILUNE_REAL_DEM")
 
@@ -64,14 +63,14 @@ def test_the_benchmark_has_test_frames_under_low_and_high_suns(kind):
     assert min(altitude) < 220 and max(altitude) > 1480
 
 
-@pytest.mark.parametrize("name", REFERENCES)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_frame_is_made_again(name, tmp_path):
     """The reference picture was rendered with the manifest; another kind of machine may differ in single pixels."""
     dem = None
-    if name.startswith("south-pole"):
+    if name.startswith("south-pole") or name.endswith(("npb", "npc")):
         if REAL is None:
             pytest.skip("PERILUNE_REAL_DEM is not set to the elevation model NPC_2km.tif")
-        dem = Path(REAL)
+        dem = Path(REAL).with_name("NPB_1km.tif") if name.endswith("npb") else Path(REAL)
     (reference,) = (FOLDER / "reference_frames" / name).rglob("*.png")
     frame_id = reference.relative_to(FOLDER / "reference_frames" / name).with_suffix("").as_posix()
     with Progress(disable=True) as progress:
