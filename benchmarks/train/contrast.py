@@ -1,14 +1,14 @@
 """How well the labels' contrast separates craters that a trained detector finds from those that it misses.
 
-`python -m benchmarks.train.contrast DATASET RUN` takes a dataset and a detect run on it. Evaluates on the test split,
-for the craters of the selection `visible` without its contrast threshold: the area under the ROC curve (AUC) of
-contrast, depth ratio and radius, overall and by radius; the fraction found by contrast; and the metrics of the run's
-detections with each selection. A crater is found if a detection with a score of at least the run's threshold has an IoU
-of at least 0.5 with it; detections are matched in order of score. Writes runs/bench/contrast.json, and with --picture
-FRAME_ID contrast.jpg, an enlarged frame, plain and coloured by contrast.
+`python -m benchmarks.train.contrast DATASET RUN` takes a dataset and a detect run on it. Evaluates on the validation
+split, where the rule `visible` is chosen, or on another --split, for the craters of `visible` without its contrast
+threshold: the area under the ROC curve (AUC) of contrast, depth ratio and radius, overall and by radius; the fraction
+found by contrast and radius, for several limits of the pixels that count (`contrast_pixels`); and the metrics of the
+run's detections with each selection. A crater is found if a detection with a score of at least the run's threshold has
+an IoU of at least 0.5 with it; detections are matched in order of score. Writes runs/bench/contrast.json, and with
+--picture FRAME_ID contrast.jpg, an enlarged frame, plain and coloured by contrast.
 """
 
-import json
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -16,7 +16,6 @@ from typing import Annotated
 import cv2
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as pq
 import typer
 from numpy.typing import NDArray
 
@@ -24,7 +23,7 @@ from benchmarks.figures import write_figures
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.errors import run_command_line
 from perilune_shared.geometry.frames import Array
-from perilune_shared.labels.selection import read_labels, selected
+from perilune_shared.labels.selection import limited_contrast, read_labels, selected
 from perilune_shared.labels.thresholds import SELECTIONS
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.split import load_split
@@ -32,10 +31,18 @@ from perilune_train.detect.evaluate.bins import RADIUS_BINS_PX
 from perilune_train.detect.evaluate.boxes import iou_matrix
 from perilune_train.detect.evaluate.matching import Detections, match_split
 from perilune_train.detect.evaluate.metrics import figures
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.scales import detect_split
+from perilune_train.training.runs import RunFolder
 
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
 _ELLIPSE = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 _EDGES = (-1e9, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, np.inf)
+_PIXELS = (60, 100, 150, 200, 250, 300, 400, 600, None)
+"""Limits of the pixels that count, None for no limit."""
+_STEPS = (2, 3, 4, 5, 6, 7)
+"""Lower ends of the steps of contrast."""
 _COLOURS = ((2.0, (60, 60, 255)), (4.0, (0, 150, 255)), (8.0, (0, 235, 235)), (np.inf, (80, 220, 80)))
 """Upper bounds of contrast with their colours (blue, green, red)."""
 _SCALE = 4
@@ -69,9 +76,9 @@ def found_by(labels: pd.DataFrame, detections: dict[str, Detections], threshold:
     return found
 
 
-def measure(dataset: Dataset, detections: dict[str, Detections], threshold: float) -> dict:
+def measure(dataset: Dataset, detections: dict[str, Detections], threshold: float, split: str) -> dict:
     """AUC and fraction found, for contrast.json."""
-    labels = read_labels(dataset, _BOX, "test")
+    labels = read_labels(dataset, _BOX, split)
     labels = labels[selected(labels, SELECTIONS["visible"].model_copy(update={"min_contrast": None}))]
     labels = labels.reset_index(drop=True)
     labels["depth_ratio"] = labels["depth_m"] / labels["diameter_m"]
@@ -91,16 +98,29 @@ def measure(dataset: Dataset, detections: dict[str, Detections], threshold: floa
         own = (contrast >= low) & (contrast < high)
         share = float(found[own].mean()) if own.any() else None
         shares.append({"from": low, "labels": int(own.sum()), "found": share})
-    return {"auc": table, "found_by_contrast": shares}
+    limits = {str(pixels): by_limit(contrast, radius, found, pixels) for pixels in _PIXELS}
+    return {"auc": table, "found_by_contrast": shares, "by_contrast_pixels": limits}
 
 
-def evaluate(dataset: Dataset, detections: dict[str, Detections], threshold: float) -> dict:
+def by_limit(contrast: Array, radius_px: Array, found: NDArray[np.bool_], pixels: float | None) -> dict:
+    """AUC of the limited contrast, and the fraction found and number of labels by radius in steps of contrast."""
+    values = limited_contrast(contrast, radius_px, pixels)
+    result: dict = {"auc": auc(values, found)}
+    for low, high in pairwise(RADIUS_BINS_PX[:-1]):
+        for step in _STEPS:
+            own = (radius_px >= low) & (radius_px < high) & (values >= step) & (values < step + 1)
+            share = float(found[own].mean()) if own.any() else None
+            result[f"{low:g}-{high:g} px/{step}-{step + 1}"] = {"labels": int(own.sum()), "found": share}
+    return result
+
+
+def evaluate(dataset: Dataset, detections: dict[str, Detections], threshold: float, split_name: str) -> dict:
     """Evaluate the detections with each selection, and with `visible` without its contrast threshold."""
     settings = {name: LabelSettings(selection=name) for name in ("visible", "paper")}
     settings["visible without contrast"] = LabelSettings(selection="visible", min_contrast=None)
     result = {}
     for name, chosen in settings.items():
-        split = load_split(dataset, "test", chosen)
+        split = load_split(dataset, split_name, chosen)
         none = Detections(np.empty((0, 4)), np.empty(0))
         found = [detections.get(frame, none) for frame in split.frames.table["frame_id"]]
         height, width = split.frames.images.shape[1:]
@@ -130,18 +150,21 @@ def draw(dataset: Dataset, frame_id: str, path: Path) -> None:
 def main(
     dataset: Path,
     run: Path,
+    split: Annotated[str, typer.Option(help="val, or test for a report.")] = "val",
     picture: Annotated[str, typer.Option(help="frame_id to draw.")] = "",
     out: Path = Path("runs/bench"),
 ) -> None:
     """Compare the labels' contrast with the craters that a detector found."""
     opened = open_dataset(dataset)
-    table = pq.read_table(run / "detections.parquet").to_pandas().sort_values("score", ascending=False, kind="stable")
-    detections = {
-        str(name): Detections(rows[["x0_px", "y0_px", "x1_px", "y1_px"]].to_numpy(), rows["score"].to_numpy())
-        for name, rows in table.groupby("frame_id")
+    config, threshold = config_of_run(run), chosen_threshold(run)
+    frames = load_split(opened, split, config.labels)
+    found, _ = detect_split(open_detector(RunFolder(run).best, config), frames, split)
+    detections = dict(zip(frames.frames.table["frame_id"], found, strict=True))
+    result = {
+        **measure(opened, detections, threshold, split),
+        "metrics": evaluate(opened, detections, threshold, split),
     }
-    threshold = json.loads((run / "metrics.json").read_text())["test/threshold"]
-    result = {**measure(opened, detections, threshold), "metrics": evaluate(opened, detections, threshold)}
+    result["split"] = split
     write_figures(out / "contrast.json", result)
     if picture:
         draw(opened, picture, out / "contrast.jpg")

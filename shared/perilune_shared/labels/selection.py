@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from perilune_shared.dataset.keys import FRAME_COLUMNS, KeyCheck
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.labels.thresholds import Selection, default_label_bound_px
+from perilune_shared.labels.thresholds import REACH_RADII, Selection, default_label_bound_px
 
 _THRESHOLDED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
 Columns = pd.DataFrame | Mapping[str, NDArray]
@@ -34,14 +34,24 @@ def selected(labels: Columns, selection: Selection) -> NDArray[np.bool_]:
     if selection.radius_px is not None:
         least_px, largest_px = selection.radius_px
         chosen &= (radius_px >= least_px) & (radius_px <= (np.inf if largest_px is None else largest_px))
-    for column in ("visible_fraction", "sunlit_fraction", "contrast"):
+    for column in ("visible_fraction", "sunlit_fraction"):
         least = getattr(selection, f"min_{column}")
         if least is not None:
-            values = np.asarray(labels[column])
-            chosen &= (values >= least) | (np.isnan(values) & (column == "contrast"))
+            chosen &= np.asarray(labels[column]) >= least
+    if selection.min_contrast is not None:
+        contrast = limited_contrast(np.asarray(labels["contrast"]), radius_px, selection.contrast_pixels)
+        chosen &= (contrast >= selection.min_contrast) | np.isnan(contrast)
     if selection.min_depth_ratio is not None:
         chosen &= np.asarray(labels["depth_m"]) >= selection.min_depth_ratio * np.asarray(labels["diameter_m"])
     return chosen
+
+
+def limited_contrast(contrast: NDArray, radius_px: NDArray, pixels: float | None) -> NDArray:
+    """Contrast (N,) as if at most `pixels` pixels around each crater were independent; unchanged if None."""
+    if pixels is None:
+        return contrast
+    around = np.pi * (REACH_RADII * radius_px) ** 2
+    return contrast * np.sqrt(np.minimum(1.0, pixels / np.maximum(around, 1e-9)))
 
 
 def label_bound_px(info: DatasetInfo) -> float:

@@ -27,6 +27,9 @@ class Selection(Section):
     """Minimum ratio of depth to diameter on the finished terrain; lower ratios mean an eroded crater."""
     min_contrast: float | None = None
     """Minimum contrast: the crater's own shading in the frame divided by its standard error, from noise and clutter."""
+    contrast_pixels: Positive | None = None
+    """Largest number of pixels that the contrast counts as independent; in a larger neighbourhood it is reduced by the
+    square root of the ratio, since neighbouring pixels of a blurred, cluttered frame are alike. null counts all."""
 
 
 SELECTIONS: dict[str, Selection] = {
@@ -37,11 +40,16 @@ SELECTIONS: dict[str, Selection] = {
         min_visible_fraction=0.3,
         min_sunlit_fraction=0.1,
         min_depth_ratio=0.04,
-        min_contrast=4.0,
+        min_contrast=5.0,
+        contrast_pixels=250.0,
     ),
 }
 """`all`: every label. `paper`: the paper's rule, radius 2 to 50 px and centre in the frame (true of every label).
 `visible`: craters that a person can see in the frame, for training and evaluation."""
+
+
+REACH_RADII = 1.5
+"""The contrast is measured within this distance of the crater's centre, in radii."""
 
 
 def default_label_bound_px(width_px: int) -> float:

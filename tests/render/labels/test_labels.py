@@ -9,11 +9,12 @@ from perilune_render.config import LabelsConfig, SensorConfig
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import expected, expose
 from perilune_render.labels.frame_labels import RimCircles, Shown, crater_index, label_frame, with_contrast
-from perilune_render.labels.pixels import contrasts, sunlit_fractions
+from perilune_render.labels.pixels import REACH, contrasts, sunlit_fractions
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
 from perilune_shared.labels.masks import crater_masks
+from perilune_shared.labels.thresholds import REACH_RADII
 
 CAMERA = Camera.from_field_of_view(128, 128, 50.0)
 ABOVE = np.array([0.0, 0.0, 500.0])
@@ -186,3 +187,7 @@ def test_the_instance_image_is_the_smallest_of_the_masks(hidden):
             expected_index[masks[k].window][seen] = circles.crater_id[k]
     np.testing.assert_array_equal(index, expected_index)
     assert len(np.unique(index)) > 50 and (not hidden or (index[:, 40:90] == -1).all())
+
+
+def test_the_rule_of_visible_counts_the_pixels_in_which_contrast_is_measured():
+    assert REACH == REACH_RADII

@@ -26,7 +26,7 @@ def test_the_named_selections():
     rows = labels(
         {},
         {"radius_px": 1.9},
-        {"radius_px": 51.0},
+        {"radius_px": 51.0, "contrast": 200.0},
         {"visible_fraction": 0.2},
         {"sunlit_fraction": 0.05},
         {"contrast": 3.9},
@@ -62,6 +62,18 @@ def test_the_label_bound_comes_from_the_recipe_or_the_image_width(tiny, width_px
 def test_each_threshold_is_inclusive_and_independent(threshold, value, row):
     chosen = selected(labels({}, row), Selection(**{threshold: value}))
     assert chosen.dtype == np.bool_ and chosen.tolist() == [True, False]
+
+
+def test_the_contrast_of_large_craters_is_limited():
+    """4 px: pi (1.5 x 4)^2 = 113 pixels; 20 px: 2827 pixels, of which a hundredth counts."""
+    rows = labels(
+        {"radius_px": 4.0, "contrast": 5.0},
+        {"radius_px": 20.0, "contrast": 49.9},
+        {"radius_px": 20.0, "contrast": 50.1},
+    )
+    limited = Selection(min_contrast=5.0, contrast_pixels=28.2743)
+    assert selected(rows, limited).tolist() == [False, False, True]
+    assert selected(rows, Selection(min_contrast=5.0)).all()
 
 
 def test_labels_are_read_with_their_craters(tiny):

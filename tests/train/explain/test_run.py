@@ -11,7 +11,8 @@ from tests.helpers.terrain_record import store_record, uses_of
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_shared.labels.selection import read_labels
+from perilune_shared.labels.selection import read_labels, selected
+from perilune_shared.labels.thresholds import SELECTIONS
 from perilune_train.data.frames import load_frames
 from perilune_train.detect.cli.evaluate import config_of_run
 from perilune_train.detect.inference.detector import load_detector
@@ -128,7 +129,7 @@ def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect)
     config = config_of_run(checkpoints[0].parent.parent, ())
     _, truth, reported = detect_frames(settings, config, dataset_detect)
     labels = read_labels(open_dataset(dataset_detect), ["ellipse_cx_px", "ellipse_cy_px"], "test")
-    seen = (labels["contrast"] >= 4) & (labels["depth_m"] >= 0.04 * labels["diameter_m"])
+    seen = pd.Series(selected(labels, SELECTIONS["visible"]))
     values = {True: [], False: []}
     for (_, rows), mask in zip(labels.groupby("frame_id"), truth, strict=True):
         for row in rows.itertuples():
@@ -138,7 +139,7 @@ def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect)
                 values[bool(seen[row.Index])].append(mask[int(row.ellipse_cy_px), int(row.ellipse_cx_px)])
     assert len(values[True]) > 10 and len(values[False]) > 5
     assert set(values[True]) == {0} and set(values[False]) == {1}
-    assert reported["labels/min_contrast"] == 4
+    assert reported["labels/min_contrast"] == 5
 
 
 def test_masks_are_those_of_the_network_at_the_frames_size(dataset_detect, tmp_path):

@@ -66,7 +66,8 @@ def test_a_run_stores_the_selection_that_it_used(finished):
         "min_visible_fraction": 0.3,
         "min_sunlit_fraction": 0.1,
         "min_depth_ratio": 0.04,
-        "min_contrast": 4.0,
+        "min_contrast": 5.0,
+        "contrast_pixels": 250.0,
     }
     stored = parse_yaml(finished.config.read_text(), "")["detect"]["labels"]
     assert stored == {**visible, "radius_px": [2.0, None]}
