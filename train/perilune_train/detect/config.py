@@ -107,6 +107,9 @@ class EvaluationSettings(Section):
     two craters is longer than a crater seen from above. None keeps all."""
     max_detections: Count = 2000
     """Largest number of detections in a frame; the usual 100 would truncate crowded frames."""
+    varied_frames: bool = False
+    """Choose the score threshold on the validation frames and on copies of them with other contrast, blur and noise,
+    for a detector of images from unknown cameras."""
     min_precision: Annotated[float, Field(gt=0, lt=1)] | None = None
     """Choose the score threshold with the highest recall at this precision on the validation split. None: highest
     F1."""

@@ -7,13 +7,11 @@ from perilune_shared.storage.store import Address
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import EDGE
-from perilune_train.detect.evaluate.metrics import curve
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.evaluate.split_evaluation import (
     WRITTEN,
     dataset_entries,
     evaluate_split,
-    match_detections,
     report_head,
     selection_entries,
     write_detections,
@@ -21,6 +19,7 @@ from perilune_train.detect.evaluate.split_evaluation import (
 from perilune_train.detect.finished_run import check_output, chosen_threshold
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.detect.inference.scales import detect_split
+from perilune_train.detect.train.threshold import threshold_on_validation
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import read_metrics, write_metrics
 from perilune_train.evaluation.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
@@ -65,9 +64,8 @@ def evaluate_again(
     if choose_threshold:
         val = load_split(dataset, "val", config.labels)
         seen, _ = detect_split(detector, val, "val")
-        points = curve(match_detections(val, seen, config))
-        chosen, rule = points.operating_threshold(config.evaluation.min_precision)
-        threshold_source = f"{rule} on the dataset's val"
+        chosen, chosen_on = threshold_on_validation(detector, val, seen)
+        threshold_source = f"{chosen_on} of the dataset"
     found, rate = detect_split(detector, frames, split)
     evaluation = evaluate_split(frames, found, config, chosen)
     write_detections(folder / "detections.parquet", frames, found)

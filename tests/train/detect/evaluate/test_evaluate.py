@@ -85,7 +85,7 @@ def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path
     assert own["test/threshold"] == figures(run)["test/threshold"] != chosen["test/threshold"]
     assert own["test/ap50_paper"] == chosen["test/ap50_paper"] != figures(run)["test/ap50_paper"]
     assert own["evaluation/scales"] == "1 2" and figures(run)["evaluation/scales"] == "1"
-    assert "of highest F1 on the dataset's val" in (tmp_path / "chosen/report.md").read_text()
+    assert "of highest F1 on val of the dataset" in (tmp_path / "chosen/report.md").read_text()
     assert "evaluated at scale 1 and 2" in (tmp_path / "chosen/report.md").read_text()
     table = call("compare", run, tmp_path / "chosen", "--out", tmp_path / "both")
     assert "| 1 |" in table and "| 1 2 |" in table

@@ -13,7 +13,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.data.streamed import open_streamed
 from perilune_train.detect.evaluate.matching import EDGE
-from perilune_train.detect.evaluate.metrics import curve, figures
+from perilune_train.detect.evaluate.metrics import figures
 from perilune_train.detect.evaluate.report import write_evaluation
 from perilune_train.detect.evaluate.split_evaluation import (
     WRITTEN,
@@ -34,6 +34,7 @@ from perilune_train.detect.train.network import (
     load_teacher,
 )
 from perilune_train.detect.train.task import DetectTask
+from perilune_train.detect.train.threshold import threshold_on_validation
 from perilune_train.detect.train.transfer import inherited_terrain, start_from
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
@@ -152,10 +153,10 @@ def evaluate(
     found_val, _ = detect_split(detector, splits["val"], "val")
     found, rate = detect_split(detector, splits["test"], "test")
     matches = match_detections(splits["val"], found_val, config)
-    threshold, rule = curve(matches).operating_threshold(config.evaluation.min_precision)
+    threshold, chosen_on = threshold_on_validation(detector, splits["val"], found_val)
     evaluation = evaluate_split(splits["test"], found, config, threshold)
     write_detections(run.root / "detections.parquet", splits["test"], found)
-    about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, f"{rule} on val")
+    about = report_head(dataset, "test", config, protocol_of(dataset.info), run.root.name, chosen_on)
     about.append(anchor_report(detector.network, sizes_px, config.anchor_ratio))
     write_evaluation(run.root, evaluation, list(splits["test"].frames.images), about)
     metrics: Metrics = {f"val/{key}": value for key, value in figures(matches, threshold).items()}

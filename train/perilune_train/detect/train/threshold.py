@@ -1,0 +1,44 @@
+"""Choose the score threshold of a detector on validation frames, also under varied contrast, blur and noise."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from perilune_train.detect.config import AugmentSettings
+from perilune_train.detect.data.augment import augment
+from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.evaluate.matching import Detections, match_split
+from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.inference.detector import Detector
+from perilune_train.detect.inference.scales import detect_split
+
+VARIED = AugmentSettings(flips_and_turns=False, gain=0.3, gamma=0.6, stretch=0.1, blur_px=0.6, noise=5.0)
+"""How the copies of the validation frames vary: wider than in training, as published images are."""
+_STREAM = 7
+
+
+def threshold_on_validation(detector: Detector, split: DetectSplit, found: list[Detections]) -> tuple[float, str]:
+    """The threshold by `detect.evaluation`, and how it was chosen, from the detections of a split.
+
+    With `detect.evaluation.varied_frames` the frames count twice: as they are and varied.
+    """
+    config = detector.config
+    labels, detections, frames = list(split.labels), list(found), "val"
+    if config.evaluation.varied_frames:
+        varied, _ = detect_split(detector, varied_split(split, config.seed), "varied val")
+        labels, detections, frames = labels * 2, detections + varied, "val and varied val"
+    height, width = split.frames.images.shape[1:]
+    matches = match_split(detections, labels, (width, height), config.evaluation.match_iou, split.radius_px)
+    threshold, rule = curve(matches).operating_threshold(config.evaluation.min_precision)
+    return threshold, f"{rule} on {frames}"
+
+
+def varied_split(split: DetectSplit, seed: int) -> DetectSplit:
+    """The same frames with other contrast, black and white points, blur and noise (`VARIED`); same labels."""
+    images = np.empty_like(split.frames.images)
+    for number, image in enumerate(split.frames.images):
+        own = split.labels[number]
+        rng = np.random.default_rng([seed, _STREAM, number])
+        pixels, _, _ = augment(image, own.boxes, own.selected, split.radius_px, VARIED, rng)
+        images[number] = np.clip(np.rint(pixels), 0, 255).astype(np.uint8)
+    return replace(split, frames=replace(split.frames, images=images))
