@@ -5,11 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from perilune_shared.errors import UserError
+
 Task = Literal["detect", "navigate"]
 WEIGHTS = "weights.safetensors"
 BENCHMARK = "benchmark.json"
 CARD = "card.md"
 _FOLDER = Path(__file__).parent
+_TASKS: dict[str, Task] = {"crater-detector": "detect", "lander-navigator": "navigate"}
 
 
 @dataclass(frozen=True)
@@ -37,10 +40,12 @@ class ShippedModel:
 
 def shipped_models() -> list[ShippedModel]:
     """All installed networks, by name."""
-    tasks: dict[str, Task] = {"crater-detector": "detect", "lander-navigator": "navigate"}
-    return [ShippedModel(n, t, _FOLDER / n) for n, t in tasks.items() if (_FOLDER / n / WEIGHTS).is_file()]
+    return [ShippedModel(n, t, _FOLDER / n) for n, t in _TASKS.items() if (_FOLDER / n / WEIGHTS).is_file()]
 
 
 def shipped_run(task: Task) -> Path:
-    """Folder of the installed network of a task."""
-    return next(model.folder for model in shipped_models() if model.task == task)
+    """Folder of the installed network of a task. Raises UserError if none is installed."""
+    found = [model.folder for model in shipped_models() if model.task == task]
+    if not found:
+        raise UserError("--run", "run", "not given, and no network is installed for this task", "the folder of a run")
+    return found[0]

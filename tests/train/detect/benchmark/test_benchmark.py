@@ -179,8 +179,7 @@ def test_detections_come_back_by_frame_and_score(places, tmp_path, no_pictures):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "either --run or --detections"),
-        (["--run", "a", "--detections", "b"], "either --run or --detections"),
+        (["--run", "a", "--detections", "b"], "both --run and --detections"),
         (["--detections", "b"], "--threshold"),
         (["--run", "a", "--threshold", "0.5"], "a run has its own threshold"),
         (["--detections", "b", "--threshold", "2"], "a number from 0 to 1"),

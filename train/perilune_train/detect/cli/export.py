@@ -8,11 +8,14 @@ import typer
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
 from perilune_train.cli_options import AllowOverlap
+from perilune_train.shipped.models import shipped_run
 
 
 def export(
-    run: Annotated[Path, typer.Option(help="Folder of a finished run, for example runs/detect/small.")],
     out: Annotated[Path, typer.Option(help="New folder for the files.")],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a finished run. [default: the detector that is installed]")
+    ] = None,
     formats: Annotated[str, typer.Option(help="onnx, openvino, or both separated by a comma.")] = "onnx,openvino",
     size_px: Annotated[int, typer.Option(help="Side of the square images, a multiple of 32.")] = 256,
     dataset: Annotated[
@@ -38,5 +41,5 @@ def export(
     # Importing torch takes seconds; check the options first.
     from perilune_train.detect.deploy.export import export_run
 
-    export_run(run, out, asked, size_px, dataset, int8, allow_overlap)
+    export_run(run or shipped_run("detect"), out, asked, size_px, dataset, int8, allow_overlap)
     console.print(f"{out}: README.md explains how to use the files")

@@ -10,11 +10,14 @@ from perilune_shared.terminal import console
 from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales, TileSide
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.shipped.models import shipped_run
 
 
 def predict(
     images: Annotated[list[Path], typer.Argument(help="PNG, TIFF or JPEG of any size.")],
-    run: Annotated[Path, typer.Option(help="Folder of a detect run.")] = Path("runs/detect/small"),
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a detect run. [default: the detector that is installed]")
+    ] = None,
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("predictions"),
     threshold: Annotated[
         float | None, typer.Option(help="Minimum score. [default: the run's, chosen on its validation split]")
@@ -31,6 +34,7 @@ def predict(
     """
     if threshold is not None and not 0 < threshold <= 1:
         raise UserError("--threshold", "score", threshold, "above 0, at most 1")
+    run = run or shipped_run("detect")
     config = config_of_run(run, ())
     # Importing torch takes seconds; check the options first.
     from perilune_train.detect.images.predict import predict_images

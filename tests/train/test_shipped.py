@@ -1,0 +1,63 @@
+"""The networks that are installed: listed, used without --run, and refused in one line if there is none."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+from tests.helpers import in_process
+from tests.helpers.stored_run import THRESHOLD, store_run
+
+from perilune_train.cli import main
+from perilune_train.shipped import models
+from perilune_train.training.half_weights import write_half
+from perilune_train.training.runs import RunFolder, load_weights
+
+
+@pytest.fixture
+def picture(tmp_path):
+    path = tmp_path / "photo.png"
+    cv2.imwrite(str(path), np.random.default_rng(1).integers(0, 256, (96, 96), np.uint8))
+    return path
+
+
+@pytest.fixture
+def shipped(tmp_path, monkeypatch):
+    """A folder with one installed detector, as scripts/ship.py writes it."""
+    run, folder = store_run(tmp_path / "run"), tmp_path / "shipped" / "crater-detector"
+    folder.mkdir(parents=True)
+    write_half(folder / "weights.safetensors", load_weights(RunFolder(run).best))
+    for name in ("config.yaml", "metrics.json"):
+        shutil.copyfile(run / name, folder / name)
+    figures = {"headline/ap50_paper": 0.5, "headline/ap50_paper_account": "paper, strict"}
+    (folder / "benchmark.json").write_text(json.dumps(figures))
+    monkeypatch.setattr(models, "_FOLDER", folder.parent)
+    return folder
+
+
+def test_they_are_listed(shipped):
+    done = in_process.call(main, "models")
+    assert done.returncode == 0
+    (line,) = done.stdout.splitlines()
+    assert line.startswith("crater-detector  detect  ") and line.endswith(str(shipped))
+    assert "AP 0.500 (paper, strict)" in line
+
+
+def test_predict_needs_no_run(shipped, picture, tmp_path):
+    done = in_process.call(main, "detect", "predict", picture, "--out", tmp_path / "a")
+    assert done.returncode == 0, done.stderr
+    named = in_process.call(main, "detect", "predict", picture, "--out", tmp_path / "b", "--run", shipped)
+    assert named.returncode == 0
+    found, again = (pd.read_parquet(tmp_path / name / "detections.parquet") for name in "ab")
+    assert found.equals(again) and (found["score"] >= THRESHOLD).all()
+
+
+def test_without_an_installed_network_a_run_is_needed(picture, tmp_path, monkeypatch):
+    monkeypatch.setattr(models, "_FOLDER", tmp_path)
+    for command in (("predict", picture), ("benchmark",), ("export",)):
+        done = in_process.call(main, "detect", *command, "--out", tmp_path / "out")
+        assert done.returncode == 2 and "no network is installed" in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1 and not (tmp_path / "out").exists()
+    assert in_process.call(main, "models").stdout == ""
