@@ -37,6 +37,7 @@ def test_detection_is_as_in_the_paper():
     assert config.labels.min_contrast is None and config.labels.min_depth_ratio is None
     loss = config.loss
     assert (loss.aspect, loss.objectness, loss.lambda_iou, loss.lambda_obj) == ("circular", "hard", 0.05, 1)
+    assert loss.reduction == "sums" and config.anchor_sampling == "plain"
     assert config.assignment == "one" and config.init_layers == "from_second" and config.ema_decay == 0
     augment = config.augment.model_dump()
     assert augment.pop("scale") == (1, 1) and not any(augment.values())

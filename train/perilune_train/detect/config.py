@@ -80,6 +80,8 @@ class LossSettings(Section):
     """Reference of the aspect term of CIoU: a circle (the paper), or the aspect ratio of the label."""
     objectness: Literal["hard", "iou"] = "iou"
     """Objectness target of a positive predictor: 1, or the IoU of its box with its label."""
+    reduction: Literal["means", "sums"] = "means"
+    """means: over the predictors of each scale, scales weighted by 1 / stride. sums: plain sums (the paper)."""
     lambda_iou: Positive = 0.05
     """Weight of L_ciou."""
     lambda_obj: Positive = 1.0
@@ -158,6 +160,9 @@ class DetectConfig(Section):
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
     """Decay per step of the moving average of the weights; the average is evaluated and saved. At step s the decay is
     at most (1 + s) / (10 + s), so that 0.998 holds from step 4490 on."""
+    anchor_sampling: Literal["rare", "plain"] = "rare"
+    """Sizes of labels from which anchors are clustered. rare: with weights of one over the square root of their
+    frequency, so that large craters get anchors. plain: as frequent as they are (the paper)."""
     assignment: Literal["several", "one"] = "several"
     """Predictors that learn a label. several: every anchor within anchor_ratio, in the cell of the label's centre and
     in the two nearest cells. one: the anchor of highest IoU in the cell of the centre, as in YOLOv3 (the paper)."""

@@ -23,6 +23,8 @@ _DEVIATIONS = (
     "The grey frame is repeated in three channels, as PANGU's images of a grey ground are.",
     "Optimiser (AdamW with warm-up and one cosine for detection), learning rate and batch of detection, and the weight "
     "of empty cells in the objectness loss (1) are ours; the paper does not state them.",
+    "Sums of the loss are divided by the number of frames in the batch. Craters with a radius just outside 2 to 50 px, "
+    "or with their centre off the frame, are neither positive nor negative.",
     "A cell can place a centre up to half a cell outside itself (models/yolo.py); there is no class output.",
     "The initial objectness is 0.01 in every cell.",
     "Rotations are output in units of their r.m.s. in training. Without attitude noise the camera does not rotate, "

@@ -58,3 +58,11 @@ def test_the_seed_alone_decides_which_sizes_are_drawn():
     sizes = np.random.default_rng(1).lognormal(2.5, 0.5, (25_000, 2))
     one, same, other = (kmeans_anchors(sizes, 9, np.random.default_rng(seed)) for seed in (3, 3, 4))
     assert np.array_equal(one, same) and not np.array_equal(one, other)
+
+
+def test_plain_sampling_follows_the_frequency():
+    """Craters fall off with the square of their size: without weights the anchors are smaller."""
+    side = np.minimum(4 / np.sqrt(np.random.default_rng(2).uniform(0.001, 1, 20_000)), 100)
+    sizes = np.stack([side, side], axis=1)
+    rare, plain = (kmeans_anchors(sizes, 9, np.random.default_rng(0), plain=plain) for plain in (False, True))
+    assert np.median(plain) < 0.9 * np.median(rare)

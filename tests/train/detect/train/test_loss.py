@@ -76,6 +76,18 @@ def test_loss_by_hand():
     assert confidence.item() == pytest.approx((3 + 0.5 * 45) * math.log(2) / 48, rel=1e-5)
 
 
+def test_plain_sums_by_hand():
+    """The case above on two scales of two frames, the label in the first frame of each."""
+    anchors, _ = anchors_and_output()
+    label = BatchLabels(torch.tensor([[8.0, 8.0, 16.0, 16.0]]), torch.tensor([0]), torch.tensor([True]))
+    both = torch.cat([anchors, anchors])
+    targets = assign(label, both, (8, 8), [(2, 4, 4)] * 2, 1.5)
+    settings = LossSettings(lambda_noobj=0.5, reduction="sums")
+    box, confidence = detection_loss([torch.zeros(2, 3, 4, 4, 5)] * 2, targets, both, (8, 8), settings)
+    assert box.item() == pytest.approx(2 * (0 + 2 * (1 + 64 / 320)) / 2, abs=1e-5)
+    assert confidence.item() == pytest.approx(2 * (3 + 0.5 * 93) * math.log(2) / 2, rel=1e-5)
+
+
 def test_ignored_label_takes_its_predictors_out_of_the_loss():
     anchors, raw = anchors_and_output()
     boxes = torch.tensor([[8.0, 8.0, 16.0, 16.0]])

@@ -16,19 +16,19 @@ def size_iou(sizes: Array, anchors: Array) -> Array:
     return iou_matrix(*(np.concatenate([-sides, sides], axis=1) / 2 for sides in (sizes, anchors)))
 
 
-def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator) -> Array:
+def kmeans_anchors(sizes_px: Array, count: int, rng: np.random.Generator, plain: bool = False) -> Array:
     """`count` anchors (count, 2), width and height in pixels, sorted by area, for sizes (N, 2) > 0.
 
     Clusters 20,000 sizes drawn with `rng`, weighted by the inverse square root of the frequency of each size. Without
-    the weights all anchors would go to small craters: craters of 40 px are a hundred times rarer than those of 5 px.
-    Starts from evenly spaced logarithms of the area. An empty cluster takes the size with the worst fit.
+    the weights (`plain`) most anchors would go to small craters: craters of 40 px are a hundred times rarer than those
+    of 5 px. Starts from evenly spaced logarithms of the area. An empty cluster takes the size with the worst fit.
     """
     sizes = np.asarray(sizes_px, np.float64)
     if len(sizes) == 0:
         raise ValueError("no sizes to cluster")
     log_area = np.log(sizes.prod(axis=1))
     step = np.digitize(log_area, np.linspace(log_area.min(), log_area.max(), _STEPS + 1)[1:-1])
-    weight = np.bincount(step, minlength=_STEPS)[step] ** -0.5
+    weight = np.bincount(step, minlength=_STEPS)[step] ** (0.0 if plain else -0.5)
     sizes = sizes[rng.choice(len(sizes), _SAMPLE, p=weight / weight.sum())]
     log_area = np.log(sizes.prod(axis=1))
     side = np.exp(np.linspace(log_area.min(), log_area.max(), count) / 2)

@@ -45,11 +45,14 @@ def detection_loss(
 ) -> tuple[Tensor, Tensor]:
     """L_ciou and L_obj of raw outputs (N, 3, h, w, 5) per scale; the loss is their weighted sum.
 
-    For each scale, L_ciou is the mean over its positive predictors, 0 if there are none. L_obj is the sum of the binary
-    cross-entropy of the objectness over positive and (times lambda_noobj) negative predictors, divided by the number of
-    all predictors of the scale. The scales are averaged with weights 1 / stride. Deviation: the paper has plain sums
-    over all scales. With means, both parts train with the paper's weights 0.05 and 1. The weights 1 / stride raise the
-    coarse scales relative to a plain sum, because their craters are a hundred times rarer.
+    With `reduction` "sums", the paper's form: both are plain sums over all predictors of all scales, divided by the
+    number of frames.
+
+    With "means", our deviation: for each scale, L_ciou is the mean over its positive predictors, 0 if there are none.
+    L_obj is the sum of the binary cross-entropy of the objectness over positive and (times lambda_noobj) negative
+    predictors, divided by the number of all predictors of the scale. The scales are averaged with weights 1 / stride.
+    With means, both parts train with the paper's weights 0.05 and 1. The weights 1 / stride raise the coarse scales
+    relative to a plain sum, because their craters are a hundred times rarer.
 
     No shape depends on values, so that a GPU never makes the process wait.
 
@@ -62,9 +65,15 @@ def detection_loss(
         frame, anchor, row, column = found.places
         chosen, cells = raw[frame, anchor, row, column].float(), torch.stack([column, row], 1)
         boxes, labels = decode(chosen, cells, own_anchors[anchor], stride), found.boxes
-        share = 1 / stride / total
+        sums = settings.reduction == "sums"
+        # What the sums over the predictors of this scale are divided by.
+        of_boxes, of_scores = (
+            (len(raw), len(raw))
+            if sums
+            else (max(len(labels), 1) * total * stride, raw[..., 4].numel() * total * stride)
+        )
         # An empty sum keeps the graph, so that a batch of empty frames remains differentiable.
-        box = box + share * ciou_loss(boxes, labels, settings.aspect).sum() / max(len(labels), 1)
+        box = box + ciou_loss(boxes, labels, settings.aspect).sum() / of_boxes
         positive = found.positive
         weight = torch.where(positive, 1.0, settings.lambda_noobj * (~found.ignored))
         target = positive.float()
@@ -80,5 +89,5 @@ def detection_loss(
             )
         logits = raw[..., 4].float()
         entropy = F.binary_cross_entropy_with_logits(logits, target, weight, reduction="sum")
-        confidence = confidence + share * entropy / logits.numel()
+        confidence = confidence + entropy / of_scores
     return box, confidence

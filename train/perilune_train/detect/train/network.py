@@ -22,7 +22,8 @@ def build_network(config: DetectConfig, sizes_px: np.ndarray, where: object) -> 
     if len(sizes_px) == 0:
         raise UserError(where, "labels", "no visible crater in the training split", "at least one")
     count = len(config.strides) * ANCHORS_PER_SCALE
-    anchors = kmeans_anchors(sizes_px, count, np.random.default_rng([config.seed, _ANCHOR_STREAM]))
+    rng = np.random.default_rng([config.seed, _ANCHOR_STREAM])
+    anchors = kmeans_anchors(sizes_px, count, rng, plain=config.anchor_sampling == "plain")
     lightning.seed_everything(config.seed, verbose=False)
     shaped = torch.as_tensor(anchors).view(len(config.strides), ANCHORS_PER_SCALE, 2)
     return YOLOv3(shaped, config.in_channels, config.width, config.attention, config.strides)
