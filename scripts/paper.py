@@ -29,6 +29,7 @@ BIN = Path(sys.executable).parent
 PROTOCOL = Path("configs/paper_protocol.yaml")
 ATTITUDE_DEG = 1.0
 """Standard deviation of the attitude in the second experiment, per axis."""
+OWN = "train own network, to start from"
 RENDER_FRAMES_PER_S = 4.0
 """Roughly, on two cores, scene included; the rendering states its own estimate when it runs."""
 
@@ -185,7 +186,7 @@ def _own_network(one: Experiment) -> list[Step]:
     train = [str(BIN / "perilune-train"), "detect", "train", "--preset", pretraining, *sets, "--dataset", str(data)]
     return [
         Step(f"render {pretraining}, to pretrain on", [*render, "--out", str(data.parent)], _rendered(data)),
-        Step("train own network, to start from", [*train, "--out", str(one.runs), "--name", "own"], _finished(run)),
+        Step(OWN, [*train, "--out", str(one.runs), "--name", "own"], _finished(run)),
     ]
 
 
@@ -220,8 +221,10 @@ def _page_steps(one: Experiment) -> list[Step]:
         f"preset `{one.preset}`, part `{one.part}`, attitude noise of {ATTITUDE_DEG if one.attitude else 0:g} degrees"
     ]
     if one.part == Part.QUARTER:
-        about.append("cut to fit two cores: every fourth detection frame; 5 detection epochs (the first frozen)")
-        about.append("and 5 fine epochs of the navigators; batch norms of the navigators see one sequence at a time")
+        about.append(
+            "cut to fit two cores: every fourth detection frame, 5 epochs of the detectors (the first frozen), 5 fine "
+            "epochs of the navigators; the navigators' batch norms see one sequence at a time"
+        )
     command = [str(BIN / "perilune-train"), "paper", "--runs", str(one.runs), "--dataset", str(one.data / "detect")]
     return [Step("page", [*command, *[text for line in about for text in ("--about", line)]], lambda: False)]
 
@@ -257,6 +260,9 @@ def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
     for kind in ("detect", "nav"):
         if f"render {kind}" in left:
             found[f"render {kind}"] = dataset[kind] / RENDER_FRAMES_PER_S
+    if OWN in left:
+        # `small` has 1088 training frames and 5 epochs, `tiny` fewer.
+        found[OWN] = detect_seconds(detect.model_copy(update={"attention": "none"}), size) * 1088 * 5
     for folder, attention in zip(DETECTORS.values(), ("none", "cbam"), strict=True):
         if f"train {folder}" in left:
             seconds = detect_seconds(detect.model_copy(update={"attention": attention}), size)
