@@ -102,10 +102,10 @@ benchmark: setup ## score the installed detector, or a run (RUN=folder), on the 
 	@$(MAKE) --no-print-directory benchmark-frames KIND=detect
 	@$(BIN)/perilune-train detect benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
 
-benchmark-nav: setup ## score a navigate run (RUN=folder) on the locked benchmark of navigation; writes runs/benchmark/<name>-navigate
-	@$(call checked_run,navigate)
+benchmark-nav: setup ## score the installed navigator, or a run (RUN=folder), on the locked benchmark of navigation; writes runs/benchmark/<name>-navigate
+	@$(if $(RUN),$(call checked_run,navigate))
 	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
-	@$(BIN)/perilune-train navigate benchmark --run $(call quoted,$(RUN)) --data $(BENCHMARK)
+	@$(BIN)/perilune-train navigate benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
 
 # The experiment has presets of its own: PRESET=paper unless one is given.
 paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=quarter for two cores, ATTITUDE=1, DARKNET=yolov3.weights)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from model_card import Shipment, model_card
 
 from perilune_shared.errors import UserError, run_command_line
 from perilune_shared.storage.files import sha256_of, write_text
@@ -29,6 +30,8 @@ MAX_MB = {"crater-detector": 16.0, "lander-navigator": 8.0}
 
 def ship(run: Path, name: str, benchmark: Path, manifest: str) -> Path:
     """Write the folder of a shipped network; returns it."""
+    if name not in MAX_MB:
+        raise UserError("--name", "name", name, "one of " + ", ".join(MAX_MB))
     source, folder = RunFolder(run), SHIPPED / name
     content = load_weights(source.best)
     locked = ROOT / "data_manifests" / manifest / "dataset.json"
@@ -45,83 +48,15 @@ def ship(run: Path, name: str, benchmark: Path, manifest: str) -> Path:
     write_text(folder / METRICS_FILE, json.dumps(kept, indent=2) + "\n")
     write_text(folder / BENCHMARK, json.dumps(figures, indent=2) + "\n")
     shutil.copyfile(source.config, folder / "config.yaml")
-    card = _card(name, content, metrics, figures, manifest, sha256_of(locked), size)
+    card = model_card(Shipment(name, content, metrics, figures, manifest, sha256_of(locked), size))
     write_text(folder / CARD, card)
     write_text(ROOT / "docs/reference/models" / f"{name}.md", card)
     return folder
 
 
-def _card(name: str, content: dict, metrics: dict, figures: dict, manifest: str, sha256: str, size_mb: float) -> str:
-    """The model card, from the figures."""
-
-    def figure(key: str) -> str:
-        value, low, high = (figures.get(f"{key}{end}") for end in ("", "_low", "_high"))
-        if not isinstance(value, int | float):
-            return "not measured"
-        limits = f" ({low:.3f} to {high:.3f})" if isinstance(low, float) and isinstance(high, float) else ""
-        return f"{value:.3f}{limits}"
-
-    architecture = content["architecture"]
-    rows = [
-        f"| {rule} | {account} | {figure(f'{rule}/{prefix}ap50_paper')} | {figure(f'{rule}/{prefix}f1')} |"
-        for rule in ("visible", "paper")
-        for account, prefix in (("usual", ""), ("edge", "edge/"), ("strict", "strict/"))
-    ]
-    bins = [
-        f"| {key.removeprefix('visible/').removesuffix('/ap50_paper').replace('_', ' ')} | {value:.3f} |"
-        for key, value in figures.items()
-        if key.startswith(("visible/radius_", "visible/sun_", "visible/altitude_")) and key.endswith("/ap50_paper")
-    ]
-    network = (
-        f"attention-YOLOv3, width {architecture['width']:g}, {architecture['in_channels']} channel, attention "
-        f"`{architecture['attention']}`, strides {' '.join(map(str, architecture['strides']))}"
-    )
-    commit = str(metrics.get("run/commit", "unknown"))[:7]
-    return "\n".join(
-        [
-            f"# {name}",
-            "",
-            "Finds lunar craters in camera images seen from above. `perilune-train detect predict` loads it if `--run` "
-            "is not given.",
-            "",
-            "| | |",
-            "|---|---|",
-            f"| Network | {network} |",
-            f"| Weights | {size_mb:.1f} MB, half precision, safetensors |",
-            f"| Training data | manifest `{manifest}`, SHA-256 of dataset.json {sha256[:16]}; rendered frames only |",
-            f"| Trained at | commit {commit}, {metrics.get('run/hardware', 'unknown hardware')} |",
-            f"| Threshold | {figures.get('threshold', 0):.3f}, chosen on validation scenes |",
-            "| Licence | Apache-2.0 |",
-            "",
-            "## Locked benchmark",
-            "",
-            f"**AP {figures['headline/ap50_paper']:.3f}, F1 {figures['headline/f1']:.3f}** by the least favourable "
-            "account.",
-            "",
-            "| labels | account | AP | F1 |",
-            "|---|---|---|---|",
-            *rows,
-            "",
-            "In brackets: 95 % intervals over scenes.",
-            "",
-            "| bin, labels by `visible`, usual account | AP |",
-            "|---|---|",
-            *bins,
-            "",
-            "## Limits",
-            "",
-            "- It was trained on rendered frames of 256 x 256 pixels over 50 degrees; real images differ.",
-            "- It looks for craters of about 2 to 80 pixels radius. Cut or shrink images with larger ones (`--scale`).",
-            "- A view far from straight down was not trained.",
-            "- One training; no spread over seeds.",
-            "",
-        ]
-    )
-
-
 def main(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
-    name: Annotated[str, typer.Option(help="Name of the shipped network.")] = "crater-detector",
+    name: Annotated[str, typer.Option(help="crater-detector or lander-navigator.")] = "crater-detector",
     benchmark: Annotated[Path, typer.Option(help="benchmark.json of the run.")] = Path("benchmark.json"),
     manifest: Annotated[str, typer.Option(help="Shared manifest of the training data.")] = "shipped-detect",
 ) -> None:

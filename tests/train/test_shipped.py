@@ -56,8 +56,10 @@ def test_predict_needs_no_run(shipped, picture, tmp_path):
 
 def test_without_an_installed_network_a_run_is_needed(picture, tmp_path, monkeypatch):
     monkeypatch.setattr(models, "_FOLDER", tmp_path)
-    for command in (("predict", picture), ("benchmark",), ("export",)):
-        done = in_process.call(main, "detect", *command, "--out", tmp_path / "out")
+    detect = [("detect", *command) for command in (("predict", picture), ("benchmark",), ("export",))]
+    navigate = [("navigate", "benchmark"), ("navigate", "evaluate", "--dataset", tmp_path)]
+    for command in (*detect, *navigate):
+        done = in_process.call(main, *command, "--out", tmp_path / "out")
         assert done.returncode == 2 and "no network is installed" in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1 and not (tmp_path / "out").exists()
     assert in_process.call(main, "models").stdout == ""

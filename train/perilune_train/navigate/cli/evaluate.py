@@ -9,13 +9,19 @@ from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
 from perilune_train.cli_options import AllowOverlap
+from perilune_train.shipped.models import shipped_run
 
 
 def evaluate(
-    run: Annotated[Path, typer.Option(help="Folder of a finished navigate run, for example runs/navigate/small.")],
     dataset: Annotated[str, typer.Option(help="Dataset: a folder, s3://bucket/prefix or gs://bucket/prefix.")],
+    run: Annotated[
+        Path | None, typer.Option(help="Folder of a finished navigate run. [default: the navigator that is installed]")
+    ] = None,
     split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
-    out: Annotated[Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation]")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder to write into. [default: <run>/evaluation; runs/evaluation/<name> without --run]"),
+    ] = None,
     allow_overlap: AllowOverlap = False,
 ) -> None:
     """Evaluate a run's best weights together with KLT tracks and the nominal motion.
@@ -28,5 +34,6 @@ def evaluate(
     # torch takes seconds to load.
     from perilune_train.navigate.evaluate_run import evaluate_navigator
 
-    folder = evaluate_navigator(run, dataset, split, out or run / "evaluation", allow_overlap)
+    default = run / "evaluation" if run else Path("runs/evaluation", "lander-navigator")
+    folder = evaluate_navigator(run or shipped_run("navigate"), dataset, split, out or default, allow_overlap)
     console.print(f"{folder}: metrics.json, navigation.parquet, errors.parquet, descent.png, errors.png")

@@ -1,0 +1,136 @@
+"""The card of an installed network, from its metrics and its figures on the locked benchmark."""
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Shipment:
+    """What a card is made from."""
+
+    name: str
+    """crater-detector or lander-navigator."""
+    content: dict[str, Any]
+    """Checkpoint: architecture and weights."""
+    metrics: dict[str, Any]
+    """metrics.json of the run."""
+    figures: dict[str, Any]
+    """benchmark.json of the run."""
+    manifest: str
+    """Shared manifest of the training data."""
+    sha256: str
+    """SHA-256 of its dataset.json."""
+    size_mb: float
+    """Size of the weights, MB."""
+
+
+def model_card(one: Shipment) -> str:
+    """The card as Markdown."""
+    lines = _detector(one) if one.name == "crater-detector" else _navigator(one)
+    return "\n".join([f"# {one.name}", "", *lines, ""])
+
+
+def _facts(one: Shipment, network: str, threshold: str | None) -> list[str]:
+    commit = str(one.metrics.get("run/commit", "unknown"))[:7]
+    data = f"manifest `{one.manifest}`, SHA-256 of dataset.json {one.sha256[:16]}; rendered frames only"
+    rows = {
+        "Network": network,
+        "Weights": f"{one.size_mb:.1f} MB, half precision, safetensors",
+        "Training data": data,
+        "Trained at": f"commit {commit}, {one.metrics.get('run/hardware', 'unknown hardware')}",
+        "Threshold": threshold,
+        "Licence": "Apache-2.0",
+    }
+    return ["| | |", "|---|---|", *[f"| {key} | {value} |" for key, value in rows.items() if value]]
+
+
+def _figure(figures: dict[str, Any], key: str) -> str:
+    value, low, high = (figures.get(f"{key}{end}") for end in ("", "_low", "_high"))
+    if not isinstance(value, int | float):
+        return "not measured"
+    limits = f" ({low:.3f} to {high:.3f})" if isinstance(low, float) and isinstance(high, float) else ""
+    return f"{value:.3f}{limits}"
+
+
+def _detector(one: Shipment) -> list[str]:
+    figures, shape = one.figures, one.content["architecture"]
+    network = (
+        f"attention-YOLOv3, width {shape['width']:g}, {shape['in_channels']} channel, attention "
+        f"`{shape['attention']}`, strides {' '.join(map(str, shape['strides']))}"
+    )
+    rows = [
+        f"| {rule} | {account} | {_figure(figures, f'{rule}/{prefix}ap50_paper')} | "
+        f"{_figure(figures, f'{rule}/{prefix}f1')} |"
+        for rule in ("visible", "paper")
+        for account, prefix in (("usual", ""), ("edge", "edge/"), ("strict", "strict/"))
+    ]
+    bins = [
+        f"| {key.removeprefix('visible/').removesuffix('/ap50_paper').replace('_', ' ')} | {value:.3f} |"
+        for key, value in figures.items()
+        if key.startswith(("visible/radius_", "visible/sun_", "visible/altitude_"))
+        and key.endswith("/ap50_paper")
+        and isinstance(value, float)
+    ]
+    return [
+        "Finds lunar craters in camera images seen from above. `perilune-train detect predict` loads it if `--run` is "
+        "not given.",
+        "",
+        *_facts(one, network, f"{figures.get('threshold', 0):.3f}, chosen on validation scenes"),
+        "",
+        "## Locked benchmark",
+        "",
+        f"**AP {figures['headline/ap50_paper']:.3f}, F1 {figures['headline/f1']:.3f}** by the least favourable "
+        "account.",
+        "",
+        "| labels | account | AP | F1 |",
+        "|---|---|---|---|",
+        *rows,
+        "",
+        "In brackets: 95 % intervals over scenes.",
+        "",
+        "| bin, labels by `visible`, usual account | AP |",
+        "|---|---|",
+        *bins,
+        "",
+        "## Limits",
+        "",
+        "- It was trained on rendered frames of 256 x 256 pixels over 50 degrees; real images differ.",
+        "- It looks for craters of about 2 to 80 pixels radius. Shrink images with larger ones (`--scale`).",
+        "- A view far from straight down was not trained.",
+        "- The figures are of one training; the spread over seeds is in the notebook.",
+    ]
+
+
+def _navigator(one: Shipment) -> list[str]:
+    figures, shape = one.figures, one.content["architecture"]
+    method = str(figures["headline/method"])
+    network = (
+        f"Darknet53-LSTM, fusion `{method}`, width {shape['width']:g}, attention `{shape['attention']}`, frames of "
+        f"{shape['size_px']} pixels"
+    )
+    names = {method: "this network", "klt": "tracked corners (KLT)", "nominal": "nominal motion"}
+    keys = ("position_rmse_vector_m", "position_rmse_per_component_m", "orientation_rmse_angle_deg")
+    rows = [
+        f"| {title} | " + " | ".join(_figure(figures, f"{name}/{key}") for key in keys) + " |"
+        for name, title in names.items()
+    ]
+    return [
+        "Estimates the motion of a camera between two frames of a landing, from the frames and the nominal motion. "
+        "`perilune-train navigate evaluate` and `benchmark` load it if `--run` is not given.",
+        "",
+        *_facts(one, network, None),
+        "",
+        "## Locked benchmark",
+        "",
+        "| method | position RMSE of a step, vector (m) | per component (m) | orientation RMSE, angle (deg) |",
+        "|---|---|---|---|",
+        *rows,
+        "",
+        "In brackets: 95 % intervals over scenes. A step is about 36 m.",
+        "",
+        "## Limits",
+        "",
+        "- Classical tracking is better wherever its row says so; use it then.",
+        "- It needs the nominal motion and altitude, and was trained on errors of rendered descents only.",
+        "- The figures are of one training.",
+    ]
