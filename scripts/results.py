@@ -146,14 +146,15 @@ def _record_of(file: Path) -> Record:
             date=made["date"],
             hardware=hardware,
             load=made["load"],
-            command=command,
+            # A run of a second working tree names this one by its absolute path.
+            command=command.replace(f"{ROOT}/", ""),
             figures=figures,
         )
     except ValidationError as error:
         raise UserError(file, "run", str(made), f"{_NEEDED}, with committed code: {error.errors()[0]['msg']}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise UserError(file, "run", "no commit, hardware and command", _NEEDED) from None
-    if re.search(r"(^|[\s=])/", command):
+    if re.search(r"(^|[\s=])/", found.command):
         raise UserError(file, "run/command", command, "paths relative to the repository, so that others can run it")
     if not is_ancestor(commit):
         raise UserError(file, "run/commit", commit, "a commit of this branch")
