@@ -44,14 +44,14 @@ class Part(StrEnum):
 PARTS: dict[Part, dict[str, str]] = {
     Part.WHOLE: {},
     Part.QUARTER: {
-        "detect.epochs": "5",
+        "detect.epochs": "4",
         "detect.frozen_epochs": "1",
         "detect.batch_size": "8",
         "detect.warmup_steps": "200",
         "detect.workers": "0",
         "navigate.workers": "0",
         "navigate.stack.coarse_epochs": "20",
-        "navigate.stack.fine_epochs": "5",
+        "navigate.stack.fine_epochs": "4",
         "navigate.stack.batch_sequences": "1",
         "navigate.stack.accumulate": "8",
     },
@@ -222,7 +222,7 @@ def _page_steps(one: Experiment) -> list[Step]:
     ]
     if one.part == Part.QUARTER:
         about.append(
-            "cut to fit two cores: every fourth detection frame, 5 epochs of the detectors (the first frozen), 5 fine "
+            "cut to fit two cores: every fourth detection frame, 4 epochs of the detectors (the first frozen), 4 fine "
             "epochs of the navigators; the navigators' batch norms see one sequence at a time"
         )
     command = [str(BIN / "perilune-train"), "paper", "--runs", str(one.runs), "--dataset", str(one.data / "detect")]

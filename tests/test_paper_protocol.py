@@ -74,7 +74,7 @@ def test_the_steps_of_a_quarter(script):
     assert "data/paper-quarter/plans/nav" in found["render nav"], "all frames of navigation"
     plain, attended = found["train yolov3"], found["train attention-yolov3"]
     assert plain.replace("attention=none", "attention=cbam").replace("yolov3", "attention-yolov3") == attended
-    assert "detect.epochs=5" in plain and "detect.frozen_epochs=1" in plain and "detect/own/checkpoints" in plain
+    assert "detect.epochs=4" in plain and "detect.frozen_epochs=1" in plain and "detect/own/checkpoints" in plain
     navigator = found["train attention-darknet53-lstm"]
     assert "detect/attention-yolov3/checkpoints/best.ckpt" in navigator
     assert "batch_sequences=1" in navigator and "accumulate=8" in navigator
