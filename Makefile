@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-suppress bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -206,6 +206,9 @@ bench-contrast: setup ## AUC of contrast for the craters that the detector finds
 
 bench-infer: setup ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer
+
+bench-latency: setup ## where the time of the detector goes, by groups of operations, and the processor's limit; writes runs/bench/latency.json
+	@$(BIN)/python -m benchmarks.train.latency
 
 bench-train: detect-frames ## training speed, compared with training from memory and with a bare loop; writes runs/bench/train.json
 	@$(BIN)/python -m benchmarks.train.train --dataset "$(DATA)/detect" --preset $(PRESET)
