@@ -251,7 +251,7 @@ def test_quantised_files_hold_integers_but_for_gates_and_heads(exported, images,
     quantised = {n.name for n in graph.node if n.op_type == "Conv" and made.get(n.input[0]) == "DequantizeLinear"}
     every = {n.name for n in graph.node if n.op_type == "Conv"}
     assert "/network/backbone/stem/conv/Conv" in every
-    assert len(quantised) > 50
+    assert len(quantised) > 50 and "/network/heads.4/heads.4.0/conv/Conv" in quantised
     assert not [name for name in quantised if "squeeze" in name or "spatial" in name or "heads.4.1" in name]
     boxes, scores = onnxruntime_engine(tmp_path / "q.onnx", 1)(images)
     _, exact = lively().detect(torch.as_tensor(images))

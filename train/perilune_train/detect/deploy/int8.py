@@ -2,6 +2,7 @@
 
 import dataclasses
 import logging
+import re
 import statistics
 import time
 from collections.abc import Iterator
@@ -26,8 +27,9 @@ MAX_AP_LOSS = 0.005
 """Largest accepted loss of AP on the validation split."""
 _CALIBRATION_FRAMES = 64
 _TIMED = 30
-_KEPT_FLOAT = ("/squeeze", "/excite", "/spatial", "/heads.")
-"""Parts of the graph that stay in floating point: the gates, which are cheap, and the heads, which give the boxes."""
+_KEPT_FLOAT = re.compile(r"/(squeeze|excite|spatial)|/heads\.\d+\.1/")
+"""Operations that stay in floating point: the gates, which are cheap, and the last convolution of each head, which
+gives the boxes."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def quantise(source: Path, out: Path, images: Array) -> None:
             per_channel=True,
             activation_type=quantization.QuantType.QUInt8,
             weight_type=quantization.QuantType.QInt8,
-            nodes_to_exclude=[node.name for node in graph.node if any(part in node.name for part in _KEPT_FLOAT)],
+            nodes_to_exclude=[node.name for node in graph.node if _KEPT_FLOAT.search(node.name)],
             # So that engines can fuse a convolution with the next operation before rounding.
             extra_options={"OpTypesToExcludeOutputQuantization": ["Conv"]},
         )
