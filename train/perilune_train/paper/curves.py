@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from perilune_train.evaluation.pictures import save_figure
 from perilune_train.paper.runs import PaperRuns
@@ -41,6 +42,7 @@ def draw_learning(path: Path, runs: PaperRuns) -> None:
             values = learning_curve(folder, key)
             axes.plot(range(1, len(values) + 1), values, marker="o", label=network)
         axes.set(xlabel="epoch", title=title)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
         axes.legend()
     save_figure(path, figure)
