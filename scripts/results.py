@@ -123,8 +123,13 @@ def write() -> None:
 
 
 def record_name(file: Path) -> str:
-    """Name of a file's record: bench/labels.json is `labels`, detect/small/metrics.json is `detect-small`."""
+    """Name of a file's record: `labels` of bench/labels.json, `detect-small` of detect/small/metrics.json.
+
+    `benchmark-small` of benchmark/small/benchmark.json.
+    """
     parts = file.resolve().parts
+    if file.name == "benchmark.json":
+        return f"benchmark-{parts[-2]}"
     return f"{parts[-3]}-{parts[-2]}" if file.name == "metrics.json" else file.stem
 
 
