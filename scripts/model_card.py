@@ -97,7 +97,7 @@ def _detector(one: Shipment) -> list[str]:
         "- It was trained on rendered frames of 256 x 256 pixels over 50 degrees; real images differ.",
         "- It looks for craters of about 2 to 80 pixels radius. Shrink images with larger ones (`--scale`).",
         "- A view far from straight down was not trained.",
-        "- The figures are of one training; the spread over seeds is in the notebook.",
+        "- The figures are of one training; other seeds differ.",
     ]
 
 

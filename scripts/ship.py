@@ -1,10 +1,12 @@
-"""Put a trained run into the package, as the network that is installed by default.
+"""Put a trained run into the package, as the network that is installed by default; then write its card.
 
-    python scripts/ship.py RUN --name crater-detector --benchmark benchmark.json --manifest shipped-detect
+    python scripts/ship.py install runs/detect/shipped --name crater-detector
+    make benchmark
+    python scripts/ship.py card --name crater-detector --benchmark runs/benchmark/crater-detector/benchmark.json
 
-Writes train/perilune_train/shipped/NAME/: weights.safetensors in half precision, config.yaml, metrics.json,
-benchmark.json and card.md, and docs/reference/models/NAME.md, a copy of the card. The benchmark's figures must be those
-of the half-precision weights or of the run itself; the card states which.
+The benchmark scores the installed weights in half precision. `install` writes train/perilune_train/shipped/NAME/ with
+weights.safetensors, config.yaml and metrics.json. `card` adds benchmark.json and card.md, and writes
+docs/reference/models/NAME.md, a copy of the card, and NAME-benchmark.md, the page of the benchmark.
 """
 
 import json
@@ -23,48 +25,61 @@ from perilune_train.training.half_weights import write_half
 from perilune_train.training.runs import RunFolder, load_weights
 
 ROOT = Path(__file__).resolve().parents[1]
-SHIPPED = ROOT / "train/perilune_train/shipped"
+SHIPPED, PAGES = ROOT / "train/perilune_train/shipped", ROOT / "docs/reference/models"
 MAX_MB = {"crater-detector": 16.0, "lander-navigator": 8.0}
 """Largest size of the weights, MB."""
+MANIFESTS = {"crater-detector": "shipped-detect", "lander-navigator": "shipped-nav"}
+"""Shared manifests of the training data."""
+
+Name = Annotated[str, typer.Option(help="crater-detector or lander-navigator.")]
+app = typer.Typer(pretty_exceptions_enable=False, add_completion=False, no_args_is_help=True)
 
 
-def ship(run: Path, name: str, benchmark: Path, manifest: str) -> Path:
-    """Write the folder of a shipped network; returns it."""
-    if name not in MAX_MB:
-        raise UserError("--name", "name", name, "one of " + ", ".join(MAX_MB))
-    source, folder = RunFolder(run), SHIPPED / name
-    content = load_weights(source.best)
-    locked = ROOT / "data_manifests" / manifest / "dataset.json"
-    if not locked.is_file():
-        raise UserError(locked, "--manifest", "no such file", "the shared manifest of the training data")
-    metrics, figures = read_metrics(run), read_metrics(benchmark.parent, benchmark.name)
+@app.command()
+def install(run: Annotated[Path, typer.Argument(help="Folder of a finished run.")], name: Name) -> None:
+    """Write weights, configuration and metrics of a run into the package; a card of an earlier network is removed."""
+    folder, source = _folder(name), RunFolder(run)
+    content, metrics = load_weights(source.best), read_metrics(run)
     folder.mkdir(parents=True, exist_ok=True)
+    for stale in (BENCHMARK, CARD):
+        (folder / stale).unlink(missing_ok=True)
     write_half(folder / WEIGHTS, content)
     size = (folder / WEIGHTS).stat().st_size / 1e6
     if size > MAX_MB[name]:
+        (folder / WEIGHTS).unlink()
         raise UserError(folder / WEIGHTS, "size", f"{size:.1f} MB", f"at most {MAX_MB[name]:g} MB")
-    # Paths of the machine that trained it say nothing to others.
+    # The command may have paths of the machine that trained it.
     kept = {key: value for key, value in metrics.items() if not key.startswith("run/command")}
     write_text(folder / METRICS_FILE, json.dumps(kept, indent=2) + "\n")
-    write_text(folder / BENCHMARK, json.dumps(figures, indent=2) + "\n")
     shutil.copyfile(source.config, folder / "config.yaml")
-    card = model_card(Shipment(name, content, metrics, figures, manifest, sha256_of(locked), size))
-    write_text(folder / CARD, card)
-    write_text(ROOT / "docs/reference/models" / f"{name}.md", card)
-    return folder
+    print(f"{folder}: {size:.1f} MB; next: score it on the locked benchmark, then `ship.py card`")
 
 
-def main(
-    run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
-    name: Annotated[str, typer.Option(help="crater-detector or lander-navigator.")] = "crater-detector",
-    benchmark: Annotated[Path, typer.Option(help="benchmark.json of the run.")] = Path("benchmark.json"),
-    manifest: Annotated[str, typer.Option(help="Shared manifest of the training data.")] = "shipped-detect",
+@app.command()
+def card(
+    name: Name,
+    benchmark: Annotated[Path, typer.Option(help="benchmark.json of the installed network.")],
 ) -> None:
-    """Write the folder of a shipped network."""
-    print(ship(run, name, benchmark, manifest))
+    """Write the card of the installed network and the page of its benchmark."""
+    folder, manifest = _folder(name), MANIFESTS[name]
+    content, metrics = load_weights(folder / WEIGHTS), read_metrics(folder)
+    figures = read_metrics(benchmark.parent, benchmark.name)
+    size = (folder / WEIGHTS).stat().st_size / 1e6
+    sha256 = sha256_of(ROOT / "data_manifests" / manifest / "dataset.json")
+    text = model_card(Shipment(name, content, metrics, figures, manifest, sha256, size))
+    write_text(folder / BENCHMARK, json.dumps(figures, indent=2) + "\n")
+    write_text(folder / CARD, text)
+    PAGES.mkdir(parents=True, exist_ok=True)
+    write_text(PAGES / f"{name}.md", text)
+    shutil.copyfile(benchmark.with_suffix(".md"), PAGES / f"{name}-benchmark.md")
+    print(PAGES / f"{name}.md")
+
+
+def _folder(name: str) -> Path:
+    if name not in MAX_MB:
+        raise UserError("--name", "name", name, "one of " + ", ".join(MAX_MB))
+    return SHIPPED / name
 
 
 if __name__ == "__main__":
-    app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
-    app.command()(main)
     run_command_line(app)

@@ -25,7 +25,7 @@ def test_all_are_here():
     kinds = ("detect", "nav")
     of_presets = [f"{p}-{k}" for p in ("small", "paper", "large") for k in kinds]
     benchmark = [f"benchmark-{k}-{part}" for k in kinds for part in PARTS]
-    assert sorted([*of_presets, *benchmark, "shipped-detect", "south-pole-detect"]) == NAMES
+    assert sorted([*of_presets, *benchmark, "shipped-detect", "shipped-nav", "south-pole-detect"]) == NAMES
     counts = {name: open_dataset(FOLDER / name).info.counts for name in NAMES}
     assert [counts[f"{p}-{k}"].trajectories for p in ("paper", "large") for k in kinds] == [343, 49, 343, 49]
     assert all(
@@ -48,7 +48,7 @@ def test_no_two_manifests_share_terrain_but_the_papers():
     for name in NAMES:
         for content in open_dataset(FOLDER / name).table("scenes", ["content_sha256"])["content_sha256"].to_pylist():
             owners[content].add(name)
-    assert len(owners) == 343 + 49 + 24 + 1 + 64 + 1 + 1 + 2 * 22
+    assert len(owners) == 343 + 49 + 24 + 1 + 64 + 16 + 1 + 1 + 2 * 22
     assert [names for names in owners.values() if len(names) > 1] == [{"paper-detect", "paper-nav"}]
 
 

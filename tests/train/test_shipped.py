@@ -1,7 +1,9 @@
 """The networks that are installed: listed, used without --run, and refused in one line if there is none."""
 
+import hashlib
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,10 +12,13 @@ import pytest
 from tests.helpers import in_process
 from tests.helpers.stored_run import THRESHOLD, store_run
 
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.cli import main
 from perilune_train.shipped import models
 from perilune_train.training.half_weights import write_half
 from perilune_train.training.runs import RunFolder, load_weights
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -43,6 +48,8 @@ def test_they_are_listed(shipped):
     (line,) = done.stdout.splitlines()
     assert line.startswith("crater-detector  detect  ") and line.endswith(str(shipped))
     assert "AP 0.500 (paper, strict)" in line
+    (shipped / "benchmark.json").unlink()
+    assert "not scored on the locked benchmark" in in_process.call(main, "models").stdout
 
 
 def test_predict_needs_no_run(shipped, picture, tmp_path):
@@ -52,6 +59,22 @@ def test_predict_needs_no_run(shipped, picture, tmp_path):
     assert named.returncode == 0
     found, again = (pd.read_parquet(tmp_path / name / "detections.parquet") for name in "ab")
     assert found.equals(again) and (found["score"] >= THRESHOLD).all()
+
+
+@pytest.mark.parametrize("model", models.shipped_models(), ids=lambda model: model.name)
+def test_the_installed_network_is_the_one_on_its_card(model):
+    """Size, training data and figures; the same card is in the docs."""
+    assert model.megabytes <= {"detect": 16, "navigate": 8}[model.task]
+    card = (model.folder / models.CARD).read_text(encoding="utf-8")
+    assert card == (ROOT / f"docs/reference/models/{model.name}.md").read_text(encoding="utf-8")
+    manifest = ROOT / f"data_manifests/shipped-{'detect' if model.task == 'detect' else 'nav'}/dataset.json"
+    assert hashlib.sha256(manifest.read_bytes()).hexdigest()[:16] in card
+    figures = json.loads((model.folder / models.BENCHMARK).read_text(encoding="utf-8"))
+    headline = "ap50_paper" if model.task == "detect" else "position_rmse_vector_m"
+    assert f"{figures[f'headline/{headline}']:.3f}" in card
+    scenes = set(open_dataset(manifest.parent).table("scenes", ["content_sha256"])["content_sha256"].to_pylist())
+    record = load_weights(RunFolder(model.folder).best)["terrain"]
+    assert record["known"] and {use[3] for use in record["uses"]} <= scenes
 
 
 def test_without_an_installed_network_a_run_is_needed(picture, tmp_path, monkeypatch):

@@ -34,7 +34,10 @@ class ShippedModel:
     @property
     def headline(self) -> str:
         """Its least favourable figure on the locked benchmark, as text."""
-        figures = json.loads((self.folder / BENCHMARK).read_text(encoding="utf-8"))
+        path = self.folder / BENCHMARK
+        if not path.is_file():
+            return "not scored on the locked benchmark"
+        figures = json.loads(path.read_text(encoding="utf-8"))
         if self.task == "navigate":
             return f"position RMSE {figures['headline/position_rmse_vector_m']:.2f} m"
         return f"AP {figures['headline/ap50_paper']:.3f} ({figures['headline/ap50_paper_account']})"
