@@ -59,6 +59,7 @@ def install(run: Annotated[Path, typer.Argument(help="Folder of a finished run."
 def card(
     name: Name,
     benchmark: Annotated[Path, typer.Option(help="benchmark.json of the installed network.")],
+    other: Annotated[list[Path] | None, typer.Option(help="benchmark.json of a training with another seed.")] = None,
 ) -> None:
     """Write the card of the installed network and the page of its benchmark."""
     folder, manifest = _folder(name), MANIFESTS[name]
@@ -66,7 +67,8 @@ def card(
     figures = read_metrics(benchmark.parent, benchmark.name)
     size = (folder / WEIGHTS).stat().st_size / 1e6
     sha256 = sha256_of(ROOT / "data_manifests" / manifest / "dataset.json")
-    text = model_card(Shipment(name, content, metrics, figures, manifest, sha256, size))
+    others = tuple(read_metrics(path.parent, path.name) for path in other or [])
+    text = model_card(Shipment(name, content, metrics, figures, manifest, sha256, size, others))
     write_text(folder / BENCHMARK, json.dumps(figures, indent=2) + "\n")
     write_text(folder / CARD, text)
     PAGES.mkdir(parents=True, exist_ok=True)

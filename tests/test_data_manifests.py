@@ -48,7 +48,7 @@ def test_no_two_manifests_share_terrain_but_the_papers():
     for name in NAMES:
         for content in open_dataset(FOLDER / name).table("scenes", ["content_sha256"])["content_sha256"].to_pylist():
             owners[content].add(name)
-    assert len(owners) == 343 + 49 + 24 + 1 + 64 + 16 + 1 + 1 + 2 * 22
+    assert len(owners) == 343 + 49 + 24 + 6 + 64 + 16 + 1 + 1 + 2 * 22
     assert [names for names in owners.values() if len(names) > 1] == [{"paper-detect", "paper-nav"}]
 
 

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
-from perilune_shared.dataset.names import SplitUnit
+from perilune_shared.dataset.names import InertialGrade, SplitUnit
 from perilune_shared.labels.thresholds import default_label_bound_px
 
 
@@ -45,6 +45,10 @@ class CameraConfig(Section):
     """Lens distortion."""
 
 
+_LEAST_LIMIT = 3.0
+"""Smallest limit of that acceleration, in standard deviations on an axis: about half of all draws keep it."""
+
+
 class FlightConfig(Section):
     """The trajectory: a parabola with smooth Gaussian perturbations."""
 
@@ -64,12 +68,46 @@ class FlightConfig(Section):
     """Standard deviation of the attitude from level, per axis, degrees."""
     correlation_time_s: Positive = 3.0
     """Correlation time of the perturbations (squared-exponential kernel), seconds."""
+    attitude_correlation_time_s: Positive | None = None
+    """Correlation time of the perturbation of the attitude, seconds; null is correlation_time_s."""
+    max_perturbation_mps2: Positive | None = None
+    """Largest acceleration by the perturbation of the position, metres per second squared; null for no limit."""
 
     @model_validator(mode="after")
     def _end_below_start(self) -> "FlightConfig":
         if self.end_altitude_m >= self.start_altitude_m:
             raise ValueError(f"end_altitude_m below start_altitude_m, {self.start_altitude_m}")
         return self
+
+    @model_validator(mode="after")
+    def _limit_can_be_kept(self) -> "FlightConfig":
+        least = _LEAST_LIMIT * 3**0.5 * self.position_sigma_m / self.correlation_time_s**2
+        if self.max_perturbation_mps2 is not None and self.max_perturbation_mps2 < least:
+            raise ValueError(
+                f"max_perturbation_mps2 at least {least:.3g}, {_LEAST_LIMIT:g} standard deviations of the acceleration "
+                f"on each axis, sqrt(3) position_sigma_m / correlation_time_s^2"
+            )
+        return self
+
+    @property
+    def attitude_correlation_s(self) -> float:
+        """Correlation time of the perturbation of the attitude, seconds."""
+        return self.attitude_correlation_time_s or self.correlation_time_s
+
+
+class InstrumentsConfig(Section):
+    """Simulated measurements along each trajectory, for navigation filters: tables `inertial` and `ranges`."""
+
+    inertial_grades: tuple[InertialGrade, ...] = ()
+    """Grades of inertial measurement units (gyroscopes and accelerometers) to simulate."""
+    inertial_rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
+    """Inertial measurements per second."""
+    range_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Measurements of the laser altimeter per second; 0 for none."""
+    range_sigma_m: NotNegative = 0.2
+    """Standard deviation of a range at distance 0, metres."""
+    range_sigma_share: Share = 0.0005
+    """Additional standard deviation of a range, share of the range."""
 
 
 class SunConfig(Section):
@@ -106,6 +144,8 @@ class KindConfig(Section):
     """Trajectories."""
     sun: SunConfig = SunConfig()
     """Direction of the Sun."""
+    instruments: InstrumentsConfig = InstrumentsConfig()
+    """Measurements other than frames."""
 
     @model_validator(mode="after")
     def _shares_below_one(self) -> "KindConfig":

@@ -20,10 +20,11 @@ from perilune_shared.dataset.info_file import INFO_NAME, with_own_hash, write_in
 from perilune_shared.dataset.metadata import CameraRecord, Counts, DatasetInfo, Recipe, recipes_of
 from perilune_shared.dataset.names import WHOLE_TABLE
 from perilune_shared.dataset.parts import Written, write_part
-from perilune_shared.dataset.schema import SCHEMA_VERSION, TABLES
+from perilune_shared.dataset.schema import OPTIONAL_TABLES, SCHEMA_VERSION, TABLES
 from perilune_shared.geometry import frames
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.ellipse import project_circles
+from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_shared.storage.files import is_plain
 from perilune_shared.storage.locks import LOCK_NAME
@@ -120,6 +121,8 @@ def build_dataset(
                 "duration_s": nominal.duration_s,
             }
         )
+        if kind == "nav":
+            _add_measurements(rows, scene, trajectory, nominal)
         wobble = np.cumsum(rng.standard_normal((n_frames, 6)), axis=0)
         wobble /= max(wobble.std(), 1e-9)
         for k, time_s in enumerate(np.linspace(0, nominal.duration_s, n_frames)):
@@ -164,7 +167,8 @@ def build_dataset(
         scene["content_sha256"] = content_sha256(*own)
     tables["scenes"] = _table("scenes", rows["scenes"])
     for name, table in tables.items():
-        write_part(root, name, WHOLE_TABLE, table)
+        if len(table) or name not in OPTIONAL_TABLES:
+            write_part(root, name, WHOLE_TABLE, table)
     info = DatasetInfo(
         name="test",
         kind=kind,
@@ -180,6 +184,16 @@ def build_dataset(
     write_info(root, info)
     seal(root)
     return root
+
+
+def _add_measurements(rows: dict[str, list[dict]], scene: str, trajectory: str, nominal: NominalTrajectory) -> None:
+    """Measurements of the nominal motion, once per second."""
+    keys = {"scene_id": scene, "trajectory_id": trajectory}
+    force = np.array(nominal.acceleration_mps2) - gravity_mps2(0.0)
+    for time_s in np.arange(1.0, nominal.duration_s):
+        rows["ranges"].append(keys | {"time_s": time_s, "range_m": nominal.position_at(time_s)[2]})
+        unit = {"grade": "tactical", "time_s": time_s, "interval_s": 1.0}
+        rows["inertial"].append(keys | unit | {"angular_rate_radps": np.zeros(3), "specific_force_mps2": force})
 
 
 def seal(root: Path) -> None:

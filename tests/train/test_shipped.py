@@ -61,6 +61,17 @@ def test_predict_needs_no_run(shipped, picture, tmp_path):
     assert found.equals(again) and (found["score"] >= THRESHOLD).all()
 
 
+def test_evaluation_needs_no_run(shipped, picture, tmp_path):
+    picture.with_suffix(".txt").write_text("X,Y,W,H\n10,10,20,20\n50,40,30,30\n")
+    out = ("--out", tmp_path / "report")
+    done = in_process.call(main, "detect", "evaluate", "--images", picture.parent, *out)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "report" / "report.md").is_file() and not list(shipped.glob("images"))
+    for given, missing in ((("--images", picture.parent), "--out"), (out, "--dataset")):
+        refused = in_process.call(main, "detect", "evaluate", *given)
+        assert refused.returncode == 2 and refused.stderr.startswith(f"error: {missing}: ")
+
+
 @pytest.mark.parametrize("model", models.shipped_models(), ids=lambda model: model.name)
 def test_the_installed_network_is_the_one_on_its_card(model):
     """Size, training data and figures; the same card is in the docs."""

@@ -28,6 +28,7 @@ from perilune_render.provenance.versions import imaging_versions
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
+from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
@@ -196,7 +197,9 @@ def _develop_trajectory(source: Dataset, out: Store, frame_source: FrameSource, 
             found = frame_source.with_contrast(Labels.from_table(own.to_pandas()), frame)
             labels.append(with_column(own, "contrast", found.contrast))
     rows = tables.developed_frame_table(frames, frame_source.camera, written)
-    commit(out, scene_id, trajectory_id, labels, rows)
+    keys = {"scene_id": scene_id, "trajectory_id": trajectory_id}
+    measurements = {name: source.table(name, **keys) for name in OPTIONAL_TABLES if source.parts(name)}
+    commit(out, labels, rows, measurements)
 
 
 def _copy_scene(source: Dataset, out: Store, scene_id: str, recipe: Recipe) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.dataset.begin import new_info
+from perilune_render.flight.motion import Motion, draw_motion
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import view_envelope
@@ -23,6 +24,8 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_shared.storage.files import sha256_of
 
+_SAME_M = 1e-6
+"""Largest difference of a recorded position from the same draw, metres: rounding on another processor."""
 _OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "rotation_wxyz")
 
 
@@ -52,7 +55,7 @@ def plan_from_manifest(
         ScenePlan(row["scene_id"], row["seed"], row["sun_azimuth_deg"], row["sun_elevation_deg"])
         for row in manifest.table("scenes").sort_by("scene_id").to_pylist()
     ]
-    recorded = Recorded.of(manifest, [scene.scene_id for scene in scenes])
+    recorded = Recorded.of(manifest, [scene.scene_id for scene in scenes], config.kind(recipe.kind).flight)
     of_scene = [row["scene_id"] for row in recorded.rows]
     places = {
         scene.scene_id: range(bisect_left(of_scene, scene.scene_id), bisect_right(of_scene, scene.scene_id))
@@ -86,9 +89,11 @@ class Recorded(Sequence[TrajectoryPlan]):
     """Index of the first frame of each trajectory, and the number of frames (n_trajectories + 1,)."""
     columns: dict[str, np.ndarray]
     """Columns of the table `frames`, in the order of trajectories and of `frame_index`, each (n_frames, ...)."""
+    settings: FlightConfig | None
+    """Settings of the flights, to know the motion between the frames; None if that is not needed."""
 
     @classmethod
-    def of(cls, manifest: Dataset, scene_ids: list[str]) -> "Recorded":
+    def of(cls, manifest: Dataset, scene_ids: list[str], settings: FlightConfig | None = None) -> "Recorded":
         """Read the trajectories and poses of some scenes of a manifest."""
         keys = ["scene_id", "trajectory_id"]
         trajectories = manifest.table("trajectories").sort_by([(key, "ascending") for key in keys])
@@ -101,7 +106,7 @@ class Recorded(Sequence[TrajectoryPlan]):
         order = np.lexsort((frames["frame_index"].to_numpy(), place))[np.count_nonzero(place < 0) :]
         first = np.concatenate([[0], np.cumsum(np.bincount(place[order], minlength=len(names)))])
         columns = {name: _values(frames[name])[order] for name in _OF_FRAMES}
-        return cls(trajectories.to_pylist(), first, columns)
+        return cls(trajectories.to_pylist(), first, columns, settings)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -113,7 +118,7 @@ class Recorded(Sequence[TrajectoryPlan]):
         place = range(len(self))[place]
         row, own = self.rows[place], slice(self.first[place], self.first[place + 1])
         columns = {name: values[own] for name, values in self.columns.items()}
-        flight = partial(_flight, row, columns)
+        flight = partial(_flight, row, columns, self.settings)
         index, splits = tuple(columns["frame_index"].tolist()), tuple(columns["split"].tolist())
         return TrajectoryPlan(row["scene_id"], row["trajectory_id"], row["seed"], index, splits, flight, is_drawn=False)
 
@@ -125,13 +130,25 @@ def _values(column: pa.ChunkedArray) -> np.ndarray:
     return column.to_numpy()
 
 
-def _flight(row: dict[str, Any], columns: dict[str, np.ndarray]) -> Flight:
-    """The flight of a row of the table `trajectories` and the columns of its frames."""
+def _flight(row: dict[str, Any], columns: dict[str, np.ndarray], settings: FlightConfig | None) -> Flight:
+    """The flight of a row of the table `trajectories` and the columns of its frames.
+
+    Its motion is that of the recorded seed, unless a position differs: then it was not drawn, or with other settings.
+    """
     position, velocity, acceleration = (
         tuple(row[f"nominal_{name}"]) for name in ("position_m", "velocity_mps", "acceleration_mps2")
     )
     nominal = NominalTrajectory(position, velocity, acceleration, row["duration_s"])
-    return Flight(nominal, *(columns[name] for name in ("time_s", "position_m", "velocity_mps", "rotation_wxyz")))
+    motion = draw_motion(settings, row["seed"]) if settings is not None else None
+    if motion is not None and not _passes(motion, columns):
+        motion = None
+    time, path, speed, rotation = (columns[name] for name in ("time_s", "position_m", "velocity_mps", "rotation_wxyz"))
+    return Flight(nominal, time, path, speed, rotation, motion)
+
+
+def _passes(motion: Motion, columns: dict[str, np.ndarray]) -> bool:
+    """Whether a motion passes through the recorded positions of all frames."""
+    return np.allclose(motion.path_at(columns["time_s"])[0], columns["position_m"], rtol=0, atol=_SAME_M)
 
 
 def compare_hashes(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:

@@ -4,7 +4,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import ArrayLike
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config import DatasetConfig, InstrumentsConfig
+from perilune_render.flight.altimeter import measure_ranges
+from perilune_render.flight.inertial import measured, true_increments
 from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
 from perilune_render.labels.frame_labels import Labels
 from perilune_render.terrain.craters.population import ORIGINS
@@ -134,6 +136,35 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
         "real_ground_share": [row.get("real_ground_share") for row in files],
     }
     return _table("frames", columns | {name: [row.get(name) for row in files] for name in (*_FILES, *_OF_LABELS)})
+
+
+def measurement_tables(trajectory: TrajectoryPlan, scene: Scene, config: InstrumentsConfig) -> dict[str, pa.Table]:
+    """Parts of the tables `inertial` and `ranges` for one trajectory: those that have rows.
+
+    There are none if the motion between the frames is not known.
+    """
+    motion = trajectory.flight.motion
+    if motion is None:
+        return {}
+
+    def table(name: str, n_rows: int, columns: dict) -> pa.Table:
+        keys = {"scene_id": [trajectory.scene_id] * n_rows, "trajectory_id": [trajectory.trajectory_id] * n_rows}
+        return _table(name, keys | columns)
+
+    found, duration_s, seed = {}, motion.nominal.duration_s, trajectory.seed
+    if config.inertial_grades:
+        true = true_increments(motion, config.inertial_rate_hz)
+        units = [measured(true, grade, seed) for grade in config.inertial_grades]
+        columns = {name: np.concatenate([getattr(unit, name) for unit in units]) for name in ("time_s", "interval_s")}
+        for name in ("angular_rate_radps", "specific_force_mps2"):
+            columns[name] = _vectors(np.concatenate([getattr(unit, name) for unit in units]))
+        grades = [grade for grade in config.inertial_grades for _ in true.time_s]
+        found["inertial"] = table("inertial", len(grades), {"grade": grades, **columns})
+    if config.range_rate_hz:
+        ranges = measure_ranges(motion, scene, config, duration_s, seed)
+        columns = {"time_s": ranges.time_s, "range_m": pa.array(ranges.range_m, from_pandas=True)}
+        found["ranges"] = table("ranges", len(ranges.time_s), columns)
+    return found
 
 
 def developed_frame_table(table: pa.Table, camera: Camera, files: list[dict]) -> pa.Table:

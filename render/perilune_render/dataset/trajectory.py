@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pyarrow as pa
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config import DatasetConfig, InstrumentsConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.real_ground import real_ground_share
@@ -38,6 +38,7 @@ def render_trajectory(
     trajectory: TrajectoryPlan,
     scene: Scene,
     config: DatasetConfig,
+    instruments: InstrumentsConfig,
     advance: Callable[[], object] = lambda: None,
 ) -> list[str]:
     """Render and write one trajectory of `scene` into the dataset at `out`; returns the ids of its dark frames.
@@ -52,7 +53,7 @@ def render_trajectory(
         advance()
     rows = tables.frame_table(trajectory, source.camera, source.engine.sun, [frame.row for frame in frames])
     labels = [frame.labels for frame in frames]
-    commit(out, trajectory.scene_id, trajectory.trajectory_id, labels, rows)
+    commit(out, labels, rows, tables.measurement_tables(trajectory, scene, instruments))
     return [trajectory.frame_id(place) for place, frame in enumerate(frames) if frame.is_dark]
 
 

@@ -1,7 +1,7 @@
 """The finished trajectories of a dataset in progress, below work/.
 
     work/<table>/<scene>.parquet               scenes, craters, boulders, trajectories: the rows of a scene
-    work/<table>/<scene>.<trajectory>.parquet  frames, labels: the rows of a trajectory
+    work/<table>/<scene>.<trajectory>.parquet  frames, labels, inertial, ranges: the rows of a trajectory
     work/index/<scene>.<trajectory>.parquet    commit of a trajectory: its files and rows, with sizes and hashes
 
 The commit is written last: a trajectory is finished once it exists. Until then all is written again, since an attempt
@@ -18,15 +18,15 @@ from perilune_shared.dataset.index import INDEX, frame_rows, index_rows
 from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.names import stem_of
 from perilune_shared.dataset.parts import Part, Written
-from perilune_shared.dataset.schema import complete
+from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES, complete
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Store
 
 FOLDER = "work"
 OF_SCENE = ("scenes", "craters", "boulders", "trajectories")
 """Tables with a file for each scene."""
-OF_TRAJECTORY = ("frames", "labels")
-"""Tables with a file for each trajectory."""
+OF_TRAJECTORY = ("frames", "labels", *OPTIONAL_TABLES)
+"""Tables with a file for each trajectory; optional ones only if they have rows."""
 
 
 def committed(store: Store) -> set[str]:
@@ -35,14 +35,14 @@ def committed(store: Store) -> set[str]:
     return {stem_of(path) for path in listed if path.endswith(".parquet") and not stem_of(path).startswith(".")}
 
 
-def commit(store: Store, scene_id: str, trajectory_id: str, labels: list[pa.Table], frames: pa.Table) -> None:
+def commit(store: Store, labels: list[pa.Table], frames: pa.Table, measurements: Mapping[str, pa.Table]) -> None:
     """Write the rows of a trajectory whose files are written, then its commit.
 
-    `labels` holds the labels of each frame, `frames` the rows of all frames.
+    `labels` holds the labels of each frame, `frames` the rows of all frames, `measurements` those of optional tables.
     """
-    name = f"{scene_id}.{trajectory_id}"
-    tables = {"frames": frames, "labels": with_frame_columns(pa.concat_tables(labels), frames)}
-    rows = index_rows(_write(store, table, name, tables[table]) for table in OF_TRAJECTORY)
+    name = ".".join(frames[key][0].as_py() for key in ("scene_id", "trajectory_id"))
+    tables = {"frames": frames, "labels": with_frame_columns(pa.concat_tables(labels), frames), **measurements}
+    rows = index_rows(_write(store, table, name, tables[table]) for table in OF_TRAJECTORY if table in tables)
     files = frame_rows(frames)
     store.sync([*files["path"].to_pylist(), *rows["path"].to_pylist()])
     store.replace(_path("index", name), _parquet(pa.concat_tables([rows, files])))
@@ -79,17 +79,21 @@ def trajectory_rows(store: Store, name: str) -> tuple[dict[str, pa.Table], pa.Ta
     Raises UserError if its rows are not those of its commit.
     """
     committed = Part(store, _path("index", name), "index", INDEX).read()
-    listed = {row["path"]: row for row in committed.slice(0, len(OF_TRAJECTORY)).to_pylist()}
+    n_tables = sum(path.startswith(f"{FOLDER}/") for path in committed["path"].to_pylist())
+    listed = {row["path"]: row for row in committed.slice(0, n_tables).to_pylist()}
     found = {}
     for table in OF_TRAJECTORY:
         path = _path(table, name)
+        if table in OPTIONAL_TABLES and path not in listed:
+            found[table] = TABLES[table].empty_table()
+            continue
         recorded = listed.get(path, {"bytes": 0, "sha256": ""})
         content = store.read(path, most_bytes=recorded["bytes"])
         if hashlib.sha256(content).hexdigest() != recorded["sha256"]:
             expected = f"SHA-256 {recorded['sha256']}; delete {_path('index', name)} to render the trajectory again"
             raise UserError(store.at(path), "SHA-256", "a different SHA-256", expected)
         found[table] = pq.read_table(pa.BufferReader(content))
-    return found, committed.slice(len(OF_TRAJECTORY))
+    return found, committed.slice(n_tables)
 
 
 def _path(table: str, name: str) -> str:

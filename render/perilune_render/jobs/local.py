@@ -24,6 +24,8 @@ from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Store, open_store
 
+WORKER = ("-m", "perilune_render.jobs.worker")
+"""What Python runs in a worker process."""
 RECYCLED_AFTER = 64
 """Number of trajectories after which a worker is replaced, so that its memory cannot grow without limit."""
 LOST_STARTS = 3
@@ -171,7 +173,7 @@ class LocalWorkers:
             with theirs:
                 process = subprocess.Popen(
                     # -P: a module in the current folder must not take the place of an installed one.
-                    [sys.executable, "-P", "-m", "perilune_render.jobs.worker", *arguments],
+                    [sys.executable, "-P", *WORKER, *arguments],
                     pass_fds=[theirs.fileno()],
                     env={**os.environ, **dict.fromkeys(ONE_THREAD, "1")},
                     stdin=subprocess.DEVNULL,

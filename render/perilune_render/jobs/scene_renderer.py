@@ -69,7 +69,9 @@ class SceneRenderer:
         try:
             self._record.begin(self._job.name(place))
             scene, source = self._open(trajectory.scene_id, note)
-            return render_trajectory(self._out, source, trajectory, scene, self._job.config, counted)
+            config = self._job.config
+            instruments = config.kind(self._job.info.kind).instruments
+            return render_trajectory(self._out, source, trajectory, scene, config, instruments, counted)
         except BaseException:
             self.close()  # Blender's scene may be half changed
             raise

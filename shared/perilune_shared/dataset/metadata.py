@@ -94,6 +94,10 @@ class Counts(_Info):
     """Number of frames."""
     labels: Annotated[int, Field(ge=0)] = 0
     """Number of labels, one per crater and frame."""
+    inertial: Annotated[int, Field(ge=0)] = 0
+    """Number of inertial measurements."""
+    ranges: Annotated[int, Field(ge=0)] = 0
+    """Number of measurements of the altimeter."""
 
 
 class Origin(_Info):

@@ -164,7 +164,26 @@ TABLES: dict[str, pa.Schema] = {
             nullable=True,
         ),
     ),
+    "inertial": _table(
+        "inertial",
+        _SCENE,
+        _TRAJECTORY,
+        _column("grade", _TEXT, "", "grade of the inertial measurement unit: tactical or navigation"),
+        _column("time_s", _REAL, "s", "end of the interval of the measurement, since the first frame"),
+        _column("interval_s", _REAL, "s", "length of the interval"),
+        _column("angular_rate_radps", _vector(3), "rad/s", "mean angular rate of the body against O_L, measured, O_B"),
+        _column("specific_force_mps2", _vector(3), "m/s^2", "mean acceleration without gravity, measured, O_B"),
+    ),
+    "ranges": _table(
+        "ranges",
+        _SCENE,
+        _TRAJECTORY,
+        _column("time_s", _REAL, "s", "since the first frame"),
+        _column("range_m", _REAL, "m", "measured distance to ground along -Z_B; null without a return", nullable=True),
+    ),
 }
+OPTIONAL_TABLES = ("inertial", "ranges")
+"""Tables that a dataset has only if they have rows: they were added without a new schema version."""
 _ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius")
 MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {"frames": _ABSENT_IN_FRAMES, "shards": _ABSENT_IN_FRAMES}
 """Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
@@ -176,5 +195,7 @@ KEYS: dict[str, list[str]] = {
     "trajectories": ["scene_id", "trajectory_id"],
     "frames": ["frame_id"],
     "labels": ["frame_id", "crater_id"],
+    "inertial": ["scene_id", "trajectory_id", "grade", "time_s"],
+    "ranges": ["scene_id", "trajectory_id", "time_s"],
 }
 """Columns that identify a row, by table."""

@@ -7,7 +7,7 @@ import pyarrow as pa
 from perilune_shared.dataset.metadata import Counts
 from perilune_shared.dataset.names import WHOLE_TABLE
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, Written, write_part
-from perilune_shared.dataset.schema import TABLES, complete
+from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES, complete
 from perilune_shared.storage.store import Store
 
 _FEWEST_ROWS_PER_GROUP, _MOST_GROUPS = 1000, 200
@@ -46,9 +46,10 @@ class WholeTables:
             rows = rows[free:]
 
     def finish(self) -> list[Written]:
-        """Write buffered rows, and one empty part for each table without rows; return all parts."""
+        """Write buffered rows, and one empty part for each required table without rows; return all parts."""
         for name in TABLES:
-            if self._buffered[name] or not self._n_parts[name]:
+            is_needed = name not in OPTIONAL_TABLES and not self._n_parts[name]
+            if self._n_buffered[name] or is_needed:
                 self._write(name)
         return self._written
 

@@ -8,9 +8,10 @@ import pyarrow.compute as pc
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
 from perilune_shared.dataset.names import ImageMode, frame_id_of
+from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.editing.licence import joined_licence
 from perilune_shared.editing.rewrite import check_source, state_of, without_derived_rows
-from perilune_shared.editing.writer import SceneTables, check_scene, new_dataset, with_column
+from perilune_shared.editing.writer import SceneTables, check_scene, new_dataset, of_trajectories, with_column
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address
@@ -124,7 +125,7 @@ def _join(
     scene_id: str, members: Sequence[tuple[Dataset, str]]
 ) -> tuple[SceneTables, list[tuple[Dataset, pa.Table, dict[str, str]]]]:
     """Return the tables of a merged scene and, for each member, the frames taken from it and their new frame_ids."""
-    joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels")}
+    joined: dict[str, list[pa.Table]] = {name: [] for name in ("trajectories", "frames", "labels", *OPTIONAL_TABLES)}
     used_frames: list[tuple[Dataset, pa.Table, dict[str, str]]] = []
     known_trajectories: list[tuple[dict, str]] = []
     taken: dict[str, dict] = {}
@@ -137,8 +138,10 @@ def _join(
                 name: with_column(tables[name], "scene_id", [scene_id] * len(tables[name])) for name in _TERRAIN_TABLES
             }
         new_ids, rows = _trajectories(tables["trajectories"], known_trajectories)
-        rows = with_column(rows, "scene_id", [scene_id] * len(rows))
+        rows = _moved(rows, scene_id, new_ids)
         joined["trajectories"].append(rows)
+        for name in OPTIONAL_TABLES:
+            joined[name].append(of_trajectories(_moved(tables[name], scene_id, new_ids), rows))
         frames = tables["frames"]
         old = frames.select(["frame_id", "trajectory_id", "frame_index", *_FIXED_IN_FRAMES]).to_pylist()
         names = {
@@ -162,7 +165,7 @@ def _join(
 
 
 def _trajectories(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tuple[dict[str, str], pa.Table]:
-    """Return the new id of each trajectory of a member, and the renamed rows of trajectories not yet in `known`.
+    """Return the new id of each trajectory of a member, and the rows of trajectories not yet in `known`.
 
     `known` contains the trajectories of earlier members (content and new id); new ones are added to it.
     """
@@ -178,8 +181,7 @@ def _trajectories(trajectories: pa.Table, known: list[tuple[dict, str]]) -> tupl
         else:
             new.append(False)
         names[row["trajectory_id"]] = matching_ids[0]
-    renamed = with_column(trajectories, "trajectory_id", [names[n] for n in trajectories["trajectory_id"].to_pylist()])
-    return names, renamed.filter(pa.array(new, pa.bool_()))
+    return names, trajectories.filter(pa.array(new, pa.bool_()))
 
 
 def _check_same(source: Dataset, row: dict, earlier: dict) -> None:
@@ -192,6 +194,10 @@ def _check_same(source: Dataset, row: dict, earlier: dict) -> None:
 
 def _renamed(frames: pa.Table, scene_id: str, new_ids: dict[str, str], names: dict[str, str]) -> pa.Table:
     ids = [names[frame_id] for frame_id in frames["frame_id"].to_pylist()]
-    frames = with_column(frames, "scene_id", [scene_id] * len(frames))
-    frames = with_column(frames, "trajectory_id", [new_ids[name] for name in frames["trajectory_id"].to_pylist()])
-    return with_column(frames, "frame_id", ids)
+    return with_column(_moved(frames, scene_id, new_ids), "frame_id", ids)
+
+
+def _moved(rows: pa.Table, scene_id: str, new_ids: dict[str, str]) -> pa.Table:
+    """Return rows with the scene and the trajectories of the merged dataset."""
+    rows = with_column(rows, "scene_id", [scene_id] * len(rows))
+    return with_column(rows, "trajectory_id", [new_ids[name] for name in rows["trajectory_id"].to_pylist()])

@@ -8,13 +8,14 @@ from perilune_shared.dataset.keys import check_keys
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import ImageMode, ImageState
+from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.editing.writer import SceneTables, new_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.storage.store import Address, Store, open_store
 from perilune_shared.validation.files import check_files
 
-_DERIVED_TABLES = ("craters", "boulders", "labels")
+_DERIVED_TABLES = ("craters", "boulders", "labels", *OPTIONAL_TABLES)
 
 
 def rewrite(
@@ -86,5 +87,5 @@ def state_of(sources: list[Dataset], images: ImageMode) -> ImageState:
 
 
 def without_derived_rows(tables: SceneTables) -> SceneTables:
-    """Return a scene without craters, boulders and labels: its seed and poses reproduce them."""
+    """Return a scene without craters, boulders, labels and measurements: its seed and poses reproduce them."""
     return tables | {name: tables[name].slice(0, 0) for name in _DERIVED_TABLES}

@@ -20,6 +20,7 @@ from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import IMAGE_KINDS, SplitUnit, frame_path
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, Written
+from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.dataset.whole_tables import WholeTables
 from perilune_shared.errors import UserError
 from perilune_shared.storage import files
@@ -64,6 +65,9 @@ class DatasetWriter:
         trajectories = _with_counts_and_splits(tables["trajectories"], frames)
         labels = with_frame_columns(tables["labels"], frames)
         tables = {**tables, "frames": frames, "trajectories": trajectories, "labels": labels}
+        for name in OPTIONAL_TABLES:
+            if name in tables:
+                tables[name] = of_trajectories(tables[name], trajectories)
         if self.info.images == "files":
             self._index.append(frame_rows(frames))
         for name, rows in tables.items():
@@ -165,6 +169,11 @@ def with_new_paths(frames: pa.Table) -> pa.Table:
         paths = [None if path is None else frame_path(key, kind) for key, path in zip(ids, known, strict=True)]
         frames = with_column(frames, name, paths)
     return frames
+
+
+def of_trajectories(rows: pa.Table, trajectories: pa.Table) -> pa.Table:
+    """Return the rows of one scene that belong to its given trajectories."""
+    return rows.filter(pc.is_in(rows["trajectory_id"], trajectories["trajectory_id"].combine_chunks()))
 
 
 def _with_counts_and_splits(trajectories: pa.Table, frames: pa.Table) -> pa.Table:

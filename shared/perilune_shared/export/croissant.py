@@ -18,7 +18,7 @@ import pyarrow as pa
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.parts import Part
-from perilune_shared.dataset.schema import KEYS, MAY_BE_ABSENT, TABLES
+from perilune_shared.dataset.schema import KEYS, MAY_BE_ABSENT, OPTIONAL_TABLES, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.export.added_files import Target, add_files, check_index
 from perilune_shared.export.citation import citation_of, table_hashes
@@ -122,6 +122,8 @@ def metadata_of(dataset: Dataset) -> dict[str, Any]:
     ]
     record_sets = []
     for table, schema in TABLES.items():
+        if table in OPTIONAL_TABLES and not dataset.parts(table):
+            continue
         distribution.append(_distribution(dataset, table, hashes))
         # Omit optional columns that a file lacks: mlcroissant would not find them.
         missing = {

@@ -67,6 +67,19 @@ def matrix_from_rotation_vector(rotation_vector_rad: ArrayLike) -> Array:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
 
 
+def rotation_vectors(rotation: ArrayLike) -> Array:
+    """Return the rotation vectors (..., 3), radians, of rotation matrices (..., 3, 3); angles well below 180 degrees.
+
+    The angle is computed from sine and cosine; the arc cosine alone is inexact for small angles.
+    """
+    r = np.asarray(rotation, np.float64)
+    skew = r - np.swapaxes(r, -1, -2)
+    twice_sine = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+    length = np.linalg.norm(twice_sine, axis=-1, keepdims=True)
+    angle = np.arctan2(length, np.trace(r, axis1=-2, axis2=-1)[..., None] - 1)
+    return twice_sine * np.where(length > 1e-12, angle / np.where(length > 1e-12, length, 1), 0.5)
+
+
 def sun_direction(azimuth_deg: float, elevation_deg: float) -> Array:
     """Return the unit vector (3,) in O_L towards the Sun; azimuth clockwise from north, so 90 degrees is east."""
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])

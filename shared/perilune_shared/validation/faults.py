@@ -44,6 +44,8 @@ _POSITIVE = (
     "fy_px",
     "png_bytes",
     "exr_bytes",
+    "interval_s",
+    "range_m",
 )
 _NOT_NEGATIVE = ("crater_id", "boulder_id", "shape_id", "frame_index", "seed", "time_s", "n_craters_above_max_radius")
 _RANGES = {

@@ -15,18 +15,19 @@ import pyarrow.compute as pc
 from perilune_shared.content import content_sha256, terrain_of
 from perilune_shared.dataset.manifest import Dataset, count_rows
 from perilune_shared.dataset.names import is_whole
-from perilune_shared.dataset.schema import KEYS, TABLES
+from perilune_shared.dataset.schema import KEYS, OPTIONAL_TABLES, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
 from perilune_shared.progress import NO_PROGRESS, Progress
 from perilune_shared.validation.faults import Fault, part_faults
 from perilune_shared.validation.files import file_faults
 from perilune_shared.validation.images import image_faults
+from perilune_shared.validation.measurements import measurement_faults
 from perilune_shared.validation.shards import shard_faults
 from perilune_shared.validation.trajectory import trajectory_faults
 
 _TOLERANCE_DEG = 1e-9
-_EMPTY_IN_PLANS = ("craters", "boulders", "labels")
+_EMPTY_IN_PLANS = ("craters", "boulders", "labels", *OPTIONAL_TABLES)
 
 
 def validate(dataset: Dataset, progress: Progress = NO_PROGRESS) -> list[Fault]:
@@ -162,6 +163,11 @@ def _scene_faults(
             yield from _repeated_keys(dataset, name, rows.select(KEYS[name]), places[name])
         faults = trajectory_faults(dataset.info, row, craters, trajectory, frames, labels, places)
         yield from _in_file(dataset, faults, f"{scene_id}/{trajectory_id}/", reported)
+        for name in OPTIONAL_TABLES:
+            rows = dataset.table(name, scene_id=scene_id, trajectory_id=trajectory_id)
+            seen[name] += len(rows)
+            if len(rows):
+                yield from measurement_faults(name, rows, trajectory)
 
 
 def _in_file(dataset: Dataset, faults: Iterator[Fault], own: str, reported: set[tuple[str, str]]) -> Iterator[Fault]:

@@ -16,6 +16,7 @@ import pytest
 from llvmlite.binding import get_host_cpu_features
 
 from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.schema import OPTIONAL_TABLES
 
 PINNED = Path(__file__).with_name("tiny_pinned.json")
 KINDS = ("detect", "nav")
@@ -66,7 +67,10 @@ def bytes_of(folder):
     for kind in KINDS:
         root = folder / kind
         dataset = open_dataset(root)
-        tables = {name: dataset.table(name) for name in ("scenes", "craters", "boulders", "trajectories", "frames")}
+        tables = {
+            name: dataset.table(name)
+            for name in ("scenes", "craters", "boulders", "trajectories", "frames", *OPTIONAL_TABLES)
+        }
         tables = {**tables, "scenes": tables["scenes"].drop_columns(["recipe"]), "labels": dataset.table("labels")}
         groups = {}
         for path in sorted(path for path in root.rglob("*") if path.suffix in (".png", ".exr", ".parquet")):

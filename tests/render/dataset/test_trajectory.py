@@ -39,7 +39,8 @@ def render(out, fails_at=None, advance=lambda: None):
     plan, scene = make_plan(CONFIG, "detect"), flat_scene(3000, 41, round_craters([(10, 0, 60, 0.1)]))
     engine = WatchingEngine(plan, out, fails_at)
     source = FrameSource.of(engine, CONFIG, plan.camera, RimCircles.of_scene(scene))
-    assert render_trajectory(open_store(out), source, plan.trajectories[0], scene, CONFIG, advance) == []
+    given = plan.trajectories[0], scene, CONFIG, CONFIG.detect.instruments, advance
+    assert render_trajectory(open_store(out), source, *given) == []
     return engine
 
 

@@ -1,7 +1,8 @@
 import numpy as np
 
 from perilune_render.config import FlightConfig
-from perilune_render.flight.trajectories import fly, smooth_process
+from perilune_render.flight.smooth_process import SmoothProcess
+from perilune_render.flight.trajectories import fly
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 
 FLIGHT = FlightConfig(position_sigma_m=8.0, attitude_sigma_deg=0.5, correlation_time_s=3.0)
@@ -23,7 +24,7 @@ def test_perturbations_have_the_asked_sizes():
 
 
 def test_perturbations_are_correlated_as_asked():
-    value, _ = smooth_process(np.arange(0, 3000.0, 1.0), 3.0, np.random.default_rng(2), 4)
+    value = SmoothProcess.draw([3.0] * 4, np.random.default_rng(2)).at(np.arange(0, 3000.0, 1.0))[0]
     for lag in (1, 3, 6):
         correlation = np.mean(value[lag:] * value[:-lag])
         assert abs(correlation - np.exp(-(lag**2) / 18)) < 0.15

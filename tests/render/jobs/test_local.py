@@ -1,8 +1,8 @@
 """Rendering in worker processes: the same bytes as in one process, also when workers are killed."""
 
 import os
-import signal
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from rich.progress import Progress
@@ -19,43 +19,39 @@ from perilune_shared.storage.store import open_store
 from perilune_shared.validation.validate import validate
 
 
-class KilledWorkers(LocalWorkers):
-    """Kills the worker of trajectory `killed` after its second frame, `n_kills` times."""
+@pytest.fixture
+def kill(tmp_path_factory, monkeypatch):
+    """Function that lets the worker of the second trajectory kill itself `n_kills` times, within the trajectory."""
 
-    killed = 1
-    n_kills = 1
+    def kill(n_kills):
+        kills = tmp_path_factory.mktemp("kills")
+        for k in range(n_kills):
+            kills.joinpath(str(k)).touch()
+        monkeypatch.setenv("KILLS", str(kills))
+        monkeypatch.setattr(local, "WORKER", (str(Path(__file__).with_name("killed_worker.py")),))
 
-    def __init__(self, job, out):
-        super().__init__(job, out, 2)
-        self.frames = 0
-
-    def _handle(self, worker, message, work, report):
-        if message == ("frame",) and worker.place == self.killed and self.n_kills:
-            self.frames += 1
-            if self.frames % 2 == 0:
-                self.n_kills -= 1
-                os.kill(worker.process.pid, signal.SIGKILL)
-                worker.process.wait()
-        super()._handle(worker, message, work, report)
+    return kill
 
 
-class AlwaysKilledWorkers(KilledWorkers):
-    n_kills = 99
+def two_workers(job, out):
+    return LocalWorkers(job, out, 2)
 
 
 def test_two_workers_one_killed_and_all_recycled_give_the_same_bytes(
-    job, whole, files_of, tmp_path, monkeypatch, capsys
+    job, whole, files_of, tmp_path, monkeypatch, kill, capsys
 ):
     monkeypatch.setattr(local, "RECYCLED_AFTER", 1)
-    render_job(job, tmp_path, Progress(disable=True), KilledWorkers)
+    kill(1)
+    render_job(job, tmp_path, Progress(disable=True), two_workers)
     assert files_of(tmp_path) == whole and len(whole) > 20
     (line,) = capsys.readouterr().err.splitlines()
     assert line == "warning: scene-0000/trajectory-0001: worker killed by SIGKILL; trying again (3 left)"
 
 
-def test_a_trajectory_that_always_fails_is_named_and_all_others_are_rendered(job, whole, files_of, tmp_path):
+def test_a_trajectory_that_always_fails_is_named_and_all_others_are_rendered(job, whole, files_of, tmp_path, kill):
+    kill(99)
     with pytest.raises(RenderingFailed) as failed:
-        render_job(job, tmp_path, Progress(disable=True), AlwaysKilledWorkers)
+        render_job(job, tmp_path, Progress(disable=True), two_workers)
     assert failed.value.errors == {"scene-0000/trajectory-0001": "worker killed by SIGKILL"}
     dataset = open_dataset(tmp_path)
     assert not dataset.info.complete and len(committed(dataset.store)) == 3

@@ -54,7 +54,8 @@ class Flat:
             rows = tables.scene_tables(plan, self.scene, self.job.config, self.job.info.recipe().key)
             trajectories = tables.trajectory_table(self.job.plan.of_scene(plan.scene_id))
             write_scene(self.out, plan.scene_id, {**rows, "trajectories": trajectories})
-            render_trajectory(self.out, source, self.job.plan.trajectories[place], self.scene, self.job.config)
+            config, trajectory = self.job.config, self.job.plan.trajectories[place]
+            render_trajectory(self.out, source, trajectory, self.scene, config, config.nav.instruments)
             work.done(place)
             report.done(place, [])
 

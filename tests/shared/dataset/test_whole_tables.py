@@ -4,7 +4,7 @@ import pytest
 
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.parts import Part
-from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES
 from perilune_shared.dataset.whole_tables import WholeTables
 from perilune_shared.storage.store import open_store
 
@@ -26,9 +26,11 @@ def test_rows_continue_in_further_parts(little, tmp_path):
     assert copy.parts("frames") == ["manifest/frames/all.parquet", "manifest/frames/all.0001.parquet"]
 
 
-def test_a_table_without_rows_is_one_part(tmp_path):
+def test_a_required_table_without_rows_is_one_part(tmp_path):
     written = WholeTables(open_store(tmp_path)).finish()
-    assert [file.path for file in written] == [f"manifest/{name}/all.parquet" for name in TABLES]
+    assert [file.path for file in written] == [
+        f"manifest/{name}/all.parquet" for name in TABLES if name not in OPTIONAL_TABLES
+    ]
 
 
 def test_existing_parts_are_overwritten_only_on_request(little, tmp_path):

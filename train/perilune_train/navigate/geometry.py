@@ -97,16 +97,3 @@ def euler_from_rotation(rotation: Tensor) -> Tensor:
         ],
         dim=-1,
     )
-
-
-def rotation_vectors(rotation: ArrayLike) -> Array:
-    """Rotation vectors (..., 3) in radians of rotation matrices (..., 3, 3) with angles well below 180 degrees.
-
-    The angle is computed from sine and cosine; the arc cosine alone is inexact for small angles.
-    """
-    r = np.asarray(rotation, np.float64)
-    skew = r - np.swapaxes(r, -1, -2)
-    twice_sine = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
-    length = np.linalg.norm(twice_sine, axis=-1, keepdims=True)
-    angle = np.arctan2(length, np.trace(r, axis1=-2, axis2=-1)[..., None] - 1)
-    return twice_sine * np.where(length > 1e-12, angle / np.where(length > 1e-12, length, 1), 0.5)

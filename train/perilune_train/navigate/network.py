@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.models.navigator import StackNavigator, State, WarpNavigator
 from perilune_train.navigate.data.sequences import Sequence, pair_sequence
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
-from perilune_train.navigate.geometry import euler_from_rotation, rotation_from_sixd, rotation_vectors
+from perilune_train.navigate.geometry import euler_from_rotation, rotation_from_sixd
 from perilune_train.training.runs import check_architecture, load_state, load_weights
 
 Fusion = Literal["warp", "stack"]

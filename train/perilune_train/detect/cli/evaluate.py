@@ -13,6 +13,7 @@ from perilune_train.detect.cli.tiling_options import BoxMargin, Overlap, Scales,
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.shipped.models import shipped_run
 
 _FOR_DATASETS = ("dataset", "split", "allow_overlap")
 _FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin")
@@ -20,7 +21,10 @@ _FOR_IMAGES = ("min_size", "tile", "overlap", "box_margin")
 
 def evaluate(
     context: typer.Context,
-    run: Annotated[Path, typer.Option(help="Folder of a finished detect run, for example runs/detect/small.")],
+    run: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a finished detect run. [default: the detector that is installed]"),
+    ] = None,
     dataset: Annotated[
         str | None,
         typer.Option(
@@ -45,7 +49,10 @@ def evaluate(
         ),
     ] = False,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write into. [default: <run>/evaluation, with --images <run>/images]")
+        Path | None,
+        typer.Option(
+            help="Folder to write into. [default: <run>/evaluation, with --images <run>/images; needed without --run]"
+        ),
     ] = None,
     allow_overlap: AllowOverlap = False,
     images: Annotated[
@@ -81,6 +88,12 @@ def evaluate(
             if images is None:
                 raise UserError(option, "options", "no --images", f"--images, or no {option}")
             raise UserError(option, "options", "together with --images", "only one of them")
+    if run is None:
+        run = shipped_run("detect")
+        if out is None:
+            raise UserError("--out", "folder", "none", "a folder to write into, since --run is not given")
+        if dataset is None and images is None:
+            raise UserError("--dataset", "address", "none", "a dataset or --images, since --run is not given")
     config = config_of_run(run, tuple(set_ or ()))
     if images is not None:
         for text in set_ or ():

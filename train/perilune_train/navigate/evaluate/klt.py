@@ -10,14 +10,13 @@ import cv2
 import numpy as np
 
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
 from perilune_train.data.frames import normalised
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
 from perilune_train.navigate.geometry import (
     apply_homography,
     pixel_index_homography,
     plane_homography,
-    rotation_vectors,
 )
 
 _N_CORNERS = 600

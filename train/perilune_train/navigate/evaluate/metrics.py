@@ -3,10 +3,10 @@
 import numpy as np
 import pandas as pd
 
-from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.evaluation.spread import Resamples, Spread, draw_resamples, spreads
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
-from perilune_train.navigate.geometry import dead_reckoning, rotation_vectors
+from perilune_train.navigate.geometry import dead_reckoning
 
 
 def motion_errors(trajectories: list[Trajectory], motions: list[Motion]) -> pd.DataFrame:

@@ -1,0 +1,113 @@
+"""Simulated inertial measurements: gyroscopes and accelerometers along a motion.
+
+A measurement is the mean over its interval of the angular rate and of the specific force (acceleration without
+gravity), in the body's axes: what a strapdown unit gives as increments, divided by the interval. To the true value each
+axis adds a bias and white noise. The bias is drawn once for each trajectory and then walks. Scale factors, misalignment
+and quantisation are not simulated.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.flight.motion import Motion
+from perilune_render.streams import stream
+from perilune_shared.dataset.names import InertialGrade
+from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_shared.geometry.gravity import gravity_mps2
+
+_HOUR_S = 3600.0
+_STANDARD_GRAVITY_MPS2 = 9.80665
+
+
+@dataclass(frozen=True, slots=True)
+class InertialErrors:
+    """Errors of an inertial measurement unit, standard deviations on each axis."""
+
+    gyro_bias_deg_per_h: float
+    """Bias of the angular rate at the start, degrees per hour."""
+    gyro_bias_walk_deg_per_h: float
+    """Random walk of this bias in one hour, degrees per hour."""
+    angular_random_walk_deg: float
+    """White noise of the angular rate: angle after integration over one hour, degrees."""
+    accelerometer_bias_mg: float
+    """Bias of the specific force at the start, thousandths of standard gravity."""
+    accelerometer_bias_walk_mg: float
+    """Random walk of this bias in one hour, thousandths of standard gravity."""
+    velocity_random_walk_mps: float
+    """White noise of the specific force: velocity after integration over one hour, metres per second."""
+
+
+GRADES: dict[InertialGrade, InertialErrors] = {
+    "tactical": InertialErrors(10.0, 10.0, 0.1, 1.0, 1.0, 0.06),
+    "navigation": InertialErrors(0.01, 0.01, 0.002, 0.05, 0.05, 0.01),
+}
+"""Errors of each grade: biases and noise within the ranges that Groves (Principles of GNSS, Inertial, and Multisensor
+Integrated Navigation Systems, 2nd edition, 2013, section 4.4) gives for tactical and aviation grade. The random walks
+are ours: in one minute a bias changes by an eighth of its size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Increments:
+    """Mean angular rates and specific forces over consecutive intervals, from time 0 to the end of a trajectory."""
+
+    time_s: Array
+    """End of each interval, seconds since the first frame (N,)."""
+    interval_s: Array
+    """Length of each interval, seconds (N,)."""
+    angular_rate_radps: Array
+    """Mean angular rates, O_B, radians per second (N, 3)."""
+    specific_force_mps2: Array
+    """Mean specific forces, O_B, metres per second squared (N, 3)."""
+
+
+def true_increments(motion: Motion, rate_hz: float) -> Increments:
+    """Increments without errors, `rate_hz` of them per second; the last interval may be shorter.
+
+    Turned by the angular rate for the interval, the attitude at its start is exactly that at its end. The specific
+    force is integrated by Simpson's rule.
+    """
+    duration_s = motion.nominal.duration_s
+    time = np.arange(int(np.ceil(duration_s * rate_hz - 1e-9)) + 1) / rate_hz
+    time[-1] = duration_s
+    interval = np.diff(time)
+    with_middles = np.empty(2 * len(time) - 1)
+    with_middles[::2], with_middles[1::2] = time, time[:-1] + interval / 2
+    rotation = motion.rotation_site_from_body_at(with_middles)
+    position, _, acceleration = motion.path_at(with_middles)
+    force = np.einsum("nji,nj->ni", rotation, acceleration - gravity_mps2(position[:, 2]))
+    turn = np.einsum("nji,njk->nik", rotation[:-2:2], rotation[2::2])
+    mean_force = (force[:-2:2] + 4 * force[1::2] + force[2::2]) / 6
+    return Increments(time[1:], interval, rotation_vectors(turn) / interval[:, None], mean_force)
+
+
+def measured(true: Increments, grade: InertialGrade, seed: int) -> Increments:
+    """The increments as a unit of this grade measures them on the trajectory of a random seed."""
+    errors, rng = GRADES[grade], stream(seed, "inertial", grade)
+    per_s, per_root_s = np.radians(1) / _HOUR_S, 1 / np.sqrt(_HOUR_S)
+    mg = _STANDARD_GRAVITY_MPS2 / 1000
+    gyro = _errors(
+        rng,
+        true.interval_s,
+        errors.gyro_bias_deg_per_h * per_s,
+        errors.gyro_bias_walk_deg_per_h * per_s * per_root_s,
+        np.radians(errors.angular_random_walk_deg) * per_root_s,
+    )
+    accelerometer = _errors(
+        rng,
+        true.interval_s,
+        errors.accelerometer_bias_mg * mg,
+        errors.accelerometer_bias_walk_mg * mg * per_root_s,
+        errors.velocity_random_walk_mps * per_root_s,
+    )
+    rate, force = true.angular_rate_radps + gyro, true.specific_force_mps2 + accelerometer
+    return Increments(true.time_s, true.interval_s, rate, force)
+
+
+def _errors(rng: np.random.Generator, interval_s: Array, bias: float, walk: float, noise: float) -> Array:
+    """Errors (N, 3): bias, its random walk (per square root of a second), white noise (integrated, likewise)."""
+    size = len(interval_s), 3
+    root = np.sqrt(interval_s)[:, None]
+    start = bias * rng.normal(size=3)
+    steps = walk * root * rng.normal(size=size)
+    return start + np.cumsum(steps, axis=0) + noise / root * rng.normal(size=size)

@@ -1,0 +1,92 @@
+"""The true motion of the lander at any time: a nominal parabola plus smooth Gaussian perturbations."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.config import FlightConfig
+from perilune_render.flight.smooth_process import SmoothProcess
+from perilune_render.streams import stream
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
+
+_MOST_DRAWS = 1000
+_STEP = 2 * np.pi / 20
+"""Step at which the acceleration of a draw is checked, radians of its fastest wave."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Position and attitude of the lander as functions of time.
+
+    Position and attitude deviate from the nominal motion by independent stationary Gaussian processes with the kernel
+    sigma^2 exp(-dt^2 / (2 tau^2)) on each axis. The paper states "small perturbations with Gaussian distribution"
+    without sizes; white noise on each frame would not be a possible motion of a lander.
+    """
+
+    nominal: NominalTrajectory
+    """Nominal parabola."""
+    position_sigma_m: float
+    """Standard deviation of the perturbation of the position, per axis, metres."""
+    attitude_sigma_rad: float
+    """Standard deviation of the perturbation of the attitude, per axis, radians."""
+    position_process: SmoothProcess
+    """Perturbation of the position, three axes of unit variance."""
+    attitude_process: SmoothProcess
+    """Perturbation of the attitude, three axes of unit variance."""
+
+    def path_at(self, time_s: Array) -> tuple[Array, Array, Array]:
+        """Positions (N, 3), metres, velocities, metres per second, and accelerations, O_L, at times (N,).
+
+        Velocity and acceleration are the exact derivatives of the position.
+        """
+        offset, rate, second = self.position_process.at(time_s)
+        return (
+            self.nominal.position_at(time_s) + self.position_sigma_m * offset,
+            self.nominal.velocity_at(time_s) + self.position_sigma_m * rate,
+            np.array(self.nominal.acceleration_mps2) + self.position_sigma_m * second,
+        )
+
+    def largest_perturbation_mps2(self) -> float:
+        """Largest acceleration by the perturbation from first to last frame, metres per second squared.
+
+        Taken at 20 or more steps in the period of every wave.
+        """
+        step_s = _STEP / np.abs(self.position_process.omega_radps).max()
+        _, _, second = self.position_process.at(np.arange(0, self.nominal.duration_s, step_s))
+        return float(self.position_sigma_m * np.linalg.norm(second, axis=1).max())
+
+    def rotation_site_from_body_at(self, time_s: Array) -> Array:
+        """Rotations (N, 3, 3) at times (N,)."""
+        tilt = self.attitude_sigma_rad * self.attitude_process.at(time_s)[0]
+        return np.stack([matrix_from_rotation_vector(v) for v in tilt])
+
+    def rotation_camera_from_site_at(self, time_s: Array) -> Array:
+        """Rotations (N, 3, 3) at times (N,)."""
+        return np.stack([ROTATION_CAMERA_FROM_BODY @ r.T for r in self.rotation_site_from_body_at(time_s)])
+
+
+def draw_motion(config: FlightConfig, seed: int) -> Motion:
+    """Draw the motion of a random seed.
+
+    With `max_perturbation_mps2`, motions are drawn until the acceleration of the perturbation is nowhere above it.
+    Raises UserError if none of a thousand draws is.
+    """
+    rng = stream(seed, "flight")
+    azimuth = rng.uniform(config.azimuth_deg.low, config.azimuth_deg.high)
+    nominal = NominalTrajectory.parabola(
+        config.start_altitude_m, config.end_altitude_m, config.downrange_m, azimuth, config.duration_s
+    )
+    sigmas = config.position_sigma_m, float(np.radians(config.attitude_sigma_deg))
+    correlation_s = np.repeat([config.correlation_time_s, config.attitude_correlation_s], 3)
+    limit = config.max_perturbation_mps2
+    for number in range(_MOST_DRAWS):
+        process = SmoothProcess.draw(correlation_s, rng)
+        motion = Motion(nominal, *sigmas, process.part(slice(0, 3)), process.part(slice(3, 6)))
+        if limit is None or motion.largest_perturbation_mps2() <= limit:
+            return motion
+        rng = stream(seed, "flight", number)
+    expected = "a larger limit, a smaller position_sigma_m, or a longer correlation_time_s"
+    raise UserError("configuration", "flight.max_perturbation_mps2", limit, expected)

@@ -1,0 +1,20 @@
+"""Gravity at the landing site."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perilune_shared.geometry.frames import MOON_RADIUS_M, Array
+
+MOON_GM_M3_PER_S2 = 4.902800118e12
+"""Gravitational parameter of the Moon, metres cubed per second squared (GRAIL, doi 10.1002/2014GL060027)."""
+
+
+def gravity_mps2(height_m: ArrayLike) -> Array:
+    """Return the acceleration by gravity (..., 3), O_L, metres per second squared, at heights (...) above the site.
+
+    That of a sphere, along -Z_L everywhere, since the ground of a site is a plane: 2 km beside the site its true
+    direction differs by 0.07 degrees. The Moon's rotation (0.55 degrees per hour) is neglected.
+    """
+    height = np.asarray(height_m, np.float64)
+    down = MOON_GM_M3_PER_S2 / (MOON_RADIUS_M + height) ** 2
+    return np.stack([np.zeros_like(down), np.zeros_like(down), -down], axis=-1)
