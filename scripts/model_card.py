@@ -135,7 +135,13 @@ def _navigator(one: Shipment) -> list[str]:
         f"Darknet53-LSTM, fusion `{method}`, width {shape['width']:g}, attention `{shape['attention']}`, frames of "
         f"{shape['size_px']} pixels"
     )
-    names = {method: "this network", "klt": "tracked corners (KLT)", "nominal": "nominal motion"}
+    names = {
+        method: "this network",
+        "klt": "tracked corners (KLT)",
+        "alignment": "direct alignment",
+        "alignment_gyroscope": "direct alignment, with a gyroscope",
+        "nominal": "nominal motion",
+    }
     keys = ("position_rmse_vector_m", "position_rmse_per_component_m", "orientation_rmse_angle_deg")
     rows = [
         f"| {title} | " + " | ".join(_figure(figures, f"{name}/{key}") for key in keys) + " |"
@@ -157,7 +163,7 @@ def _navigator(one: Shipment) -> list[str]:
         "",
         "## Limits",
         "",
-        "- Classical tracking is better wherever its row says so; use it then.",
+        "- A method without training is better wherever its row says so; use it then.",
         "- It needs the nominal motion and altitude, and was trained on errors of rendered descents only.",
         "- The figures are of one training.",
     ]

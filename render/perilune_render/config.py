@@ -7,7 +7,8 @@ from pydantic import Field, model_validator
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
-from perilune_shared.dataset.names import InertialGrade, SplitUnit
+from perilune_shared.dataset.names import SplitUnit
+from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.labels.thresholds import default_label_bound_px
 
 

@@ -121,8 +121,6 @@ def build_dataset(
                 "duration_s": nominal.duration_s,
             }
         )
-        if kind == "nav":
-            _add_measurements(rows, scene, trajectory, nominal)
         wobble = np.cumsum(rng.standard_normal((n_frames, 6)), axis=0)
         wobble /= max(wobble.std(), 1e-9)
         for k, time_s in enumerate(np.linspace(0, nominal.duration_s, n_frames)):
@@ -158,6 +156,8 @@ def build_dataset(
                 }
             )
             _add_labels(rows, frame, split, grounds[scene], camera, position, rotation)
+        if kind == "nav":
+            _add_measurements(rows, nominal, rows["frames"][-n_frames:])
     tables = {name: _table(name, content_rows) for name, content_rows in rows.items()}
     for scene in rows["scenes"]:
         own = [
@@ -186,14 +186,20 @@ def build_dataset(
     return root
 
 
-def _add_measurements(rows: dict[str, list[dict]], scene: str, trajectory: str, nominal: NominalTrajectory) -> None:
-    """Measurements of the nominal motion, once per second."""
-    keys = {"scene_id": scene, "trajectory_id": trajectory}
+def _add_measurements(rows: dict[str, list[dict]], nominal: NominalTrajectory, own: list[dict]) -> None:
+    """Five measurements between two frames: of the true constant turn, and of the nominal force and altitude."""
     force = np.array(nominal.acceleration_mps2) - gravity_mps2(0.0)
-    for time_s in np.arange(1.0, nominal.duration_s):
-        rows["ranges"].append(keys | {"time_s": time_s, "range_m": nominal.position_at(time_s)[2]})
-        unit = {"grade": "tactical", "time_s": time_s, "interval_s": 1.0}
-        rows["inertial"].append(keys | unit | {"angular_rate_radps": np.zeros(3), "specific_force_mps2": force})
+    keys = {key: own[0][key] for key in ("scene_id", "trajectory_id")}
+    # The body is turned against the site by R_site_from_body = R_camera_from_site^T R_camera_from_body.
+    body = [frames.matrix_from_quaternion(row["rotation_wxyz"]).T @ ROTATION_CAMERA_FROM_BODY for row in own]
+    for k in range(len(own) - 1):
+        start_s, interval_s = own[k]["time_s"], (own[k + 1]["time_s"] - own[k]["time_s"]) / 5
+        rate = frames.rotation_vectors(body[k].T @ body[k + 1]) / (5 * interval_s)
+        for part in range(1, 6):
+            time_s = start_s + part * interval_s
+            rows["ranges"].append(keys | {"time_s": time_s, "range_m": nominal.position_at(time_s)[2]})
+            unit = {"grade": "tactical", "time_s": time_s, "interval_s": interval_s}
+            rows["inertial"].append(keys | unit | {"angular_rate_radps": rate, "specific_force_mps2": force})
 
 
 def seal(root: Path) -> None:

@@ -12,39 +12,9 @@ import numpy as np
 
 from perilune_render.flight.motion import Motion
 from perilune_render.streams import stream
-from perilune_shared.dataset.names import InertialGrade
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_shared.geometry.gravity import gravity_mps2
-
-_HOUR_S = 3600.0
-_STANDARD_GRAVITY_MPS2 = 9.80665
-
-
-@dataclass(frozen=True, slots=True)
-class InertialErrors:
-    """Errors of an inertial measurement unit, standard deviations on each axis."""
-
-    gyro_bias_deg_per_h: float
-    """Bias of the angular rate at the start, degrees per hour."""
-    gyro_bias_walk_deg_per_h: float
-    """Random walk of this bias in one hour, degrees per hour."""
-    angular_random_walk_deg: float
-    """White noise of the angular rate: angle after integration over one hour, degrees."""
-    accelerometer_bias_mg: float
-    """Bias of the specific force at the start, thousandths of standard gravity."""
-    accelerometer_bias_walk_mg: float
-    """Random walk of this bias in one hour, thousandths of standard gravity."""
-    velocity_random_walk_mps: float
-    """White noise of the specific force: velocity after integration over one hour, metres per second."""
-
-
-GRADES: dict[InertialGrade, InertialErrors] = {
-    "tactical": InertialErrors(10.0, 10.0, 0.1, 1.0, 1.0, 0.06),
-    "navigation": InertialErrors(0.01, 0.01, 0.002, 0.05, 0.05, 0.01),
-}
-"""Errors of each grade: biases and noise within the ranges that Groves (Principles of GNSS, Inertial, and Multisensor
-Integrated Navigation Systems, 2nd edition, 2013, section 4.4) gives for tactical and aviation grade. The random walks
-are ours: in one minute a bias changes by an eighth of its size."""
+from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2, InertialGrade
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +54,8 @@ def true_increments(motion: Motion, rate_hz: float) -> Increments:
 def measured(true: Increments, grade: InertialGrade, seed: int) -> Increments:
     """The increments as a unit of this grade measures them on the trajectory of a random seed."""
     errors, rng = GRADES[grade], stream(seed, "inertial", grade)
-    per_s, per_root_s = np.radians(1) / _HOUR_S, 1 / np.sqrt(_HOUR_S)
-    mg = _STANDARD_GRAVITY_MPS2 / 1000
+    per_s, per_root_s = np.radians(1) / HOUR_S, 1 / np.sqrt(HOUR_S)
+    mg = STANDARD_GRAVITY_MPS2 / 1000
     gyro = _errors(
         rng,
         true.interval_s,

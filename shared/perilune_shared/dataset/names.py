@@ -11,8 +11,6 @@ Split = Literal["train", "val", "test"]
 """Part of a dataset for training, validation or test."""
 SplitUnit = Literal["scene", "trajectory", "frame"]
 """Rows that belong to one split as a whole."""
-InertialGrade = Literal["tactical", "navigation"]
-"""Grade of an inertial measurement unit."""
 ImageState = Literal["files", "packed", "absent", "planned"]
 """Where the frames are: under frames/, in shards/*.parquet, left out, or not rendered yet (then without labels)."""
 ImageKind = Literal["png", "exr"]

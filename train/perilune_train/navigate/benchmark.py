@@ -31,16 +31,19 @@ _COLUMNS = {
     "position_rmse_per_component_m": "per component (m)",
     "orientation_rmse_angle_deg": "orientation RMSE, angle (deg)",
     "drift_final_m": "drift at the end (m)",
+    "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is right)",
 }
+_OF_BINS = tuple(_COLUMNS)[:3]
+"""The figures that are also given by region, altitude and Sun."""
 _ALTITUDES_M = (200, 500, 1000, 1600)
 _SUNS_DEG = (0, 15, 30, 45, 60, 90)
 
 
 def score_navigator(run: Path, data: Address, manifests: Address, out: Path, allow_overlap: bool = False) -> Metrics:
-    """Score a run's best weights, KLT tracks and the nominal motion; writes page, figures, tables and pictures.
+    """Score a run's best weights, the classical methods and the nominal motion, and return the figures.
 
-    Returns the figures. Raises UserError if the benchmark is missing or changed, or if the network was fitted to its
-    terrain, unless `allow_overlap`.
+    Writes page, figures, tables and pictures. Raises UserError if the benchmark is missing or changed, or if the
+    network was fitted to its terrain, unless `allow_overlap`.
     """
     parts = open_parts("nav", data, manifests)
     best = RunFolder(run).best
@@ -56,13 +59,15 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
         for trajectory in trajectories:
             motions[fusion].append(predict(network, architecture, trajectory))
             progress.advance(bar)
-    motions |= baselines([], trajectories)
-    errors = {method: motion_errors(trajectories, found) for method, found in motions.items()}
+    classical = baselines([], trajectories)
+    motions |= classical.motions
+    covariances = classical.covariances
+    errors = {method: motion_errors(trajectories, found, covariances.get(method)) for method, found in motions.items()}
     mark = "; ".join(dict.fromkeys(check.mark for check in checks if check.mark))
     counts = {part.name: (part.dataset.info.counts.frames, part.n_locked) for part in parts}
     ms = round(1e3 * predict_by_pairs(network, architecture, trajectories[0])[1], 2)
     details: Metrics = {"test/ms_per_single_pair": ms, "terrain/mark": mark, "dataset/name": "locked benchmark"}
-    write_evaluation(out, fusion, "test", trajectories, motions, details)
+    write_evaluation(out, fusion, "test", trajectories, motions, covariances, details)
     figures = _figures(errors, regions, suns) | {"headline/method": fusion, f"headline/{HEADLINE}": None}
     figures[f"headline/{HEADLINE}"] = figures[f"{fusion}/{HEADLINE}"]
     for name, (n_frames, n_locked) in counts.items():
@@ -99,7 +104,7 @@ def _figures(errors: dict[str, pd.DataFrame], regions: dict[str, str], suns: dic
         ):
             for name, rows in own.groupby(names):
                 found = summary(rows)
-                figures |= {f"{method}/{kind}/{name}/{key}": found[key] for key in _COLUMNS if key != "drift_final_m"}
+                figures |= {f"{method}/{kind}/{name}/{key}": found[key] for key in _OF_BINS}
                 figures[f"{method}/{kind}/{name}/scenes"] = int(rows["scene_id"].nunique())
     return figures
 
@@ -132,7 +137,7 @@ def _page(
         cells = [
             spreads[method][key].text(float(figures[f"{method}/{key}"] or np.nan))
             if key in spreads[method]
-            else number(figures[f"{method}/{key}"])
+            else number(figures.get(f"{method}/{key}"))
             for key in _COLUMNS
         ]
         rows.append([method, *cells])

@@ -17,7 +17,7 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 
 def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Path, allow_overlap: bool = False) -> Path:
-    """Evaluate a run's best weights, KLT tracks and the nominal motion on a split; returns `out`, which has all output.
+    """Evaluate a run's best weights, the classical methods and the nominal motion on a split; returns `out`.
 
     Raises UserError if `run` is no navigation run, if `out` is the run's own folder, or on test terrain that the
     network was fitted to (unless `allow_overlap`).
@@ -44,7 +44,9 @@ def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Pat
         **terrain_check.metrics(),
     }
     # Mean motions are those of the training set, which this dataset may not have.
-    write_evaluation(out, fusion, split, trajectories, {fusion: found, **baselines([], trajectories)}, details)
+    classical = baselines([], trajectories)
+    motions = {fusion: found, **classical.motions}
+    write_evaluation(out, fusion, split, trajectories, motions, classical.covariances, details)
     return out
 
 

@@ -1,18 +1,22 @@
 """Trajectories as arrays, with the nominal motion."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
+import pandas as pd
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import SPLITS
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_train.data.frames import frame_table, load_images
 from perilune_train.data.shares import ALONE, Share
+from perilune_train.navigate.data.gyroscope import GyroscopeTurns, gyroscope_turns
 from perilune_train.navigate.data.undistort import undistorted
 from perilune_train.navigate.geometry import relative_poses
 
@@ -40,6 +44,8 @@ class Trajectory:
     """Positions (n, 3), metres, on the nominal curve at the frames' times, O_L."""
     nominal_rotation_camera_from_site: Array
     """Nominal attitude (3, 3): the camera on a level body, the same for all frames."""
+    gyroscopes: Mapping[InertialGrade, GyroscopeTurns] = field(default_factory=dict)
+    """Rotations measured by a gyroscope, by its grade; only those that the dataset has, and none in training."""
 
     @property
     def n_pairs(self) -> int:
@@ -155,4 +161,12 @@ def _split_trajectories(
             )
         )
         start = stop
+        if split != "train" and number in own:
+            trajectories[-1] = replace(trajectories[-1], gyroscopes=_gyroscopes(dataset, trajectories[-1], rows))
     return trajectories
+
+
+def _gyroscopes(dataset: Dataset, trajectory: Trajectory, rows: pd.DataFrame) -> dict[InertialGrade, GyroscopeTurns]:
+    time_s, mounting = rows["time_s"].to_numpy(), trajectory.nominal_rotation_camera_from_site
+    measured = {grade: gyroscope_turns(dataset, trajectory.ids, grade, time_s, mounting) for grade in GRADES}
+    return {grade: turns for grade, turns in measured.items() if turns is not None}

@@ -1,26 +1,53 @@
-"""The methods without training: KLT tracks, the nominal motion, and mean motions of the training set."""
+"""The methods without training: KLT tracks, direct alignment, the nominal motion, mean motions of the training set."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.terminal import progress_bar
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
-from perilune_train.navigate.evaluate.klt import klt_trajectory
+from perilune_train.navigate.relative.descent import aligned_trajectory
+from perilune_train.navigate.relative.klt import klt_trajectory
+
+GYROSCOPE: InertialGrade = "tactical"
+"""The grade whose rotations `alignment_gyroscope` uses."""
 
 
-def baselines(training: list[Trajectory], test: list[Trajectory]) -> dict[str, list[Motion]]:
-    """Motions of the test trajectories by each method; without training trajectories there are no mean motions."""
+@dataclass(frozen=True, slots=True)
+class Baselines:
+    """Motions of the test trajectories by each method, and their covariances by those methods that state them."""
+
+    motions: dict[str, list[Motion]]
+    """Motions of each trajectory, by method."""
+    covariances: dict[str, list[Array]]
+    """Covariances (n - 1, 6, 6) of each trajectory, as in `Alignment`, by method."""
+
+
+def baselines(training: list[Trajectory], test: list[Trajectory]) -> Baselines:
+    """Estimate by all methods. Without training trajectories there are no mean motions, without gyroscope no method
+    that uses one.
+    """
     with progress_bar() as progress:
-        task = progress.add_task("KLT baseline", total=len(test), unit="trajectories", note="")
-        tracked = []
+        task = progress.add_task("classical methods", total=len(test), unit="trajectories", note="")
+        tracked, aligned, aided = [], [], []
         for trajectory in test:
             tracked.append(klt_trajectory(trajectory))
+            aligned.append(aligned_trajectory(trajectory))
+            if GYROSCOPE in trajectory.gyroscopes:
+                aided.append(aligned_trajectory(trajectory, trajectory.gyroscopes[GYROSCOPE]))
             progress.advance(task)
-    found = {"klt": tracked, "nominal": [trajectory.nominal_motion for trajectory in test]}
+    found = {"klt": tracked, "alignment": [one.motion for one in aligned]}
+    covariances = {"alignment": [one.covariance for one in aligned]}
+    if len(aided) == len(test):
+        found["alignment_gyroscope"] = [one.motion for one in aided]
+        covariances["alignment_gyroscope"] = [one.covariance for one in aided]
+    found["nominal"] = [trajectory.nominal_motion for trajectory in test]
     if training:
         found["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]
         found["mean"] = [mean_motion(training, trajectory) for trajectory in test]
-    return found
+    return Baselines(found, covariances)
 
 
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:

@@ -15,6 +15,8 @@ COLOURS = {
     "warp": "tab:red",
     "stack": "tab:purple",
     "klt": "tab:green",
+    "alignment": "tab:blue",
+    "alignment_gyroscope": "tab:cyan",
     "nominal": "tab:gray",
     "mean_at_step": "tab:orange",
     "mean": "tab:brown",

@@ -9,15 +9,19 @@ from perilune_train.navigate.data.trajectories import Motion, Trajectory
 from perilune_train.navigate.geometry import dead_reckoning
 
 
-def motion_errors(trajectories: list[Trajectory], motions: list[Motion]) -> pd.DataFrame:
+def motion_errors(
+    trajectories: list[Trajectory], motions: list[Motion], covariances: list[Array] | None = None
+) -> pd.DataFrame:
     """Errors of the motion, and of the position dead reckoned from the true first pose; one row per pair.
 
     Columns: scene_id, trajectory_id, step, altitude_m (nominal), position_error_m (length) with its components
     error_x_m, error_y_m, error_z_m in O_C of the earlier frame, orientation_error_deg (angle of the residual rotation)
-    with its components error_x_deg ... (rotation vector, O_C of the later frame), drift_m and drift_x_m ... (O_L).
+    with its components error_x_deg ... (rotation vector, O_C of the later frame), drift_m and drift_x_m ... (O_L),
+    and, with `covariances` (n - 1, 6, 6) as in `Alignment`, normalised_error_squared.
     """
     tables = []
-    for trajectory, (translation, rotation) in zip(trajectories, motions, strict=True):
+    stated = covariances if covariances is not None else [None] * len(trajectories)
+    for trajectory, (translation, rotation), covariance in zip(trajectories, motions, stated, strict=True):
         true_translation, true_rotation = trajectory.motion
         shift = translation - true_translation
         turn = np.degrees(rotation_vectors(rotation @ np.swapaxes(true_rotation, 1, 2)))
@@ -36,8 +40,22 @@ def motion_errors(trajectories: list[Trajectory], motions: list[Motion]) -> pd.D
         }
         for i, axis in enumerate("xyz"):
             columns |= {f"error_{axis}_m": shift[:, i], f"error_{axis}_deg": turn[:, i], f"drift_{axis}_m": drift[:, i]}
+        if covariance is not None:
+            columns["normalised_error_squared"] = normalised_errors(trajectory, (translation, rotation), covariance)
         tables.append(pd.DataFrame(columns))
     return pd.concat(tables, ignore_index=True)
+
+
+def normalised_errors(trajectory: Trajectory, motion: Motion, covariance: Array) -> Array:
+    """Squared errors of rotation and shift together, divided by their covariance (n - 1, 6, 6): 6 in the mean if right.
+
+    (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.)
+    """
+    (translation, rotation), (true_translation, true_rotation) = motion, trajectory.motion
+    turn = rotation_vectors(true_rotation @ np.swapaxes(rotation, 1, 2))
+    shift = np.einsum("nij,nj->ni", true_rotation, translation - true_translation)
+    error = np.concatenate([turn, shift], axis=1)
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
 
 
 def summary(errors: pd.DataFrame) -> dict[str, float]:
@@ -51,6 +69,8 @@ def summary(errors: pd.DataFrame) -> dict[str, float]:
     figures |= {f"orientation_rmse_{axis}_deg": _rms(errors[f"error_{axis}_deg"]) for axis in "xyz"}
     figures["drift_rms_m"] = _rms(errors["drift_m"])
     figures["drift_final_m"] = _rms(ends)
+    if "normalised_error_squared" in errors:
+        figures["normalised_error_squared_mean"] = float(errors["normalised_error_squared"].mean())
     return figures
 
 

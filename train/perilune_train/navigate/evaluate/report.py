@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from perilune_shared.geometry.frames import Array
 from perilune_shared.storage.files import written_aside
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
@@ -22,6 +23,7 @@ def write_evaluation(
     split: str,
     trajectories: list[Trajectory],
     motions: Mapping[str, list[Motion]],
+    covariances: Mapping[str, list[Array]],
     details: Mapping[str, float | int | str | None],
 ) -> None:
     """Write the errors of all methods on the trajectories of a split.
@@ -30,7 +32,7 @@ def write_evaluation(
     metrics.json: <split>/<figure> for the method `own`, <method>/<figure> for another network, baseline/<method>/...
     for the others, and `details`, which have the mark of the terrain check.
     """
-    errors = {method: motion_errors(trajectories, found) for method, found in motions.items()}
+    errors = {method: motion_errors(trajectories, found, covariances.get(method)) for method, found in motions.items()}
     rows = {method: summary(table) for method, table in errors.items()}
     _write_table(folder / "navigation.parquet", pd.DataFrame([{"method": m, **row} for m, row in rows.items()]))
     pairs = pd.concat([table.assign(method=method) for method, table in errors.items()], ignore_index=True)

@@ -84,7 +84,8 @@ def navigate_run(
     if not is_first_process():
         return list(folders.values())
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
-    motions = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
+    classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
+    motions = classical.motions
     # stack comes first, so that the table of the warp run, which finishes last, has both.
     for fusion, run in folders.items():
         network, architecture = load_navigator(run.best, fusion)
@@ -104,7 +105,7 @@ def navigate_run(
             "dataset/protocol": protocol_of(opened.info),
             **terrain_check.metrics(),
         }
-        write_evaluation(run.root, fusion, "test", test, motions, details)
+        write_evaluation(run.root, fusion, "test", test, motions, classical.covariances, details)
     return list(folders.values())
 
 

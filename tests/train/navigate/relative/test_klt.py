@@ -3,8 +3,8 @@ import pytest
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.navigate.data.trajectories import load_trajectories
-from perilune_train.navigate.evaluate.klt import klt_motion, klt_trajectory
 from perilune_train.navigate.evaluate.metrics import motion_errors, summary
+from perilune_train.navigate.relative.klt import klt_motion, klt_trajectory
 
 
 @pytest.fixture(scope="module")

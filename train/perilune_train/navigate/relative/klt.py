@@ -39,8 +39,7 @@ def klt_trajectory(trajectory: Trajectory) -> Motion:
     updated with the estimated motions; the attitude is assumed level.
     """
     nominal_translation, nominal_rotation = trajectory.nominal_motion
-    # OpenCV tracks 8-bit images and rejects flat windows by a fixed threshold, so stretch dim frames first.
-    images = np.clip(110 + 45 * normalised(trajectory.images), 0, 255).astype(np.uint8)
+    images = stretched(trajectory.images)
     altitude_m = float(trajectory.position_m[0, 2])
     translations, rotations = [], []
     for i in range(trajectory.n_pairs):
@@ -57,6 +56,11 @@ def klt_trajectory(trajectory: Trajectory) -> Motion:
         translations.append(translation)
         rotations.append(rotation)
     return np.stack(translations), np.stack(rotations)
+
+
+def stretched(images: np.ndarray) -> np.ndarray:
+    """Frames (n, height, width) of one mean and contrast, 8 bits: OpenCV rejects flat windows by a fixed threshold."""
+    return np.clip(110 + 45 * normalised(images), 0, 255).astype(np.uint8)
 
 
 def klt_motion(

@@ -1,0 +1,36 @@
+"""Errors of inertial measurement units, by grade: what `inertial` is simulated with and what a filter assumes."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+InertialGrade = Literal["tactical", "navigation"]
+"""Grade of an inertial measurement unit."""
+HOUR_S = 3600.0
+STANDARD_GRAVITY_MPS2 = 9.80665
+
+
+@dataclass(frozen=True, slots=True)
+class InertialErrors:
+    """Errors of an inertial measurement unit, standard deviations on each axis."""
+
+    gyro_bias_deg_per_h: float
+    """Bias of the angular rate at the start, degrees per hour."""
+    gyro_bias_walk_deg_per_h: float
+    """Random walk of this bias in one hour, degrees per hour."""
+    angular_random_walk_deg: float
+    """White noise of the angular rate: angle after integration over one hour, degrees."""
+    accelerometer_bias_mg: float
+    """Bias of the specific force at the start, thousandths of standard gravity."""
+    accelerometer_bias_walk_mg: float
+    """Random walk of this bias in one hour, thousandths of standard gravity."""
+    velocity_random_walk_mps: float
+    """White noise of the specific force: velocity after integration over one hour, metres per second."""
+
+
+GRADES: dict[InertialGrade, InertialErrors] = {
+    "tactical": InertialErrors(10.0, 10.0, 0.1, 1.0, 1.0, 0.06),
+    "navigation": InertialErrors(0.01, 0.01, 0.002, 0.05, 0.05, 0.01),
+}
+"""Errors of each grade: biases and noise within the ranges that Groves (Principles of GNSS, Inertial, and Multisensor
+Integrated Navigation Systems, 2nd edition, 2013, section 4.4) gives for tactical and aviation grade. The random walks
+are ours: in one minute a bias changes by an eighth of its size."""

@@ -1,0 +1,66 @@
+"""Local contrast of frames, their pyramid, and its values between pixels."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+
+_FINE_PX, _COARSE_PX = 0.5, 2.0
+"""Standard deviations of both blurs. Chosen on training and validation scenes."""
+_LEAST_BACKGROUND = 2.0
+"""Added to the background, grey values, so that the contrast of black shadow stays finite."""
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """One level of a pyramid."""
+
+    camera: Camera
+    """Intrinsics of this level."""
+    contrast: Array
+    """Local contrast (height, width)."""
+
+
+def local_contrast(image: np.ndarray) -> Array:
+    """Detail of an 8-bit image relative to its surroundings, (height, width): (G_fine - G_coarse) / G_coarse.
+
+    Brightness that varies over many pixels (slopes, albedo, phase angle) changes with the view and would pull an
+    alignment with it; local contrast has none of it.
+    """
+    grey = image.astype(np.float32)
+    fine, coarse = (
+        cv2.GaussianBlur(grey, (0, 0), sigma, borderType=cv2.BORDER_REFLECT) for sigma in (_FINE_PX, _COARSE_PX)
+    )
+    return (fine - coarse) / (coarse + _LEAST_BACKGROUND)
+
+
+def pyramid(image: np.ndarray, camera: Camera, n_levels: int) -> list[Level]:
+    """Levels of an image, the coarsest first; each has half the size of the next, by area averaging."""
+    levels = []
+    for number in range(n_levels):
+        if number:
+            height, width = image.shape[0] // 2, image.shape[1] // 2
+            across, down = width / image.shape[1], height / image.shape[0]
+            image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+            camera = Camera(
+                width, height, camera.fx_px * across, camera.fy_px * down, camera.cx_px * across, camera.cy_px * down
+            )
+        levels.append(Level(camera, local_contrast(image)))
+    return levels[::-1]
+
+
+def sampled(values: Array, pixels: Array) -> Array:
+    """Bilinear values (k, n) of maps (k, height, width) at image coordinates (n, 2); NaN outside."""
+    height, width = values.shape[1:]
+    x, y = pixels[:, 0] - 0.5, pixels[:, 1] - 0.5
+    inside = (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    column, row = x.astype(np.intp), y.astype(np.intp)
+    right, down = (x - column).astype(np.float32), (y - row).astype(np.float32)
+    flat, first = values.reshape(len(values), -1), row * width + column
+    upper = flat[:, first] * (1 - right) + flat[:, first + 1] * right
+    lower = flat[:, first + width] * (1 - right) + flat[:, first + width + 1] * right
+    return np.where(inside, upper * (1 - down) + lower * down, np.nan)
