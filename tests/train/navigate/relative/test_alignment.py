@@ -5,9 +5,10 @@ import pytest
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
-from perilune_train.navigate.relative.alignment import NOMINAL_TURN_SIGMA_RAD, Prior, State, align
+from perilune_train.navigate.relative.alignment import Prior, State, align
 from perilune_train.navigate.relative.contrast import local_contrast, pyramid, sampled
 from perilune_train.navigate.relative.ground import carried, ground_points, node_pixels, node_weights, unknown_heights
+from perilune_train.navigate.relative.klt import NOMINAL_TURN_SIGMA_RAD
 
 CAMERA = Camera.from_field_of_view(160, 160, 45.0)
 DOWN = np.array([0.0, 0.0, 1.0])

@@ -51,3 +51,17 @@ def test_without_motion_the_same_frame_gives_none(trajectories):
     assert tracks > 30
     np.testing.assert_allclose(translation, 0, atol=1.0)
     np.testing.assert_allclose(rotation, np.eye(3), atol=1e-3)
+
+
+def test_a_known_rotation_is_kept_and_makes_the_shift_better(trajectories):
+    free, known = [], []
+    for d in trajectories:
+        altitude_m = float(d.position_m[0, 2])
+        for k, sigma in ((free, None), (known, 1e-6)):
+            more = () if sigma is None else (sigma,)
+            rotation = d.motion[1][0]
+            found = klt_motion(d.camera, *d.images[:2], d.nominal_motion[0][0], rotation, d.down_c, altitude_m, *more)
+            k.append(np.linalg.norm(found[0] - d.motion[0][0]))
+            if sigma is not None:
+                np.testing.assert_allclose(found[1], rotation, atol=1e-5)
+    assert np.mean(known) < 0.5 * np.mean(free)

@@ -16,14 +16,11 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
 from perilune_train.navigate.relative.contrast import Level, sampled
 from perilune_train.navigate.relative.ground import N_NODES, Heights, node_weights
+from perilune_train.navigate.relative.klt import SHIFT_SHARE
 
 _TUKEY = 4.685
 _DEPENDENT_PIXELS = 6.0
 """Errors of neighbouring pixels are alike: so many pixels count as one. Chosen on training and validation scenes."""
-NOMINAL_TURN_SIGMA_RAD = float(np.radians(0.5))
-"""Standard deviation of the turn between two frames around the nominal one, on each axis."""
-_SHIFT_SHARE = 0.02
-"""Standard deviation of the shift around the nominal one, on each axis, divided by altitude."""
 _TILT_SIGMA_RAD = float(np.radians(0.5))
 """Standard deviation of the tilt around a level attitude, on each axis."""
 _ITERATIONS = 8
@@ -90,7 +87,7 @@ def align(first: list[Level], second: list[Level], prior: Prior, start: State) -
     Turns are from the left, radians; shifts are metres, O_C of frame 2.
     """
     precision = np.zeros((_N_UNKNOWN, _N_UNKNOWN))
-    shift_sigma_m = _SHIFT_SHARE * prior.altitude_m
+    shift_sigma_m = SHIFT_SHARE * prior.altitude_m
     sigmas = [prior.turn_sigma_rad] * 3 + [shift_sigma_m] * 3 + [_TILT_SIGMA_RAD] * 2
     precision[range(_N_POSE), range(_N_POSE)] = 1 / np.square(sigmas)
     precision[_N_POSE:, _N_POSE:] = np.linalg.inv(prior.heights.covariance_m2)

@@ -7,10 +7,10 @@ import numpy as np
 from perilune_shared.geometry.frames import Array
 from perilune_train.navigate.data.gyroscope import GyroscopeTurns
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
-from perilune_train.navigate.relative.alignment import NOMINAL_TURN_SIGMA_RAD, Prior, State, align
+from perilune_train.navigate.relative.alignment import Prior, State, align
 from perilune_train.navigate.relative.contrast import pyramid
 from perilune_train.navigate.relative.ground import N_NODES, Heights, carried, unknown_heights
-from perilune_train.navigate.relative.klt import klt_motion, stretched
+from perilune_train.navigate.relative.klt import NOMINAL_TURN_SIGMA_RAD, klt_motion, stretched
 
 _LEVELS = 2
 
@@ -43,10 +43,9 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
     for i in range(trajectory.n_pairs):
         second = pyramid(trajectory.images[i + 1], camera, _LEVELS)
         expected = nominal_translation[i], rotation[i]
-        start = klt_motion(camera, grey[i], grey[i + 1], *expected, down, altitude_m)[:2]
-        if turns is not None:
-            start = start[0], expected[1]
-        prior = Prior(*expected, float(turn_sigma[i]), down, altitude_m, heights)
+        # KLT must know the gyroscope's rotation too: its shift balances an error of its own rotation.
+        start = klt_motion(camera, grey[i], grey[i + 1], *expected, down, altitude_m, turn_sigma[i])[:2]
+        prior = Prior(*expected, turn_sigma[i], down, altitude_m, heights)
         found, covariance = align(first, second, prior, State(*start, np.zeros(2), heights.mean_m))
         motion = found.translation_m, found.rotation_c2_from_c1
         down_1 = found.down_c(prior)

@@ -24,8 +24,8 @@ _WINDOW_PX = 11
 _CONSISTENCY_PX = 0.5
 """Largest distance, pixels, between a track's start and its end after tracking back."""
 _TUKEY = 4.685
-_PRIOR_TURN_RAD = np.radians(0.5)
-_PRIOR_SHIFT = 0.02
+NOMINAL_TURN_SIGMA_RAD = float(np.radians(0.5))
+SHIFT_SHARE = 0.02
 """Standard deviations of a weak prior around the nominal motion: of rotation, and of shift divided by altitude. Few or
 crowded corners cannot separate tilt from sideways shift, which look alike from above."""
 _ITERATIONS = 15
@@ -71,9 +71,11 @@ def klt_motion(
     nominal_rotation_c2_from_c1: Array,
     plane_normal_c1: Array,
     altitude_m: float,
+    turn_sigma_rad: float = NOMINAL_TURN_SIGMA_RAD,
 ) -> tuple[Array, Array, int]:
     """Motion between two 8-bit images: translation_m (3,), rotation_c2_from_c1 (3, 3), number of consistent tracks.
 
+    `turn_sigma_rad` is the standard deviation of the nominal rotation; that of a gyroscope if it gave the rotation.
     If fewer than 8 corners can be tracked, returns the nominal motion and 0 tracks.
     """
     nominal = plane_homography(
@@ -84,7 +86,7 @@ def klt_motion(
         return nominal_translation_m, nominal_rotation_c2_from_c1, 0
     rays = camera.rays(pixels_1)
     points_c1 = rays * (altitude_m / (rays @ plane_normal_c1))[:, None]
-    return _fit(camera, points_c1, pixels_2, nominal_translation_m, nominal_rotation_c2_from_c1)
+    return _fit(camera, points_c1, pixels_2, nominal_translation_m, nominal_rotation_c2_from_c1, turn_sigma_rad)
 
 
 def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tuple[Array, Array]:
@@ -112,14 +114,14 @@ def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tupl
 
 
 def _fit(
-    camera: Camera, points_c1: Array, pixels_2: Array, translation_m: Array, rotation: Array
+    camera: Camera, points_c1: Array, pixels_2: Array, translation_m: Array, rotation: Array, turn_sigma_rad: float
 ) -> tuple[Array, Array, int]:
     """Fit the motion that maps points (N, 3) of O_C of frame 1 to pixels (N, 2) of frame 2."""
     focal = np.array([camera.fx_px, camera.fy_px])
     weights = np.ones(len(points_c1))
     nominal_translation_m, nominal_rotation = translation_m, rotation
     altitude_m = float(np.median(points_c1[:, 2]))
-    prior = 1 / np.square([_PRIOR_TURN_RAD] * 3 + [_PRIOR_SHIFT * altitude_m] * 3)
+    prior = 1 / np.square([turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
     for _ in range(_ITERATIONS):
         points = (points_c1 - translation_m) @ rotation.T
         error = camera.project(points) - pixels_2
