@@ -24,12 +24,14 @@ class Shipment:
     """Size of the weights, MB."""
     others: tuple[dict[str, Any], ...] = ()
     """benchmark.json of trainings with other seeds, which are not installed."""
+    notes: tuple[str, ...] = ()
+    """Caveats of this network or of its benchmark, a line each."""
 
 
 def model_card(one: Shipment) -> str:
     """The card as Markdown."""
     lines = _detector(one) if one.name == "crater-detector" else _navigator(one)
-    return "\n".join([f"# {one.name}", "", *lines, ""])
+    return "\n".join([f"# {one.name}", "", *lines, *[f"- {note}" for note in one.notes], ""])
 
 
 def _facts(one: Shipment, network: str, threshold: str | None) -> list[str]:

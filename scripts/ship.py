@@ -60,20 +60,22 @@ def card(
     name: Name,
     benchmark: Annotated[Path, typer.Option(help="benchmark.json of the installed network.")],
     other: Annotated[list[Path] | None, typer.Option(help="benchmark.json of a training with another seed.")] = None,
+    note: Annotated[list[str] | None, typer.Option(help="Caveat of the network or of its benchmark.")] = None,
 ) -> None:
-    """Write the card of the installed network and the page of its benchmark."""
+    """Write the card of the installed network and the page of its benchmark, both with the notes."""
     folder, manifest = _folder(name), MANIFESTS[name]
     content, metrics = load_weights(folder / WEIGHTS), read_metrics(folder)
     figures = read_metrics(benchmark.parent, benchmark.name)
     size = (folder / WEIGHTS).stat().st_size / 1e6
     sha256 = sha256_of(ROOT / "data_manifests" / manifest / "dataset.json")
     others = tuple(read_metrics(path.parent, path.name) for path in other or [])
-    text = model_card(Shipment(name, content, metrics, figures, manifest, sha256, size, others))
+    text = model_card(Shipment(name, content, metrics, figures, manifest, sha256, size, others, tuple(note or [])))
     write_text(folder / BENCHMARK, json.dumps(figures, indent=2) + "\n")
     write_text(folder / CARD, text)
     PAGES.mkdir(parents=True, exist_ok=True)
     write_text(PAGES / f"{name}.md", text)
-    shutil.copyfile(benchmark.with_suffix(".md"), PAGES / f"{name}-benchmark.md")
+    page = benchmark.with_suffix(".md").read_text(encoding="utf-8").rstrip("\n")
+    write_text(PAGES / f"{name}-benchmark.md", "\n".join([page, *[f"\n{text}" for text in note or []], ""]))
     print(PAGES / f"{name}.md")
 
 

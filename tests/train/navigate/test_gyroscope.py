@@ -1,8 +1,11 @@
 import numpy as np
+import pytest
 
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
-from perilune_train.navigate.data.gyroscope import turns_between
+from perilune_train.navigate.data.gyroscope import gyroscope_turns, turns_between
 
 
 def _attitude(time_s):
@@ -42,3 +45,12 @@ def test_standard_deviations_follow_the_grade():
     # Tactical: bias of 10 degrees per hour, 0.1 degrees per root hour.
     assert np.allclose(np.degrees(sigmas["tactical"]), [np.hypot(1 / 360, 0.1 / 60), np.hypot(9 / 360, 0.3 / 60)])
     assert (sigmas["navigation"] < sigmas["tactical"] / 10).all()
+
+
+def test_frames_after_the_last_measurement_are_an_error_and_another_grade_is_none(dataset_nav):
+    dataset = open_dataset(dataset_nav)
+    row = dataset.table("trajectories").to_pylist()[0]
+    ids, times = (row["scene_id"], row["trajectory_id"]), np.array([0.0, 2 * row["duration_s"]])
+    with pytest.raises(UserError, match="no gap from 0 to 80 s"):
+        gyroscope_turns(dataset, ids, "tactical", times, ROTATION_CAMERA_FROM_BODY)
+    assert gyroscope_turns(dataset, ids, "navigation", times, ROTATION_CAMERA_FROM_BODY) is None

@@ -5,7 +5,7 @@ from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.navigate.data.trajectories import Trajectory
 from perilune_train.navigate.evaluate.baselines import mean_motion, mean_motion_at_step
-from perilune_train.navigate.evaluate.metrics import motion_errors, summary, summary_spreads
+from perilune_train.navigate.evaluate.metrics import motion_errors, normalised_errors, summary, summary_spreads
 
 
 def _trajectory(steps_m, name="t0"):
@@ -55,6 +55,19 @@ def test_errors_and_drift_by_hand():
     assert not {"position_rmse_m", "orientation_rmse_deg"} & set(figures)
     assert figures["drift_final_m"] == pytest.approx(np.sqrt(52))
     assert figures["drift_rms_m"] == pytest.approx(np.sqrt((25 + 52) / 2))
+
+
+def test_normalised_errors_by_hand():
+    trajectory = _trajectory([[0, 0, -10], [0, 0, -10]])
+    translation, rotation = (values.copy() for values in trajectory.motion)
+    translation[0] += [3, 0, 4]
+    rotation[1] = matrix_from_rotation_vector([0.003, 0, 0]) @ rotation[1]
+    covariance = np.stack([np.diag([1e-6] * 3 + [4.0, 1.0, 16.0]), np.diag([1e-6] * 3 + [1.0] * 3)])
+    found = normalised_errors(trajectory, (translation, rotation), covariance)
+    # (3 / 2)^2 + (4 / 4)^2; (0.003 / 0.001)^2.
+    np.testing.assert_allclose(found, [3.25, 9], rtol=1e-4)
+    errors = motion_errors([trajectory], [(translation, rotation)], [covariance])
+    assert summary(errors)["normalised_error_squared_mean"] == pytest.approx(6.125, rel=1e-4)
 
 
 def errors_of(n_trajectories):

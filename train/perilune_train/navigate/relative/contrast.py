@@ -27,8 +27,8 @@ class Level:
 def local_contrast(image: np.ndarray) -> Array:
     """Detail of an 8-bit image relative to its surroundings, (height, width): (G_fine - G_coarse) / G_coarse.
 
-    Brightness that varies over many pixels (slopes, albedo, phase angle) changes with the view and would pull an
-    alignment with it; local contrast has none of it.
+    It does not change where brightness is multiplied by a factor that varies over many pixels. Alignments of grey
+    values had errors of metres (docs/notebook/2026-11-23-alignment.md).
     """
     grey = image.astype(np.float32)
     fine, coarse = (
@@ -53,7 +53,10 @@ def pyramid(image: np.ndarray, camera: Camera, n_levels: int) -> list[Level]:
 
 
 def sampled(values: Array, pixels: Array) -> Array:
-    """Bilinear values (k, n) of maps (k, height, width) at image coordinates (n, 2); NaN outside."""
+    """Bilinear values (k, n) of maps (k, height, width) at image coordinates (n, 2); NaN outside.
+
+    Not by OpenCV's `remap`, which rounds coordinates to 1/32 px.
+    """
     height, width = values.shape[1:]
     x, y = pixels[:, 0] - 0.5, pixels[:, 1] - 0.5
     inside = (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
