@@ -1,0 +1,183 @@
+"""Jacobians against finite differences, and consistency on simulated flights."""
+
+import numpy as np
+import pytest
+
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY as MOUNTING
+from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
+from perilune_shared.geometry.gravity import gravity_mps2
+from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2
+from perilune_train.navigate.filter import measurements
+from perilune_train.navigate.filter.propagate import Increment, InertialNoise, propagated
+from perilune_train.navigate.filter.state import N_ERRORS, State
+from perilune_train.navigate.filter.update import updated
+
+NOISE = InertialNoise.of(GRADES["tactical"])
+QUIET = InertialNoise(0.0, 0.0, 0.0, 0.0)
+
+
+def some_state(rng):
+    turn = matrix_from_rotation_vector(rng.normal(size=3) * 0.1)
+    last = matrix_from_rotation_vector(rng.normal(size=3) * 0.1)
+    return State(
+        3.0,
+        np.array([30.0, -40, 900]),
+        np.array([5.0, 2, -30]),
+        turn,
+        rng.normal(size=3) * 1e-4,
+        rng.normal(size=3) * 1e-2,
+        np.array([25.0, -43, 935]),
+        last,
+        rng.normal(size=5) * 0.1,
+        3.0,
+        np.array([4, 9]),
+        rng.normal(size=(2, 2)),
+        np.eye(N_ERRORS + 4),
+    )
+
+
+def difference(one, other):
+    """The error (31,) that leads from a state to another."""
+    return np.concatenate(
+        [
+            other.position_m - one.position_m,
+            other.velocity_mps - one.velocity_mps,
+            rotation_vectors(one.rotation_site_from_body.T @ other.rotation_site_from_body),
+            other.gyro_bias_radps - one.gyro_bias_radps,
+            other.force_bias_mps2 - one.force_bias_mps2,
+            other.last_position_m - one.last_position_m,
+            rotation_vectors(one.last_rotation_site_from_body.T @ other.last_rotation_site_from_body),
+            other.common_px - one.common_px,
+            [other.ground_m - one.ground_m],
+            (other.offsets_m - one.offsets_m).ravel(),
+        ]
+    )
+
+
+def test_propagation_of_errors_is_the_derivative():
+    state = some_state(np.random.default_rng(0))
+    measured = Increment(3.01, 0.01, np.array([0.02, -0.03, 0.05]), np.array([0.3, -0.2, 1.7]))
+    ends = propagated(state, measured, QUIET)
+    for k in range(N_ERRORS + 4):
+        column = np.zeros(N_ERRORS + 4)
+        column[k] = 1e-5
+        moved = propagated(state.corrected(column, state.covariance), measured, QUIET)
+        found = difference(ends, moved) / 1e-5
+        # With a covariance e_k e_k^T, the new covariance is the outer product of the column.
+        single = State(**{**fields(state), "covariance": np.outer(column, column) * 1e10})
+        outer = propagated(single, measured, QUIET).covariance
+        np.testing.assert_allclose(outer, np.outer(found, found), atol=2e-5)
+
+
+def fields(state):
+    return {name: getattr(state, name) for name in State.__slots__}
+
+
+@pytest.mark.parametrize("kind", ["range", "pose", "motion"])
+def test_measurements_have_the_derivatives_of_their_innovations(kind, monkeypatch):
+    state = some_state(np.random.default_rng(1))
+    caught = {}
+
+    def catch(state, innovation, by_error, noise):
+        caught["innovation"], caught["by_error"] = innovation, by_error
+        return updated(state, innovation, by_error, noise)
+
+    monkeypatch.setattr(measurements, "updated", catch)
+
+    def measure(of):
+        if kind == "range":
+            measurements.range_update(of, 880.0, 4.0, 2.0)
+        elif kind == "pose":
+            pose = MOUNTING @ of_true.rotation_site_from_body.T
+            measurements.pose_update(of, np.array([32.0, -41, 903]), pose, np.eye(6), MOUNTING)
+        else:
+            rotations = of_true.last_rotation_site_from_body, of_true.rotation_site_from_body
+            first, second = (MOUNTING @ rotation.T for rotation in rotations)
+            moved = first @ (of_true.position_m - of_true.last_position_m)
+            measurements.motion_update(of, moved, second @ first.T, np.eye(6), MOUNTING)
+        return dict(caught)
+
+    of_true = state
+    here = measure(state)
+    for k in range(N_ERRORS):
+        column = np.zeros(N_ERRORS + 4)
+        column[k] = 1e-6
+        there = measure(state.corrected(column, state.covariance))
+        found = (here["innovation"] - there["innovation"]) / 1e-6
+        scale = max(1.0, np.abs(here["by_error"]).max())
+        np.testing.assert_allclose(here["by_error"][:, k], found, atol=1e-4 * scale)
+
+
+def started(position, velocity, turn, sigmas, rng):
+    """The state of a lander whose position, velocity and attitude are off by their deviations."""
+    off = sigmas[:9] * rng.normal(size=9)
+    turned = turn @ matrix_from_rotation_vector(off[6:])
+    return State.starting(position + off[:3], velocity + off[3:6], turned, sigmas, 0.0)
+
+
+def fly(seed, with_motion):
+    """Simulate a flight with known errors and filter it; returns the normalised errors squared of the poses."""
+    rng, grade = np.random.default_rng(seed), GRADES["tactical"]
+    step, n_steps = 0.02, 1500
+    gyro = np.radians(grade.gyro_bias_deg_per_h) / HOUR_S * rng.normal(size=3)
+    force = grade.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000 * rng.normal(size=3)
+    position, velocity, turn = np.array([0.0, 0, 1400]), np.array([8.0, 3, -35]), np.eye(3)
+    sigmas = np.concatenate(
+        [
+            np.full(3, 20.0),
+            np.full(3, 1.0),
+            np.full(3, np.radians(0.5)),
+            np.full(3, np.radians(grade.gyro_bias_deg_per_h) / HOUR_S),
+            np.full(3, grade.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000),
+        ]
+    )
+    state = started(position, velocity, turn, sigmas, rng)
+    found, innovations = [], []
+    root = np.sqrt(step)
+    last = position, turn
+    for k in range(1, n_steps + 1):
+        rate = 0.02 * np.array([np.sin(k * step), np.cos(0.7 * k * step), 0.3])
+        thrust = np.array([0.2 * np.sin(0.5 * k * step), 0.1, 1.9])
+        middle = turn @ matrix_from_rotation_vector(rate * step / 2)
+        acceleration = middle @ thrust + gravity_mps2(position[2])
+        position = position + velocity * step + acceleration * step**2 / 2
+        velocity, turn = velocity + acceleration * step, turn @ matrix_from_rotation_vector(rate * step)
+        gyro = gyro + np.sqrt(NOISE.gyro_bias) * root * rng.normal(size=3)
+        force = force + np.sqrt(NOISE.force_bias) * root * rng.normal(size=3)
+        seen_rate = rate + gyro + np.sqrt(NOISE.turn) / root * rng.normal(size=3)
+        seen_force = thrust + force + np.sqrt(NOISE.velocity) / root * rng.normal(size=3)
+        state = propagated(state, Increment(k * step, step, seen_rate, seen_force), NOISE)
+        if k % 50:
+            continue
+        camera = MOUNTING @ turn.T
+        if with_motion:
+            noise = np.diag([2e-4] * 3 + [0.2] * 3) ** 2
+            error = np.sqrt(np.diag(noise)) * rng.normal(size=6)
+            first = MOUNTING @ last[1].T
+            turned = matrix_from_rotation_vector(error[:3]) @ camera @ first.T
+            moved = first @ (position - last[0]) - turned.T @ error[3:]
+            done = measurements.motion_update(state, moved, turned, noise, MOUNTING)
+            innovations.append(done.innovation_squared)
+            state = done.state
+        if k % 250 == 0 or not with_motion:
+            noise = np.diag([3.0] * 3 + [1e-3] * 3) ** 2
+            error = np.sqrt(np.diag(noise)) * rng.normal(size=6)
+            pose = matrix_from_rotation_vector(error[3:]) @ camera
+            done = measurements.pose_update(state, position + error[:3], pose, noise, MOUNTING)
+            innovations.append(done.innovation_squared)
+            state = done.state
+        done = measurements.range_update(state, position[2] / turn[2, 2] + 2 * rng.normal(), 0.0, 2.0)
+        state = done.state
+        state, last = state.with_frame(), (position, turn)
+        error = state.pose_error(position, turn)
+        own = [*range(3), *range(6, 9)]
+        found.append(error @ np.linalg.solve(state.covariance[np.ix_(own, own)], error))
+    return np.mean(found), np.mean(innovations)
+
+
+@pytest.mark.parametrize("with_motion", [False, True])
+def test_errors_have_the_stated_size(with_motion):
+    squared, innovation = np.mean([fly(seed, with_motion) for seed in range(20)], axis=0)
+    # Poses along a flight are correlated: 20 flights have about 60 independent ones, a deviation of 0.45.
+    assert 4.8 < squared < 7.2
+    assert 5.4 < innovation < 6.6

@@ -1,0 +1,132 @@
+"""A simulated descent over craters whose places are wrong, from inertial measurements, ranges and sightings."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from tests.train.navigate.craters.crater_world import CAMERA, ground_m, sighted, world
+
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY as MOUNTING
+from perilune_shared.geometry.gravity import gravity_mps2
+from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2
+from perilune_train.navigate.craters.catalogue import CatalogueErrors, with_errors
+from perilune_train.navigate.craters.projection import Pose
+from perilune_train.navigate.craters.sightings import STATIC_SHARE, Sightings
+from perilune_train.navigate.filter.lander import Lander, Surroundings
+from perilune_train.navigate.filter.propagate import Increment, InertialNoise
+from perilune_train.navigate.filter.state import State
+
+GRADE = GRADES["tactical"]
+NOISE = InertialNoise.of(GRADE)
+WORLD = world()
+STEP_S = 0.05
+POSITION_M, VELOCITY_MPS = np.array([-300.0, 100, 1400]), np.array([9.0, -4, -35])
+NOTHING = Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+
+
+def lander(seed, off_m=20.0, claimed_m=20.0):
+    """A lander whose start is off, its catalogue with errors, and the generator of its measurements."""
+    rng = np.random.default_rng(seed)
+    biases = np.radians(GRADE.gyro_bias_deg_per_h) / HOUR_S, GRADE.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
+    sigmas = np.repeat([claimed_m, 1.0, np.radians(0.3), *biases], 3)
+    start = State.starting(
+        POSITION_M + off_m * rng.normal(size=3), VELOCITY_MPS + rng.normal(size=3), np.eye(3), sigmas, 5.0
+    )
+    catalogue = with_errors(WORLD, CatalogueErrors(), rng)
+    return Lander(start, NOISE, Surroundings(CAMERA, MOUNTING, catalogue, 2.0, 5.0)), rng, biases
+
+
+def flown(craft, rng, biases, see=lambda k, seen: seen, seconds=30, feel=lambda k: True):
+    """Fly a straight line; returns errors of position (n, 3), normalised errors squared (n,), and statuses by frame."""
+    # What repeats with a crater is drawn once.
+    shift = STATIC_SHARE * WORLD.radius_m[:, None] * rng.normal(size=(len(WORLD), 3)) * [1, 1, 0]
+    apparent = dataclasses.replace(WORLD, centre_m=WORLD.centre_m + shift)
+    gyro, force = (bias * rng.normal(size=3) for bias in biases)
+    noise = np.sqrt([NOISE.turn, NOISE.velocity]) / np.sqrt(STEP_S)
+    position, errors, squared, status = POSITION_M, [], [], []
+    for k in range(round(seconds / STEP_S)):
+        if k * STEP_S % 1 == 0:
+            seen = sighted(apparent, Pose(position, MOUNTING), rng, static=False)
+            craft.sightings(see(k * STEP_S, seen))
+            errors.append(craft.state.position_m - position)
+            own = [*range(3), *range(6, 9)]
+            error = craft.state.pose_error(position, np.eye(3))
+            squared.append(error @ np.linalg.solve(craft.state.covariance[np.ix_(own, own)], error))
+            status.append(craft.status)
+        position = position + VELOCITY_MPS * STEP_S
+        rate, lift = gyro + noise[0] * rng.normal(size=3), force + noise[1] * rng.normal(size=3)
+        if feel(k * STEP_S):
+            lift = lift - gravity_mps2(position[2])
+            craft.inertial(Increment((k + 1) * STEP_S, STEP_S, rate, lift))
+            craft.range(position[2] - ground_m(position) + 2 * rng.normal())
+    return np.array(errors), np.array(squared), status
+
+
+def test_errors_are_small_and_of_the_stated_size():
+    squared, last = [], []
+    for seed in range(8):
+        errors, normalised, status = flown(*lander(seed))
+        assert set(status) == {"tracking"}
+        squared.append(normalised.mean())
+        last.append(np.linalg.norm(errors[-1]))
+    # Errors along a descent hang together: 8 descents have about 16 independent ones of 6 parts, a deviation of 0.9.
+    assert 3.3 < np.mean(squared) < 8.7
+    assert np.mean(last) < 1.5
+
+
+def test_an_outage_of_ten_seconds():
+    _, normalised, status = flown(*lander(1), see=lambda t, seen: NOTHING if 8 <= t < 18 else seen)
+    assert status[:8] == ["tracking"] * 8
+    assert "tracking" not in status[8:18]
+    assert status[18:] == ["tracking"] * 12
+    assert normalised.max() < 40
+
+
+def test_a_start_that_is_300_m_off_is_noticed():
+    craft, rng, biases = lander(2, off_m=0.0, claimed_m=15.0)
+    craft.state = dataclasses.replace(craft.state, position_m=craft.state.position_m + np.array([300.0, 0, 0]))
+    errors, _, status = flown(craft, rng, biases)
+    wrong = np.linalg.norm(errors, axis=1) > 20
+    # Whenever it is wrong it does not claim to track.
+    assert not any(status[k] == "tracking" for k in np.flatnonzero(wrong))
+
+
+def test_half_of_the_sightings_false():
+    def see(t, seen):
+        rng = np.random.default_rng(int(t))
+        n = len(seen)
+        return Sightings(
+            np.concatenate([seen.centre_px, rng.uniform(0, 256, (n, 2))]),
+            np.concatenate([seen.radius_px, rng.permutation(seen.radius_px)]),
+            np.concatenate([seen.score, seen.score]),
+        )
+
+    errors, normalised, status = flown(*lander(3), see=see)
+    assert set(status[2:]) == {"tracking"}
+    assert np.linalg.norm(errors[2:], axis=1).max() < 12
+    assert normalised[2:].mean() < 14
+
+
+def test_a_gap_of_the_inertial_unit_makes_the_state_uncertain():
+    whole, gap = lander(4), lander(4)
+    flown(*whole, see=lambda t, seen: seen if t < 5 else NOTHING, seconds=9)
+    flown(*gap, see=lambda t, seen: seen if t < 5 else NOTHING, seconds=9, feel=lambda t: not 6 <= t < 8)
+    sigma = [np.sqrt(np.trace(one[0].state.covariance[:3, :3])) for one in (whole, gap)]
+    assert sigma[1] > 2 * sigma[0]
+    assert np.isfinite(gap[0].state.covariance).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_senseless_measurements_change_nothing(value):
+    craft, *_ = lander(5)
+    before = craft.state
+    assert not craft.range(value)
+    assert not craft.range(-3.0)
+    craft.inertial(Increment(0.05, 0.05, np.full(3, value), np.zeros(3)))
+    craft.inertial(Increment(-1.0, 0.05, np.zeros(3), np.zeros(3)))
+    assert craft.state is before
+
+
+def test_no_sightings_for_long_is_lost():
+    _, _, status = flown(*lander(6), see=lambda t, seen: NOTHING, seconds=20)
+    assert status[-1] == "lost"

@@ -1,0 +1,1 @@
+"""Absolute navigation by craters: a catalogue, matching detections to it, and the pose that follows."""

@@ -1,0 +1,151 @@
+"""The filter in flight: one call for each measurement, in the order of time."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+from perilune_train.navigate.craters.catalogue import Catalogue
+from perilune_train.navigate.craters.fix import PosePrior
+from perilune_train.navigate.craters.locate import Located, locate
+from perilune_train.navigate.craters.projection import Pose
+from perilune_train.navigate.craters.sightings import Sightings
+from perilune_train.navigate.filter.measurements import craters_update, pose_update, range_update
+from perilune_train.navigate.filter.propagate import Increment, InertialNoise, over_new_ground, propagated
+from perilune_train.navigate.filter.state import ATTITUDE, POSITION, VELOCITY, State
+
+Status = Literal["tracking", "coasting", "lost"]
+"""tracking: the last frame was matched to craters; coasting: it was not; lost: none was for 15 s, or a fix contradicts
+the state."""
+_LOST_S = 15.0
+_CONTRADICTIONS = 2
+"""Fixes in a row that the gate refuses, after which the filter starts again from a fix."""
+_GAP_S = 0.05
+_UNKNOWN_MPS2, _UNKNOWN_RADPS = 2.0, 0.05
+"""Standard deviations of the motion while inertial measurements are missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the lander knows of its camera and of the ground."""
+
+    camera: Camera
+    """Intrinsics."""
+    rotation_camera_from_body: Array
+    """Mounting of the camera (3, 3)."""
+    catalogue: Catalogue
+    """Craters of the landing site."""
+    range_sigma_m: float
+    """Standard deviation of a range."""
+    relief_m: float
+    """Standard deviation of the ground's height about that of the nearest craters."""
+
+
+class Lander:
+    """State and status of a lander; every method takes one measurement."""
+
+    def __init__(self, state: State, noise: InertialNoise, around: Surroundings):
+        self.state, self.status = state, "coasting"
+        self._noise, self._around = noise, around
+        self._contradictions = 0
+        self._matched_s = state.time_s
+
+    status: Status
+
+    def inertial(self, measured: Increment) -> None:
+        """Propagate to the end of an inertial measurement; one that is older, or not finite, is ignored."""
+        self.until(measured.time_s, measured)
+
+    def until(self, time_s: float, measured: Increment) -> None:
+        """Propagate to a time within an inertial measurement."""
+        if not (np.isfinite(measured.angular_rate_radps).all() and np.isfinite(measured.specific_force_mps2).all()):
+            return
+        start_s = min(measured.time_s - measured.interval_s, time_s)
+        if start_s > self.state.time_s + _GAP_S:
+            self._coast(start_s)
+        step_s = time_s - self.state.time_s
+        if step_s > 0:
+            state = propagated(self.state, replace(measured, time_s=time_s, interval_s=step_s), self._noise)
+            self.state = over_new_ground(state, step_s, self._around.relief_m)
+
+    def range(self, range_m: float) -> bool:
+        """Update by a range at the present time; whether it was accepted. One that is no length is not."""
+        if not (np.isfinite(range_m) and range_m > 0):
+            return False
+        done = range_update(self.state, range_m, self._ground_m(), self._around.range_sigma_m)
+        self.state = done.state
+        return done.accepted
+
+    def sightings(self, seen: Sightings) -> Located | None:
+        """Update by the craters of a frame at the present time; the fix, if one was accepted."""
+        found = locate(seen, self._around.catalogue, self._around.camera, self._expected())
+        if found is None:
+            self._unmatched()
+            return None
+        fix, mounting = found.fix, self._around.rotation_camera_from_body
+        pose = fix.pose.position_m, fix.pose.rotation_camera_from_site
+        done = pose_update(self.state, *pose, fix.covariance, mounting)
+        if not done.accepted:
+            self._contradictions += 1
+            if self._contradictions < _CONTRADICTIONS:
+                self._unmatched()
+                return None
+            self._restart(found)
+        else:
+            around = self._around
+            self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
+        self._contradictions, self._matched_s, self.status = 0, self.state.time_s, "tracking"
+        return found
+
+    def _unmatched(self) -> None:
+        late = self.state.time_s - self._matched_s > _LOST_S
+        self.status = "lost" if late or self._contradictions else "coasting"
+
+    def _restart(self, found: Located) -> None:
+        """Take position and attitude from a fix; the velocity becomes uncertain by what the position was wrong."""
+        fix, mounting = found.fix, self._around.rotation_camera_from_body
+        state = self.state.with_craters(np.zeros(0, int), np.zeros(0))
+        covariance = state.covariance.copy()
+        for part in (POSITION, ATTITUDE):
+            covariance[part], covariance[:, part] = 0, 0
+        covariance[VELOCITY, VELOCITY] += np.eye(3) * 5.0**2
+        body = np.zeros((6, 6))
+        body[:3, :3], body[3:, 3:] = np.eye(3), -mounting.T
+        own = body @ fix.covariance @ body.T
+        covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = own[:3, :3], own[3:, 3:]
+        covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = own[:3, 3:], own[3:, :3]
+        self.state = replace(
+            state,
+            position_m=fix.pose.position_m,
+            rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ mounting,
+            covariance=covariance,
+        )
+
+    def _coast(self, until_s: float) -> None:
+        """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""
+        gap_s, state = until_s - self.state.time_s, self.state
+        position = state.position_m + state.velocity_mps * gap_s
+        change = np.eye(len(state.covariance))
+        change[POSITION, VELOCITY] = gap_s * np.eye(3)
+        covariance = change @ state.covariance @ change.T
+        covariance[VELOCITY, VELOCITY] += np.eye(3) * (_UNKNOWN_MPS2 * gap_s) ** 2
+        covariance[POSITION, POSITION] += np.eye(3) * (_UNKNOWN_MPS2 * gap_s**2 / 2) ** 2
+        covariance[ATTITUDE, ATTITUDE] += np.eye(3) * (_UNKNOWN_RADPS * gap_s) ** 2
+        self.state = replace(state, time_s=until_s, position_m=position, covariance=covariance)
+
+    def _expected(self) -> PosePrior:
+        """The camera's expected pose, with its covariance as of a step of `Pose`."""
+        mounting, state = self._around.rotation_camera_from_body, self.state
+        own = [*range(3), *range(6, 9)]
+        to_camera = np.zeros((6, 6))
+        to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -mounting
+        covariance = to_camera @ state.covariance[np.ix_(own, own)] @ to_camera.T
+        return PosePrior(Pose(state.position_m, mounting @ state.rotation_site_from_body.T), covariance)
+
+    def _ground_m(self) -> float:
+        """Height of the ground below, from the nearest craters of the catalogue."""
+        centre = self._around.catalogue.centre_m
+        distance = np.linalg.norm(centre[:, :2] - self.state.position_m[:2], axis=1)
+        return float(np.median(centre[np.argsort(distance)[:10], 2]))

@@ -1,0 +1,114 @@
+"""Propagation of the state by one inertial measurement (strapdown integration, e.g. Sola 2017, arXiv 1711.02508)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
+from perilune_shared.geometry.gravity import gravity_mps2
+from perilune_shared.geometry.inertial_grades import HOUR_S, STANDARD_GRAVITY_MPS2, InertialErrors
+from perilune_train.navigate.filter.state import (
+    ATTITUDE,
+    FORCE_BIAS,
+    GROUND,
+    GYRO_BIAS,
+    POSITION,
+    VELOCITY,
+    State,
+)
+
+_GROUND_S = 10.0
+"""Time in which the ground below a lander becomes another, at 10 to 30 m/s over ground."""
+_CHANGED = 15
+"""Parts of the error state that change between measurements: all but the last frame's pose and the offsets."""
+
+
+@dataclass(frozen=True, slots=True)
+class Increment:
+    """One measurement of an inertial unit: means over an interval."""
+
+    time_s: float
+    """End of the interval, seconds since the first frame."""
+    interval_s: float
+    """Length of the interval, seconds."""
+    angular_rate_radps: Array
+    """Mean angular rate (3,), O_B."""
+    specific_force_mps2: Array
+    """Mean specific force (3,), O_B."""
+
+
+@dataclass(frozen=True, slots=True)
+class InertialNoise:
+    """Variances that a unit adds in one second, per axis."""
+
+    turn: float
+    """Of the attitude, square radians."""
+    velocity: float
+    """Of the velocity, square metres per square second."""
+    gyro_bias: float
+    """Of the gyroscope's bias."""
+    force_bias: float
+    """Of the accelerometer's bias."""
+
+    @classmethod
+    def of(cls, errors: InertialErrors) -> "InertialNoise":
+        """From the errors of a grade."""
+        per_s, milli_g = np.radians(1) / HOUR_S, STANDARD_GRAVITY_MPS2 / 1000
+        return cls(
+            np.radians(errors.angular_random_walk_deg) ** 2 / HOUR_S,
+            errors.velocity_random_walk_mps**2 / HOUR_S,
+            (errors.gyro_bias_walk_deg_per_h * per_s) ** 2 / HOUR_S,
+            (errors.accelerometer_bias_walk_mg * milli_g) ** 2 / HOUR_S,
+        )
+
+
+def propagated(state: State, measured: Increment, noise: InertialNoise) -> State:
+    """The state at the end of the interval of a measurement."""
+    step = measured.interval_s
+    rate = measured.angular_rate_radps - state.gyro_bias_radps
+    force = measured.specific_force_mps2 - state.force_bias_mps2
+    start = state.rotation_site_from_body
+    middle = start @ matrix_from_rotation_vector(rate * step / 2)
+    acceleration = middle @ force + gravity_mps2(state.position_m[2])
+    turn = matrix_from_rotation_vector(rate * step)
+    # x(t + step) by x(t): the error of the attitude turns the force, and that of the biases adds up.
+    change = np.eye(_CHANGED)
+    by_turn = -middle @ _cross(force)
+    change[POSITION, VELOCITY] = step * np.eye(3)
+    change[POSITION, ATTITUDE], change[VELOCITY, ATTITUDE] = by_turn * step**2 / 2, by_turn * step
+    change[POSITION, GYRO_BIAS], change[VELOCITY, GYRO_BIAS] = -by_turn * step**3 / 4, -by_turn * step**2 / 2
+    change[POSITION, FORCE_BIAS], change[VELOCITY, FORCE_BIAS] = -middle * step**2 / 2, -middle * step
+    change[ATTITUDE, ATTITUDE], change[ATTITUDE, GYRO_BIAS] = turn.T, -step * np.eye(3)
+    covariance = state.covariance.copy()
+    covariance[:_CHANGED] = change @ covariance[:_CHANGED]
+    covariance[:, :_CHANGED] = covariance[:, :_CHANGED] @ change.T
+    for part, variance in (
+        (VELOCITY, noise.velocity),
+        (ATTITUDE, noise.turn),
+        (GYRO_BIAS, noise.gyro_bias),
+        (FORCE_BIAS, noise.force_bias),
+    ):
+        covariance[part, part] += variance * step * np.eye(3)
+    return replace(
+        state,
+        time_s=measured.time_s,
+        position_m=state.position_m + state.velocity_mps * step + acceleration * step**2 / 2,
+        velocity_mps=state.velocity_mps + acceleration * step,
+        rotation_site_from_body=start @ turn,
+        covariance=covariance,
+    )
+
+
+def _cross(vector: Array) -> Array:
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def over_new_ground(state: State, step_s: float, relief_m: float) -> State:
+    """The state after a time in which the ground below changes, as a Gauss-Markov process."""
+    kept = np.exp(-step_s / _GROUND_S)
+    covariance = state.covariance.copy()
+    covariance[GROUND] *= kept
+    covariance[:, GROUND] *= kept
+    covariance[GROUND, GROUND] += relief_m**2 * (1 - kept**2)
+    return replace(state, ground_m=kept * state.ground_m, covariance=covariance)

@@ -1,0 +1,136 @@
+"""State of the lander, and small errors of it.
+
+The error state begins with 21 parts: shift and change of velocity in O_L (metres, metres per second), turn of the body
+from the right (radians, O_B), errors of the gyroscope's and the accelerometer's bias, and shift and turn of the pose at
+the last frame, which measurements of relative motion refer to (Roumeliotis & Burdick 2002, doi
+10.1109/ROBOT.2002.1014801). Behind them come five numbers of an error that all sightings of craters share, the height
+of the ground below, and an offset over ground of every crater in view. Errors of the catalogue, of the detector and of
+the ground's height repeat from frame to frame; taken for noise, they would make the filter sure of what it does not
+know.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
+
+POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
+GYRO_BIAS, FORCE_BIAS = slice(9, 12), slice(12, 15)
+LAST_POSITION, LAST_ATTITUDE = slice(15, 18), slice(18, 21)
+COMMON, GROUND = slice(21, 26), slice(26, 27)
+N_ERRORS = 27
+"""Parts of the error state without the craters."""
+
+_COMMON_SIGMAS_PX = np.array([0.08, 0.08, 0.15, 0.2, 0.2])
+"""Deviations of what sightings share, from the validation scenes of `shipped-nav`."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Estimate of the lander's motion and of the errors of its inertial unit."""
+
+    time_s: float
+    """Seconds since the first frame."""
+    position_m: Array
+    """Position (3,), O_L."""
+    velocity_mps: Array
+    """Velocity (3,), O_L."""
+    rotation_site_from_body: Array
+    """Attitude (3, 3)."""
+    gyro_bias_radps: Array
+    """Bias of the gyroscope (3,), O_B."""
+    force_bias_mps2: Array
+    """Bias of the accelerometer (3,), O_B."""
+    last_position_m: Array
+    """Position (3,) at the last frame."""
+    last_rotation_site_from_body: Array
+    """Attitude (3, 3) at the last frame."""
+    common_px: Array
+    """What all sightings share (5,), pixels: as `common_pattern` has it."""
+    ground_m: float
+    """Height of the ground below, by that of the nearest craters of the catalogue."""
+    craters: NDArray[np.integer]
+    """Craters in view (n,): places in the catalogue."""
+    offsets_m: Array
+    """How far they appear from their place in the catalogue (n, 2), O_L, x and y."""
+    covariance: Array
+    """Covariance of the error state (27 + 2 n, 27 + 2 n)."""
+
+    @classmethod
+    def starting(
+        cls, position_m: Array, velocity_mps: Array, rotation_site_from_body: Array, sigmas: Array, relief_m: float
+    ) -> "State":
+        """The state at the first frame.
+
+        `sigmas` (15,) are the deviations of the first 15 errors; `relief_m` is that of the ground's height.
+        """
+        none = np.zeros(3)
+        pose = position_m, rotation_site_from_body
+        covariance = np.diag(np.square(np.concatenate([sigmas, np.zeros(6), _COMMON_SIGMAS_PX, [relief_m]])))
+        state = cls(
+            0.0, position_m, velocity_mps, rotation_site_from_body, none, none, *pose,
+            np.zeros(5), 0.0, np.zeros(0, int), np.zeros((0, 2)), covariance,
+        )  # fmt: skip
+        return state.with_frame()
+
+    def corrected(self, error: Array, covariance: Array) -> "State":
+        """The state with an estimated error (27 + 2 n,) removed, and its new covariance."""
+        return State(
+            self.time_s,
+            self.position_m + error[POSITION],
+            self.velocity_mps + error[VELOCITY],
+            self.rotation_site_from_body @ matrix_from_rotation_vector(error[ATTITUDE]),
+            self.gyro_bias_radps + error[GYRO_BIAS],
+            self.force_bias_mps2 + error[FORCE_BIAS],
+            self.last_position_m + error[LAST_POSITION],
+            self.last_rotation_site_from_body @ matrix_from_rotation_vector(error[LAST_ATTITUDE]),
+            self.common_px + error[COMMON],
+            self.ground_m + float(error[GROUND][0]),
+            self.craters,
+            self.offsets_m + error[N_ERRORS:].reshape(-1, 2),
+            (covariance + covariance.T) / 2,
+        )
+
+    def with_frame(self) -> "State":
+        """The state with its present pose as that of the last frame."""
+        copy = np.eye(len(self.covariance))
+        copy[LAST_POSITION], copy[LAST_ATTITUDE] = copy[POSITION].copy(), copy[ATTITUDE].copy()
+        return replace(
+            self,
+            last_position_m=self.position_m,
+            last_rotation_site_from_body=self.rotation_site_from_body,
+            covariance=copy @ self.covariance @ copy.T,
+        )
+
+    def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
+        """The state with the offsets of these craters alone (n,), which have a deviation (n,) where they are new."""
+        place = {int(crater): k for k, crater in enumerate(self.craters)}
+        before = np.array([place.get(int(crater), -1) for crater in craters], int)
+        known = np.flatnonzero(before >= 0)
+        old = np.concatenate([np.arange(N_ERRORS), (N_ERRORS + 2 * before[known, None] + [0, 1]).ravel()])
+        new = np.concatenate([np.arange(N_ERRORS), (N_ERRORS + 2 * known[:, None] + [0, 1]).ravel()])
+        covariance = np.diag(np.concatenate([np.zeros(N_ERRORS), np.repeat(sigma_m**2, 2)]))
+        covariance[np.ix_(new, new)] = self.covariance[np.ix_(old, old)]
+        offsets = np.zeros((len(craters), 2))
+        offsets[known] = self.offsets_m[before[known]]
+        return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
+
+    def pose_error(self, position_m: Array, rotation_site_from_body: Array) -> Array:
+        """Shift and turn (6,) from the estimate to a true pose."""
+        turn = rotation_vectors(self.rotation_site_from_body.T @ rotation_site_from_body)
+        return np.concatenate([position_m - self.position_m, turn])
+
+
+def common_pattern(ray: Array) -> Array:
+    """Displacements (n, 2, 5) in the image by what sightings share, at rays (n, 2) on the plane at depth 1.
+
+    A shift, a scale and two parts that grow with the square of the distance from the middle: a pose that is off in
+    position, altitude and tilt displaces craters likewise, and no frame can tell one from the other.
+    """
+    x, y = ray.T
+    none, one = np.zeros_like(x), np.ones_like(x)
+    return np.stack(
+        [np.stack([one, none, x, x**2, x * y], axis=1), np.stack([none, one, y, x * y, y**2], axis=1)], axis=1
+    )
