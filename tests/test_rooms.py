@@ -32,7 +32,8 @@ ROOMS = {
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
     ),
     "train/perilune_train/navigate": (
-        "config geometry data network relative craters filter evaluate train evaluate_run compare_runs benchmark cli"
+        "config geometry data network relative craters filter fly evaluate train evaluate_run compare_runs "
+        "benchmark cli"
     ),
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""

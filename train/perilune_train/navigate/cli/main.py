@@ -5,10 +5,12 @@ import typer
 from perilune_train.navigate.cli.benchmark import benchmark
 from perilune_train.navigate.cli.compare import compare
 from perilune_train.navigate.cli.evaluate import evaluate
+from perilune_train.navigate.cli.fly import fly
 from perilune_train.navigate.cli.train import train
+from perilune_train.navigate.cli.unpack import unpack
 
 app = typer.Typer(
-    help="Landing navigation: train the networks, evaluate a run on any dataset, compare runs.",
+    help="Landing navigation: train the networks, evaluate and compare runs, fly the filter over a descent.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -16,3 +18,5 @@ app.command("train")(train)
 app.command("evaluate")(evaluate)
 app.command("benchmark")(benchmark)
 app.command("compare")(compare)
+app.command("fly")(fly)
+app.command("unpack")(unpack)

@@ -1,6 +1,6 @@
 """One descent through the filter: measurements in the order of time, an estimate at every frame."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,23 +58,28 @@ class Estimate:
     """The fix that was accepted."""
 
 
-def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: list[Sightings]) -> Iterator[Estimate]:
-    """Run a filter over a descent; `seen` holds the sightings of the frames at increasing times (n,)."""
+def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Iterable[Sightings]) -> Iterator[Estimate]:
+    """Run a filter over a descent.
+
+    `seen` has the sightings of the frames at increasing times (n,); those of a frame are asked for when it is its turn.
+    Inertial measurements that are not finite are missing ones; what was measured before the lander's state is ignored.
+    """
     times = np.concatenate([instruments.range_time_s, frame_time_s])
     is_frame = np.concatenate([np.zeros(len(instruments.range_time_s), bool), np.ones(len(frame_time_s), bool)])
     place = np.concatenate([np.arange(len(instruments.range_time_s)), np.arange(len(frame_time_s))])
     # At the same time, the range is first.
     order = np.lexsort([is_frame, times])
-    waiting = iter(instruments.inertial)
+    sightings = iter(seen)
+    waiting = (measured for measured in instruments.inertial if measured.is_finite)
     following = next(waiting, None)
-    for k in order:
+    for k in order[times[order] >= lander.state.time_s - _SAME_S]:
         while following is not None and following.time_s <= times[k] + _SAME_S:
             lander.inertial(following)
             following = next(waiting, None)
-        if following is not None and times[k] > lander.state.time_s + _SAME_S:
-            lander.until(times[k], following)
+        if times[k] > lander.state.time_s + _SAME_S:
+            lander.until(times[k], following) if following is not None else lander.coast(times[k])
         if is_frame[k]:
-            located = lander.sightings(seen[place[k]])
+            located = lander.sightings(next(sightings))
             yield Estimate(int(place[k]), lander.state, lander.status, located)
         else:
             lander.range(float(instruments.range_m[place[k]]))

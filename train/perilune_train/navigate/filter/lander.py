@@ -60,11 +60,11 @@ class Lander:
 
     def until(self, time_s: float, measured: Increment) -> None:
         """Propagate to a time within an inertial measurement."""
-        if not (np.isfinite(measured.angular_rate_radps).all() and np.isfinite(measured.specific_force_mps2).all()):
+        if not measured.is_finite:
             return
         start_s = min(measured.time_s - measured.interval_s, time_s)
         if start_s > self.state.time_s + _GAP_S:
-            self._coast(start_s)
+            self.coast(start_s)
         step_s = time_s - self.state.time_s
         if step_s > 0:
             state = propagated(self.state, replace(measured, time_s=time_s, interval_s=step_s), self._noise)
@@ -123,7 +123,7 @@ class Lander:
             covariance=covariance,
         )
 
-    def _coast(self, until_s: float) -> None:
+    def coast(self, until_s: float) -> None:
         """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""
         gap_s, state = until_s - self.state.time_s, self.state
         position = state.position_m + state.velocity_mps * gap_s

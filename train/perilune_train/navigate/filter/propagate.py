@@ -36,6 +36,11 @@ class Increment:
     specific_force_mps2: Array
     """Mean specific force (3,), O_B."""
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all of it was measured."""
+        return bool(np.isfinite(self.angular_rate_radps).all() and np.isfinite(self.specific_force_mps2).all())
+
 
 @dataclass(frozen=True, slots=True)
 class InertialNoise:
