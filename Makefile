@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-suppress bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-suppress bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -124,6 +124,10 @@ ablate-detect: train-detect ## train with one change each (no attention, plain C
 train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect
 	@$(BIN)/perilune-train navigate train $(TRAIN) --dataset "$(DATA)/nav" $(OVER)
+
+navigate: nav-frames ## fly all methods of navigation over the test descents; writes runs/navigate/<name>-methods
+	@$(BIN)/perilune-train navigate methods --dataset "$(DATA)/nav" --out "$(RUNS)/navigate/$(NAME)-methods" \
+	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)")
 
 # Each network without attention; the stack network starts from the detector without attention, if there is one.
 train-nav-baseline: nav-frames ## the same networks without attention, into <name>-none and <name>-none-stack
@@ -216,9 +220,9 @@ bench-train: detect-frames ## training speed, compared with training from memory
 bench-transfer: detect-frames ## compare four ways to start from a frozen backbone; writes runs/bench/transfer.json
 	@$(BIN)/python -m benchmarks.train.transfer --dataset "$(DATA)/detect"
 
-bench-landing: setup ## errors of poses from craters and of the filter on the validation descents of shipped-nav; writes runs/bench/landing.json
+bench-landing: setup ## all methods of navigation on the validation descents of shipped-nav; writes runs/bench/landing
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
-	@$(BIN)/python -m benchmarks.train.landing data/shipped/nav val
+	@$(BIN)/perilune-train navigate methods --dataset data/shipped/nav --split val --allow-overlap --out runs/bench/landing
 
 bench-suppress: setup ## time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress

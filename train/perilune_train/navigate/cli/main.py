@@ -6,6 +6,7 @@ from perilune_train.navigate.cli.benchmark import benchmark
 from perilune_train.navigate.cli.compare import compare
 from perilune_train.navigate.cli.evaluate import evaluate
 from perilune_train.navigate.cli.fly import fly
+from perilune_train.navigate.cli.methods import methods
 from perilune_train.navigate.cli.train import train
 from perilune_train.navigate.cli.unpack import unpack
 
@@ -18,5 +19,6 @@ app.command("train")(train)
 app.command("evaluate")(evaluate)
 app.command("benchmark")(benchmark)
 app.command("compare")(compare)
+app.command("methods")(methods)
 app.command("fly")(fly)
 app.command("unpack")(unpack)

@@ -1,0 +1,45 @@
+"""All methods over a rendered dataset, from the command to its page."""
+
+import numpy as np
+import pandas as pd
+from tests.helpers import in_process
+
+from perilune_train.cli import main
+
+
+def methods(*arguments):
+    return in_process.call(main, "navigate", "methods", *arguments)
+
+
+def test_a_page_with_every_method(tiny, tmp_path):
+    out = tmp_path / "methods"
+    done = methods("--dataset", tiny / "nav", "--out", out)
+    assert done.returncode == 0, done.stderr
+    rows = pd.read_parquet(out / "navigation.parquet").set_index("method")
+    expected = {"warp", "klt", "alignment", "alignment_gyroscope", "nominal", "fix", "filter", "filter, star tracker"}
+    assert expected <= set(rows.index)
+    page = (out / "methods.md").read_text(encoding="utf-8")
+    assert all(f"`{method}`" in page for method in rows.index)
+    assert "terrain" not in page.split("##")[0]
+    frames = pd.read_parquet(out / "frames.parquet")
+    flown = frames[frames["method"] == "filter"]
+    assert len(flown) == rows.loc["filter", "n_frames"]
+    assert np.isclose(np.sqrt(np.mean(flown["error_m"] ** 2)), rows.loc["filter", "position_rmse_m"])
+    for name in ("altitude.png", "flights.png"):
+        assert (out / name).stat().st_size > 10_000
+        assert f"]({name})" in page
+    again = methods("--dataset", tiny / "nav", "--out", out)
+    assert again.returncode == 2
+    assert len(again.stderr.strip().splitlines()) == 1
+
+
+def test_mistakes_get_one_line(tmp_path):
+    for arguments, words in (
+        (["--dataset", tmp_path / "nowhere"], ["nowhere", "no such file"]),
+        (["--dataset", tmp_path, "--split", "tset"], ["--split", "tset", "one of train, val, test"]),
+    ):
+        done = methods(*arguments, "--out", tmp_path / "out")
+        assert done.returncode == 2
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert all(word in done.stderr for word in words)
+        assert not (tmp_path / "out").exists()
