@@ -127,7 +127,8 @@ def _absolute(
     if "tactical" in inertial["grade"].unique().to_pylist():
         flown = flights(dataset, descents, rough, "tactical", 0.5)
         pointed = flights(dataset, descents, rough, "tactical", 0.02)
-        for name, table in (("filter", flown), ("filter, star tracker", pointed)):
+        best = flights(dataset, descents, exact, "tactical", 0.5)
+        for name, table in (("filter", flown), ("filter, star tracker", pointed), ("filter, exact catalogue", best)):
             rows.append({"method": name, **flight_summary(table)})
             frames.append(table.assign(method=name))
     summaries = pd.DataFrame(rows).assign(kind="absolute")
