@@ -1,10 +1,11 @@
 """Catalogues with the errors that a mission's have."""
 
 import numpy as np
+import pytest
 from scipy.spatial import KDTree
 from tests.train.navigate.craters.crater_world import world
 
-from perilune_train.navigate.craters.catalogue import CatalogueErrors, with_errors
+from perilune_train.navigate.craters.catalogue import Catalogue, CatalogueErrors, with_errors
 
 
 def test_errors_have_their_sizes_and_shares():
@@ -25,3 +26,13 @@ def test_errors_have_their_sizes_and_shares():
 def test_the_same_generator_gives_the_same_catalogue():
     one, two = (with_errors(world(), CatalogueErrors(), np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(one.centre_m, two.centre_m)
+
+
+@pytest.mark.parametrize("count", [1, 10, 5000])
+def test_the_ground_is_that_of_the_nearest_craters(count):
+    rng = np.random.default_rng(5)
+    centre = rng.uniform(-500, 500, (2000, 3))
+    catalogue = Catalogue(centre, np.tile([0.0, 0, 1], (2000, 1)), np.full(2000, 5.0), 0.0, 0.0)
+    place = np.array([120.0, -80.0, 900.0])
+    distance = np.hypot(*(centre[:, :2] - place[:2]).T)
+    assert catalogue.ground_m(place, count) == np.median(centre[np.argsort(distance)[:count], 2])

@@ -34,6 +34,12 @@ class Catalogue:
         """Some of the craters."""
         return replace(self, centre_m=self.centre_m[chosen], normal=self.normal[chosen], radius_m=self.radius_m[chosen])
 
+    def ground_m(self, position_m: Array, count: int) -> float:
+        """Median height of the `count` craters nearest to a position, over ground: (2,) or (3,), O_L."""
+        distance = np.linalg.norm(self.centre_m[:, :2] - position_m[:2], axis=1)
+        nearest = np.argpartition(distance, count - 1)[:count] if len(self) > count else slice(None)
+        return float(np.median(self.centre_m[nearest, 2]))
+
 
 @dataclass(frozen=True, slots=True)
 class CatalogueErrors:

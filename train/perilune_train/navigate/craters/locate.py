@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.craters.fix import Fix, PosePrior, refine
 from perilune_train.navigate.craters.projection import Pose
@@ -22,6 +21,8 @@ _AHEAD = 1.5
 _SIGMAS = 3.5
 _REACHES = (1.0, 3.0)
 """How far a search goes, by what the prior says: it may be wrong."""
+_NEAREST = 30
+"""Craters whose median height is that of the ground."""
 _LEAST_MARGIN = 0.06
 """Least margin of the altitude in a search, as a share: the ground is not level."""
 
@@ -41,7 +42,7 @@ def locate(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
 
     None if too few sightings can be matched, or if two places explain them about equally well.
     """
-    ground_m = _ground_m(catalogue, prior.pose.position_m)
+    ground_m = catalogue.ground_m(prior.pose.position_m, _NEAREST)
     altitude_m = float(prior.pose.position_m[2] - ground_m)
     sigma = np.sqrt(np.diag(prior.covariance))
     on_ground_m = float(np.hypot(sigma[:2].max(), altitude_m * sigma[3:5].max()))
@@ -83,9 +84,3 @@ def _same(one: Pose, other: Pose) -> bool:
 def _around(pose: Pose) -> PosePrior:
     """Weak knowledge around a pose, so that a fix tells what the sightings tell and nothing twice."""
     return PosePrior(pose, np.diag(np.square([300.0] * 3 + [np.radians(3.0)] * 3)))
-
-
-def _ground_m(catalogue: Catalogue, position_m: Array) -> float:
-    """Median height of the 30 nearest craters."""
-    distance = np.linalg.norm(catalogue.centre_m[:, :2] - position_m[:2], axis=1)
-    return float(np.median(catalogue.centre_m[np.argsort(distance)[:30], 2]))

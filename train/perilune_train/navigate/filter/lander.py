@@ -23,6 +23,8 @@ _LOST_S = 15.0
 _CONTRADICTIONS = 2
 """Fixes in a row that the gate refuses, after which the filter starts again from a fix."""
 _GAP_S = 0.05
+_NEAREST = 10
+"""Craters whose median height is that of the ground below, but for an error of the state."""
 _UNKNOWN_MPS2, _UNKNOWN_RADPS = 2.0, 0.05
 """Standard deviations of the motion while inertial measurements are missing."""
 
@@ -74,7 +76,8 @@ class Lander:
         """Update by a range at the present time; whether it was accepted. One that is no length is not."""
         if not (np.isfinite(range_m) and range_m > 0):
             return False
-        done = range_update(self.state, range_m, self._ground_m(), self._around.range_sigma_m)
+        ground_m = self._around.catalogue.ground_m(self.state.position_m, _NEAREST)
+        done = range_update(self.state, range_m, ground_m, self._around.range_sigma_m)
         self.state = done.state
         return done.accepted
 
@@ -143,9 +146,3 @@ class Lander:
         to_camera[:3, :3], to_camera[3:, 3:] = np.eye(3), -mounting
         covariance = to_camera @ state.covariance[np.ix_(own, own)] @ to_camera.T
         return PosePrior(Pose(state.position_m, mounting @ state.rotation_site_from_body.T), covariance)
-
-    def _ground_m(self) -> float:
-        """Height of the ground below, from the nearest craters of the catalogue."""
-        centre = self._around.catalogue.centre_m
-        distance = np.linalg.norm(centre[:, :2] - self.state.position_m[:2], axis=1)
-        return float(np.median(centre[np.argsort(distance)[:10], 2]))
