@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
@@ -20,6 +21,7 @@ from perilune_train.navigate.craters.sightings import Sightings
 _GATES_PX = (6.0, 3.0, 1.5, 0.0, 0.0, 0.0)
 """Uncertainty of the pose in each round, pixels, beside that of the sightings."""
 _GATE_SIGMAS = 3.5
+_FORBIDDEN = 1e6
 _TUKEY = 4.685
 COMMON_PX = 0.08
 """Standard deviation of an error that all centres of a frame share, pixels."""
@@ -89,19 +91,31 @@ def _matches(
     sightings: Sightings, seen: Projected, catalogue: Catalogue, camera: Camera, gate_px: float
 ) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
     """One-to-one matches within the gate: places in `sightings` and in `seen` (K,)."""
-    across = sightings.centre_px[:, None] - seen.centre_px[None]
     mapped = camera.fx_px / seen.depth_m * catalogue.position_sigma_m
-    own_variance = sightings.noise_px**2 + sightings.static_px**2
-    variance = own_variance[:, None] + mapped[None] ** 2 + gate_px**2
-    ratio = np.log(sightings.radius_px[:, None] / seen.radius_px[None])
+    own_variance = sightings.noise_px**2 + sightings.static_px**2 + gate_px**2
+    own, other = _near(sightings, seen, own_variance + np.max(mapped, initial=0.0) ** 2)
+    across = sightings.centre_px[own] - seen.centre_px[other]
+    variance = own_variance[own] + mapped[other] ** 2
+    ratio = np.log(sightings.radius_px[own] / seen.radius_px[other])
     size_variance = sightings.size_sigma**2 + catalogue.radius_sigma_share**2 + (gate_px / 60) ** 2
-    cost = (across**2).sum(axis=2) / variance / 2 + ratio**2 / size_variance
+    cost = (across**2).sum(axis=1) / variance / 2 + ratio**2 / size_variance
     allowed = cost < _GATE_SIGMAS**2
     if not allowed.any():
         return np.zeros(0, int), np.zeros(0, int)
-    own, other = linear_sum_assignment(np.where(allowed, cost, 1e6))
-    kept = allowed[own, other]
+    costs = np.full((len(sightings), len(seen.index)), _FORBIDDEN)
+    costs[own[allowed], other[allowed]] = cost[allowed]
+    own, other = linear_sum_assignment(costs)
+    kept = costs[own, other] < _FORBIDDEN
     return own[kept], other[kept]
+
+
+def _near(sightings: Sightings, seen: Projected, variance: Array) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+    """Pairs that are near enough for the gate (K,), by the largest variance (M,) that a pair of a sighting can have."""
+    if not len(seen.index) or not len(sightings):
+        return np.zeros(0, int), np.zeros(0, int)
+    near = KDTree(seen.centre_px).query_ball_point(sightings.centre_px, _GATE_SIGMAS * np.sqrt(2 * variance))
+    counts = [len(one) for one in near]
+    return np.repeat(np.arange(len(near)), counts), np.concatenate(near).astype(int)
 
 
 def _errors(
