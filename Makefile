@@ -125,9 +125,12 @@ train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect
 	@$(BIN)/perilune-train navigate train $(TRAIN) --dataset "$(DATA)/nav" $(OVER)
 
-navigate: nav-frames ## fly all methods of navigation over the test descents; writes runs/navigate/<name>-methods
-	@$(BIN)/perilune-train navigate methods --dataset "$(DATA)/nav" --out "$(RUNS)/navigate/$(NAME)-methods" \
-	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)")
+METHODS := $(RUNS)/navigate/$(NAME)-methods
+navigate: nav-frames ## fly all methods of navigation over the test descents; writes runs/navigate/<name>-methods (OVERWRITE=1 replaces)
+	@$(if $(OVERWRITE),rm -rf "$(METHODS)")
+	@if test -f "$(METHODS)/methods.md"; then echo "$(METHODS): finished, left unchanged; OVERWRITE=1 replaces it"; else \
+	  $(BIN)/perilune-train navigate methods --dataset "$(DATA)/nav" --out "$(METHODS)" \
+	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)"); fi
 
 # Each network without attention; the stack network starts from the detector without attention, if there is one.
 train-nav-baseline: nav-frames ## the same networks without attention, into <name>-none and <name>-none-stack

@@ -34,6 +34,18 @@ def text(file, before, after):
     return change
 
 
+def repeated(file, column):
+    """A change that writes a column twice."""
+
+    def change(folder):
+        lines = (folder / file).read_text(encoding="utf-8").splitlines()
+        place = lines[0].split(",").index(column)
+        lines = [",".join([line, line.split(",")[place]]) for line in lines]
+        (folder / file).write_text("\n".join(lines), encoding="utf-8")
+
+    return change
+
+
 def missing(file):
     return lambda folder: (folder / file).unlink()
 
@@ -58,6 +70,11 @@ def missing(file):
         (setting("prior.yaml", "position_sigma_m", 0), ["prior.position_sigma_m", "0", "above 0"]),
         (text("prior.yaml", "{", "!!python/object/apply:os.system {"), ["prior.yaml", "syntax", "tag"]),
         (text("imu.csv", "interval_s", "interval"), ["imu.csv", "columns", "no interval_s"]),
+        (text("imu.csv", "interval_s", "time_s"), ["imu.csv", "columns", "no interval_s"]),
+        (text("imu.csv", "angular_rate_y_radps", "time_s"), ["imu.csv", "columns", "no angular_rate_y_radps"]),
+        (repeated("ranges.csv", "range_m"), ["ranges.csv", "columns", "2 times range_m", "once"]),
+        (repeated("frames/frames.csv", "file"), ["frames.csv", "columns", "2 times file", "once"]),
+        (text("catalogue.csv", "z_m", "x_m"), ["catalogue.csv", "columns", "no z_m"]),
         (text("imu.csv", "5.05,", "4.05,"), ["imu.csv", "time_s: row 1", "4.05", "above 5.0"]),
         (text("imu.csv", "5.05,", "soon,"), ["imu.csv", "table", "soon"]),
         (text("imu.csv", "5.05,0.05,", "5.05,-1,"), ["imu.csv", "interval_s: row 1", "-1"]),
@@ -79,6 +96,18 @@ def test_one_line_exit_code_2_and_nothing_written(tmp_path, change, words, monke
     assert len(lines) == 1, done.stderr
     for word in words:
         assert word in lines[0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["descent"]
+
+
+@pytest.mark.parametrize("live", ["live.txt", "live"])
+def test_a_live_picture_that_is_no_png(tmp_path, live):
+    folder = write_descent(tmp_path / "descent")
+    words = [*options(folder), "--out", tmp_path / "flight", "--live", tmp_path / live]
+    done = in_process.call(main, "navigate", "fly", *words)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "--live" in done.stderr
+    assert ".png" in done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["descent"]
 
 

@@ -1,10 +1,11 @@
-"""`perilune-train navigate fly`: the filter over anybody's files of one descent."""
+"""`perilune-train navigate fly`: the filter over the files of one descent."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from perilune_shared.errors import UserError
 from perilune_shared.terminal import console
 from perilune_train.shipped.models import shipped_run
 
@@ -29,6 +30,8 @@ def fly(
     in O_L, largest deviation of the attitude, craters matched. Writes estimates.parquet, estimates.csv and flight.png.
     `navigate unpack` writes an example of all files.
     """
+    if live is not None and live.suffix.lower() != ".png":
+        raise UserError("--live", "name", live, "a name that ends in .png")
     run = run or shipped_run("detect")
     # torch takes seconds to load.
     from perilune_train.navigate.fly.run import fly_descent, read_descent

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.geometry.frames import Array
 
+LEAST_DIAMETER_M = 5.0
+"""Smallest crater of a catalogue that is made from a dataset, where nothing else is asked for."""
 Chosen = NDArray[np.integer] | NDArray[np.bool_]
 """An index or a mask."""
 

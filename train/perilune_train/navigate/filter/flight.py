@@ -61,7 +61,7 @@ class Estimate:
 def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Iterable[Sightings]) -> Iterator[Estimate]:
     """Run a filter over a descent.
 
-    `seen` has the sightings of the frames at increasing times (n,); those of a frame are asked for when it is its turn.
+    `seen` has the sightings of the frames at increasing times (n,); an iterator is advanced by one at each frame.
     Inertial measurements that are not finite are missing ones; what was measured before the lander's state is ignored.
     """
     times = np.concatenate([instruments.range_time_s, frame_time_s])

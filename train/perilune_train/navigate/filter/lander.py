@@ -19,6 +19,8 @@ from perilune_train.navigate.filter.state import ATTITUDE, POSITION, VELOCITY, S
 Status = Literal["tracking", "coasting", "lost"]
 """tracking: the last frame was matched to craters; coasting: it was not; lost: none was for 15 s, or a fix contradicts
 the state."""
+RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
+"""Standard deviations of a range and of the ground's height about the nearest craters, where none are given."""
 _LOST_S = 15.0
 _CONTRADICTIONS = 2
 """Fixes in a row that the gate refuses, after which the filter starts again from a fix."""

@@ -42,6 +42,13 @@ class Increment:
         return bool(np.isfinite(self.angular_rate_radps).all() and np.isfinite(self.specific_force_mps2).all())
 
 
+def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, unit: InertialErrors) -> Array:
+    """Standard deviations (15,) of the first errors of `State` at the start, from those on each axis."""
+    gyro_bias_radps = np.radians(unit.gyro_bias_deg_per_h) / HOUR_S
+    force_bias_mps2 = unit.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
+    return np.repeat([position_m, velocity_mps, np.radians(attitude_deg), gyro_bias_radps, force_bias_mps2], 3)
+
+
 @dataclass(frozen=True, slots=True)
 class InertialNoise:
     """Variances that a unit adds in one second, per axis."""

@@ -1,1 +1,1 @@
-"""Fly the filter over files of one descent: anybody's frames, camera, catalogue and measurements."""
+"""Fly the filter over the files of one descent: frames, camera, catalogue and measurements of any source."""

@@ -11,12 +11,14 @@ from perilune_train.evaluation.pictures import save_figure
 
 _STATUS = {"tracking": ("tab:blue", "o"), "coasting": ("tab:orange", "s"), "lost": ("tab:red", "x")}
 
+_START = 3
+"""Frames at the start that do not set the scale of an axis."""
+
 
 def draw_flight(path: Path, estimates: pd.DataFrame) -> None:
     """Draw the estimates of a flight, one row per frame; with true poses the errors within their bands."""
     figure = Figure(figsize=(14, 8), layout="constrained")
     axes = figure.subplots(2, 3)
-    time_s = estimates["time_s"].to_numpy()
     for status, (colour, marker) in _STATUS.items():
         own = estimates[estimates["status"] == status]
         if own.empty:
@@ -32,18 +34,23 @@ def draw_flight(path: Path, estimates: pd.DataFrame) -> None:
     _label(axes[0, 2], "craters matched", "time (s)", "number")
     known = "error_x_m" in estimates
     for axis, place in zip("xyz", (axes[1, 0], axes[1, 1], axes[1, 2]), strict=True):
-        band = 3 * estimates[f"sigma_{axis}_m"].to_numpy()
-        place.fill_between(time_s, -band, band, color="tab:blue", alpha=0.2, linewidth=0, label="3 sigma")
-        if known:
-            place.plot(time_s, estimates[f"error_{axis}_m"], color="black", linewidth=1.5, label="error")
-        # The start is uncertain by far more than the rest of the flight.
-        late = band[min(3, len(band) - 1) :]
-        errors = np.abs(estimates[f"error_{axis}_m"].to_numpy())[min(3, len(band) - 1) :] if known else late
-        height = 1.2 * max(float(late.max()), float(errors.max()))
-        place.set_ylim(-height, height)
+        draw_band(place, estimates, axis)
         _label(place, f"{axis}: {'error' if known else 'deviation'}", "time (s)", "m")
     axes[1, 0].legend()
     save_figure(path, figure)
+
+
+def draw_band(place: Axes, estimates: pd.DataFrame, axis: str) -> None:
+    """Draw three standard deviations of the position on one axis (x, y or z) and, where it is known, the error."""
+    time_s, band = estimates["time_s"], 3 * estimates[f"sigma_{axis}_m"].to_numpy()
+    place.fill_between(time_s, -band, band, color="tab:blue", alpha=0.2, linewidth=0, label="3 sigma")
+    error = estimates.get(f"error_{axis}_m", pd.Series(0.0, estimates.index)).to_numpy()
+    if f"error_{axis}_m" in estimates:
+        place.plot(time_s, error, color="black", linewidth=1.5, label="error")
+    # The start is uncertain by far more than the rest of the flight.
+    late = slice(min(_START, len(band) - 1), None)
+    height = 1.2 * max(float(band[late].max()), float(np.abs(error[late]).max()))
+    place.set_ylim(-height, height)
 
 
 def _label(axis: Axes, title: str, x: str, y: str) -> None:

@@ -13,14 +13,10 @@ from perilune_shared.dataset.metadata import CameraRecord
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import NO_DISTORTION, ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
-from perilune_shared.geometry.inertial_grades import (
-    GRADES,
-    HOUR_S,
-    STANDARD_GRAVITY_MPS2,
-    InertialErrors,
-    InertialGrade,
-)
+from perilune_shared.geometry.inertial_grades import GRADES, InertialErrors, InertialGrade
 from perilune_shared.yaml_text import parse_yaml
+from perilune_train.navigate.filter.lander import RANGE_SIGMA_M, RELIEF_M
+from perilune_train.navigate.filter.propagate import start_sigmas
 from perilune_train.navigate.filter.state import State
 
 _LARGEST_FILE_BYTES = 100_000
@@ -65,9 +61,9 @@ class FlightPrior(Section):
     """Standard deviation of the attitude on each axis."""
     inertial: InertialGrade | UnitErrors = "tactical"
     """Grade of the inertial unit, or its errors."""
-    range_sigma_m: _Deviation = 1.0
+    range_sigma_m: _Deviation = RANGE_SIGMA_M
     """Standard deviation of a range."""
-    relief_m: _Deviation = 10.0
+    relief_m: _Deviation = RELIEF_M
     """Standard deviation of the ground's height about that of the nearest craters."""
     catalogue_position_sigma_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
     """Standard deviation of a crater's position in the catalogue on each axis."""
@@ -87,17 +83,12 @@ class FlightPrior(Section):
 
     def state(self, rotation_camera_from_body: Array) -> State:
         """The filter's state at the first frame."""
-        biases = (
-            np.radians(self.unit.gyro_bias_deg_per_h) / HOUR_S,
-            self.unit.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000,
-        )
-        pose_sigmas = self.position_sigma_m, self.velocity_sigma_mps, np.radians(self.attitude_sigma_deg)
         camera_from_site = matrix_from_quaternion(np.array(self.rotation_wxyz))
         return State.starting(
             np.array(self.position_m),
             np.array(self.velocity_mps),
             camera_from_site.T @ rotation_camera_from_body,
-            np.repeat([*pose_sigmas, *biases], 3),
+            start_sigmas(self.position_sigma_m, self.velocity_sigma_mps, self.attitude_sigma_deg, self.unit),
             self.relief_m,
         )
 

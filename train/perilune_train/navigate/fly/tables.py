@@ -148,6 +148,9 @@ def _with_columns(path: Path, table: pa.Table, columns: tuple[str, ...]) -> pa.T
     missing = [name for name in columns if name not in table.column_names]
     if missing:
         raise UserError(path, "columns", f"no {', '.join(missing)}", ", ".join(columns))
+    for name in (*columns, *NORMAL_COLUMNS):
+        if (number := table.column_names.count(name)) > 1:
+            raise UserError(path, "columns", f"{number} times {name}", f"{name} once")
     return table
 
 

@@ -12,7 +12,13 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion, quate
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.storage.files import new_folder
 from perilune_shared.yaml_text import to_yaml_text
-from perilune_train.navigate.craters.catalogue import Catalogue, CatalogueErrors, exact_catalogue, with_errors
+from perilune_train.navigate.craters.catalogue import (
+    LEAST_DIAMETER_M,
+    Catalogue,
+    CatalogueErrors,
+    exact_catalogue,
+    with_errors,
+)
 from perilune_train.navigate.craters.projection import Pose
 from perilune_train.navigate.fly.tables import (
     CRATER_COLUMNS,
@@ -25,10 +31,6 @@ from perilune_train.navigate.fly.tables import (
     RATES,
 )
 from perilune_train.navigate.fly.truth import TRUTH_COLUMNS
-
-LEAST_DIAMETER_M = 5.0
-"""Smallest crater of the catalogue."""
-_RANGE_SIGMA_M, _RELIEF_M = 1.0, 10.0
 
 
 def unpack_descent(
@@ -122,8 +124,6 @@ def _prior(
         "velocity_sigma_mps": offset[1],
         "attitude_sigma_deg": offset[2],
         "inertial": grade,
-        "range_sigma_m": _RANGE_SIGMA_M,
-        "relief_m": _RELIEF_M,
         "catalogue_position_sigma_m": catalogue.position_sigma_m,
         "catalogue_diameter_sigma_share": catalogue.radius_sigma_share,
     }

@@ -13,6 +13,7 @@ from perilune_train.evaluation.pictures import save_figure
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.craters.locate import Located
 from perilune_train.navigate.craters.projection import projected
+from perilune_train.navigate.fly.picture import draw_band
 from perilune_train.navigate.methods.flights import BAND
 from perilune_train.navigate.methods.seen import SeenDescent
 
@@ -56,13 +57,7 @@ def draw_flights(path: Path, flown: pd.DataFrame) -> None:
     axes = figure.subplots(len(groups), 3, squeeze=False, sharex=True)
     for row, (ids, own) in zip(axes, groups, strict=True):
         for axis, place in zip("xyz", row, strict=True):
-            band = 3 * own[f"sigma_{axis}_m"].to_numpy()
-            place.fill_between(own["time_s"], -band, band, color="tab:blue", alpha=0.2, linewidth=0, label="3 sigma")
-            place.plot(own["time_s"], own[f"error_{axis}_m"], color="black", linewidth=1.3, label="error")
-            late = slice(min(3, len(own) - 1), None)
-            errors = np.abs(own[f"error_{axis}_m"].to_numpy())
-            height = 1.2 * max(float(band[late].max()), float(errors[late].max()))
-            place.set_ylim(-height, height)
+            draw_band(place, own, axis)
             _label(place, f"{'/'.join(map(str, ids))}: {axis}", "", "m")
     for place in axes[-1]:
         place.set_xlabel("time (s)")

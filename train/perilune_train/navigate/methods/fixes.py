@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pandas as pd
 
-from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_shared.terminal import progress_bar
 from perilune_train.navigate.craters.catalogue import Catalogue
@@ -56,7 +55,7 @@ def fixes_lost_in_space(descents: list[SeenDescent], catalogues: Mapping[str, Ca
             turned = np.array(
                 [[np.cos(heading), np.sin(heading), 0], [-np.sin(heading), np.cos(heading), 0], [0, 0, 1]]
             )
-            assumed = Pose(np.array([*area.centre_m, altitude_m]), ROTATION_CAMERA_FROM_BODY @ turned)
+            assumed = Pose(np.array([*area.centre_m, altitude_m]), descent.level_rotation_camera_from_site @ turned)
             begun = time.process_time()
             found = lost_in_space(sightings, catalogue, descent.camera, PosePrior(assumed, np.eye(6)), area)
             rows.append(_row(descent, true, found, time.process_time() - begun))

@@ -8,18 +8,17 @@ import pandas as pd
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.geometry.frames import Array
-from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2, InertialGrade
+from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 from perilune_shared.terminal import progress_bar
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.filter.flight import Instruments, fly
-from perilune_train.navigate.filter.lander import Lander, Surroundings
-from perilune_train.navigate.filter.propagate import InertialNoise
+from perilune_train.navigate.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
+from perilune_train.navigate.filter.propagate import InertialNoise, start_sigmas
 from perilune_train.navigate.filter.state import ATTITUDE, POSITION, State
 from perilune_train.navigate.methods.seen import SeenDescent
 
 START_M, START_MPS = 60.0, 1.0
 """Standard deviations of position and velocity at the start, on each axis."""
-RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
 BAND = (1.24, 14.45)
 """Where a sum of six squares lies in 95 % of cases."""
 
@@ -51,11 +50,7 @@ def _flight(
     rng: np.random.Generator,
 ) -> pd.DataFrame:
     mounting, errors = np.array(dataset.info.camera.rotation_camera_from_body), GRADES[grade]
-    biases = (
-        np.radians(errors.gyro_bias_deg_per_h) / HOUR_S,
-        errors.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000,
-    )
-    sigmas = np.repeat([START_M, START_MPS, np.radians(attitude_deg), *biases], 3)
+    sigmas = start_sigmas(START_M, START_MPS, attitude_deg, errors)
     off = sigmas[:9] * rng.normal(size=9)
     turned = descent.true[0].changed(np.concatenate([off[:3], mounting @ off[6:]]))
     attitude = turned.rotation_camera_from_site.T @ mounting

@@ -11,7 +11,13 @@ from perilune_shared.storage.files import new_folder, write_text
 from perilune_shared.storage.store import Address
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
-from perilune_train.navigate.craters.catalogue import Catalogue, CatalogueErrors, exact_catalogue, with_errors
+from perilune_train.navigate.craters.catalogue import (
+    LEAST_DIAMETER_M,
+    Catalogue,
+    CatalogueErrors,
+    exact_catalogue,
+    with_errors,
+)
 from perilune_train.navigate.craters.fix import PosePrior
 from perilune_train.navigate.craters.locate import locate
 from perilune_train.navigate.data.trajectories import Trajectory, load_split
@@ -28,8 +34,6 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, TABLE, FRAMES = "methods.md", "navigation.parquet", "frames.parquet"
 PICTURES = ("altitude.png", "flights.png", "matches_high.png", "matches_low.png")
-LEAST_DIAMETER_M = 5.0
-"""Smallest crater of the catalogues."""
 SEED = 0
 
 

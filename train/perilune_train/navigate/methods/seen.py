@@ -36,6 +36,8 @@ class SeenDescent:
     """True poses of the camera (n)."""
     velocity_mps: Array
     """True velocity at the first frame (3,), O_L."""
+    level_rotation_camera_from_site: Array
+    """Attitude (3, 3) of the camera on a level lander of heading 0."""
     sightings: list[Sightings]
     """Detected craters of each frame (n)."""
 
@@ -59,5 +61,6 @@ def seen_descents(dataset: Dataset, trajectories: list[Trajectory], run: Path) -
             rows = dataset.table("frames", ["time_s", "velocity_mps"], *one.ids).sort_by("time_s")
             true = [Pose(*pose) for pose in zip(one.position_m, one.rotation_camera_from_site, strict=True)]
             first = np.array(rows["velocity_mps"][0].as_py())
-            descents.append(SeenDescent(one.ids, one.camera, rows["time_s"].to_numpy(), true, first, seen))
+            level = one.nominal_rotation_camera_from_site
+            descents.append(SeenDescent(one.ids, one.camera, rows["time_s"].to_numpy(), true, first, level, seen))
     return descents, seconds / n_frames
