@@ -33,7 +33,7 @@ ROOMS = {
     ),
     "train/perilune_train/navigate": (
         "config geometry data network relative craters filter fly evaluate train evaluate_run compare_runs "
-        "benchmark methods cli"
+        "benchmark methods deploy cli"
     ),
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""
@@ -108,7 +108,10 @@ SHARED_ROOMS = [
     [
         (["torch", "lightning", "bpy"], ["perilune_train.detect.evaluate", "perilune_train.evaluation"]),
         (["torch", "lightning", "bpy", "typer", "rich"], SHARED_ROOMS),
-        (["lightning", "bpy"], ["perilune_train.detect.images", "perilune_train.detect.deploy"]),
+        (
+            ["lightning", "bpy"],
+            ["perilune_train.detect.images", "perilune_train.detect.deploy", "perilune_train.navigate.deploy"],
+        ),
         (["bpy", "typer", "rich"], ["perilune_render.flight", "perilune_render.imaging", "perilune_render.labels"]),
         (["bpy", "typer", "rich"], ["perilune_render.frame_source", "perilune_render.dataset.develop"]),
     ],

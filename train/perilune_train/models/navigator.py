@@ -117,7 +117,7 @@ class WarpNavigator(nn.Module):
             shifts = functional.avg_pool2d(stacked[:, 2:], self.STRIDE)
             estimates = self.place(torch.cat([features.float(), shifts], dim=1)).permute(0, 2, 3, 1)
             flow_px, weight = estimates[..., :2], torch.exp(estimates[..., 2].clamp(-8, 8))
-            fitted = self.fitted_motion(flow_px, weight, altitude_m.flatten(), first.shape[-1])
+            fitted = self.fitted_motion(flow_px, weight, altitude_m.flatten(), int(first.shape[-1]))
         summary = torch.cat([self.summary(features).float(), fitted], dim=-1)
         correction, state = self.recurrent(summary.unflatten(0, first.shape[:2]), state)
         turn = fitted[:, 3:]
@@ -139,11 +139,20 @@ class WarpNavigator(nn.Module):
         focal_px = self.focal_over_width * width_px
         over_altitude = torch.stack([1 / altitude_m] * 3 + [torch.ones_like(altitude_m)] * 3, dim=-1)
         unit = focal_px * self.unit * over_altitude
-        jacobian = self.plane_flow(flow_px.shape[1], flow_px.shape[2], width_px) * unit[:, None, None, None]
+        # `int`: an exporter would take sizes for part of the graph.
+        rows, columns = (int(size) for size in flow_px.shape[1:3])
+        jacobian = self.plane_flow(rows, columns, width_px) * unit[:, None, None, None]
         weighted = jacobian * weight[..., None, None]
-        normal = torch.einsum("nhwij,nhwik->njk", weighted, jacobian) + torch.diag(self.log_prior.exp())
+        normal = (
+            torch.einsum("nhwij,nhwik->njk", weighted, jacobian)
+            + torch.eye(6, device=self.unit.device) * self.log_prior.exp()
+        )
+        return self.solved(normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px))
+
+    def solved(self, normal: Tensor, right: Tensor) -> Tensor:
+        """Solutions (N, 6) of equations (N, 6, 6), (N, 6). An export without this operator replaces it."""
         # `solve` would make the process wait for the GPU, to find singular matrices, which the prior excludes.
-        return torch.linalg.solve_ex(normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px))[0]
+        return torch.linalg.solve_ex(normal, right)[0]
 
     def plane_flow(self, rows: int, columns: int, width_px: int) -> Tensor:
         """Derivatives (rows, columns, 2, 6) of flow / focal length by translation / altitude and by rotation vector."""
@@ -163,6 +172,15 @@ def blurred(images: Tensor, size_px: int) -> Tensor:
     return functional.avg_pool2d(rows, (1, size_px), stride=1, padding=(0, half), count_include_pad=False)
 
 
+def slope(images: Tensor, dim: int) -> Tensor:
+    """Central differences along a dimension, one-sided at its ends: `torch.gradient`, which ONNX does not have."""
+    n = images.shape[dim]
+    inner = (images.narrow(dim, 2, n - 2) - images.narrow(dim, 0, n - 2)) / 2
+    first = images.narrow(dim, 1, 1) - images.narrow(dim, 0, 1)
+    last = images.narrow(dim, n - 1, 1) - images.narrow(dim, n - 2, 1)
+    return torch.cat([first, inner, last], dim=dim)
+
+
 def local_shift(pair: Tensor, window_px: int = 25) -> Tensor:
     """Shift from the first to the second of two images (N, 2, H, W): (N, 2, H, W), pixels along x and y.
 
@@ -170,7 +188,8 @@ def local_shift(pair: Tensor, window_px: int = 25) -> Tensor:
     brightness by the gradient. It is damped where gradients are small. Valid for shifts below the width of the images'
     finest features.
     """
-    grad_y, grad_x = torch.gradient(pair.mean(1, keepdim=True), dim=(2, 3))
+    mean = pair.mean(1, keepdim=True)
+    grad_y, grad_x = slope(mean, 2), slope(mean, 3)
     change = pair[:, :1] - pair[:, 1:]
     products = [grad_x * grad_x, grad_y * grad_y, grad_x * grad_y, grad_x * change, grad_y * change]
     xx, yy, xy, x_change, y_change = blurred(torch.cat(products, dim=1), window_px).split(1, dim=1)

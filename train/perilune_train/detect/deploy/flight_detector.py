@@ -4,9 +4,8 @@ import copy
 
 import torch
 from torch import Tensor, nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from perilune_train.models.attention import CBAM
+from perilune_train.models.fold import fold
 from perilune_train.models.yolo import YOLOv3, decode
 
 
@@ -38,39 +37,3 @@ class FlightDetector(nn.Module):
             boxes.append(decode(raw, cells, anchors, self.network.strides[scale]).flatten(1, 3))
             scores.append(raw[..., 4].sigmoid().flatten(1))
         return torch.cat(boxes, 1), torch.cat(scores, 1)
-
-
-class FlightCBAM(nn.Module):
-    """CBAM in standard operations, the channel gate's linear layers as 1 x 1 convolutions. (N, C, H, W) to the same."""
-
-    def __init__(self, cbam: CBAM):
-        super().__init__()
-        self.squeeze, self.excite = _as_convolution(cbam.squeeze), _as_convolution(cbam.excite)
-        self.spatial, self.scale = cbam.spatial, cbam.scale
-
-    def forward(self, x: Tensor) -> Tensor:
-        mean, largest = x.mean((2, 3), keepdim=True), x.amax((2, 3), keepdim=True)
-        squeezed = torch.relu(self.squeeze(mean)) + torch.relu(self.squeeze(largest))
-        x = x * (self.scale * torch.sigmoid(self.excite(squeezed)))
-        pooled = torch.cat([x.mean(1, keepdim=True), x.amax(1, keepdim=True)], dim=1)
-        return x * (self.scale * torch.sigmoid(self.spatial(pooled)))
-
-
-def fold(network: nn.Module) -> None:
-    """Fold every batch norm of a network's `conv_block`s and replace every CBAM by FlightCBAM, in place."""
-    for name, child in list(network.named_children()):
-        if isinstance(child, CBAM):
-            setattr(network, name, FlightCBAM(child))
-            continue
-        conv, norm = getattr(child, "conv", None), getattr(child, "norm", None)
-        if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
-            child.conv = fuse_conv_bn_eval(conv, norm)
-            del child.norm
-        else:
-            fold(child)
-
-
-def _as_convolution(layer: nn.Linear) -> nn.Conv2d:
-    made = nn.Conv2d(layer.in_features, layer.out_features, 1, bias=False)
-    made.weight = nn.Parameter(layer.weight.detach()[:, :, None, None].clone(), requires_grad=False)
-    return made

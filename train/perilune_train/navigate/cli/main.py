@@ -5,13 +5,14 @@ import typer
 from perilune_train.navigate.cli.benchmark import benchmark
 from perilune_train.navigate.cli.compare import compare
 from perilune_train.navigate.cli.evaluate import evaluate
+from perilune_train.navigate.cli.export import export
 from perilune_train.navigate.cli.fly import fly
 from perilune_train.navigate.cli.methods import methods
 from perilune_train.navigate.cli.train import train
 from perilune_train.navigate.cli.unpack import unpack
 
 app = typer.Typer(
-    help="Landing navigation: train the networks, evaluate and compare runs, fly the filter over a descent.",
+    help="Landing navigation: train the networks, evaluate, compare and export runs, fly the filter over a descent.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -19,6 +20,7 @@ app.command("train")(train)
 app.command("evaluate")(evaluate)
 app.command("benchmark")(benchmark)
 app.command("compare")(compare)
+app.command("export")(export)
 app.command("methods")(methods)
 app.command("fly")(fly)
 app.command("unpack")(unpack)

@@ -1,0 +1,1 @@
+"""Trained navigators as files for flight."""
