@@ -56,16 +56,17 @@ def difference(one, other):
 
 def test_propagation_of_errors_is_the_derivative():
     state = some_state(np.random.default_rng(0))
-    measured = Increment(3.01, 0.01, np.array([0.02, -0.03, 0.05]), np.array([0.3, -0.2, 1.7]))
-    ends = propagated(state, measured, QUIET)
+    rate, force = np.array([0.02, -0.03, 0.05]), np.array([0.3, -0.2, 1.7])
+    measured = [Increment(3.01, 0.01, rate, force), Increment(3.03, 0.02, -rate, 0.5 * force)]
+    ends = propagated(state, measured, QUIET, 0.0)
     for k in range(N_ERRORS + 4):
         column = np.zeros(N_ERRORS + 4)
         column[k] = 1e-5
-        moved = propagated(state.corrected(column, state.covariance), measured, QUIET)
+        moved = propagated(state.corrected(column, state.covariance), measured, QUIET, 0.0)
         found = difference(ends, moved) / 1e-5
         # With a covariance e_k e_k^T, the new covariance is the outer product of the column.
         single = State(**{**fields(state), "covariance": np.outer(column, column) * 1e10})
-        outer = propagated(single, measured, QUIET).covariance
+        outer = propagated(single, measured, QUIET, 0.0).covariance
         np.testing.assert_allclose(outer, np.outer(found, found), atol=2e-5)
 
 
@@ -146,7 +147,7 @@ def fly(seed, with_motion):
         force = force + np.sqrt(NOISE.force_bias) * root * rng.normal(size=3)
         seen_rate = rate + gyro + np.sqrt(NOISE.turn) / root * rng.normal(size=3)
         seen_force = thrust + force + np.sqrt(NOISE.velocity) / root * rng.normal(size=3)
-        state = propagated(state, Increment(k * step, step, seen_rate, seen_force), NOISE)
+        state = propagated(state, [Increment(k * step, step, seen_rate, seen_force)], NOISE, 0.0)
         if k % 50:
             continue
         camera = MOUNTING @ turn.T

@@ -24,14 +24,13 @@ POSITION_M, VELOCITY_MPS = np.array([-300.0, 100, 1400]), np.array([9.0, -4, -35
 NOTHING = Sightings(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 
-def lander(seed, off_m=20.0, claimed_m=20.0):
+def lander(seed, off_m=20.0, claimed_m=20.0, moved_m=0.0):
     """A lander whose start is off, its catalogue with errors, and the generator of its measurements."""
     rng = np.random.default_rng(seed)
     biases = np.radians(GRADE.gyro_bias_deg_per_h) / HOUR_S, GRADE.accelerometer_bias_mg * STANDARD_GRAVITY_MPS2 / 1000
     sigmas = np.repeat([claimed_m, 1.0, np.radians(0.3), *biases], 3)
-    start = State.starting(
-        POSITION_M + off_m * rng.normal(size=3), VELOCITY_MPS + rng.normal(size=3), np.eye(3), sigmas, 5.0
-    )
+    position = POSITION_M + off_m * rng.normal(size=3) + [moved_m, 0, 0]
+    start = State.starting(position, VELOCITY_MPS + rng.normal(size=3), np.eye(3), sigmas, 5.0)
     catalogue = with_errors(WORLD, CatalogueErrors(), rng)
     return Lander(start, NOISE, Surroundings(CAMERA, MOUNTING, catalogue, 2.0, 5.0)), rng, biases
 
@@ -83,9 +82,7 @@ def test_an_outage_of_ten_seconds():
 
 
 def test_a_start_that_is_300_m_off_is_noticed():
-    craft, rng, biases = lander(2, off_m=0.0, claimed_m=15.0)
-    craft.state = dataclasses.replace(craft.state, position_m=craft.state.position_m + np.array([300.0, 0, 0]))
-    errors, _, status = flown(craft, rng, biases)
+    errors, _, status = flown(*lander(2, off_m=0.0, claimed_m=15.0, moved_m=300.0))
     wrong = np.linalg.norm(errors, axis=1) > 20
     # Whenever it is wrong it does not claim to track.
     assert not any(status[k] == "tracking" for k in np.flatnonzero(wrong))

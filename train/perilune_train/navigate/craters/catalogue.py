@@ -1,9 +1,11 @@
 """Crater catalogues: what a mission knows of the craters at its landing site."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.geometry.frames import Array
@@ -14,7 +16,7 @@ Chosen = NDArray[np.integer] | NDArray[np.bool_]
 """An index or a mask."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Catalogue:
     """N craters as circles in space."""
 
@@ -38,9 +40,12 @@ class Catalogue:
 
     def ground_m(self, position_m: Array, count: int) -> float:
         """Median height of the `count` craters nearest to a position, over ground: (2,) or (3,), O_L."""
-        distance = np.linalg.norm(self.centre_m[:, :2] - position_m[:2], axis=1)
-        nearest = np.argpartition(distance, count - 1)[:count] if len(self) > count else slice(None)
+        _, nearest = self._tree.query(position_m[:2], min(count, len(self)))
         return float(np.median(self.centre_m[nearest, 2]))
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.centre_m[:, :2])
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,13 +15,15 @@ from scipy.spatial import KDTree
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.navigate.craters.catalogue import Catalogue
-from perilune_train.navigate.craters.projection import Pose, Projected, projected
+from perilune_train.navigate.craters.projection import Pose, Projected, in_view, projected
 from perilune_train.navigate.craters.sightings import Sightings
 
 _GATES_PX = (6.0, 3.0, 1.5, 0.0, 0.0, 0.0)
 """Uncertainty of the pose in each round, pixels, beside that of the sightings."""
 _GATE_SIGMAS = 3.5
 _FORBIDDEN = 1e6
+_FARTHEST_PX, _SMALLER = 64.0, 0.8
+"""Craters that no round can match are left out: by distance from the image, pixels, and share of the least size."""
 _TUKEY = 4.685
 COMMON_PX = 0.08
 """Standard deviation of an error that all centres of a frame share, pixels."""
@@ -65,6 +67,8 @@ def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     precision = np.linalg.inv(prior.covariance)
     pose = start
     least_px = _LEAST_SIZE * float(sightings.radius_px.min()) if len(sightings) else 1.0
+    places = in_view(catalogue, camera, start, _FARTHEST_PX, _SMALLER * least_px)
+    catalogue = catalogue.part(places)
     for gate_px in _GATES_PX:
         seen = projected(catalogue, camera, pose, 3 * gate_px, least_px)
         own, other = _matches(sightings, seen, catalogue, camera, gate_px)
@@ -84,7 +88,7 @@ def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     factor = max(1.0, float(squares / max(2 * weight.sum() - 6, 1.0)))
     covariance = factor * np.linalg.inv(normal)
     covariance[3:5, 3:5] += np.eye(2) * (COMMON_PX / camera.fx_px) ** 2
-    return Fix(pose, covariance, own, seen.index[other], weight, float(np.sqrt(np.mean(error[:, :2] ** 2))))
+    return Fix(pose, covariance, own, places[seen.index[other]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2))))
 
 
 def _matches(

@@ -47,21 +47,28 @@ def projected(
 ) -> Projected:
     """Craters of a least radius whose centre is in the image or at most `margin_px` beside it."""
     rotation = pose.rotation_camera_from_site
-    points = camera_from_site(catalogue.centre_m, pose.position_m, rotation)
-    depth = points[:, 2]
-    ahead = depth > catalogue.radius_m
-    safe = np.where(ahead, depth, 1.0)
-    rough = points[:, :2] / safe[:, None] * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
-    size = np.array([camera.width_px, camera.height_px])
-    near = ((rough > -margin_px) & (rough < size + margin_px)).all(axis=1)
-    index = np.flatnonzero(ahead & near & (camera.fx_px * catalogue.radius_m / safe >= least_radius_px))
-    points, part = points[index], catalogue.part(index)
+    index = in_view(catalogue, camera, pose, margin_px, least_radius_px)
+    part = catalogue.part(index)
+    points = camera_from_site(part.centre_m, pose.position_m, rotation)
     boxes = project_circles(camera, points, part.normal @ rotation.T, part.radius_m).bounding_boxes()
     seen = np.isfinite(boxes).all(axis=1)
     boxes, points, index = boxes[seen], points[seen], index[seen]
     radius = np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1)) / 2
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
     return Projected(index, centre, radius, points[:, 2], _jacobian(points, rotation, camera))
+
+
+def in_view(
+    catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float, least_radius_px: float
+) -> NDArray[np.integer]:
+    """Places of the craters whose centre is in the image or at most `margin_px` beside it, by radius over depth."""
+    points = camera_from_site(catalogue.centre_m, pose.position_m, pose.rotation_camera_from_site)
+    depth = points[:, 2]
+    ahead = depth > catalogue.radius_m
+    safe = np.where(ahead, depth, 1.0)
+    x, y = camera.fx_px * points[:, 0] / safe + camera.cx_px, camera.fy_px * points[:, 1] / safe + camera.cy_px
+    near = (x > -margin_px) & (x < camera.width_px + margin_px) & (y > -margin_px) & (y < camera.height_px + margin_px)
+    return np.flatnonzero(ahead & near & (camera.fx_px * catalogue.radius_m / safe >= least_radius_px))
 
 
 def _jacobian(points: Array, rotation: Array, camera: Camera) -> Array:

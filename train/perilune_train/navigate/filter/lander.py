@@ -13,7 +13,7 @@ from perilune_train.navigate.craters.locate import Located, locate
 from perilune_train.navigate.craters.projection import Pose
 from perilune_train.navigate.craters.sightings import Sightings
 from perilune_train.navigate.filter.measurements import craters_update, pose_update, range_update
-from perilune_train.navigate.filter.propagate import Increment, InertialNoise, over_new_ground, propagated
+from perilune_train.navigate.filter.propagate import Increment, InertialNoise, propagated
 from perilune_train.navigate.filter.state import ATTITUDE, POSITION, VELOCITY, State
 
 Status = Literal["tracking", "coasting", "lost"]
@@ -51,12 +51,21 @@ class Lander:
     """State and status of a lander; every method takes one measurement."""
 
     def __init__(self, state: State, noise: InertialNoise, around: Surroundings):
-        self.state, self.status = state, "coasting"
+        self._state, self.status = state, "coasting"
         self._noise, self._around = noise, around
+        self._pending: list[Increment] = []
         self._contradictions = 0
-        self._matched_s = state.time_s
+        self._matched_s = self._time_s = state.time_s
 
     status: Status
+
+    @property
+    def state(self) -> State:
+        """The state at the present time."""
+        if self._pending:
+            self._state = propagated(self._state, self._pending, self._noise, self._around.relief_m)
+            self._pending = []
+        return self._state
 
     def inertial(self, measured: Increment) -> None:
         """Propagate to the end of an inertial measurement; one that is older, or not finite, is ignored."""
@@ -67,12 +76,12 @@ class Lander:
         if not measured.is_finite:
             return
         start_s = min(measured.time_s - measured.interval_s, time_s)
-        if start_s > self.state.time_s + _GAP_S:
+        if start_s > self._time_s + _GAP_S:
             self.coast(start_s)
-        step_s = time_s - self.state.time_s
+        step_s = time_s - self._time_s
         if step_s > 0:
-            state = propagated(self.state, replace(measured, time_s=time_s, interval_s=step_s), self._noise)
-            self.state = over_new_ground(state, step_s, self._around.relief_m)
+            self._pending.append(replace(measured, time_s=time_s, interval_s=step_s))
+            self._time_s = time_s
 
     def range(self, range_m: float) -> bool:
         """Update by a range at the present time; whether it was accepted. One that is no length is not."""
@@ -80,7 +89,7 @@ class Lander:
             return False
         ground_m = self._around.catalogue.ground_m(self.state.position_m, _NEAREST)
         done = range_update(self.state, range_m, ground_m, self._around.range_sigma_m)
-        self.state = done.state
+        self._state = done.state
         return done.accepted
 
     def sightings(self, seen: Sightings) -> Located | None:
@@ -100,7 +109,7 @@ class Lander:
             self._restart(found)
         else:
             around = self._around
-            self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
+            self._state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
         self._contradictions, self._matched_s, self.status = 0, self.state.time_s, "tracking"
         return found
 
@@ -121,7 +130,7 @@ class Lander:
         own = body @ fix.covariance @ body.T
         covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = own[:3, :3], own[3:, 3:]
         covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = own[:3, 3:], own[3:, :3]
-        self.state = replace(
+        self._state = replace(
             state,
             position_m=fix.pose.position_m,
             rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ mounting,
@@ -138,7 +147,8 @@ class Lander:
         covariance[VELOCITY, VELOCITY] += np.eye(3) * (_UNKNOWN_MPS2 * gap_s) ** 2
         covariance[POSITION, POSITION] += np.eye(3) * (_UNKNOWN_MPS2 * gap_s**2 / 2) ** 2
         covariance[ATTITUDE, ATTITUDE] += np.eye(3) * (_UNKNOWN_RADPS * gap_s) ** 2
-        self.state = replace(state, time_s=until_s, position_m=position, covariance=covariance)
+        self._state = replace(state, time_s=until_s, position_m=position, covariance=covariance)
+        self._time_s = until_s
 
     def _expected(self) -> PosePrior:
         """The camera's expected pose, with its covariance as of a step of `Pose`."""

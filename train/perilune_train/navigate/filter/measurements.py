@@ -122,8 +122,8 @@ def craters_update(
     by_error[:, :, POSITION] = by_pose[:, :, :3]
     by_error[:, :, ATTITUDE] = by_pose[:, :, 3:] @ -rotation_camera_from_body
     by_error[:, :, COMMON] = pattern
-    for k, place in enumerate(seen.index):
-        by_error[k, :, N_ERRORS + 2 * place : N_ERRORS + 2 * place + 2] = by_offset[k]
+    for axis in (0, 1):
+        by_error[np.arange(n), :, N_ERRORS + 2 * seen.index + axis] = by_offset[:, :, axis]
     innovation = (sightings.centre_px[own[seen.index]] - predicted).ravel()
     variance = sightings.noise_px[own[seen.index]] ** 2 / weight[seen.index]
     return updated(state, innovation, by_error.reshape(2 * n, -1), np.diag(np.repeat(variance, 2)), gate=False)

@@ -1,5 +1,6 @@
-"""Propagation of the state by one inertial measurement (strapdown integration, e.g. Sola 2017, arXiv 1711.02508)."""
+"""Propagation of the state by inertial measurements (strapdown integration, e.g. Sola 2017, arXiv 1711.02508)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -74,53 +75,54 @@ class InertialNoise:
         )
 
 
-def propagated(state: State, measured: Increment, noise: InertialNoise) -> State:
-    """The state at the end of the interval of a measurement."""
-    step = measured.interval_s
-    rate = measured.angular_rate_radps - state.gyro_bias_radps
-    force = measured.specific_force_mps2 - state.force_bias_mps2
-    start = state.rotation_site_from_body
-    middle = start @ matrix_from_rotation_vector(rate * step / 2)
-    acceleration = middle @ force + gravity_mps2(state.position_m[2])
-    turn = matrix_from_rotation_vector(rate * step)
-    # x(t + step) by x(t): the error of the attitude turns the force, and that of the biases adds up.
-    change = np.eye(_CHANGED)
-    by_turn = -middle @ _cross(force)
-    change[POSITION, VELOCITY] = step * np.eye(3)
-    change[POSITION, ATTITUDE], change[VELOCITY, ATTITUDE] = by_turn * step**2 / 2, by_turn * step
-    change[POSITION, GYRO_BIAS], change[VELOCITY, GYRO_BIAS] = -by_turn * step**3 / 4, -by_turn * step**2 / 2
-    change[POSITION, FORCE_BIAS], change[VELOCITY, FORCE_BIAS] = -middle * step**2 / 2, -middle * step
-    change[ATTITUDE, ATTITUDE], change[ATTITUDE, GYRO_BIAS] = turn.T, -step * np.eye(3)
-    covariance = state.covariance.copy()
-    covariance[:_CHANGED] = change @ covariance[:_CHANGED]
-    covariance[:, :_CHANGED] = covariance[:, :_CHANGED] @ change.T
-    for part, variance in (
-        (VELOCITY, noise.velocity),
-        (ATTITUDE, noise.turn),
-        (GYRO_BIAS, noise.gyro_bias),
-        (FORCE_BIAS, noise.force_bias),
-    ):
-        covariance[part, part] += variance * step * np.eye(3)
+def propagated(state: State, measured: Sequence[Increment], noise: InertialNoise, relief_m: float) -> State:
+    """The state after consecutive inertial measurements, each over its interval.
+
+    The ground's height below changes as a Gauss-Markov process of deviation `relief_m`.
+    """
+    position, velocity, rotation = state.position_m, state.velocity_mps, state.rotation_site_from_body
+    added = np.repeat([0.0, noise.velocity, noise.turn, noise.gyro_bias, noise.force_bias], 3)
+    change, variance = np.eye(_CHANGED), np.zeros((_CHANGED, _CHANGED))
+    for one in measured:
+        step = one.interval_s
+        rate = one.angular_rate_radps - state.gyro_bias_radps
+        force = one.specific_force_mps2 - state.force_bias_mps2
+        half = matrix_from_rotation_vector(rate * (step / 2))
+        middle = rotation @ half
+        acceleration = middle @ force + gravity_mps2(position[2])
+        own = _change(middle, half @ half, force, step)
+        change, variance = own @ change, own @ variance @ own.T
+        variance[np.diag_indices(_CHANGED)] += added * step
+        position = position + velocity * step + acceleration * (step**2 / 2)
+        velocity = velocity + acceleration * step
+        rotation = middle @ half
+    covariance, kept = state.covariance.copy(), np.exp(-sum(one.interval_s for one in measured) / _GROUND_S)
+    covariance[GROUND] *= kept
+    covariance[:, GROUND] *= kept
+    covariance[GROUND, GROUND] += relief_m**2 * (1 - kept**2)
+    own = change @ covariance[:_CHANGED]
+    covariance[:_CHANGED], covariance[:, :_CHANGED] = own, own.T
+    covariance[:_CHANGED, :_CHANGED] = own[:, :_CHANGED] @ change.T + variance
     return replace(
         state,
-        time_s=measured.time_s,
-        position_m=state.position_m + state.velocity_mps * step + acceleration * step**2 / 2,
-        velocity_mps=state.velocity_mps + acceleration * step,
-        rotation_site_from_body=start @ turn,
+        time_s=measured[-1].time_s,
+        position_m=position,
+        velocity_mps=velocity,
+        rotation_site_from_body=rotation,
+        ground_m=float(kept * state.ground_m),
         covariance=covariance,
     )
 
 
-def _cross(vector: Array) -> Array:
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def over_new_ground(state: State, step_s: float, relief_m: float) -> State:
-    """The state after a time in which the ground below changes, as a Gauss-Markov process."""
-    kept = np.exp(-step_s / _GROUND_S)
-    covariance = state.covariance.copy()
-    covariance[GROUND] *= kept
-    covariance[:, GROUND] *= kept
-    covariance[GROUND, GROUND] += relief_m**2 * (1 - kept**2)
-    return replace(state, ground_m=kept * state.ground_m, covariance=covariance)
+def _change(middle: Array, turn: Array, force: Array, step: float) -> Array:
+    """Derivative (15, 15) of the errors after a step by those before: that of the attitude turns the force, and those
+    of the biases add up."""
+    x, y, z = force
+    by_turn = middle @ np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
+    change = np.eye(_CHANGED)
+    change[[0, 1, 2], [3, 4, 5]], change[[6, 7, 8], [9, 10, 11]] = step, -step
+    change[POSITION, ATTITUDE], change[VELOCITY, ATTITUDE] = by_turn * (step**2 / 2), by_turn * step
+    change[POSITION, GYRO_BIAS], change[VELOCITY, GYRO_BIAS] = by_turn * (-(step**3) / 4), by_turn * (-(step**2) / 2)
+    change[POSITION, FORCE_BIAS], change[VELOCITY, FORCE_BIAS] = middle * (-(step**2) / 2), middle * -step
+    change[ATTITUDE, ATTITUDE] = turn.T
+    return change

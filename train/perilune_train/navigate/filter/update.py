@@ -1,6 +1,7 @@
 """Updates of the state by measurements, with a gate on the normalised innovation squared."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy.stats import chi2
@@ -26,6 +27,12 @@ class Update:
     """Whether it passed the gate."""
 
 
+@cache
+def _gate(n_parts: int) -> float:
+    """Largest normalised innovation squared of a measurement of so many parts."""
+    return float(chi2.isf(GATE_SHARE, n_parts))
+
+
 def updated(state: State, innovation: Array, by_error: Array, noise: Array, gate: bool = True) -> Update:
     """Update by a measurement: innovation (n,), its derivative by the first parts of the error state (n, m), noise
     covariance (n, n)."""
@@ -33,7 +40,7 @@ def updated(state: State, innovation: Array, by_error: Array, noise: Array, gate
     crossed = state.covariance[:, :m] @ by_error.T
     spread = by_error @ crossed[:m] + noise
     squared = float(innovation @ np.linalg.solve(spread, innovation))
-    if gate and squared > chi2.isf(GATE_SHARE, len(innovation)):
+    if gate and squared > _gate(len(innovation)):
         return Update(state, squared, len(innovation), False)
     gain = np.linalg.solve(spread, crossed.T).T
     covariance = state.covariance - gain @ crossed.T
