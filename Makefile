@@ -108,7 +108,7 @@ benchmark-nav: setup ## score the installed navigator, or a run (RUN=folder), on
 	@$(BIN)/perilune-train navigate benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
 
 # The experiment has presets of its own: PRESET=paper unless one is given.
-paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=quarter for two cores, ATTITUDE=1, DARKNET=yolov3.weights)
+paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=quarter or twentieth for two cores, ATTITUDE=1, DARKNET=yolov3.weights)
 	@$(BIN)/python scripts/paper.py --preset $(if $(filter file,$(origin PRESET)),paper,$(PRESET)) $(if $(PART),--part $(PART)) \
 	  $(if $(ATTITUDE),--attitude) $(if $(DARKNET),--darknet $(call quoted,$(DARKNET)))
 

@@ -1,6 +1,6 @@
 """The paper's experiment: render, train, evaluate, explain, and write its page. Run again to resume (`make paper`).
 
-    python scripts/paper.py [--preset paper] [--part quarter] [--attitude] [--darknet yolov3.weights]
+    python scripts/paper.py [--preset paper] [--part quarter|twentieth] [--attitude] [--darknet yolov3.weights]
 
 Every step is one of the commands that a user has, printed before it runs. A finished step is left unchanged.
 """
@@ -12,7 +12,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -23,6 +22,7 @@ from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
 from perilune_train.navigate.config import NavigateConfig
+from perilune_train.paper.parts import PARTS, Cut, Part
 from perilune_train.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
 
 BIN = Path(sys.executable).parent
@@ -32,31 +32,6 @@ ATTITUDE_DEG = 1.0
 OWN = "train own network, to start from"
 RENDER_FRAMES_PER_S = 4.0
 """Roughly, on two cores, scene included; the rendering states its own estimate when it runs."""
-
-
-class Part(StrEnum):
-    """How much of the experiment is made."""
-
-    WHOLE = "whole"
-    QUARTER = "quarter"
-
-
-PARTS: dict[Part, dict[str, str]] = {
-    Part.WHOLE: {},
-    Part.QUARTER: {
-        "detect.epochs": "4",
-        "detect.frozen_epochs": "1",
-        "detect.batch_size": "8",
-        "detect.warmup_steps": "200",
-        "detect.workers": "0",
-        "navigate.workers": "0",
-        "navigate.stack.coarse_epochs": "20",
-        "navigate.stack.fine_epochs": "4",
-        "navigate.stack.batch_sequences": "1",
-        "navigate.stack.accumulate": "8",
-    },
-}
-"""Settings that fit two cores and 16 GB; `quarter` also takes every fourth detection frame."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +59,11 @@ class Experiment:
     benchmark: Path
 
     @property
+    def cut(self) -> Cut:
+        """What is left out."""
+        return PARTS[self.part]
+
+    @property
     def label(self) -> str:
         """Name of the dataset and of the folders: paper, paper-tiny, paper-attitude."""
         preset = [] if self.preset == "paper" else [self.preset]
@@ -102,7 +82,7 @@ class Experiment:
     @property
     def settings(self) -> dict[str, str]:
         """Settings over the preset and the protocol."""
-        chosen = PARTS[self.part] | {"dataset.name": self.label}
+        chosen = self.cut.settings | {"dataset.name": self.label}
         if self.preset == "tiny":
             # Frozen and unfrozen epochs, coarse and fine ones, as in the whole experiment.
             chosen |= {"detect.epochs": "2", "detect.frozen_epochs": "1"}
@@ -140,15 +120,21 @@ def _data_steps(one: Experiment) -> list[Step]:
                 _rendered(plan),
             )
         )
-        source = plan
-        if one.part == Part.QUARTER and kind == "detect":
-            source = one.data / "plans" / "quarter"
-            where = "frame_index % 4 == 0"
+        source, where = plan, _chosen(kind, one.cut)
+        if where is not None:
+            source = one.data / "plans" / f"{kind}-{one.part}"
             command = [manifest, "subset", str(plan), "--out", str(source), "--images", "none", "--where", where]
-            found.append(Step("every fourth frame", command, _rendered(source)))
+            found.append(Step(f"take {where}", command, _rendered(source)))
         command = [render, "dataset", "--manifest", str(source), "--out", str(out)]
         found.append(Step(f"render {kind}", command, _rendered(out)))
     return found
+
+
+def _chosen(kind: str, cut: Cut) -> str | None:
+    """Condition on the frames of a plan that a part takes; None for all frames."""
+    if kind == "detect":
+        return f"frame_index % {cut.detect_every} == 0" if cut.detect_every > 1 else None
+    return None if cut.nav_trajectories is None else f"trajectory_id < 'trajectory-{cut.nav_trajectories:04d}'"
 
 
 def _network_steps(one: Experiment) -> list[Step]:
@@ -180,7 +166,7 @@ def _own_network(one: Experiment) -> list[Step]:
     pretraining = "tiny" if one.preset == "tiny" else "small"
     data, run = Path("data", pretraining, "detect"), one.runs / "detect" / "own"
     settings = {"attention": "none", "in_channels": "3", "strides": "[8, 16, 32]"}
-    settings |= {} if one.preset == "tiny" else {"width": "1.0"}
+    settings |= {} if one.preset == "tiny" else {"width": "1.0", "epochs": str(one.cut.own_epochs)}
     sets = [text for key, value in settings.items() for text in ("--set", f"detect.{key}={value}")]
     render = [str(BIN / "perilune-render"), "dataset", "--preset", pretraining, "--kind", "detect"]
     train = [str(BIN / "perilune-train"), "detect", "train", "--preset", pretraining, *sets, "--dataset", str(data)]
@@ -197,7 +183,7 @@ def _benchmark_steps(one: Experiment) -> list[Step]:
     for kind, networks in (("detect", DETECTORS), ("nav", NAVIGATORS)):
         rendered = any(one.benchmark.glob(f"benchmark-{kind}-*/dataset.json"))
         if one.preset == "paper":
-            command = ["scripts/render-benchmark", kind, str(one.benchmark)]
+            command = ["scripts/render-benchmark", kind, str(one.benchmark), str(one.cut.benchmark_scenes)]
             parts = [one.benchmark / f"benchmark-{kind}-{part}" for part in ("highland", "mare", "camera")]
             found.append(Step(f"render the benchmark, {kind}", command, _rendered(*parts)))
         elif not rendered:
@@ -220,11 +206,7 @@ def _page_steps(one: Experiment) -> list[Step]:
     about = [
         f"preset `{one.preset}`, part `{one.part}`, attitude noise of {ATTITUDE_DEG if one.attitude else 0:g} degrees"
     ]
-    if one.part == Part.QUARTER:
-        about.append(
-            "cut to fit two cores: every fourth detection frame, 4 epochs of the detectors (the first frozen), 4 fine "
-            "epochs of the navigators; the navigators' batch norms see one sequence at a time"
-        )
+    about += one.cut.lines
     command = [str(BIN / "perilune-train"), "paper", "--runs", str(one.runs), "--dataset", str(one.data / "detect")]
     return [Step("page", [*command, *[text for line in about for text in ("--about", line)]], lambda: False)]
 
@@ -261,8 +243,8 @@ def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
         if f"render {kind}" in left:
             found[f"render {kind}"] = dataset[kind] / RENDER_FRAMES_PER_S
     if OWN in left:
-        # `small` has 1088 training frames and 5 epochs, `tiny` fewer.
-        found[OWN] = detect_seconds(detect.model_copy(update={"attention": "none"}), size) * 1088 * 5
+        # `small` has 1088 training frames, `tiny` fewer.
+        found[OWN] = detect_seconds(detect.model_copy(update={"attention": "none"}), size) * 1088 * one.cut.own_epochs
     for folder, attention in zip(DETECTORS.values(), ("none", "cbam"), strict=True):
         if f"train {folder}" in left:
             seconds = detect_seconds(detect.model_copy(update={"attention": attention}), size)
@@ -288,14 +270,15 @@ def _dataset_settings(one: Experiment) -> dict[str, float]:
     for kind in ("detect", "nav"):
         own = dataset.kind(kind)
         frames[kind] = float(own.n_scenes * own.trajectories_per_scene * own.n_frames)
-    if one.part == Part.QUARTER:
-        frames["detect"] /= 4
+    frames["detect"] /= one.cut.detect_every
+    if one.cut.nav_trajectories is not None:
+        frames["nav"] = min(frames["nav"], float(one.cut.nav_trajectories * dataset.nav.n_frames))
     return {**frames, "width_px": dataset.camera.width_px}
 
 
 def main(
     preset: Annotated[str, typer.Option(help="Preset of sizes: paper, or tiny for a trial.")] = "paper",
-    part: Annotated[Part, typer.Option(help="whole, or quarter: what fits two cores.")] = Part.WHOLE,
+    part: Annotated[Part, typer.Option(help="whole, or quarter or twentieth: for two cores.")] = Part.WHOLE,
     attitude: Annotated[bool, typer.Option("--attitude", help="The second experiment, with attitude noise.")] = False,
     darknet: Annotated[Path | None, typer.Option(help="YOLOv3's weights of COCO (yolov3.weights).")] = None,
     benchmark: Annotated[Path, typer.Option(help="Folder of the rendered locked benchmark.")] = Path("data/benchmark"),

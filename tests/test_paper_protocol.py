@@ -69,8 +69,8 @@ def commands(script, one):
 def test_the_steps_of_a_quarter(script):
     one = experiment(script, part=script.Part.QUARTER)
     found = commands(script, one)
-    assert "frame_index % 4 == 0" in found["every fourth frame"]
-    assert "data/paper-quarter/plans/quarter" in found["render detect"]
+    assert "--where frame_index % 4 == 0" in found["take frame_index % 4 == 0"]
+    assert "data/paper-quarter/plans/detect-quarter" in found["render detect"]
     assert "data/paper-quarter/plans/nav" in found["render nav"], "all frames of navigation"
     plain, attended = found["train yolov3"], found["train attention-yolov3"]
     assert plain.replace("attention=none", "attention=cbam").replace("yolov3", "attention-yolov3") == attended
@@ -81,6 +81,24 @@ def test_the_steps_of_a_quarter(script):
     titles = list(found)
     assert titles.index("train yolov3") < titles.index("train darknet53-lstm") < titles.index("explain")
     assert titles[-1] == "page"
+
+
+def test_the_steps_of_a_twentieth(script):
+    found = commands(script, experiment(script, part=script.Part.TWENTIETH))
+    assert "--where frame_index % 20 == 0" in found["take frame_index % 20 == 0"]
+    assert "data/paper-twentieth/plans/detect-twentieth" in found["render detect"]
+    assert "--where trajectory_id < 'trajectory-0012'" in found["take trajectory_id < 'trajectory-0012'"]
+    assert "data/paper-twentieth/plans/nav-twentieth" in found["render nav"]
+    assert "detect.epochs=2" in found["train own network, to start from"]
+    assert found["render the benchmark, detect"].endswith(" b 2"), "two scenes of each part"
+    assert "6 of the 20 scenes" in found["page"] and "every twentieth" in found["page"]
+
+
+def test_the_whole_is_not_cut(script):
+    found = commands(script, experiment(script))
+    assert not any(title.startswith("take ") for title in found)
+    assert found["render the benchmark, detect"].endswith(" b 0") and "cut to fit" not in found["page"]
+    assert "detect.epochs=5" in found["train own network, to start from"]
 
 
 def test_the_second_experiment_and_given_weights(script):
