@@ -71,6 +71,19 @@ def test_errors_have_the_stated_size(false_share, found_share):
     assert np.median(rms_px) < 1.0
 
 
+def test_a_fix_names_places_in_the_whole_catalogue():
+    rng = np.random.default_rng(6)
+    true = pose(rng, 900.0)
+    seen = sighted(WORLD, true, rng, 0.9, 0.0)
+    prior = nearby(true, [3, -2, 2], [0.1, 0.1, 0.1])
+    fix = refine(seen, WORLD, CAMERA, prior, prior.pose)
+    assert len(fix.crater) > 20 and fix.crater.max() > 20
+    images = projected(WORLD.part(fix.crater), CAMERA, fix.pose, margin_px=50, least_radius_px=0)
+    np.testing.assert_array_equal(images.index, np.arange(len(fix.crater)))
+    distance = np.linalg.norm(images.centre_px - seen.centre_px[fix.sighting], axis=1)
+    assert np.median(distance) < 1.0 and (distance < 6).all()
+
+
 def test_no_fix_from_few_sightings_or_another_place():
     rng = np.random.default_rng(5)
     true = pose(rng, 900.0)

@@ -70,6 +70,21 @@ def test_propagation_of_errors_is_the_derivative():
         np.testing.assert_allclose(outer, np.outer(found, found), atol=2e-5)
 
 
+def test_several_measurements_at_once_are_the_same_as_one_after_the_other():
+    state, rng = some_state(np.random.default_rng(0)), np.random.default_rng(1)
+    measured = [
+        Increment(3 + 0.01 * k, 0.01, 0.05 * rng.normal(size=3), [0, 0, 1.6] + 0.3 * rng.normal(size=3))
+        for k in range(1, 31)
+    ]
+    single = state
+    for one in measured:
+        single = propagated(single, [one], NOISE, 5.0)
+    together = propagated(state, measured, NOISE, 5.0)
+    np.testing.assert_allclose(difference(single, together), 0, atol=1e-9)
+    np.testing.assert_allclose(together.ground_m, single.ground_m, rtol=1e-9)
+    np.testing.assert_allclose(together.covariance, single.covariance, rtol=1e-6, atol=1e-12)
+
+
 def fields(state):
     return {name: getattr(state, name) for name in State.__slots__}
 

@@ -23,7 +23,8 @@ _GATES_PX = (6.0, 3.0, 1.5, 0.0, 0.0, 0.0)
 _GATE_SIGMAS = 3.5
 _FORBIDDEN = 1e6
 _FARTHEST_PX, _SMALLER = 64.0, 0.8
-"""Craters that no round can match are left out: by distance from the image, pixels, and share of the least size."""
+"""Craters beside the image at the start by more pixels, or below a share of the least size, are left out of all rounds.
+The start is right to a few pixels; the rounds look 18 px beside the image."""
 _TUKEY = 4.685
 COMMON_PX = 0.08
 """Standard deviation of an error that all centres of a frame share, pixels."""
