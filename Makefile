@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-suppress bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-monte-carlo explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-suppress bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -131,6 +131,15 @@ navigate: nav-frames ## fly all methods of navigation over the test descents; wr
 	@if test -f "$(METHODS)/methods.md"; then echo "$(METHODS): finished, left unchanged; OVERWRITE=1 replaces it"; else \
 	  $(BIN)/perilune-train navigate methods --dataset "$(DATA)/nav" --out "$(METHODS)" \
 	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)"); fi
+
+DRAWS ?= 200
+SCENARIO ?= nominal
+MONTE_CARLO := $(RUNS)/navigate/$(NAME)-monte-carlo-$(SCENARIO)
+navigate-monte-carlo: nav-frames ## the filter over 200 draws of each test descent (DRAWS=number SCENARIO=nominal|outage|wrong-prior|false-detections); writes runs/navigate/<name>-monte-carlo-<scenario>
+	@$(if $(OVERWRITE),rm -rf "$(MONTE_CARLO)")
+	@if test -f "$(MONTE_CARLO)/monte_carlo.md"; then echo "$(MONTE_CARLO): finished, left unchanged; OVERWRITE=1 replaces it"; else \
+	  $(BIN)/perilune-train navigate monte-carlo --dataset "$(DATA)/nav" --draws $(call quoted,$(DRAWS)) \
+	  --scenario $(call quoted,$(SCENARIO)) --out "$(MONTE_CARLO)"; fi
 
 # Each network without attention; the stack network starts from the detector without attention, if there is one.
 train-nav-baseline: nav-frames ## the same networks without attention, into <name>-none and <name>-none-stack

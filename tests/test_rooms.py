@@ -33,7 +33,7 @@ ROOMS = {
     ),
     "train/perilune_train/navigate": (
         "config geometry data network relative craters filter fly evaluate train evaluate_run compare_runs "
-        "benchmark methods deploy cli"
+        "benchmark methods monte_carlo deploy cli"
     ),
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""

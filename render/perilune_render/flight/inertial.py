@@ -14,7 +14,8 @@ from perilune_render.flight.motion import Motion
 from perilune_render.streams import stream
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_shared.geometry.gravity import gravity_mps2
-from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2, InertialGrade
+from perilune_shared.geometry.inertial_errors import drawn_errors
+from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,31 +54,6 @@ def true_increments(motion: Motion, rate_hz: float) -> Increments:
 
 def measured(true: Increments, grade: InertialGrade, seed: int) -> Increments:
     """The increments as a unit of this grade measures them on the trajectory of a random seed."""
-    errors, rng = GRADES[grade], stream(seed, "inertial", grade)
-    per_s, per_root_s = np.radians(1) / HOUR_S, 1 / np.sqrt(HOUR_S)
-    mg = STANDARD_GRAVITY_MPS2 / 1000
-    gyro = _errors(
-        rng,
-        true.interval_s,
-        errors.gyro_bias_deg_per_h * per_s,
-        errors.gyro_bias_walk_deg_per_h * per_s * per_root_s,
-        np.radians(errors.angular_random_walk_deg) * per_root_s,
-    )
-    accelerometer = _errors(
-        rng,
-        true.interval_s,
-        errors.accelerometer_bias_mg * mg,
-        errors.accelerometer_bias_walk_mg * mg * per_root_s,
-        errors.velocity_random_walk_mps * per_root_s,
-    )
+    gyro, accelerometer = drawn_errors(GRADES[grade], true.interval_s, stream(seed, "inertial", grade))
     rate, force = true.angular_rate_radps + gyro, true.specific_force_mps2 + accelerometer
     return Increments(true.time_s, true.interval_s, rate, force)
-
-
-def _errors(rng: np.random.Generator, interval_s: Array, bias: float, walk: float, noise: float) -> Array:
-    """Errors (N, 3): bias, its random walk (per square root of a second), white noise (integrated, likewise)."""
-    size = len(interval_s), 3
-    root = np.sqrt(interval_s)[:, None]
-    start = bias * rng.normal(size=3)
-    steps = walk * root * rng.normal(size=size)
-    return start + np.cumsum(steps, axis=0) + noise / root * rng.normal(size=size)

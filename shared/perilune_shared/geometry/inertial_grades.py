@@ -1,4 +1,8 @@
-"""Errors of inertial measurement units, by grade: what `inertial` is simulated with and what a filter assumes."""
+"""Errors of inertial measurement units, by grade: what `inertial` is simulated with and what a filter assumes.
+
+Each axis has a bias, drawn once and then walking, and white noise. Scale factors, misalignment and quantisation are not
+simulated.
+"""
 
 from dataclasses import dataclass
 from typing import Literal

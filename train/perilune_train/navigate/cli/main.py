@@ -8,6 +8,7 @@ from perilune_train.navigate.cli.evaluate import evaluate
 from perilune_train.navigate.cli.export import export
 from perilune_train.navigate.cli.fly import fly
 from perilune_train.navigate.cli.methods import methods
+from perilune_train.navigate.cli.monte_carlo import monte_carlo
 from perilune_train.navigate.cli.train import train
 from perilune_train.navigate.cli.unpack import unpack
 
@@ -22,5 +23,6 @@ app.command("benchmark")(benchmark)
 app.command("compare")(compare)
 app.command("export")(export)
 app.command("methods")(methods)
+app.command("monte-carlo")(monte_carlo)
 app.command("fly")(fly)
 app.command("unpack")(unpack)

@@ -32,32 +32,43 @@ def flights(
 ) -> pd.DataFrame:
     """Errors of the filter at every frame of all descents; the starts are off, drawn by the place of the descent."""
     tables = []
+    mounting, sigmas = np.array(dataset.info.camera.rotation_camera_from_body), default_sigmas(grade, attitude_deg)
     with progress_bar() as progress:
         task = progress.add_task(f"filter, {attitude_deg:g} deg", total=len(descents), unit="descents", note="")
         for place, descent in enumerate(descents):
-            rng = np.random.default_rng(place)
-            tables.append(_flight(dataset, descent, catalogues[descent.ids[0]], grade, attitude_deg, rng))
+            instruments = Instruments.of_trajectory(dataset, descent.ids, grade)
+            off = sigmas[:9] * np.random.default_rng(place).normal(size=9)
+            begun = time.process_time()
+            flown = flight(descent, instruments, mounting, catalogues[descent.ids[0]], grade, sigmas, off)
+            tables.append(flown.assign(seconds=(time.process_time() - begun) / max(len(flown), 1)))
             progress.advance(task)
     return pd.concat(tables, ignore_index=True)
 
 
-def _flight(
-    dataset: Dataset,
+def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:
+    """Standard deviations of the start: `START_M`, `START_MPS`, an attitude, and the biases of a grade."""
+    return start_sigmas(START_M, START_MPS, attitude_deg, GRADES[grade])
+
+
+def flight(
     descent: SeenDescent,
+    instruments: Instruments,
+    mounting: Array,
     catalogue: Catalogue,
     grade: InertialGrade,
-    attitude_deg: float,
-    rng: np.random.Generator,
+    sigmas: Array,
+    off: Array,
 ) -> pd.DataFrame:
-    mounting, errors = np.array(dataset.info.camera.rotation_camera_from_body), GRADES[grade]
-    sigmas = start_sigmas(START_M, START_MPS, attitude_deg, errors)
-    off = sigmas[:9] * rng.normal(size=9)
+    """Errors of the filter at every frame of a descent.
+
+    `mounting` is rotation_camera_from_body (3, 3), `sigmas` states the errors of the start, `off` (9,) has its true
+    errors: position, velocity, attitude.
+    """
     turned = descent.true[0].changed(np.concatenate([off[:3], mounting @ off[6:]]))
     attitude = turned.rotation_camera_from_site.T @ mounting
     start = State.starting(turned.position_m, descent.velocity_mps + off[3:6], attitude, sigmas, RELIEF_M)
     around = Surroundings(descent.camera, mounting, catalogue, RANGE_SIGMA_M, RELIEF_M)
-    lander, begun = Lander(start, InertialNoise.of(errors), around), time.process_time()
-    instruments = Instruments.of_trajectory(dataset, descent.ids, grade)
+    lander = Lander(start, InertialNoise.of(GRADES[grade]), around)
     rows = []
     for estimate in fly(lander, instruments, descent.time_s, descent.sightings):
         true = descent.true[estimate.frame]
@@ -73,9 +84,8 @@ def _flight(
                 "squared": _squared(error, estimate.state.covariance),
             }
         )
-    seconds = (time.process_time() - begun) / max(len(rows), 1)
     own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
-    return pd.DataFrame(rows).assign(**own, time_s=descent.time_s, seconds=seconds)
+    return pd.DataFrame(rows).assign(**own, time_s=descent.time_s)
 
 
 def _axes(name: str, values: Array) -> dict[str, float]:

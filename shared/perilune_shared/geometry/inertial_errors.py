@@ -1,0 +1,36 @@
+"""Random errors of inertial measurement units."""
+
+import numpy as np
+
+from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.inertial_grades import HOUR_S, STANDARD_GRAVITY_MPS2, InertialErrors
+
+
+def drawn_errors(errors: InertialErrors, interval_s: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Random errors of mean angular rates, rad/s, and of mean specific forces, m/s^2, over N intervals: (N, 3) each."""
+    per_s, per_root_s = np.radians(1) / HOUR_S, 1 / np.sqrt(HOUR_S)
+    mg = STANDARD_GRAVITY_MPS2 / 1000
+    gyro = _drawn(
+        rng,
+        interval_s,
+        errors.gyro_bias_deg_per_h * per_s,
+        errors.gyro_bias_walk_deg_per_h * per_s * per_root_s,
+        np.radians(errors.angular_random_walk_deg) * per_root_s,
+    )
+    accelerometer = _drawn(
+        rng,
+        interval_s,
+        errors.accelerometer_bias_mg * mg,
+        errors.accelerometer_bias_walk_mg * mg * per_root_s,
+        errors.velocity_random_walk_mps * per_root_s,
+    )
+    return gyro, accelerometer
+
+
+def _drawn(rng: np.random.Generator, interval_s: Array, bias: float, walk: float, noise: float) -> Array:
+    """Errors (N, 3): bias, its random walk (per square root of a second), white noise (integrated, likewise)."""
+    size = len(interval_s), 3
+    root = np.sqrt(interval_s)[:, None]
+    start = bias * rng.normal(size=3)
+    steps = walk * root * rng.normal(size=size)
+    return start + np.cumsum(steps, axis=0) + noise / root * rng.normal(size=size)

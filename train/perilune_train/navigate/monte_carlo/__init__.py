@@ -1,0 +1,1 @@
+"""The filter over many random starts, catalogues and inertial errors."""

@@ -1,0 +1,14 @@
+"""What goes wrong in the flights of a Monte Carlo run."""
+
+from typing import Literal
+
+Scenario = Literal["nominal", "outage", "wrong-prior", "false-detections"]
+"""Name of a scenario."""
+OUTAGE_S, WRONG_PRIOR_M = 10.0, 300.0
+SCENARIOS: dict[Scenario, str] = {
+    "nominal": "nothing goes wrong",
+    "outage": f"no detections for {OUTAGE_S:g} s at a random time",
+    "wrong-prior": f"the start is {WRONG_PRIOR_M:g} m off over ground, and states 60 m on each axis",
+    "false-detections": "a false detection is added for each detection",
+}
+"""What each scenario is."""
