@@ -14,7 +14,7 @@ from perilune_train.navigate.craters.projection import Pose
 from perilune_train.navigate.craters.sightings import STATIC_SHARE, Sightings
 from perilune_train.navigate.filter.lander import Lander, Surroundings
 from perilune_train.navigate.filter.propagate import Increment, InertialNoise
-from perilune_train.navigate.filter.state import State
+from perilune_train.navigate.filter.state import N_ERRORS, State
 
 GRADE = GRADES["tactical"]
 NOISE = InertialNoise.of(GRADE)
@@ -71,6 +71,40 @@ def test_errors_are_small_and_of_the_stated_size():
     # Errors along a descent hang together: 8 descents have about 16 independent ones of 6 parts, a deviation of 0.9.
     assert 3.3 < np.mean(squared) < 8.7
     assert np.mean(last) < 1.5
+
+
+def test_craters_missed_in_one_frame_keep_their_offsets():
+    """Else their catalogue errors would count as new information when they are seen again."""
+    craft, rng, _ = lander(6)
+    true = Pose(POSITION_M, MOUNTING)
+    seen = sighted(WORLD, true, rng)
+    craft.sightings(seen)
+    known, covariance = craft.state.craters, craft.state.covariance
+    assert len(known) > 40
+    some = Sightings(seen.centre_px[::2], seen.radius_px[::2], seen.score[::2])
+    craft.sightings(some)
+    lost = np.setdiff1d(known, craft.state.craters)
+    # Those at the very border of the image may leave it.
+    assert len(lost) < 0.05 * len(known)
+    before = dict(zip(known, np.diag(covariance)[N_ERRORS::2], strict=True))
+    after = dict(zip(craft.state.craters, np.diag(craft.state.covariance)[N_ERRORS::2], strict=True))
+    assert all(after[crater] <= before[crater] * (1 + 1e-9) for crater in set(before) & set(after))
+
+
+def test_craters_out_of_view_leave_the_state():
+    craft, rng, _ = lander(7)
+    around = Surroundings(CAMERA, MOUNTING, WORLD, 2.0, 5.0)
+    craft = Lander(craft.state, NOISE, around)
+    craft.sightings(sighted(WORLD, Pose(POSITION_M, MOUNTING), rng))
+    first = craft.state
+    # The view is as wide as 93 % of the altitude: half of it is new.
+    moved = np.array([0.0, 650.0, 0.0])
+    craft = Lander(dataclasses.replace(first, position_m=first.position_m + moved), NOISE, around)
+    assert craft.sightings(sighted(WORLD, Pose(POSITION_M + moved, MOUNTING), rng)) is not None
+    behind = first.craters[WORLD.centre_m[first.craters, 1] < POSITION_M[1] - 60]
+    assert len(behind) > 20
+    assert not np.isin(behind, craft.state.craters).any()
+    assert np.isin(first.craters, craft.state.craters).sum() > 20
 
 
 def test_an_outage_of_ten_seconds():

@@ -6,7 +6,7 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.craters.fix import Fix
-from perilune_train.navigate.craters.projection import projected
+from perilune_train.navigate.craters.projection import in_view, projected
 from perilune_train.navigate.craters.sightings import STATIC_SHARE, Sightings
 from perilune_train.navigate.filter.state import (
     ATTITUDE,
@@ -96,14 +96,18 @@ def craters_update(
 ) -> Update:
     """Update by the craters that a fix has matched, with their offsets as part of the state.
 
+    Craters that are in view but not matched stay in the state: a crater that is missed in one frame must not bring its
+    error of the catalogue as new information in the next.
     The measurement is linear about the pose of the fix, which is nearer to the truth than the state (iterated filter,
     Bell & Cathey 1993, doi 10.1109/9.250476).
     """
     used = np.flatnonzero(fix.weight > _LEAST_WEIGHT)
     own, crater, weight = fix.sighting[used], fix.crater[used], fix.weight[used]
-    part = catalogue.part(crater)
-    state = state.with_craters(crater, np.hypot(catalogue.position_sigma_m, STATIC_SHARE * part.radius_m))
-    seen = projected(part, camera, fix.pose, margin_px=np.inf, least_radius_px=0.0)
+    unmatched = np.setdiff1d(state.craters, crater)
+    unmatched = unmatched[in_view(catalogue.part(unmatched), camera, fix.pose, 0.0, 0.0)]
+    known = np.concatenate([crater, unmatched])
+    state = state.with_craters(known, np.hypot(catalogue.position_sigma_m, STATIC_SHARE * catalogue.radius_m[known]))
+    seen = projected(catalogue.part(crater), camera, fix.pose, margin_px=np.inf, least_radius_px=0.0)
     by_pose = seen.jacobian[:, :2]
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(expected @ fix.pose.rotation_camera_from_site.T)
@@ -118,7 +122,7 @@ def craters_update(
         + pattern @ state.common_px
     )
     n = len(seen.index)
-    by_error = np.zeros((n, 2, N_ERRORS + 2 * len(crater)))
+    by_error = np.zeros((n, 2, N_ERRORS + 2 * len(known)))
     by_error[:, :, POSITION] = by_pose[:, :, :3]
     by_error[:, :, ATTITUDE] = by_pose[:, :, 3:] @ -rotation_camera_from_body
     by_error[:, :, COMMON] = pattern
