@@ -43,7 +43,7 @@ NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
 	@echo
-	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port  RUN=folder  SCENES=number  ELEVATION=folder'
+	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port  RUN=folder  SCENES=number  ELEVATION=folder  DRAWS=number  SCENARIO=name'
 	@echo
 	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""

@@ -80,6 +80,12 @@ class Experiment:
         return Path("runs", self.data.name)
 
     @property
+    def scored(self) -> Path:
+        """Folder of the rendered benchmark; a part of it has its own, named as `make benchmark SCENES=2` does."""
+        scenes = self.cut.benchmark_scenes
+        return self.benchmark.with_name(f"{self.benchmark.name}-{scenes}-scenes") if scenes else self.benchmark
+
+    @property
     def settings(self) -> dict[str, str]:
         """Settings over the preset and the protocol."""
         chosen = self.cut.settings | {"dataset.name": self.label}
@@ -181,17 +187,17 @@ def _benchmark_steps(one: Experiment) -> list[Step]:
     found = []
     train = str(BIN / "perilune-train")
     for kind, networks in (("detect", DETECTORS), ("nav", NAVIGATORS)):
-        rendered = any(one.benchmark.glob(f"benchmark-{kind}-*/dataset.json"))
+        rendered = any(one.scored.glob(f"benchmark-{kind}-*/dataset.json"))
         if one.preset == "paper":
-            command = ["scripts/render-benchmark", kind, str(one.benchmark), str(one.cut.benchmark_scenes)]
-            parts = [one.benchmark / f"benchmark-{kind}-{part}" for part in ("highland", "mare", "camera")]
+            command = ["scripts/render-benchmark", kind, str(one.scored), str(one.cut.benchmark_scenes)]
+            parts = [one.scored / f"benchmark-{kind}-{part}" for part in ("highland", "mare", "camera")]
             found.append(Step(f"render the benchmark, {kind}", command, _rendered(*parts)))
         elif not rendered:
             continue
         for folder in networks.values():
             task, run = ("detect", f"detect/{folder}") if kind == "detect" else ("navigate", f"navigate/{folder}-stack")
             out = one.runs / "benchmark" / folder
-            command = [train, task, "benchmark", "--run", str(one.runs / run), "--data", str(one.benchmark)]
+            command = [train, task, "benchmark", "--run", str(one.runs / run), "--data", str(one.scored)]
             found.append(
                 Step(
                     f"benchmark {folder}",

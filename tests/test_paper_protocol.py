@@ -90,7 +90,10 @@ def test_the_steps_of_a_twentieth(script):
     assert "--where trajectory_id < 'trajectory-0012'" in found["take trajectory_id < 'trajectory-0012'"]
     assert "data/paper-twentieth/plans/nav-twentieth" in found["render nav"]
     assert "detect.epochs=2" in found["train own network, to start from"]
-    assert found["render the benchmark, detect"].endswith(" b 2"), "two scenes of each part"
+    assert found["render the benchmark, detect"].endswith(" b-2-scenes 2"), (
+        "two scenes of each part, in their own folder"
+    )
+    assert "--data b-2-scenes" in found["benchmark yolov3"]
     assert "6 of the 20 scenes" in found["page"] and "every twentieth" in found["page"]
 
 

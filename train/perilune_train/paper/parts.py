@@ -53,7 +53,7 @@ PARTS = {
     Part.QUARTER: Cut(
         detect_every=4,
         settings=_TWO_CORES,
-        lines=(f"cut to fit two cores in a day: every fourth detection frame, {_FEWER_EPOCHS}",),
+        lines=(f"cut to fit two cores: every fourth detection frame, {_FEWER_EPOCHS}",),
     ),
     Part.TWENTIETH: Cut(
         detect_every=20,
@@ -62,7 +62,7 @@ PARTS = {
         benchmark_scenes=2,
         settings=_TWO_CORES | {"detect.warmup_steps": "50"},
         lines=(
-            "cut to fit two cores in about three hours: every twentieth detection frame, the first 12 of 49 navigation "
+            "cut to fit two cores: every twentieth detection frame, the first 12 of 49 navigation "
             f"trajectories, {_FEWER_EPOCHS}; 2 epochs of the network that the backbones start from; 6 of the 20 "
             "scenes of the locked benchmark",
         ),

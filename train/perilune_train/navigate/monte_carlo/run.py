@@ -41,7 +41,8 @@ from perilune_train.training.runs import RunFolder, load_weights
 PAGE, TABLE = "monte_carlo.md", "draws.parquet"
 PICTURES = ("errors.png", "consistency.png")
 REFERENCE: InertialGrade = "navigation"
-"""Inertial measurements that are taken as the true motion: the errors of this grade are 16 to 1000 times smaller."""
+"""Inertial measurements that are taken as the true motion: the errors of this grade are smaller than those of
+`GRADE` by factors of 6 (noise of the specific force) to 1000."""
 GRADE: InertialGrade = "tactical"
 
 
