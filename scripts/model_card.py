@@ -140,6 +140,7 @@ def _navigator(one: Shipment) -> list[str]:
     names = {
         method: "this network",
         "klt": "tracked corners (KLT)",
+        "klt_gyroscope": "the same, with a gyroscope",
         "alignment": "direct alignment",
         "alignment_gyroscope": "direct alignment, with a gyroscope",
         "nominal": "nominal motion",
@@ -148,6 +149,7 @@ def _navigator(one: Shipment) -> list[str]:
     rows = [
         f"| {title} | " + " | ".join(_figure(figures, f"{name}/{key}") for key in keys) + " |"
         for name, title in names.items()
+        if f"{name}/{keys[0]}" in figures
     ]
     return [
         "Estimates the motion of a camera between two frames of a landing, from the frames and the nominal motion. "

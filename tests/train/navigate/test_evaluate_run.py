@@ -77,7 +77,7 @@ def test_a_run_is_evaluated_on_another_dataset(runs, elsewhere, tmp_path):
     done = call("evaluate", "--run", runs / "a-stack", "--dataset", elsewhere, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     table = pd.read_parquet(tmp_path / "out" / "navigation.parquet").set_index("method")
-    assert list(table.index) == ["stack", "klt", "alignment", "alignment_gyroscope", "nominal"]
+    assert list(table.index) == ["stack", "klt", "klt_gyroscope", "alignment", "alignment_gyroscope", "nominal"]
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics["test/position_rmse_vector_m"] == pytest.approx(table.loc["stack", "position_rmse_vector_m"])
     assert (metrics["evaluation/method"], metrics["test/pairs"]) == ("stack", 10)

@@ -59,7 +59,7 @@ def runs(dataset_nav, tmp_path_factory, detector):
 
 def test_a_run_leaves_one_table_of_all_methods(runs):
     table = pd.read_parquet(runs / "tiny" / "navigation.parquet").set_index("method")
-    classical = ["klt", "alignment", "alignment_gyroscope", "nominal"]
+    classical = ["klt", "klt_gyroscope", "alignment", "alignment_gyroscope", "nominal"]
     assert list(table.index) == ["warp", "stack", *classical, "mean_at_step", "mean"]
     metrics = json.loads((runs / "tiny" / "metrics.json").read_text())
     assert metrics["test/position_rmse_vector_m"] == pytest.approx(table.loc["warp", "position_rmse_vector_m"])

@@ -31,6 +31,7 @@ _COLUMNS = {
     "position_rmse_per_component_m": "per component (m)",
     "orientation_rmse_angle_deg": "orientation RMSE, angle (deg)",
     "drift_final_m": "drift at the end (m)",
+    "stated_position_rmse_vector_m": "stated position RMSE, vector (m)",
     "normalised_error_squared_mean": "mean normalised error squared (6 if the stated covariance is right)",
 }
 _OF_BINS = tuple(_COLUMNS)[:3]

@@ -19,6 +19,7 @@ def test_a_page_with_every_method(tiny, tmp_path):
     expected = {
         "warp",
         "klt",
+        "klt_gyroscope",
         "alignment",
         "alignment_gyroscope",
         "nominal",

@@ -27,7 +27,7 @@ def test_alignment_is_better_than_tracks_and_best_with_a_gyroscope(trajectories)
     tracked, aligned, aided = (
         summary(motion_errors(trajectories, [method(one) for one in trajectories]))
         for method in (
-            klt_trajectory,
+            lambda one: klt_trajectory(one).motion,
             lambda one: aligned_trajectory(one).motion,
             lambda one: aligned_trajectory(one, one.gyroscopes["tactical"]).motion,
         )

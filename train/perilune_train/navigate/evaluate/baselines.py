@@ -9,10 +9,14 @@ from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.terminal import progress_bar
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
 from perilune_train.navigate.relative.descent import aligned_trajectory
+from perilune_train.navigate.relative.estimate import EstimatedMotion
 from perilune_train.navigate.relative.klt import klt_trajectory
 
 GYROSCOPE: InertialGrade = "tactical"
-"""The grade whose rotations `alignment_gyroscope` uses."""
+"""The grade whose rotations `klt_gyroscope` and `alignment_gyroscope` use."""
+
+CLASSICAL = ("klt", "klt_gyroscope", "alignment", "alignment_gyroscope")
+"""Methods that read the images, in the order of the tables."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +26,7 @@ class Baselines:
     motions: dict[str, list[Motion]]
     """Motions of each trajectory, by method."""
     covariances: dict[str, list[Array]]
-    """Covariances (n - 1, 6, 6) of each trajectory, as in `Alignment`, by method."""
+    """Covariances (n - 1, 6, 6) of each trajectory, as in `EstimatedMotion`, by method."""
 
 
 def baselines(training: list[Trajectory], test: list[Trajectory]) -> Baselines:
@@ -31,18 +35,17 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> Baselines:
     """
     with progress_bar() as progress:
         task = progress.add_task("classical methods", total=len(test), unit="trajectories", note="")
-        tracked, aligned, aided = [], [], []
+        estimated: dict[str, list[EstimatedMotion]] = {}
         for trajectory in test:
-            tracked.append(klt_trajectory(trajectory))
-            aligned.append(aligned_trajectory(trajectory))
-            if GYROSCOPE in trajectory.gyroscopes:
-                aided.append(aligned_trajectory(trajectory, trajectory.gyroscopes[GYROSCOPE]))
+            gyroscope = trajectory.gyroscopes.get(GYROSCOPE)
+            for name, method in (("klt", klt_trajectory), ("alignment", aligned_trajectory)):
+                estimated.setdefault(name, []).append(method(trajectory))
+                if gyroscope is not None:
+                    estimated.setdefault(f"{name}_gyroscope", []).append(method(trajectory, gyroscope))
             progress.advance(task)
-    found = {"klt": tracked, "alignment": [one.motion for one in aligned]}
-    covariances = {"alignment": [one.covariance for one in aligned]}
-    if len(aided) == len(test):
-        found["alignment_gyroscope"] = [one.motion for one in aided]
-        covariances["alignment_gyroscope"] = [one.covariance for one in aided]
+    whole = {name: estimated[name] for name in CLASSICAL if len(estimated.get(name, [])) == len(test)}
+    found = {name: [one.motion for one in own] for name, own in whole.items()}
+    covariances = {name: [one.covariance for one in own] for name, own in whole.items()}
     found["nominal"] = [trajectory.nominal_motion for trajectory in test]
     if training:
         found["mean_at_step"] = [mean_motion_at_step(training, trajectory) for trajectory in test]

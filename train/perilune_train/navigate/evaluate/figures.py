@@ -15,6 +15,7 @@ COLOURS = {
     "warp": "tab:red",
     "stack": "tab:purple",
     "klt": "tab:green",
+    "klt_gyroscope": "tab:olive",
     "alignment": "tab:blue",
     "alignment_gyroscope": "tab:cyan",
     "nominal": "tab:gray",

@@ -17,7 +17,8 @@ def motion_errors(
     Columns: scene_id, trajectory_id, step, altitude_m (nominal), position_error_m (length) with its components
     error_x_m, error_y_m, error_z_m in O_C of the earlier frame, orientation_error_deg (angle of the residual rotation)
     with its components error_x_deg ... (rotation vector, O_C of the later frame), drift_m and drift_x_m ... (O_L),
-    and, with `covariances` (n - 1, 6, 6) as in `Alignment`, normalised_error_squared.
+    and, with `covariances` (n - 1, 6, 6) as in `EstimatedMotion`, normalised_error_squared and stated_error_m, the root
+    mean square length of the position error that the covariance states.
     """
     tables = []
     stated = covariances if covariances is not None else [None] * len(trajectories)
@@ -41,6 +42,7 @@ def motion_errors(
         for i, axis in enumerate("xyz"):
             columns |= {f"error_{axis}_m": shift[:, i], f"error_{axis}_deg": turn[:, i], f"drift_{axis}_m": drift[:, i]}
         if covariance is not None:
+            columns["stated_error_m"] = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
             columns["normalised_error_squared"] = normalised_errors(trajectory, (translation, rotation), covariance)
         tables.append(pd.DataFrame(columns))
     return pd.concat(tables, ignore_index=True)
@@ -70,6 +72,7 @@ def summary(errors: pd.DataFrame) -> dict[str, float]:
     figures["drift_rms_m"] = _rms(errors["drift_m"])
     figures["drift_final_m"] = _rms(ends)
     if "normalised_error_squared" in errors:
+        figures["stated_position_rmse_vector_m"] = _rms(errors["stated_error_m"])
         figures["normalised_error_squared_mean"] = float(errors["normalised_error_squared"].mean())
     return figures
 

@@ -13,6 +13,7 @@ _KNOWS = {
     "warp": "two frames, the nominal motion",
     "stack": "two frames",
     "klt": "two frames, the altitude at the start",
+    "klt_gyroscope": "the same and a tactical gyroscope",
     "alignment": "two frames, the altitude at the start",
     "alignment_gyroscope": "the same and a tactical gyroscope",
     "nominal": "the planned curve; no frame",
@@ -27,6 +28,7 @@ _KNOWS = {
 _RELATIVE = {
     "position_rmse_m": "position RMSE of a step, vector (m)",
     "attitude_rmse_deg": "orientation RMSE, angle (deg)",
+    "stated_rmse_m": "as the covariance states (m)",
     "normalised_error_squared_mean": "normalised error squared (6)",
     "position_end_rmse_m": "drift at the end (m)",
 }
@@ -69,6 +71,9 @@ def page_of(
         "## Motion between consecutive frames",
         "",
         *_table(rows[rows["kind"] == "relative"], _RELATIVE),
+        "",
+        "What the covariance of KLT states is the Cramer-Rao bound of its tracks over a plane, if their errors are",
+        "independent.",
         "",
         "## Position over ground",
         "",

@@ -107,6 +107,7 @@ def _relative(trajectories: list[Trajectory], learned: dict) -> pd.DataFrame:
                 "n_frames": float(sum(one.n_pairs for one in trajectories)),
                 "position_rmse_m": figures["position_rmse_vector_m"],
                 "attitude_rmse_deg": figures["orientation_rmse_angle_deg"],
+                "stated_rmse_m": figures.get("stated_position_rmse_vector_m", np.nan),
                 "normalised_error_squared_mean": figures.get("normalised_error_squared_mean", np.nan),
                 "position_end_rmse_m": figures["drift_final_m"],
             }

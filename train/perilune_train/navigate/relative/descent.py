@@ -1,31 +1,19 @@
 """Direct alignment along a trajectory: each pair starts from KLT's motion and the heights of the pair before."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from perilune_shared.geometry.frames import Array
 from perilune_train.navigate.data.gyroscope import GyroscopeTurns
-from perilune_train.navigate.data.trajectories import Motion, Trajectory
+from perilune_train.navigate.data.trajectories import Trajectory
 from perilune_train.navigate.relative.alignment import Prior, State, align
 from perilune_train.navigate.relative.contrast import pyramid
+from perilune_train.navigate.relative.estimate import EstimatedMotion
 from perilune_train.navigate.relative.ground import N_NODES, Heights, carried, unknown_heights
 from perilune_train.navigate.relative.klt import NOMINAL_TURN_SIGMA_RAD, klt_motion, stretched
 
 _LEVELS = 2
 
 
-@dataclass(frozen=True, slots=True)
-class Alignment:
-    """Estimated motions of a trajectory."""
-
-    motion: Motion
-    """translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3)."""
-    covariance: Array
-    """Of each rotation (turn from the left, radians) and shift (metres, O_C of the later frame): (n - 1, 6, 6)."""
-
-
-def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> Alignment:
+def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
     """Motions of a whole trajectory, from images and, where it is given, a gyroscope.
 
     The altitude is the true one at the first frame, then updated with the estimated motions.
@@ -44,9 +32,10 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
         second = pyramid(trajectory.images[i + 1], camera, _LEVELS)
         expected = nominal_translation[i], rotation[i]
         # KLT must know the gyroscope's rotation too: its shift balances an error of its own rotation.
-        start = klt_motion(camera, grey[i], grey[i + 1], *expected, down, altitude_m, turn_sigma[i])[:2]
+        tracked = klt_motion(camera, grey[i], grey[i + 1], *expected, down, altitude_m, turn_sigma[i])
         prior = Prior(*expected, turn_sigma[i], down, altitude_m, heights)
-        found, covariance = align(first, second, prior, State(*start, np.zeros(2), heights.mean_m))
+        start = State(tracked.translation_m, tracked.rotation_c2_from_c1, np.zeros(2), heights.mean_m)
+        found, covariance = align(first, second, prior, start)
         motion = found.translation_m, found.rotation_c2_from_c1
         down_1 = found.down_c(prior)
         lower_m = altitude_m - float(down_1 @ motion[0])
@@ -56,4 +45,4 @@ def aligned_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = No
         motions.append(motion)
         covariances.append(covariance[:6, :6])
     translation, turned = (np.stack(parts) for parts in zip(*motions, strict=True))
-    return Alignment((translation, turned), np.stack(covariances))
+    return EstimatedMotion((translation, turned), np.stack(covariances))

@@ -6,18 +6,22 @@ are projected onto the ground plane at the estimated altitude. The motion is fit
 reprojection error with Tukey's weights (Beaton & Tukey 1974, doi 10.1080/00401706.1974.10489171).
 """
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
 from perilune_train.data.frames import normalised
-from perilune_train.navigate.data.trajectories import Motion, Trajectory
+from perilune_train.navigate.data.gyroscope import GyroscopeTurns
+from perilune_train.navigate.data.trajectories import Trajectory
 from perilune_train.navigate.geometry import (
     apply_homography,
     pixel_index_homography,
     plane_homography,
 )
+from perilune_train.navigate.relative.estimate import EstimatedMotion
 
 _N_CORNERS = 600
 _WINDOW_PX = 11
@@ -32,30 +36,54 @@ _ITERATIONS = 15
 _MIN_TRACKS = 8
 
 
-def klt_trajectory(trajectory: Trajectory) -> Motion:
-    """Motions of a whole trajectory: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3).
+_MEDIAN_OF_SIGMA = 1.1774
+"""Median length of a vector with two normal components, divided by their standard deviation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """Motion between two frames from tracks."""
+
+    translation_m: Array
+    """Motion (3,), O_C of frame 1."""
+    rotation_c2_from_c1: Array
+    """Rotation (3, 3)."""
+    covariance: Array
+    """Of the turn from the left (radians) and the shift (metres, O_C of frame 2), (6, 6): the Cramer-Rao bound of the
+    tracks used, if their errors are independent and the ground is the plane. The size of the errors is that of the
+    residuals."""
+    n_tracks: int
+    """Number of consistent tracks."""
+
+
+def klt_trajectory(trajectory: Trajectory, turns: GyroscopeTurns | None = None) -> EstimatedMotion:
+    """Motions of a whole trajectory, from images and, where it is given, a gyroscope.
 
     One pair gives the translation only relative to the altitude. The altitude is the true one at the first frame, then
     updated with the estimated motions; the attitude is assumed level.
     """
-    nominal_translation, nominal_rotation = trajectory.nominal_motion
+    nominal_translation, rotation = trajectory.nominal_motion
+    turn_sigma = np.full(trajectory.n_pairs, NOMINAL_TURN_SIGMA_RAD)
+    if turns is not None:
+        rotation, turn_sigma = turns.rotation_c2_from_c1, turns.sigma_rad
     images = stretched(trajectory.images)
     altitude_m = float(trajectory.position_m[0, 2])
-    translations, rotations = [], []
+    found = []
     for i in range(trajectory.n_pairs):
-        translation, rotation, _ = klt_motion(
+        one = klt_motion(
             trajectory.camera,
             images[i],
             images[i + 1],
             nominal_translation[i],
-            nominal_rotation[i],
+            rotation[i],
             trajectory.down_c,
             altitude_m,
+            turn_sigma[i],
         )
-        altitude_m -= float(trajectory.down_c @ translation)
-        translations.append(translation)
-        rotations.append(rotation)
-    return np.stack(translations), np.stack(rotations)
+        altitude_m -= float(trajectory.down_c @ one.translation_m)
+        found.append(one)
+    motion = np.stack([one.translation_m for one in found]), np.stack([one.rotation_c2_from_c1 for one in found])
+    return EstimatedMotion(motion, np.stack([one.covariance for one in found]))
 
 
 def stretched(images: np.ndarray) -> np.ndarray:
@@ -72,18 +100,19 @@ def klt_motion(
     plane_normal_c1: Array,
     altitude_m: float,
     turn_sigma_rad: float = NOMINAL_TURN_SIGMA_RAD,
-) -> tuple[Array, Array, int]:
-    """Motion between two 8-bit images: translation_m (3,), rotation_c2_from_c1 (3, 3), number of consistent tracks.
+) -> Tracked:
+    """Motion between two 8-bit images.
 
     `turn_sigma_rad` is the standard deviation of the nominal rotation; that of a gyroscope if it gave the rotation.
-    If fewer than 8 corners can be tracked, returns the nominal motion and 0 tracks.
+    If fewer than 8 corners can be tracked, returns the nominal motion with the prior's covariance and 0 tracks.
     """
     nominal = plane_homography(
         camera.matrix, nominal_translation_m, nominal_rotation_c2_from_c1, plane_normal_c1, altitude_m
     )
     pixels_1, pixels_2 = _tracks(image_1, image_2, nominal)
     if len(pixels_1) < _MIN_TRACKS:
-        return nominal_translation_m, nominal_rotation_c2_from_c1, 0
+        variance = np.square([turn_sigma_rad] * 3 + [SHIFT_SHARE * altitude_m] * 3)
+        return Tracked(nominal_translation_m, nominal_rotation_c2_from_c1, np.diag(variance), 0)
     rays = camera.rays(pixels_1)
     points_c1 = rays * (altitude_m / (rays @ plane_normal_c1))[:, None]
     return _fit(camera, points_c1, pixels_2, nominal_translation_m, nominal_rotation_c2_from_c1, turn_sigma_rad)
@@ -115,7 +144,7 @@ def _tracks(image_1: np.ndarray, image_2: np.ndarray, homography: Array) -> tupl
 
 def _fit(
     camera: Camera, points_c1: Array, pixels_2: Array, translation_m: Array, rotation: Array, turn_sigma_rad: float
-) -> tuple[Array, Array, int]:
+) -> Tracked:
     """Fit the motion that maps points (N, 3) of O_C of frame 1 to pixels (N, 2) of frame 2."""
     focal = np.array([camera.fx_px, camera.fy_px])
     weights = np.ones(len(points_c1))
@@ -137,6 +166,7 @@ def _fit(
         jacobian = np.concatenate([by_point @ cross, by_point], axis=2)
         weighted = jacobian * weights[:, None, None]
         normal = np.einsum("nij,nik->jk", weighted, jacobian)
+        information = normal / (float(np.median(distance)) / _MEDIAN_OF_SIGMA) ** 2 + np.diag(prior)
         normal += np.diag(prior) * spread**2
         offset = np.concatenate(
             [rotation_vectors(rotation @ nominal_rotation.T), rotation @ (nominal_translation_m - translation_m)]
@@ -151,4 +181,7 @@ def _fit(
         translation_m = translation_m - rotation.T @ step[3:]
         if np.linalg.norm(step[:3]) < 1e-8 and np.linalg.norm(step[3:]) < 1e-5:
             break
-    return translation_m, rotation, int((weights > 0).sum())
+    unit: Array = 1 / np.sqrt(np.diag(information))
+    scale_of_each: Array = unit[:, None] * unit
+    covariance = scale_of_each * np.linalg.inv(scale_of_each * information)
+    return Tracked(translation_m, rotation, covariance, int((weights > 0).sum()))
