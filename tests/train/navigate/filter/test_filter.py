@@ -1,12 +1,17 @@
 """Jacobians against finite differences, and consistency on simulated flights."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from tests.train.navigate.craters.crater_world import CAMERA, nearby, sighted, world
 
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY as MOUNTING
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
 from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GRAVITY_MPS2
+from perilune_train.navigate.craters.fix import refine
+from perilune_train.navigate.craters.projection import Pose, projected
 from perilune_train.navigate.filter import measurements
 from perilune_train.navigate.filter.propagate import Increment, InertialNoise, propagated
 from perilune_train.navigate.filter.state import N_ERRORS, State
@@ -197,3 +202,32 @@ def test_errors_have_the_stated_size(with_motion):
     # Poses along a flight are correlated: 20 flights have about 60 independent ones, a deviation of 0.45.
     assert 4.8 < squared < 7.2
     assert 5.4 < innovation < 6.6
+
+
+def test_heights_of_the_catalogue_are_noise_where_they_are_seen(monkeypatch):
+    rng, caught = np.random.default_rng(2), {}
+
+    def catch(state, innovation, by_error, noise, gate):
+        caught["noise"] = noise
+        return updated(state, innovation, by_error, noise, gate)
+
+    monkeypatch.setattr(measurements, "updated", catch)
+    catalogue = replace(world(), position_sigma_m=3.0)
+    true = Pose(np.array([20.0, -30, 700]), MOUNTING)
+    seen = sighted(catalogue, true, rng, false_share=0.0)
+    fix = refine(seen, catalogue, CAMERA, nearby(true, np.zeros(3), np.zeros(3)), true)
+    state = State.starting(fix.pose.position_m, np.zeros(3), np.eye(3), np.ones(15), 5.0)
+    measurements.craters_update(state, fix, seen, catalogue, CAMERA, MOUNTING)
+    higher = replace(catalogue, centre_m=catalogue.centre_m + np.array([0, 0, 3.0]))
+    used = fix.weight > 0.1
+    shift = np.zeros((used.sum(), 2))
+    for k, crater in enumerate(fix.crater[used]):
+        before, after = (
+            projected(one.part(np.array([crater])), CAMERA, fix.pose, np.inf, 0.0) for one in (catalogue, higher)
+        )
+        shift[k] = (after.centre_px - before.centre_px)[0]
+    assert np.abs(shift).max() > 0.4, "some craters are far from the middle"
+    for k, (weight, own) in enumerate(zip(fix.weight[used], fix.sighting[used], strict=True)):
+        block = caught["noise"][2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        expected = seen.noise_px[own] ** 2 / weight * np.eye(2) + np.outer(shift[k], shift[k])
+        np.testing.assert_allclose(block, expected, rtol=0.02, atol=1e-3)

@@ -122,6 +122,33 @@ def test_a_start_that_is_300_m_off_is_noticed():
     assert not any(status[k] == "tracking" for k in np.flatnonzero(wrong))
 
 
+def seen_from(t, shift_m, turn_deg):
+    """Sightings of a camera that is shifted and turned against the true pose of a flight."""
+    true = Pose(POSITION_M + VELOCITY_MPS * t, MOUNTING)
+    wrong = true.changed(np.concatenate([shift_m, np.radians(turn_deg)]))
+    return sighted(WORLD, wrong, np.random.default_rng(int(t)))
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (([16.0, 0, 0], [0, 3.0, 0]), ([16.0, 0, 0], [0, 3.0, 0])),
+        (([40.0, 0, 0], [0, 0, 0]), ([0.0, 50, 0], [0, 0, 0])),
+    ],
+    ids=["turned as no gyroscope can be", "two that differ"],
+)
+def test_wrong_fixes_do_not_replace_the_state(first, second):
+    """A state is replaced by fixes that agree with each other and with the gyroscope only."""
+
+    def see(t, seen):
+        return seen_from(t, *(first if t == 10 else second)) if t in (10, 11) else seen
+
+    errors, _, status = flown(*lander(8), see=see, seconds=16)
+    assert np.linalg.norm(errors[9:], axis=1).max() < 6
+    assert "tracking" not in status[10:12]
+    assert status[13:] == ["tracking"] * 3
+
+
 def test_half_of_the_sightings_false():
     def see(t, seen):
         rng = np.random.default_rng(int(t))

@@ -6,15 +6,16 @@ from typing import Literal
 import numpy as np
 
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.navigate.craters.catalogue import Catalogue
-from perilune_train.navigate.craters.fix import PosePrior
+from perilune_train.navigate.craters.fix import Fix, PosePrior
 from perilune_train.navigate.craters.locate import Located, locate
 from perilune_train.navigate.craters.projection import Pose
 from perilune_train.navigate.craters.sightings import Sightings
 from perilune_train.navigate.filter.measurements import craters_update, pose_update, range_update
 from perilune_train.navigate.filter.propagate import Increment, InertialNoise, propagated
 from perilune_train.navigate.filter.state import ATTITUDE, POSITION, VELOCITY, State
+from perilune_train.navigate.filter.update import passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
 """tracking: the last frame was matched to craters; coasting: it was not; lost: none was for 15 s, or a fix contradicts
@@ -22,7 +23,8 @@ the state."""
 RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
 """Standard deviations of a range and of the ground's height about the nearest craters, where none are given."""
 _LOST_S = 15.0
-_CONTRADICTIONS = 2
+_UNKNOWN_VELOCITY_MPS = 5.0
+"""Standard deviation of the velocity, on each axis, where a fix contradicts the state."""
 """Fixes in a row that the gate refuses, after which the filter starts again from a fix."""
 _GAP_S = 0.05
 _NEAREST = 10
@@ -47,6 +49,24 @@ class Surroundings:
     """Standard deviation of the ground's height about that of the nearest craters."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Contradiction:
+    """A fix that contradicts the state."""
+
+    time_s: float
+    """Time of its frame."""
+    offset_m: Array
+    """Position by the fix less that of the state (3,), O_L."""
+    covariance: Array
+    """Of the position by the fix (3, 3)."""
+
+    def agrees(self, later: "_Contradiction") -> bool:
+        """Whether a later fix has the same offset, but for errors of fixes and velocity."""
+        step_s = later.time_s - self.time_s
+        spread = self.covariance + later.covariance + np.eye(3) * (_UNKNOWN_VELOCITY_MPS * step_s) ** 2
+        return passes_gate(later.offset_m - self.offset_m, spread)
+
+
 class Lander:
     """State and status of a lander; every method takes one measurement."""
 
@@ -54,7 +74,7 @@ class Lander:
         self._state, self.status = state, "coasting"
         self._noise, self._around = noise, around
         self._pending: list[Increment] = []
-        self._contradictions = 0
+        self._contradiction: _Contradiction | None = None
         self._matched_s = self._time_s = state.time_s
 
     status: Status
@@ -102,20 +122,37 @@ class Lander:
         pose = fix.pose.position_m, fix.pose.rotation_camera_from_site
         done = pose_update(self.state, *pose, fix.covariance, mounting)
         if not done.accepted:
-            self._contradictions += 1
-            if self._contradictions < _CONTRADICTIONS:
+            if not self._replaces(fix):
                 self._unmatched()
                 return None
             self._restart(found)
         else:
             around = self._around
             self._state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
-        self._contradictions, self._matched_s, self.status = 0, self.state.time_s, "tracking"
+        self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
         return found
 
+    def _replaces(self, fix: Fix) -> bool:
+        """Whether a fix that contradicts the state shall replace it: if the fix before has the same offset.
+
+        A fix whose attitude contradicts the state is itself wrong, since a gyroscope does not jump; but not if the
+        state is lost.
+        """
+        expected, state = self._expected(), self.state
+        turn = rotation_vectors(fix.pose.rotation_camera_from_site @ expected.pose.rotation_camera_from_site.T)
+        if not self._late and not passes_gate(turn, fix.covariance[3:, 3:] + expected.covariance[3:, 3:]):
+            return False
+        before = self._contradiction
+        offset_m = fix.pose.position_m - state.position_m
+        self._contradiction = _Contradiction(state.time_s, offset_m, fix.covariance[:3, :3])
+        return before is not None and before.agrees(self._contradiction)
+
+    @property
+    def _late(self) -> bool:
+        return self.state.time_s - self._matched_s > _LOST_S
+
     def _unmatched(self) -> None:
-        late = self.state.time_s - self._matched_s > _LOST_S
-        self.status = "lost" if late or self._contradictions else "coasting"
+        self.status = "lost" if self._late or self._contradiction is not None else "coasting"
 
     def _restart(self, found: Located) -> None:
         """Take position and attitude from a fix; the velocity becomes uncertain by what the position was wrong."""
@@ -124,7 +161,7 @@ class Lander:
         covariance = state.covariance.copy()
         for part in (POSITION, ATTITUDE):
             covariance[part], covariance[:, part] = 0, 0
-        covariance[VELOCITY, VELOCITY] += np.eye(3) * 5.0**2
+        covariance[VELOCITY, VELOCITY] += np.eye(3) * _UNKNOWN_VELOCITY_MPS**2
         body = np.zeros((6, 6))
         body[:3, :3], body[3:, 3:] = np.eye(3), -mounting.T
         own = body @ fix.covariance @ body.T

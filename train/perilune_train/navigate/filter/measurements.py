@@ -1,6 +1,7 @@
 """Ranges, poses from craters, and relative motions as measurements of the state."""
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
@@ -130,4 +131,8 @@ def craters_update(
         by_error[np.arange(n), :, N_ERRORS + 2 * seen.index + axis] = by_offset[:, :, axis]
     innovation = (sightings.centre_px[own[seen.index]] - predicted).ravel()
     variance = sightings.noise_px[own[seen.index]] ** 2 / weight[seen.index]
-    return updated(state, innovation, by_error.reshape(2 * n, -1), np.diag(np.repeat(variance, 2)), gate=False)
+    # Errors of heights in the catalogue shift craters in the image, away from its middle. As parts of the state they
+    # gave the same errors and normalised errors, for a state that is half as large again.
+    by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
+    noise = variance[:, None, None] * np.eye(2) + by_height[:, :, None] * by_height[:, None, :]
+    return updated(state, innovation, by_error.reshape(2 * n, -1), block_diag(*noise), gate=False)

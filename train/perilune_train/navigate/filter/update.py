@@ -27,6 +27,11 @@ class Update:
     """Whether it passed the gate."""
 
 
+def passes_gate(difference: Array, covariance: Array) -> bool:
+    """Whether a difference (n,) is likely enough for its covariance (n, n)."""
+    return float(difference @ np.linalg.solve(covariance, difference)) <= _gate(len(difference))
+
+
 @cache
 def _gate(n_parts: int) -> float:
     """Largest normalised innovation squared of a measurement of so many parts."""
