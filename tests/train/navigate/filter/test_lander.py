@@ -188,3 +188,24 @@ def test_senseless_measurements_change_nothing(value):
 def test_no_sightings_for_long_is_lost():
     _, _, status = flown(*lander(6), see=lambda t, seen: NOTHING, seconds=20)
     assert status[-1] == "lost"
+
+
+def test_the_smoother_keeps_all_frames_and_ends_where_the_filter_ends():
+    squared, filtered, smoothed = [], [], []
+    for seed in range(4):
+        plain = lander(seed)
+        errors, _, _ = flown(*plain)
+        craft, rng, biases = lander(seed)
+        keeping = Lander(craft.state, NOISE, craft.surroundings, keep_poses=True)
+        flown(keeping, rng, biases)
+        state, at_end = keeping.state, plain[0].state
+        assert len(state.past_position_m) == len(errors)
+        np.testing.assert_allclose(state.position_m, at_end.position_m, atol=1e-6)
+        np.testing.assert_allclose(state.covariance[:15, :15], at_end.covariance[:15, :15], rtol=1e-6, atol=1e-15)
+        for k in range(len(errors)):
+            error, covariance = state.past_pose_error(k, POSITION_M + VELOCITY_MPS * k, np.eye(3))
+            squared.append(error @ np.linalg.solve(covariance, error))
+            smoothed.append(error[:3])
+        filtered.append(errors)
+    assert np.sqrt(np.mean(np.square(smoothed))) < 0.7 * np.sqrt(np.mean(np.square(filtered)))
+    assert 2.5 < np.mean(squared) < 9

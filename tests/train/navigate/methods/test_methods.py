@@ -25,6 +25,7 @@ def test_a_page_with_every_method(tiny, tmp_path):
         "nominal",
         "fix",
         "filter",
+        "smoother",
         "filter, exact catalogue",
     }
     assert expected <= set(rows.index)

@@ -68,16 +68,25 @@ class _Contradiction:
 
 
 class Lander:
-    """State and status of a lander; every method takes one measurement."""
+    """State and status of a lander; every method takes one measurement.
 
-    def __init__(self, state: State, noise: InertialNoise, around: Surroundings):
+    With `keep_poses` the state keeps the pose of every frame, and later frames correct it: a smoother.
+    """
+
+    def __init__(self, state: State, noise: InertialNoise, around: Surroundings, keep_poses: bool = False):
         self._state, self.status = state, "coasting"
+        self._keep_poses = keep_poses
         self._noise, self._around = noise, around
         self._pending: list[Increment] = []
         self._contradiction: _Contradiction | None = None
         self._matched_s = self._time_s = state.time_s
 
     status: Status
+
+    @property
+    def surroundings(self) -> Surroundings:
+        """What the lander knows of its camera and of the ground."""
+        return self._around
 
     @property
     def state(self) -> State:
@@ -114,6 +123,12 @@ class Lander:
 
     def sightings(self, seen: Sightings) -> Located | None:
         """Update by the craters of a frame at the present time; the fix, if one was accepted."""
+        found = self._matched(seen)
+        if self._keep_poses:
+            self._state = self.state.keeping_pose()
+        return found
+
+    def _matched(self, seen: Sightings) -> Located | None:
         found = locate(seen, self._around.catalogue, self._around.camera, self._expected())
         if found is None:
             self._unmatched()

@@ -6,10 +6,11 @@ the last frame, which measurements of relative motion refer to (Roumeliotis & Bu
 10.1109/ROBOT.2002.1014801). Behind them come five numbers of an error that all sightings of craters share, the height
 of the ground below, and an offset over ground of every crater in view. Errors of the catalogue, of the detector and of
 the ground's height repeat from frame to frame; taken for noise, they would make the filter sure of what it does not
-know.
+know. Last come the poses of earlier frames, if they are kept: what later frames tell of them makes a smoother
+(stochastic cloning of all poses).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,11 @@ class State:
     offsets_m: Array
     """How far they appear from their place in the catalogue (n, 2), O_L, x and y."""
     covariance: Array
-    """Covariance of the error state (27 + 2 n, 27 + 2 n)."""
+    """Covariance of the error state (27 + 2 n + 6 m, 27 + 2 n + 6 m)."""
+    past_position_m: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    """Positions at earlier frames (m, 3), O_L."""
+    past_rotation_site_from_body: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    """Attitudes at earlier frames (m, 3, 3)."""
 
     @classmethod
     def starting(
@@ -76,7 +81,9 @@ class State:
         return state.with_frame()
 
     def corrected(self, error: Array, covariance: Array) -> "State":
-        """The state with an estimated error (27 + 2 n,) removed, and its new covariance."""
+        """The state with an estimated error (27 + 2 n + 6 m,) removed, and its new covariance."""
+        end = N_ERRORS + 2 * len(self.craters)
+        past = error[end:].reshape(-1, 6)
         return State(
             self.time_s,
             self.position_m + error[POSITION],
@@ -89,8 +96,10 @@ class State:
             self.common_px + error[COMMON],
             self.ground_m + float(error[GROUND][0]),
             self.craters,
-            self.offsets_m + error[N_ERRORS:].reshape(-1, 2),
+            self.offsets_m + error[N_ERRORS:end].reshape(-1, 2),
             (covariance + covariance.T) / 2,
+            self.past_position_m + past[:, :3],
+            self.past_rotation_site_from_body @ _matrices(past[:, 3:]),
         )
 
     def with_frame(self) -> "State":
@@ -104,23 +113,56 @@ class State:
             covariance=copy @ self.covariance @ copy.T,
         )
 
+    def keeping_pose(self) -> "State":
+        """The state with its present pose added to those of earlier frames."""
+        pose = [*range(3), *range(6, 9)]
+        wider = np.concatenate([np.eye(len(self.covariance)), np.eye(len(self.covariance))[pose]])
+        return replace(
+            self,
+            covariance=wider @ self.covariance @ wider.T,
+            past_position_m=np.concatenate([self.past_position_m, self.position_m[None]]),
+            past_rotation_site_from_body=np.concatenate(
+                [self.past_rotation_site_from_body, self.rotation_site_from_body[None]]
+            ),
+        )
+
     def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
         """The state with the offsets of these craters alone (n,), which have a deviation (n,) where they are new."""
         place = {int(crater): k for k, crater in enumerate(self.craters)}
         before = np.array([place.get(int(crater), -1) for crater in craters], int)
-        known = np.flatnonzero(before >= 0)
-        old = np.concatenate([np.arange(N_ERRORS), (N_ERRORS + 2 * before[known, None] + [0, 1]).ravel()])
-        new = np.concatenate([np.arange(N_ERRORS), (N_ERRORS + 2 * known[:, None] + [0, 1]).ravel()])
-        covariance = np.diag(np.concatenate([np.zeros(N_ERRORS), np.repeat(sigma_m**2, 2)]))
+        known, n_past = np.flatnonzero(before >= 0), 6 * len(self.past_position_m)
+        old, new = (
+            np.concatenate(
+                [
+                    np.arange(N_ERRORS),
+                    (N_ERRORS + 2 * places[:, None] + [0, 1]).ravel(),
+                    N_ERRORS + 2 * count + np.arange(n_past),
+                ]
+            )
+            for places, count in ((before[known], len(self.craters)), (known, len(craters)))
+        )
+        covariance = np.diag(np.concatenate([np.zeros(N_ERRORS), np.repeat(sigma_m**2, 2), np.zeros(n_past)]))
         covariance[np.ix_(new, new)] = self.covariance[np.ix_(old, old)]
         offsets = np.zeros((len(craters), 2))
         offsets[known] = self.offsets_m[before[known]]
         return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
 
+    def past_pose_error(self, number: int, position_m: Array, rotation_site_from_body: Array) -> tuple[Array, Array]:
+        """Shift and turn (6,) from the kept pose of an earlier frame to a true one, and their covariance (6, 6)."""
+        turn = rotation_vectors(self.past_rotation_site_from_body[number].T @ rotation_site_from_body)
+        start = N_ERRORS + 2 * len(self.craters) + 6 * number
+        own = slice(start, start + 6)
+        return np.concatenate([position_m - self.past_position_m[number], turn]), self.covariance[own, own]
+
     def pose_error(self, position_m: Array, rotation_site_from_body: Array) -> Array:
         """Shift and turn (6,) from the estimate to a true pose."""
         turn = rotation_vectors(self.rotation_site_from_body.T @ rotation_site_from_body)
         return np.concatenate([position_m - self.position_m, turn])
+
+
+def _matrices(turns_rad: Array) -> Array:
+    """Matrices (m, 3, 3) of rotation vectors (m, 3)."""
+    return np.array([matrix_from_rotation_vector(turn) for turn in turns_rad]).reshape(-1, 3, 3)
 
 
 def common_pattern(ray: Array) -> Array:

@@ -29,17 +29,23 @@ def flights(
     catalogues: Mapping[str, Catalogue],
     grade: InertialGrade,
     attitude_deg: float,
+    smooth: bool = False,
 ) -> pd.DataFrame:
-    """Errors of the filter at every frame of all descents; the starts are off, drawn by the place of the descent."""
+    """Errors of the filter, or of the smoother, at every frame of all descents.
+
+    The starts are off, drawn by the place of the descent.
+    """
     tables = []
     mounting, sigmas = np.array(dataset.info.camera.rotation_camera_from_body), default_sigmas(grade, attitude_deg)
     with progress_bar() as progress:
-        task = progress.add_task(f"filter, {attitude_deg:g} deg", total=len(descents), unit="descents", note="")
+        task = progress.add_task(
+            f"{'smoother' if smooth else 'filter'}, {attitude_deg:g} deg", total=len(descents), unit="descents", note=""
+        )
         for place, descent in enumerate(descents):
             instruments = Instruments.of_trajectory(dataset, descent.ids, grade)
             off = sigmas[:9] * np.random.default_rng(place).normal(size=9)
             begun = time.process_time()
-            flown = flight(descent, instruments, mounting, catalogues[descent.ids[0]], grade, sigmas, off)
+            flown = flight(descent, instruments, mounting, catalogues[descent.ids[0]], grade, sigmas, off, smooth)
             tables.append(flown.assign(seconds=(time.process_time() - begun) / max(len(flown), 1)))
             progress.advance(task)
     return pd.concat(tables, ignore_index=True)
@@ -58,8 +64,9 @@ def flight(
     grade: InertialGrade,
     sigmas: Array,
     off: Array,
+    smooth: bool = False,
 ) -> pd.DataFrame:
-    """Errors of the filter at every frame of a descent.
+    """Errors of the filter at every frame of a descent, or with `smooth` of the smoother, which knows all frames.
 
     `mounting` is rotation_camera_from_body (3, 3), `sigmas` states the errors of the start, `off` (9,) has its true
     errors: position, velocity, attitude.
@@ -68,34 +75,45 @@ def flight(
     attitude = turned.rotation_camera_from_site.T @ mounting
     start = State.starting(turned.position_m, descent.velocity_mps + off[3:6], attitude, sigmas, RELIEF_M)
     around = Surroundings(descent.camera, mounting, catalogue, RANGE_SIGMA_M, RELIEF_M)
-    lander = Lander(start, InertialNoise.of(GRADES[grade]), around)
+    lander = Lander(start, InertialNoise.of(GRADES[grade]), around, keep_poses=smooth)
     rows = []
     for estimate in fly(lander, instruments, descent.time_s, descent.sightings):
-        true = descent.true[estimate.frame]
-        error = estimate.state.pose_error(true.position_m, true.rotation_camera_from_site.T @ mounting)
-        rows.append(
-            {
-                "altitude_m": true.position_m[2],
-                "status": estimate.status,
-                **_axes("error", -error[:3]),
-                **_axes("sigma", np.sqrt(np.diag(estimate.state.covariance))[POSITION]),
-                "error_m": float(np.linalg.norm(error[:3])),
-                "turn_deg": float(np.degrees(np.linalg.norm(error[3:]))),
-                "squared": _squared(error, estimate.state.covariance),
-            }
-        )
+        position, rotation = _true(descent, estimate.frame, mounting)
+        covariance = estimate.state.covariance[np.ix_(_POSE, _POSE)]
+        rows.append(_row(position[2], estimate.status, estimate.state.pose_error(position, rotation), covariance))
+    if smooth:
+        for number, row in enumerate(rows):
+            position, rotation = _true(descent, number, mounting)
+            error, covariance = lander.state.past_pose_error(number, position, rotation)
+            rows[number] = _row(position[2], row["status"], error, covariance)
     own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
     return pd.DataFrame(rows).assign(**own, time_s=descent.time_s)
 
 
+_POSE = np.r_[POSITION, ATTITUDE]
+
+
+def _true(descent: SeenDescent, frame: int, mounting: Array) -> tuple[Array, Array]:
+    """True position and rotation_site_from_body at a frame."""
+    true = descent.true[frame]
+    return true.position_m, true.rotation_camera_from_site.T @ mounting
+
+
+def _row(altitude_m: float, status: object, error: Array, covariance: Array) -> dict[str, object]:
+    """One frame, from the step (6,) to the true pose and its covariance (6, 6)."""
+    return {
+        "altitude_m": altitude_m,
+        "status": status,
+        **_axes("error", -error[:3]),
+        **_axes("sigma", np.sqrt(np.diag(covariance))[:3]),
+        "error_m": float(np.linalg.norm(error[:3])),
+        "turn_deg": float(np.degrees(np.linalg.norm(error[3:]))),
+        "squared": float(error @ np.linalg.solve(covariance, error)),
+    }
+
+
 def _axes(name: str, values: Array) -> dict[str, float]:
     return {f"{name}_{axis}_m": float(value) for axis, value in zip("xyz", values, strict=True)}
-
-
-def _squared(error: Array, covariance: Array) -> float:
-    """Normalised error squared of position and attitude."""
-    own = np.r_[POSITION, ATTITUDE]
-    return float(error @ np.linalg.solve(covariance[np.ix_(own, own)], error))
 
 
 def flight_summary(flown: pd.DataFrame) -> dict[str, float]:

@@ -22,6 +22,7 @@ _KNOWS = {
     "lost in space, exact catalogue": "one frame at 800 m or above, exact catalogue, altitude to 10 %, level camera",
     "lost in space": "one frame at 800 m or above, catalogue with errors, altitude to 10 %, level camera",
     "filter": "all frames so far, catalogue with errors, tactical unit, ranges, start of 60 m, 1 m/s, 0.5 degrees",
+    "smoother": "as `filter`, and all later frames; for reference, not on board",
     "filter, star tracker": "as `filter`, with a start of 0.02 degrees",
     "filter, exact catalogue": "as `filter`, with a catalogue without errors",
 }

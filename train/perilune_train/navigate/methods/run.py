@@ -133,7 +133,13 @@ def _absolute(
         flown = flights(dataset, descents, rough, "tactical", 0.5)
         pointed = flights(dataset, descents, rough, "tactical", 0.02)
         best = flights(dataset, descents, exact, "tactical", 0.5)
-        for name, table in (("filter", flown), ("filter, star tracker", pointed), ("filter, exact catalogue", best)):
+        smooth = flights(dataset, descents, rough, "tactical", 0.5, smooth=True)
+        for name, table in (
+            ("filter", flown),
+            ("smoother", smooth),
+            ("filter, star tracker", pointed),
+            ("filter, exact catalogue", best),
+        ):
             rows.append({"method": name, **flight_summary(table)})
             frames.append(table.assign(method=name))
     summaries = pd.DataFrame(rows).assign(kind="absolute")
