@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-monte-carlo explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-suppress bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-monte-carlo explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -235,6 +235,10 @@ bench-transfer: detect-frames ## compare four ways to start from a frozen backbo
 bench-landing: setup ## all methods of navigation on the validation descents of shipped-nav; writes runs/bench/landing
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
 	@$(BIN)/perilune-train navigate methods --dataset data/shipped/nav --split val --allow-overlap --out runs/bench/landing
+
+bench-motion: setup ## relative motion under noise, blur and a wrong prior, on the validation descents of shipped-nav; writes runs/bench/motion.json
+	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
+	@$(BIN)/python -m benchmarks.train.motion data/shipped/nav
 
 bench-suppress: setup ## time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress
