@@ -10,6 +10,15 @@ _DETECTION = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", 
 _POSITION, _VECTOR = "position_rmse_per_component_m", "position_rmse_vector_m"
 _ORIENTATION = "orientation_rmse_per_component_deg"
 
+_WITHOUT_NETWORK = {
+    "klt": "KLT tracks, without training",
+    "alignment": "direct alignment, without training",
+    "nominal": "nominal motion, without images",
+    "mean_at_step": "mean motion of the training at that step, without images",
+    "mean": "mean motion of the training, without images",
+}
+"""Names of the methods beside the networks."""
+
 
 def table_2(runs: PaperRuns) -> list[str]:
     """Table II as lines of Markdown: the paper, here, and the locked benchmark by the paper's rule of labels."""
@@ -35,7 +44,7 @@ def table_3(runs: PaperRuns) -> list[str]:
         if scored is not None:
             rows.append([network, "here, locked benchmark", *_navigation(scored, "stack"), _seconds(scored)])
     baselines = next(iter(runs.navigation().values()))
-    for method, name in (("klt", "KLT tracks, without training"), ("nominal", "nominal motion, without images")):
+    for method, name in _WITHOUT_NETWORK.items():
         rows.append([name, "here", *_navigation(baselines, f"baseline/{method}"), "-"])
     return table(
         [
