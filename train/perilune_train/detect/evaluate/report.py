@@ -126,8 +126,9 @@ def spread_note(resamples: Resamples) -> str:
     count, unit = resamples.count, resamples.unit
     if count < MIN_UNITS:
         return f"in brackets: the value of each {unit}; {count} of them are too few for an interval"
+    plural = "trajectories" if unit == "trajectory" else f"{unit}s"
     return (
-        f"in brackets: 95 % intervals, {RESAMPLES} resamples of {count} {unit}s; the value of each {unit} where fewer "
+        f"in brackets: 95 % intervals, {RESAMPLES} resamples of {count} {plural}; the value of each {unit} where fewer "
         f"than {MIN_UNITS} have labels"
     )
 
