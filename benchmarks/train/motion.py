@@ -122,7 +122,7 @@ def draw(path: Path, figures: dict[str, float], methods: list[str]) -> None:
         values = [figures[f"{name}/{method}/position_rmse_vector_m"] for name in CHANGES]
         axis.barh(np.arange(len(CHANGES)) + k * height, values, height, label=method)
     axis.set_yticks(np.arange(len(CHANGES)) + 0.4 - height / 2, list(CHANGES))
-    axis.set(xscale="log", xlabel="position error of a step, RMSE of the vector (m)")
+    axis.set(xlabel="position error of a step, RMSE of the vector (m)")
     axis.invert_yaxis()
     axis.legend()
     path.parent.mkdir(parents=True, exist_ok=True)
