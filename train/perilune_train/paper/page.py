@@ -98,6 +98,9 @@ def _text(runs: PaperRuns, found: list[Verdict], about: tuple[str, ...]) -> str:
             "",
             *table_3(runs),
             "",
+            "*The locked benchmark has 40 frames a descent. Where the experiment has more, steps of the benchmark are "
+            "longer than any in training, and the error there is also that of a wrong step.*",
+            "",
             "![Errors along a test trajectory](trajectory.png)",
             "",
             "## Learning curves",
@@ -105,6 +108,8 @@ def _text(runs: PaperRuns, found: list[Verdict], about: tuple[str, ...]) -> str:
             "![Learning curves](learning.png)",
             "",
             "## Attention",
+            "",
+            "Correlations do not depend on the range of a mask. Read them beside the masks: some are nearly constant.",
             "",
             *[line for name in _EXPLAINED for line in (f"![{name[:-4].replace('_', ' ')}]({name})", "")],
             "## Deviations that remain",
