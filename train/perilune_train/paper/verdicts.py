@@ -68,8 +68,8 @@ def verdicts(runs: PaperRuns, large_width_ratio: float | None) -> list[Verdict]:
 _ZERO = 1e-4
 """Errors below this are those of a constant: without attitude noise the camera does not rotate."""
 _PIXELS = {
-    "_all_pixels": "all pixels, 0 where the other half is not seen: likely the paper's way",
-    "": "pixels that both halves see: without the border that both masks of PCC4 share",
+    "_all_pixels": "all pixels, 0 where the other half is not seen",
+    "": "pixels that both halves see",
 }
 """PCC3 and PCC4 by the pixels that they are computed over."""
 _FIGURES = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", "f1": "F1"}
