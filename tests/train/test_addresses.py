@@ -85,7 +85,7 @@ def test_a_navigator_is_trained_on_a_dataset_at_an_address(bucket, tmp_path):
     given = ("navigate", "train", "--preset", "tiny", "--name", "a", "--out", tmp_path, "--dataset", f"{bucket}/nav")
     done = in_process.call(main, *given, *settings)
     assert done.returncode == 0, done.stderr
-    assert len(pd.read_parquet(tmp_path / "navigate" / "a" / "navigation.parquet")) == 7
+    assert len(pd.read_parquet(tmp_path / "navigate" / "a" / "navigation.parquet")) == 8
     inputs = (tmp_path / "navigate" / "a" / "inputs.json").read_text()
     assert "null" not in inputs
 
