@@ -1,8 +1,8 @@
 """The preset `tiny` is as it was when tiny_pinned.json was written: ground, plan, and every byte of tables and images.
 
 Bytes are compared only with the libraries with which they were written. The C library is one of them; its functions and
-Cycles differ in last digits between processors with and without AVX2 and FMA. On the one processor with AVX512-FP16 and
-AMX that was tried, images differed from the pinned ones too; the cause is not known.
+Cycles differ in last digits between processors with and without AVX2 and FMA. Rendered images also differ on processors
+with AVX512-FP16, for a reason that is not known; they have hashes of their own ("differs").
 """
 
 import hashlib
@@ -102,11 +102,27 @@ def test_ground_and_plan_of_tiny_are_as_before(tiny):
 
 def test_every_byte_of_tiny_is_as_before(tiny):
     pinned, here = json.loads(PINNED.read_text()), made_with(tiny)
-    if here != pinned["made_with"]:
+    differs = {pinned["made_with"]["processor"]: {}} | pinned["differs"]
+    if here["libraries"] != pinned["made_with"]["libraries"] or here["processor"] not in differs:
         pytest.skip(f"pinned with {pinned['made_with']}, this machine has {here}: bytes may differ")
-    assert different(bytes_of(tiny), pinned["bytes"]) == [], REMEDY
+    own = differs[here["processor"]]
+    expected = {kind: hashes | own.get(kind, {}) for kind, hashes in pinned["bytes"].items()}
+    assert different(bytes_of(tiny), expected) == [], REMEDY
+
+
+def written(folder):
+    """Content of tiny_pinned.json with this machine's hashes: all of them, or those that differ on this processor."""
+    here, found = made_with(folder), bytes_of(folder)
+    before = json.loads(PINNED.read_text())
+    if here["processor"] == before["made_with"]["processor"]:
+        return {"made_with": here, "plan": plan_of(folder), "bytes": found, "differs": {}}
+    common = before["bytes"]
+    own = {
+        kind: {name: value for name, value in hashes.items() if common[kind].get(name) != value}
+        for kind, hashes in found.items()
+    }
+    return before | {"differs": before.get("differs", {}) | {here["processor"]: own}}
 
 
 if __name__ == "__main__":
-    made = Path(sys.argv[1])
-    print(json.dumps({"made_with": made_with(made), "plan": plan_of(made), "bytes": bytes_of(made)}, indent=1))
+    print(json.dumps(written(Path(sys.argv[1])), indent=1))
