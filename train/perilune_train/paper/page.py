@@ -99,7 +99,7 @@ def _text(runs: PaperRuns, found: list[Verdict], about: tuple[str, ...]) -> str:
             *table_3(runs),
             "",
             "*The locked benchmark has 40 frames a descent. Where the experiment has more, steps of the benchmark are "
-            "longer than any in training, and the error there is also that of a wrong step.*",
+            "longer than in training, so the error there is not that of new ground alone.*",
             "",
             "![Errors along a test trajectory](trajectory.png)",
             "",

@@ -6,7 +6,7 @@ the last frame, which measurements of relative motion refer to (Roumeliotis & Bu
 10.1109/ROBOT.2002.1014801). Behind them come five numbers of an error that all sightings of craters share, the height
 of the ground below, and an offset over ground of every crater in view. Errors of the catalogue, of the detector and of
 the ground's height repeat from frame to frame; taken for noise, they would make the filter sure of what it does not
-know. Last come the poses of earlier frames, if they are kept: what later frames tell of them makes a smoother
+know. Last come the poses of earlier frames, if they are kept: later measurements correct them, which makes a smoother
 (stochastic cloning of all poses).
 """
 
