@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-monte-carlo explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-monte-carlo explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -106,6 +106,11 @@ benchmark-nav: setup ## score the installed navigator, or a run (RUN=folder), on
 	@$(if $(RUN),$(call checked_run,navigate))
 	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
 	@$(BIN)/perilune-train navigate benchmark $(if $(RUN),--run $(call quoted,$(RUN))) --data $(BENCHMARK)
+
+benchmark-landing: setup ## score craters and the filter on the locked benchmark with the installed detector, or a run (DETECTOR=folder, MAPS=folder of maps); writes runs/benchmark/<name>-landing
+	@$(MAKE) --no-print-directory benchmark-frames KIND=nav
+	@$(BIN)/perilune-train navigate benchmark-landing $(if $(DETECTOR),--detector $(call quoted,$(DETECTOR))) \
+	  $(if $(MAPS),--maps $(call quoted,$(MAPS))) --data $(BENCHMARK)
 
 # The experiment has presets of its own: PRESET=paper unless one is given.
 paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=quarter or twentieth for two cores, ATTITUDE=1, DARKNET=yolov3.weights)

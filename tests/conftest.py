@@ -77,21 +77,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory) -> Path:
     """Folder with the `tiny` preset's datasets `detect` and `nav`. Read only: copy before a change."""
+    return _rendered(tmp_path_factory, "tiny", "dataset", "--preset", "tiny")
+
+
+@pytest.fixture(scope="session")
+def tiny_survey(tiny, tmp_path_factory) -> Path:
+    """A survey of `tiny`'s scene for navigation, with coarse pixels. Read only."""
+    return _rendered(tmp_path_factory, "tiny-survey", "survey", "--manifest", str(tiny / "nav"), "--pixel-m", "3")
+
+
+def _rendered(tmp_path_factory, name: str, *arguments: str) -> Path:
+    """The folder that a command of `perilune-render` makes, once for all processes of a run."""
     pytest.importorskip("perilune_render", reason="needs a rendered dataset")
     own = tmp_path_factory.getbasetemp()
-    # The parent of a worker's folder is the whole run's. The second worker to come finds the datasets complete.
-    folder = (own.parent if WORKER else own) / "tiny"
-    command = [
-        str(Path(sys.executable).parent / "perilune-render"),
-        "dataset",
-        "--preset",
-        "tiny",
-        "--out",
-        str(folder),
-        # In the command's own process, so that Blender is loaded once.
-        "--workers",
-        "0",
-    ]
+    # The parent of a worker's folder is the whole run's. The second worker to come finds the dataset complete.
+    folder = (own.parent if WORKER else own) / name
+    program = str(Path(sys.executable).parent / "perilune-render")
+    # In the command's own process, so that Blender is loaded once.
+    command = [program, *arguments, "--out", str(folder), "--workers", "0"]
     with FileLock(f"{folder}.lock"):
         if not Path(f"{folder}.made").exists():
             subprocess.run(command, check=True, capture_output=True, text=True)

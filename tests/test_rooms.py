@@ -15,8 +15,8 @@ ROOMS = {
         "geometry dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
-        "processor config_values config_terrain config streams provenance terrain flight imaging labels "
-        "frame_source blender dataset jobs cli_options cli_dataset cli_status cli"
+        "processor config_values config_terrain config_survey config streams provenance terrain flight imaging labels "
+        "frame_source blender dataset jobs cli_options cli_dataset cli_survey cli_status cli"
     ),
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
@@ -33,7 +33,7 @@ ROOMS = {
     ),
     "train/perilune_train/navigate": (
         "config geometry data network relative craters filter fly evaluate train evaluate_run compare_runs "
-        "benchmark methods monte_carlo deploy cli"
+        "benchmark map methods monte_carlo deploy cli"
     ),
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""

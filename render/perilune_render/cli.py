@@ -22,6 +22,7 @@ from perilune_render.cli_options import (
     warn_of_size,
 )
 from perilune_render.cli_status import status
+from perilune_render.cli_survey import survey
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
@@ -52,6 +53,7 @@ def config(
 
 app.command()(dataset)
 app.command()(status)
+app.command()(survey)
 
 
 @app.command()

@@ -39,7 +39,7 @@ _UNITS = ((12, "TB"), (9, "GB"), (6, "MB"), (3, "kB"), (0, "bytes"))
 
 
 @dataclass(frozen=True, slots=True)
-class _How:
+class How:
     """How a job is rendered, and which part of it."""
 
     executor: Literal["local", "ray"]
@@ -67,7 +67,7 @@ class _How:
         shard: str | None,
         finish: bool,
         dry_run: bool,
-    ) -> "_How":
+    ) -> "How":
         """From the options of the command. Raises UserError on a shard that is none, and on options that exclude."""
         given = [name for name, is_set in (("--shard", shard), ("--finish", finish), ("--dry-run", dry_run)) if is_set]
         if len(given) > 1:
@@ -132,7 +132,7 @@ def dataset(
     ] = False,
 ) -> None:
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
-    how = _How.of(executor, address, workers, threads, shard, finish, dry_run)
+    how = How.of(executor, address, workers, threads, shard, finish, dry_run)
     if manifest is not None:
         given = [name for name in ("preset", "config", "setting", "kind") if _was_given(context, name)]
         _render_manifest(manifest, out, dem, catalogue, given, how)
@@ -163,7 +163,7 @@ def dataset(
         raise typer.Exit(1)
 
 
-def _made(job: "Job", out: Store, how: _How) -> "Dataset | None":
+def _made(job: "Job", out: Store, how: How) -> "Dataset | None":
     """Do what the options ask for; the dataset if it is finished. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
@@ -186,6 +186,17 @@ def _made(job: "Job", out: Store, how: _How) -> "Dataset | None":
     return None
 
 
+def made_or_exit(job: "Job", out: Store, how: How) -> "Dataset | None":
+    """Do what the options ask for; the dataset if it is finished. Ends the command if trajectories failed."""
+    from perilune_render.jobs.run import RenderingFailed
+
+    try:
+        return _made(job, out, how)
+    except RenderingFailed as error:
+        _print_failures(error)
+        raise typer.Exit(1) from None
+
+
 def _kill_processes() -> None:
     """Kill all processes that this one has started; those of Ray would go on for a minute."""
     import psutil
@@ -195,7 +206,7 @@ def _kill_processes() -> None:
             process.kill()
 
 
-def _print_estimate(job: "Job", out: Store, how: _How) -> None:
+def _print_estimate(job: "Job", out: Store, how: How) -> None:
     from perilune_render.jobs.estimate import estimate
 
     with progress_bar() as progress:
@@ -212,7 +223,7 @@ def _print_failures(error: "RenderingFailed") -> None:
     console.print(f"error: {error.out}: {len(error.errors)} trajectories failed; {again}", soft_wrap=True)
 
 
-def _executor(how: _How) -> "MakeExecutor":
+def _executor(how: How) -> "MakeExecutor":
     if how.workers == 0:
         # Imports Blender, which takes seconds.
         from perilune_render.jobs.here import Here
@@ -235,7 +246,7 @@ def _was_given(context: typer.Context, name: str) -> bool:
 
 
 def _render_manifest(
-    manifest: str, out: str | None, dem: Path | None, catalogue: Path | None, others: list[str], how: _How
+    manifest: str, out: str | None, dem: Path | None, catalogue: Path | None, others: list[str], how: How
 ) -> None:
     if out is None or others:
         found = "no --out" if out is None else " and ".join(f"--{name.replace('setting', 'set')}" for name in others)
@@ -246,13 +257,8 @@ def _render_manifest(
     given, store = ps.open_dataset(manifest), open_store(out)
     from perilune_render.dataset.from_manifest import compare_hashes, plan_from_manifest
     from perilune_render.jobs.job import Job
-    from perilune_render.jobs.run import RenderingFailed
 
-    try:
-        made = _made(Job(*plan_from_manifest(given, dem, catalogue), manifest), store, how)
-    except RenderingFailed as error:
-        _print_failures(error)
-        raise typer.Exit(1) from None
+    made = made_or_exit(Job(*plan_from_manifest(given, dem, catalogue), manifest), store, how)
     if made is None:
         return
     same, known, other_scenes = compare_hashes(given, made)

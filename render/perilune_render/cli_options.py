@@ -61,6 +61,8 @@ def resolved_config(
 ) -> DatasetConfig:
     """The settings of a preset with the user's changes. Raises UserError on invalid ones."""
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
+    if resolved.survey is not None:
+        raise UserError("configuration", "dataset.survey", "set", "null; `perilune-render survey` renders from orbit")
     paths = {name: str(path) for name, path in (("dem", dem), ("catalogue", catalogue)) if path is not None}
     terrain = resolved.terrain.model_copy(update=paths)
     if terrain.catalogue is not None and terrain.dem is None:

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from perilune_render.config_survey import SurveyConfig
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
 from perilune_shared.config import Section
@@ -283,6 +284,8 @@ class DatasetConfig(Section):
     """Dataset for crater detection."""
     nav: KindConfig
     """Dataset for navigation."""
+    survey: SurveyConfig | None = None
+    """Images from orbit in place of the descents, over the same ground; `perilune-render survey` sets it."""
 
     @model_validator(mode="after")
     def _same_ground(self) -> "DatasetConfig":

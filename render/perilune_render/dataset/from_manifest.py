@@ -15,6 +15,7 @@ from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.dataset.begin import new_info
 from perilune_render.flight.motion import Motion, draw_motion
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
+from perilune_render.flight.survey import survey_camera
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import view_envelope
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
@@ -48,7 +49,9 @@ def plan_from_manifest(
         raise UserError(where, "developed_from", recipe.developed_from.name, expected)
     config = config_of(recipe, where, dem, catalogue)
     _check_dem(manifest, config)
-    camera = camera_of(config.camera)
+    lander = camera_of(config.camera)
+    view = view_envelope(lander.covering_pinhole(), config.ground_flight(recipe.kind))
+    camera = lander if config.survey is None else survey_camera(config.survey, float(view.reach_m[-1]))
     if camera != info.camera.intrinsics():
         raise UserError(where, "camera", info.camera.intrinsics(), f"that of its recipe, {camera}")
     scenes = [
@@ -61,9 +64,7 @@ def plan_from_manifest(
         scene.scene_id: range(bisect_left(of_scene, scene.scene_id), bisect_right(of_scene, scene.scene_id))
         for scene in scenes
     }
-    exr_camera = camera.covering_pinhole()
-    view = view_envelope(exr_camera, config.ground_flight(recipe.kind))
-    plan = Plan(camera, exr_camera, view, tuple(scenes), recorded, places)
+    plan = Plan(camera, camera.covering_pinhole(), view, tuple(scenes), recorded, places)
     begun = new_info(config, plan, recipe_of(config, recipe.kind, recipe.preset))
     kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     return plan, config, begun.model_copy(update=kept)

@@ -27,7 +27,7 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, and those of the other kind unless the kinds share terrain.
+    speed, those of the other kind unless the kinds share terrain, and those of a survey if there is none.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -35,6 +35,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
             plain["terrain"][name] = Path(plain["terrain"][name]).name
     for name in _SPEED:
         del plain["render"][name]
+    if config.survey is None:
+        del plain["survey"]
     if not config.shared_terrain:
         del plain[_OTHER[kind]]
     return plain

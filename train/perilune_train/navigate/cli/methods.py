@@ -24,6 +24,9 @@ def methods(
     ] = None,
     split: Annotated[str, typer.Option(help="train, val or test.")] = "test",
     out: Annotated[Path, typer.Option(help="New folder for the results.")] = Path("runs/navigate/methods"),
+    maps: Annotated[
+        Path | None, typer.Option("--map", help="Folder of a map by `navigate map`, a further catalogue.")
+    ] = None,
     allow_overlap: AllowOverlap = False,
 ) -> None:
     """Fly all methods over a split: learned and classical motion, poses from craters, lost in space, the filter.
@@ -37,5 +40,6 @@ def methods(
     # torch takes seconds to load.
     from perilune_train.navigate.methods.run import PAGE, fly_methods
 
-    fly_methods(dataset, split, run or shipped_run("navigate"), detector or shipped_run("detect"), out, allow_overlap)
+    networks = run or shipped_run("navigate"), detector or shipped_run("detect")
+    fly_methods(dataset, split, *networks, out, allow_overlap, maps)
     console.print(f"{out / PAGE}: tables and pictures; navigation.parquet, frames.parquet", soft_wrap=True)

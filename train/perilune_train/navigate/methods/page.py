@@ -23,6 +23,9 @@ _KNOWS = {
     "lost in space": "one frame at 800 m or above, catalogue with errors, altitude to 10 %, level camera",
     "filter": "all frames so far, catalogue with errors, tactical unit, ranges, start of 60 m, 1 m/s, 0.5 degrees",
     "smoother": "as `filter`, and all later frames; for reference, not on board",
+    "fix, map": "as `fix`, catalogue by our own detector from images of an orbiter",
+    "lost in space, map": "as `lost in space`, that catalogue",
+    "filter, map": "as `filter`, that catalogue",
     "filter, star tracker": "as `filter`, with a start of 0.02 degrees",
     "filter, exact catalogue": "as `filter`, with a catalogue without errors",
 }
@@ -33,7 +36,7 @@ _RELATIVE = {
     "normalised_error_squared_mean": "normalised error squared (6)",
     "position_end_rmse_m": "drift at the end (m)",
 }
-_ABSOLUTE = {
+COLUMNS_ABSOLUTE = {
     "n_frames": "frames",
     "right_share": "right or tracking",
     "wrong_share": "wrong",
@@ -81,7 +84,7 @@ def page_of(
         "A fix is right if it is off by less than 5 pixels on the ground; its errors are those of the right ones.",
         "Errors of the filter are those of all frames.",
         "",
-        *_table(rows[rows["kind"] == "absolute"], _ABSOLUTE),
+        *_table(rows[rows["kind"] == "absolute"], COLUMNS_ABSOLUTE),
     ]
     for name in pictures:
         lines += ["", f"![{_CAPTIONS[name]}]({name})", "", f"*{_CAPTIONS[name]}.*"]
@@ -91,13 +94,14 @@ def page_of(
 def _table(rows: pd.DataFrame, columns: dict[str, str]) -> list[str]:
     used = {key: title for key, title in columns.items() if key in rows and rows[key].notna().any()}
     cells = [
-        [f"`{row['method']}`", _KNOWS[row["method"]], *(_cell(key, row[key]) for key in used)]
+        [f"`{row['method']}`", _KNOWS[row["method"]], *(cell(key, row[key]) for key in used)]
         for row in rows.to_dict("records")
     ]
     return table(["Method", "What it knows", *used.values()], cells)
 
 
-def _cell(key: str, value: float) -> str:
+def cell(key: str, value: float) -> str:
+    """A figure as text, by the name of its column."""
     if not math.isfinite(value):
         return "-"
     if key == "n_frames":

@@ -1,32 +1,25 @@
 """Fly all methods over the descents of a split and write tables, a page and pictures."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.storage.files import new_folder, write_text
 from perilune_shared.storage.store import Address
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
-from perilune_train.navigate.craters.catalogue import (
-    LEAST_DIAMETER_M,
-    Catalogue,
-    CatalogueErrors,
-    exact_catalogue,
-    with_errors,
-)
+from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.craters.fix import PosePrior
 from perilune_train.navigate.craters.locate import locate
 from perilune_train.navigate.data.trajectories import Trajectory, load_split
 from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.metrics import motion_errors, summary
 from perilune_train.navigate.evaluate_run import fusion_of
+from perilune_train.navigate.map.files import read_maps
+from perilune_train.navigate.methods.absolute import absolute_errors, absolute_summary, catalogues_of
 from perilune_train.navigate.methods.figures import draw_by_altitude, draw_flights, draw_matches
-from perilune_train.navigate.methods.fixes import fix_summary, fixes_lost_in_space, fixes_near_a_prior
-from perilune_train.navigate.methods.flights import flight_summary, flights
 from perilune_train.navigate.methods.page import page_of
 from perilune_train.navigate.methods.seen import SeenDescent, seen_descents
 from perilune_train.navigate.network import load_navigator, predict
@@ -34,25 +27,18 @@ from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, TABLE, FRAMES = "methods.md", "navigation.parquet", "frames.parquet"
 PICTURES = ("altitude.png", "flights.png", "matches_high.png", "matches_low.png")
-SEED = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """What the methods found."""
-
-    rows: pd.DataFrame
-    """One row per method."""
-    frames: pd.DataFrame
-    """One row per method with absolute positions and frame."""
-    flown: pd.DataFrame
-    """One row per frame of the filter, from a start of 0.5 degrees."""
 
 
 def fly_methods(
-    address: Address, split: str, navigator: Path, detector: Path, out: Path, allow_overlap: bool = False
+    address: Address,
+    split: str,
+    navigator: Path,
+    detector: Path,
+    out: Path,
+    allow_overlap: bool = False,
+    maps: Path | None = None,
 ) -> pd.DataFrame:
-    """Fly all methods over a split; returns one row per method.
+    """Fly all methods over a split; returns one row per method. `maps` is the folder of a map by our own detector.
 
     Writes methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame)
     and pictures to the new folder `out`, or nothing. Raises UserError if a network was fitted to the terrain of the
@@ -66,27 +52,23 @@ def fly_methods(
         check_terrain(read_provenance(contents[name], path), dataset, split, allow_overlap)
         for name, path in best.items()
     ]
+    mapped = {} if maps is None else read_maps(maps, dataset)
     with new_folder(out) as folder:
         trajectories = load_split(dataset, split)
+        catalogues = catalogues_of(dataset, sorted({one.ids[0] for one in trajectories}), mapped)
         descents, detection_s = seen_descents(dataset, trajectories, detector)
-        scenes = sorted({one.ids[0] for one in trajectories})
-        exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in scenes}
-        rough = {
-            scene: with_errors(exact[scene], CatalogueErrors(), np.random.default_rng(place))
-            for place, scene in enumerate(scenes)
-        }
         network, architecture = load_navigator(best["navigator"], fusion)
         relative = _relative(trajectories, {fusion: [predict(network, architecture, one) for one in trajectories]})
-        found = _absolute(dataset, descents, exact, rough)
-        rows = pd.concat([relative, found.rows], ignore_index=True)
+        errors = absolute_errors(dataset, descents, catalogues)
+        absolute = pd.DataFrame([{"method": name, **absolute_summary(name, own)} for name, own in errors.items()])
+        rows = pd.concat([relative, absolute.assign(kind="absolute")], ignore_index=True)
         rows.to_parquet(folder / TABLE, index=False)
-        found.frames.to_parquet(folder / FRAMES, index=False)
-        draw_by_altitude(
-            folder / PICTURES[0], {str(name): own for name, own in found.frames.groupby("method", sort=False)}
-        )
-        if len(found.flown):
-            draw_flights(folder / PICTURES[1], found.flown)
-        _draw_matches(folder, trajectories[0], descents[0], rough[descents[0].ids[0]])
+        frames = pd.concat([own.assign(method=name) for name, own in errors.items()], ignore_index=True)
+        frames.to_parquet(folder / FRAMES, index=False)
+        draw_by_altitude(folder / PICTURES[0], {name: errors[name] for name in errors if not name.startswith("lost")})
+        if "filter" in errors:
+            draw_flights(folder / PICTURES[1], errors["filter"])
+        _draw_matches(folder, trajectories[0], descents[0], catalogues.rough[descents[0].ids[0]])
         drawn = [name for name in PICTURES if (folder / name).is_file()]
         write_text(folder / PAGE, page_of(dataset, split, rows, descents, detection_s, drawn))
         for check in checks:
@@ -113,37 +95,6 @@ def _relative(trajectories: list[Trajectory], learned: dict) -> pd.DataFrame:
             }
         )
     return pd.DataFrame(rows)
-
-
-def _absolute(
-    dataset: Dataset, descents: list[SeenDescent], exact: dict[str, Catalogue], rough: dict[str, Catalogue]
-) -> Found:
-    """Errors of positions in O_L. The filter needs inertial measurements; without them there are fixes only."""
-    tables = {
-        "fix, exact catalogue": fixes_near_a_prior(descents, exact, SEED),
-        "fix": fixes_near_a_prior(descents, rough, SEED),
-        "lost in space, exact catalogue": fixes_lost_in_space(descents, exact, SEED),
-        "lost in space": fixes_lost_in_space(descents, rough, SEED),
-    }
-    rows = [{"method": name, **fix_summary(table)} for name, table in tables.items() if len(table)]
-    frames = [table.assign(method=name) for name, table in tables.items() if name.startswith("fix")]
-    flown = pd.DataFrame()
-    inertial = dataset.table("inertial", ["grade"], *descents[0].ids)
-    if "tactical" in inertial["grade"].unique().to_pylist():
-        flown = flights(dataset, descents, rough, "tactical", 0.5)
-        pointed = flights(dataset, descents, rough, "tactical", 0.02)
-        best = flights(dataset, descents, exact, "tactical", 0.5)
-        smooth = flights(dataset, descents, rough, "tactical", 0.5, smooth=True)
-        for name, table in (
-            ("filter", flown),
-            ("smoother", smooth),
-            ("filter, star tracker", pointed),
-            ("filter, exact catalogue", best),
-        ):
-            rows.append({"method": name, **flight_summary(table)})
-            frames.append(table.assign(method=name))
-    summaries = pd.DataFrame(rows).assign(kind="absolute")
-    return Found(summaries, pd.concat(frames, ignore_index=True), flown)
 
 
 def _draw_matches(folder: Path, trajectory: Trajectory, descent: SeenDescent, catalogue: Catalogue) -> None:

@@ -1,0 +1,80 @@
+"""The command `navigate map` over a rendered survey, and the methods that use its catalogues."""
+
+import json
+import shutil
+
+import pandas as pd
+import pytest
+from tests.helpers import in_process
+
+from perilune_train.cli import main
+
+
+@pytest.fixture(scope="module")
+def mapped(tiny_survey, tmp_path_factory):
+    out = tmp_path_factory.mktemp("maps") / "map"
+    done = in_process.call(main, "navigate", "map", "--dataset", tiny_survey, "--out", out)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_a_catalogue_with_its_errors(mapped):
+    craters = pd.read_parquet(mapped / "scene-0000.parquet")
+    assert list(craters.columns) == ["x_m", "y_m", "z_m", "diameter_m", "score"]
+    assert len(craters) > 100
+    assert craters["diameter_m"].is_monotonic_decreasing
+    errors = pd.read_parquet(mapped / "errors.parquet").set_index("diameter_m")
+    assert errors["mapped"].sum() == len(craters)
+    middle = errors.loc["20 to 40"]
+    assert middle["true_share"] > 0.7
+    assert middle["position_rmse_m"] < 4.0
+    page = (mapped / "map.md").read_text(encoding="utf-8")
+    assert "scene-0000" in page and "](map.png)" in page
+    stated = json.loads((mapped / "map.json").read_text(encoding="utf-8"))["scenes"]["scene-0000"]
+    assert stated["craters"] == len(craters)
+    assert stated["sun_elevation_deg"] == 30.0
+
+
+def test_methods_fly_over_a_map(mapped, tiny, tmp_path):
+    out = tmp_path / "methods"
+    done = in_process.call(main, "navigate", "methods", "--dataset", tiny / "nav", "--map", mapped, "--out", out)
+    assert done.returncode == 0, done.stderr
+    rows = pd.read_parquet(out / "navigation.parquet").set_index("method")
+    assert rows.loc["filter, map", "n_frames"] == rows.loc["filter", "n_frames"]
+    assert "`filter, map`" in (out / "methods.md").read_text(encoding="utf-8")
+
+
+def test_damaged_maps_get_one_line(mapped, tiny, tmp_path):
+    def damaged(name, text):
+        folder = tmp_path / name
+        shutil.copytree(mapped, folder)
+        (folder / "map.json").write_text(text, encoding="utf-8")
+        return folder
+
+    good = json.loads((mapped / "map.json").read_text(encoding="utf-8"))
+    other = json.loads(json.dumps(good))
+    other["scenes"]["scene-0000"]["content_sha256"] = "0" * 64
+    renamed = {"scenes": {"../../etc/passwd": good["scenes"]["scene-0000"]}}
+    for folder, words in (
+        (tmp_path / "nowhere", ["map.json", "no such file"]),
+        (damaged("cut", json.dumps(good)[:-20]), ["map.json", "JSONDecodeError"]),
+        (damaged("list", "[1]"), ["map.json", "TypeError"]),
+        (damaged("other", json.dumps(other)), ["content_sha256", "the ground of the dataset"]),
+        (damaged("renamed", json.dumps(renamed)), ["map.json", "scenes"]),
+        (damaged("nan", json.dumps(good).replace('"position_sigma_m": ', '"position_sigma_m": -')), ["deviations"]),
+    ):
+        done = in_process.call(
+            main, "navigate", "methods", "--dataset", tiny / "nav", "--map", folder, "--out", tmp_path / "out"
+        )
+        assert done.returncode == 2, folder
+        assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+        assert all(word in done.stderr for word in words), done.stderr
+        assert not (tmp_path / "out").exists()
+
+
+def test_frames_of_a_descent_make_no_map(tiny, tmp_path):
+    done = in_process.call(main, "navigate", "map", "--dataset", tiny / "nav", "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "perilune-render survey" in done.stderr
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,1 @@
+"""Crater catalogues from images of an orbiter."""
