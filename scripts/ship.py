@@ -20,6 +20,7 @@ from model_card import Shipment, model_card
 from perilune_shared.errors import UserError, run_command_line
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
+from perilune_train.navigate.covariance import FILE as COVARIANCE
 from perilune_train.shipped.models import BENCHMARK, CARD, WEIGHTS
 from perilune_train.training.half_weights import write_half
 from perilune_train.training.runs import RunFolder, load_weights
@@ -52,6 +53,9 @@ def install(run: Annotated[Path, typer.Argument(help="Folder of a finished run."
     kept = {key: value for key, value in metrics.items() if not key.startswith("run/command")}
     write_text(folder / METRICS_FILE, json.dumps(kept, indent=2) + "\n")
     shutil.copyfile(source.config, folder / "config.yaml")
+    (folder / COVARIANCE).unlink(missing_ok=True)
+    if (run / COVARIANCE).is_file():
+        shutil.copyfile(run / COVARIANCE, folder / COVARIANCE)
     print(f"{folder}: {size:.1f} MB; next: score it on the locked benchmark, then `ship.py card`")
 
 

@@ -32,7 +32,7 @@ ROOMS = {
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
     ),
     "train/perilune_train/navigate": (
-        "config geometry data network relative craters filter fly evaluate train evaluate_run compare_runs "
+        "config geometry data network relative craters filter fly evaluate covariance train evaluate_run compare_runs "
         "benchmark map methods monte_carlo deploy cli"
     ),
 }

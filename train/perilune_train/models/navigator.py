@@ -111,13 +111,10 @@ class WarpNavigator(nn.Module):
     def forward(
         self, first: Tensor, second: Tensor, altitude_m: Tensor, state: State | None = None
     ) -> tuple[Tensor, Tensor, State]:
-        stacked = self.stacked(first, second)
-        features = self.mix(self.backbone(stacked)[-1])
+        features, flow_px, weight = self.flow(first, second)
         with torch.autocast(features.device.type, enabled=False):
-            shifts = functional.avg_pool2d(stacked[:, 2:], self.STRIDE)
-            estimates = self.place(torch.cat([features.float(), shifts], dim=1)).permute(0, 2, 3, 1)
-            flow_px, weight = estimates[..., :2], torch.exp(estimates[..., 2].clamp(-8, 8))
-            fitted = self.fitted_motion(flow_px, weight, altitude_m.flatten(), int(first.shape[-1]))
+            normal, right = self.equations(flow_px, weight, altitude_m.flatten(), int(first.shape[-1]))
+            fitted = self.solved(normal, right)
         summary = torch.cat([self.summary(features).float(), fitted], dim=-1)
         correction, state = self.recurrent(summary.unflatten(0, first.shape[:2]), state)
         turn = fitted[:, 3:]
@@ -127,12 +124,49 @@ class WarpNavigator(nn.Module):
         motion = torch.cat([fitted[:, :3], columns], dim=-1).unflatten(0, first.shape[:2])
         return motion + correction, flow_px.unflatten(0, first.shape[:2]), state
 
-    def fitted_motion(self, flow_px: Tensor, weight: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
-        """Fit translation and rotation vector (N, 6), in units of their spreads, to flows (N, h, w, 2).
+    def flow(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Features (N, channels, h, w), flows (N, h, w, 2), pixels, and their weights (N, h, w) of all N pairs."""
+        stacked = self.stacked(first, second)
+        features = self.mix(self.backbone(stacked)[-1])
+        with torch.autocast(features.device.type, enabled=False):
+            shifts = functional.avg_pool2d(stacked[:, 2:], self.STRIDE)
+            estimates = self.place(torch.cat([features.float(), shifts], dim=1)).permute(0, 2, 3, 1)
+            return features, estimates[..., :2], torch.exp(estimates[..., 2].clamp(-8, 8))
 
-        `altitude_m` (N,) is in metres. Minimises the sum of weight |J m - flow|^2 + prior |m|^2; weight (N, h, w) is in
-        1 / px^2. The prior decides
-        between tilt and sideways shift, which look alike from above. J is the flow of a plane perpendicular to the
+    def information(self, first: Tensor, second: Tensor, altitude_m: Tensor) -> Tensor:
+        """What the flows tell of translation and rotation vector, in units of their spreads (batch, pairs, 6, 6).
+
+        It is the inverse covariance of the motion without a prior, for independent flows whose variances are 1 / weight
+        times the mean weighted square of their residuals.
+        """
+        _, flow_px, weight = self.flow(first, second)
+        altitude, width_px = altitude_m.flatten(), int(first.shape[-1])
+        normal, right = self.equations(flow_px, weight, altitude, width_px)
+        motion = self.solved(normal, right)
+        explained = torch.einsum("nhwij,nj->nhwi", self.jacobian(flow_px, altitude, width_px), motion)
+        residual = (weight[..., None] * (flow_px - explained) ** 2).mean(dim=(1, 2, 3))
+        told = normal - torch.eye(6, device=normal.device) * self.log_prior.exp()
+        return (told / residual[:, None, None]).unflatten(0, first.shape[:2])
+
+    def equations(self, flow_px: Tensor, weight: Tensor, altitude_m: Tensor, width_px: int) -> tuple[Tensor, Tensor]:
+        """Equations (N, 6, 6) and (N, 6) of translation and rotation vector, in units of their spreads.
+
+        They minimise the sum of weight |J m - flow|^2 and prior |m|^2 over flows (N, h, w, 2), weights (N, h, w) in
+        1 / px^2, at altitudes (N,) in metres. The prior decides between tilt and sideways shift, which look alike from
+        above.
+        """
+        jacobian = self.jacobian(flow_px, altitude_m, width_px)
+        weighted = jacobian * weight[..., None, None]
+        normal = (
+            torch.einsum("nhwij,nhwik->njk", weighted, jacobian)
+            + torch.eye(6, device=self.unit.device) * self.log_prior.exp()
+        )
+        return normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px)
+
+    def jacobian(self, flow_px: Tensor, altitude_m: Tensor, width_px: int) -> Tensor:
+        """Derivatives (N, h, w, 2, 6) of flows by translation and rotation vector, in units of their spreads.
+
+        It is the flow of a plane perpendicular to the
         view (Longuet-Higgins & Prazdny 1980, doi 10.1098/rspb.1980.0057), to first order in the motion; it neglects the
         nominal step compared with the altitude.
         """
@@ -141,13 +175,7 @@ class WarpNavigator(nn.Module):
         unit = focal_px * self.unit * over_altitude
         # `int`: an exporter would take sizes for part of the graph.
         rows, columns = (int(size) for size in flow_px.shape[1:3])
-        jacobian = self.plane_flow(rows, columns, width_px) * unit[:, None, None, None]
-        weighted = jacobian * weight[..., None, None]
-        normal = (
-            torch.einsum("nhwij,nhwik->njk", weighted, jacobian)
-            + torch.eye(6, device=self.unit.device) * self.log_prior.exp()
-        )
-        return self.solved(normal, torch.einsum("nhwij,nhwi->nj", weighted, flow_px))
+        return self.plane_flow(rows, columns, width_px) * unit[:, None, None, None]
 
     def solved(self, normal: Tensor, right: Tensor) -> Tensor:
         """Solutions (N, 6) of equations (N, 6, 6), (N, 6). An export without this operator replaces it."""

@@ -15,6 +15,7 @@ from perilune_train.evaluation.markdown import number, table
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
+from perilune_train.navigate.covariance import stated_covariances
 from perilune_train.navigate.data.trajectories import Motion, Trajectory, load_split
 from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.metrics import motion_errors, summary, summary_spreads
@@ -63,6 +64,9 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
     classical = baselines([], trajectories)
     motions |= classical.motions
     covariances = classical.covariances
+    stated = stated_covariances(run, network, architecture, trajectories)
+    if stated is not None:
+        covariances = {fusion: stated, **covariances}
     errors = {method: motion_errors(trajectories, found, covariances.get(method)) for method, found in motions.items()}
     mark = "; ".join(dict.fromkeys(check.mark for check in checks if check.mark))
     counts = {part.name: (part.dataset.info.counts.frames, part.n_locked) for part in parts}

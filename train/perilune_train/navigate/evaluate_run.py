@@ -9,6 +9,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import progress_bar
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
+from perilune_train.navigate.covariance import stated_covariances
 from perilune_train.navigate.data.trajectories import Motion, Trajectory, load_split
 from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.report import write_evaluation
@@ -45,8 +46,11 @@ def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Pat
     }
     # Mean motions are those of the training set, which this dataset may not have.
     classical = baselines([], trajectories)
-    motions = {fusion: found, **classical.motions}
-    write_evaluation(out, fusion, split, trajectories, motions, classical.covariances, details)
+    motions, covariances = {fusion: found, **classical.motions}, classical.covariances
+    stated = stated_covariances(run, network, architecture, trajectories)
+    if stated is not None:
+        covariances = {fusion: stated, **covariances}
+    write_evaluation(out, fusion, split, trajectories, motions, covariances, details)
     return out
 
 

@@ -4,6 +4,7 @@ import typer
 
 from perilune_train.navigate.cli.benchmark import benchmark
 from perilune_train.navigate.cli.benchmark_landing import benchmark_landing
+from perilune_train.navigate.cli.calibrate import calibrate
 from perilune_train.navigate.cli.compare import compare
 from perilune_train.navigate.cli.evaluate import evaluate
 from perilune_train.navigate.cli.export import export
@@ -23,6 +24,7 @@ app.command("train")(train)
 app.command("evaluate")(evaluate)
 app.command("benchmark")(benchmark)
 app.command("benchmark-landing")(benchmark_landing)
+app.command("calibrate")(calibrate)
 app.command("compare")(compare)
 app.command("export")(export)
 app.command("methods")(methods)

@@ -53,11 +53,16 @@ def normalised_errors(trajectory: Trajectory, motion: Motion, covariance: Array)
 
     (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.)
     """
+    error = signed_errors(trajectory, motion)
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+
+
+def signed_errors(trajectory: Trajectory, motion: Motion) -> Array:
+    """Errors (n - 1, 6) in the form of the covariance of `EstimatedMotion`: turn, radians, and shift, metres."""
     (translation, rotation), (true_translation, true_rotation) = motion, trajectory.motion
     turn = rotation_vectors(true_rotation @ np.swapaxes(rotation, 1, 2))
     shift = np.einsum("nij,nj->ni", true_rotation, translation - true_translation)
-    error = np.concatenate([turn, shift], axis=1)
-    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    return np.concatenate([turn, shift], axis=1)
 
 
 def summary(errors: pd.DataFrame) -> dict[str, float]:

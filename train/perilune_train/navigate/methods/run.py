@@ -6,14 +6,16 @@ import numpy as np
 import pandas as pd
 
 from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.geometry.frames import Array
 from perilune_shared.storage.files import new_folder, write_text
 from perilune_shared.storage.store import Address
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
+from perilune_train.navigate.covariance import stated_covariances
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.craters.fix import PosePrior
 from perilune_train.navigate.craters.locate import locate
-from perilune_train.navigate.data.trajectories import Trajectory, load_split
+from perilune_train.navigate.data.trajectories import Motion, Trajectory, load_split
 from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.metrics import motion_errors, summary
 from perilune_train.navigate.evaluate_run import fusion_of
@@ -58,7 +60,9 @@ def fly_methods(
         catalogues = catalogues_of(dataset, sorted({one.ids[0] for one in trajectories}), mapped)
         descents, detection_s = seen_descents(dataset, trajectories, detector)
         network, architecture = load_navigator(best["navigator"], fusion)
-        relative = _relative(trajectories, {fusion: [predict(network, architecture, one) for one in trajectories]})
+        learned: dict[str, list[Motion]] = {fusion: [predict(network, architecture, one) for one in trajectories]}
+        stated = stated_covariances(navigator, network, architecture, trajectories)
+        relative = _relative(trajectories, learned, {} if stated is None else {fusion: stated})
         errors = absolute_errors(dataset, descents, catalogues)
         absolute = pd.DataFrame([{"method": name, **absolute_summary(name, own)} for name, own in errors.items()])
         rows = pd.concat([relative, absolute.assign(kind="absolute")], ignore_index=True)
@@ -76,12 +80,14 @@ def fly_methods(
     return rows
 
 
-def _relative(trajectories: list[Trajectory], learned: dict) -> pd.DataFrame:
+def _relative(
+    trajectories: list[Trajectory], learned: dict[str, list[Motion]], stated: dict[str, list[Array]]
+) -> pd.DataFrame:
     """Errors of the motion between consecutive frames, one row per method."""
     classical = baselines([], trajectories)
-    rows = []
+    rows, covariances = [], {**stated, **classical.covariances}
     for method, motions in {**learned, **classical.motions}.items():
-        figures = summary(motion_errors(trajectories, motions, classical.covariances.get(method)))
+        figures = summary(motion_errors(trajectories, motions, covariances.get(method)))
         rows.append(
             {
                 "method": method,

@@ -18,6 +18,7 @@ from perilune_train.evaluation.provenance import (
     training_provenance,
 )
 from perilune_train.navigate.config import NavigateConfig
+from perilune_train.navigate.covariance import calibrate, stated_covariances
 from perilune_train.navigate.data.trajectories import Trajectory, load_trajectories
 from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.report import write_evaluation
@@ -85,12 +86,18 @@ def navigate_run(
         return list(folders.values())
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
-    motions = classical.motions
+    motions, covariances = classical.motions, classical.covariances
     # stack comes first, so that the table of the warp run, which finishes last, has both.
     for fusion, run in folders.items():
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
         motions = {fusion: [predict(network, architecture, trajectory) for trajectory in test], **motions}
+        if fusion == "warp" and fusion in seconds:
+            chosen_on = [trajectory for trajectory in trajectories if trajectory.split == "val"]
+            calibrate(run.root, network, architecture, chosen_on)
+        stated = stated_covariances(run.root, network, architecture, test)
+        if stated is not None:
+            covariances = {fusion: stated, **covariances}
         if fusion not in seconds:
             continue
         pairs = sum(trajectory.n_pairs for trajectory in test)
@@ -105,7 +112,7 @@ def navigate_run(
             "dataset/protocol": protocol_of(opened.info),
             **terrain_check.metrics(),
         }
-        write_evaluation(run.root, fusion, "test", test, motions, classical.covariances, details)
+        write_evaluation(run.root, fusion, "test", test, motions, covariances, details)
     return list(folders.values())
 
 
