@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-monte-carlo explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -131,11 +131,22 @@ train-nav: nav-frames ## train and evaluate navigation (warp and stack)
 	@$(BIN)/perilune-train navigate train $(TRAIN) --dataset "$(DATA)/nav" $(OVER)
 
 METHODS := $(RUNS)/navigate/$(NAME)-methods
+MAP := $(RUNS)/navigate/$(NAME)-map
+
+# $(1): dataset, $(2): split, $(3): folder of the survey, $(4): folder of the map.
+define surveyed
+test -e "$(3)-plan/dataset.json" || $(BIN)/perilune-manifest subset "$(1)" --out "$(3)-plan" --images none --where "split == '$(2)'"; \
+$(BIN)/perilune-render survey --manifest "$(3)-plan" --out "$(3)" && \
+{ test -e "$(4)/map.json" || $(BIN)/perilune-train navigate map --dataset "$(3)" --out "$(4)"; }
+endef
 navigate: nav-frames ## fly all methods of navigation over the test descents; writes runs/navigate/<name>-methods (OVERWRITE=1 replaces)
 	@$(if $(OVERWRITE),rm -rf "$(METHODS)")
 	@if test -f "$(METHODS)/methods.md"; then echo "$(METHODS): finished, left unchanged; OVERWRITE=1 replaces it"; else \
 	  $(BIN)/perilune-train navigate methods --dataset "$(DATA)/nav" --out "$(METHODS)" \
-	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)"); fi
+	  $(if $(wildcard $(NAVIGATE)),--run "$(RUNS)/navigate/$(NAME)") $(if $(wildcard $(MAP)/map.json),--map "$(MAP)"); fi
+
+navigate-map: nav-frames ## render the test scenes from orbit, under another Sun, and map their craters; writes runs/navigate/<name>-map, which make navigate then uses
+	@$(call surveyed,$(DATA)/nav,test,$(DATA)/survey,$(MAP))
 
 DRAWS ?= 200
 SCENARIO ?= nominal
@@ -239,7 +250,8 @@ bench-transfer: detect-frames ## compare four ways to start from a frozen backbo
 
 bench-landing: setup ## all methods of navigation on the validation descents of shipped-nav; writes runs/bench/landing
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
-	@$(BIN)/perilune-train navigate methods --dataset data/shipped/nav --split val --allow-overlap --out runs/bench/landing
+	@$(call surveyed,data/shipped/nav,val,data/shipped/survey,runs/bench/landing-map)
+	@$(BIN)/perilune-train navigate methods --dataset data/shipped/nav --split val --allow-overlap --map runs/bench/landing-map --out runs/bench/landing
 
 bench-motion: setup ## relative motion under noise, blur and a wrong prior, on the validation descents of shipped-nav; writes runs/bench/motion.json
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
