@@ -135,10 +135,11 @@ MAP := $(RUNS)/navigate/$(NAME)-map
 
 # $(1): dataset, $(2): split, $(3): folder of the survey, $(4): folder of the map.
 define surveyed
-test -e "$(3)-plan/dataset.json" || $(BIN)/perilune-manifest subset "$(1)" --out "$(3)-plan" --images none --where "split == '$(2)'"; \
+{ test -e "$(3)-plan/dataset.json" || $(BIN)/perilune-manifest subset "$(1)" --out "$(3)-plan" --images none --where "split == '$(2)'"; } && \
 $(BIN)/perilune-render survey --manifest "$(3)-plan" --out "$(3)" && \
 { test -e "$(4)/map.json" || $(BIN)/perilune-train navigate map --dataset "$(3)" --out "$(4)"; }
 endef
+
 navigate: nav-frames ## fly all methods of navigation over the test descents; writes runs/navigate/<name>-methods (OVERWRITE=1 replaces)
 	@$(if $(OVERWRITE),rm -rf "$(METHODS)")
 	@if test -f "$(METHODS)/methods.md"; then echo "$(METHODS): finished, left unchanged; OVERWRITE=1 replaces it"; else \

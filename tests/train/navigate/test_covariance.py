@@ -13,7 +13,15 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.cli import main
 from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.covariance import FILE, NAMES, Told, fit_numbers, read_numbers, told, write_numbers
+from perilune_train.navigate.covariance import (
+    FILE,
+    NAMES,
+    MotionInformation,
+    fit_numbers,
+    information_of,
+    read_numbers,
+    write_numbers,
+)
 from perilune_train.navigate.data.trajectories import load_split
 from perilune_train.navigate.evaluate.metrics import signed_errors
 from perilune_train.navigate.network import build
@@ -42,7 +50,7 @@ def known(trajectory):
     network = build(ARCHITECTURE).eval()
     # Untrained, the head finds no flow, so residuals are zero.
     torch.nn.init.normal_(network.place.weight, std=0.1)
-    return told(network, ARCHITECTURE, trajectory)
+    return information_of(network, ARCHITECTURE, trajectory)
 
 
 def estimate(trajectory, error):
@@ -71,7 +79,7 @@ def test_tilt_and_shift_are_confused_as_over_a_plane(trajectory, known):
 
 def test_numbers_are_those_that_made_the_errors(trajectory, known):
     rng = np.random.default_rng(0)
-    many = Told(
+    many = MotionInformation(
         np.tile(known.information, (400, 1, 1)),
         known.prior,
         np.repeat(np.geomspace(200, 1500, 400), len(known.altitude_m)),

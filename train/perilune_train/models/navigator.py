@@ -134,9 +134,9 @@ class WarpNavigator(nn.Module):
             return features, estimates[..., :2], torch.exp(estimates[..., 2].clamp(-8, 8))
 
     def information(self, first: Tensor, second: Tensor, altitude_m: Tensor) -> Tensor:
-        """What the flows tell of translation and rotation vector, in units of their spreads (batch, pairs, 6, 6).
+        """Inverse covariance of translation and rotation vector, in units of their spreads (batch, pairs, 6, 6).
 
-        It is the inverse covariance of the motion without a prior, for independent flows whose variances are 1 / weight
+        It comes from the flows alone, without the prior, for independent flows whose variances are 1 / weight
         times the mean weighted square of their residuals.
         """
         _, flow_px, weight = self.flow(first, second)
@@ -145,8 +145,8 @@ class WarpNavigator(nn.Module):
         motion = self.solved(normal, right)
         explained = torch.einsum("nhwij,nj->nhwi", self.jacobian(flow_px, altitude, width_px), motion)
         residual = (weight[..., None] * (flow_px - explained) ** 2).mean(dim=(1, 2, 3))
-        told = normal - torch.eye(6, device=normal.device) * self.log_prior.exp()
-        return (told / residual[:, None, None]).unflatten(0, first.shape[:2])
+        from_flows = normal - torch.eye(6, device=normal.device) * self.log_prior.exp()
+        return (from_flows / residual[:, None, None]).unflatten(0, first.shape[:2])
 
     def equations(self, flow_px: Tensor, weight: Tensor, altitude_m: Tensor, width_px: int) -> tuple[Tensor, Tensor]:
         """Equations (N, 6, 6) and (N, 6) of translation and rotation vector, in units of their spreads.

@@ -32,8 +32,8 @@ _ALTITUDE_M, _LARGEST = 1000.0, 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What a network tells of the motions of one trajectory of n frames."""
+class MotionInformation:
+    """Information on the motions of one trajectory of n frames, from a network's flows and its prior."""
 
     information: Array
     """Of the flows (n - 1, 6, 6), without factors: turn, radians, and shift, metres, as in `EstimatedMotion`."""
@@ -51,8 +51,8 @@ class Told:
         return np.asarray(np.linalg.inv(inverse) * spread[:, None] * spread)
 
 
-def told(network: WarpNavigator, architecture: dict[str, Any], trajectory: Trajectory) -> Told:
-    """What a warp network tells of the motions of a trajectory."""
+def information_of(network: WarpNavigator, architecture: dict[str, Any], trajectory: Trajectory) -> MotionInformation:
+    """Information on the motions of a trajectory, from the flows and the prior of a warp network."""
     shrunk, scales = trajectory.shrunk(architecture["size_px"]), Scales(**architecture["scales"])
     network.focal_over_width = shrunk.camera.fx_px / shrunk.camera.width_px
     sequence = pair_sequence(shrunk, 0, shrunk.n_pairs, warp=True)
@@ -64,10 +64,10 @@ def told(network: WarpNavigator, architecture: dict[str, Any], trajectory: Traje
     unit = np.array([*scales.spread_m, *[-scales.rotation_rad] * 3])
     order = np.r_[3:6, 0:3]
     found = (information / unit[:, None] / unit)[:, order][:, :, order]
-    return Told(found, (prior / unit**2)[order], shrunk.altitude_m)
+    return MotionInformation(found, (prior / unit**2)[order], shrunk.altitude_m)
 
 
-def fit_numbers(known: list[Told], trajectories: list[Trajectory], motions: list[Motion]) -> list[float]:
+def fit_numbers(known: list[MotionInformation], trajectories: list[Trajectory], motions: list[Motion]) -> list[float]:
     """The five numbers under which the errors of these motions are most likely, as those of a Gaussian."""
     errors = np.concatenate([signed_errors(one, motion) for one, motion in zip(trajectories, motions, strict=True)])
 
@@ -76,7 +76,7 @@ def fit_numbers(known: list[Told], trajectories: list[Trajectory], motions: list
         squared = np.einsum("ni,ni->n", errors, np.linalg.solve(stated, errors[:, :, None])[:, :, 0])
         return float(np.mean(np.linalg.slogdet(stated)[1] + squared))
 
-    # Bounds, since the flows of a network that was hardly trained tell nothing.
+    # Bounds, since the flows of a network that was hardly trained have no information.
     start, bounds = np.array([-4.0, 0.0, 0.0, 0.0, 0.0]), [(-_LARGEST, _LARGEST)] * len(NAMES)
     options = {"maxfev": 4000, "maxiter": 4000}
     return minimize(cost, start, method="Nelder-Mead", bounds=bounds, options=options).x.tolist()
@@ -87,7 +87,7 @@ def calibrate(
 ) -> None:
     """Fit the five numbers to validation trajectories, and write covariance.json to a run's folder."""
     motions = [predict(network, architecture, one) for one in trajectories]
-    numbers = fit_numbers([told(network, architecture, one) for one in trajectories], trajectories, motions)
+    numbers = fit_numbers([information_of(network, architecture, one) for one in trajectories], trajectories, motions)
     write_numbers(folder, numbers, sum(one.n_pairs for one in trajectories))
 
 
@@ -118,4 +118,4 @@ def stated_covariances(
     numbers = read_numbers(folder)
     if numbers is None or not isinstance(network, WarpNavigator):
         return None
-    return [told(network, architecture, one).covariance(numbers) for one in trajectories]
+    return [information_of(network, architecture, one).covariance(numbers) for one in trajectories]

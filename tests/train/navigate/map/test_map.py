@@ -7,6 +7,9 @@ import pandas as pd
 import pytest
 from tests.helpers import in_process
 
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.editing.pack import pack
+from perilune_shared.editing.subset import subset
 from perilune_train.cli import main
 
 
@@ -78,3 +81,20 @@ def test_frames_of_a_descent_make_no_map(tiny, tmp_path):
     assert len(done.stderr.strip().splitlines()) == 1
     assert "perilune-render survey" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_survey_without_frames_and_a_packed_one(tiny_survey, mapped, tmp_path):
+    survey = open_dataset(tiny_survey)
+    subset(survey, tmp_path / "absent", images="none")
+    done = in_process.call(main, "navigate", "map", "--dataset", tmp_path / "absent", "--out", tmp_path / "out")
+    assert done.returncode == 2
+    # The line before it is the progress bar.
+    *_, last = done.stderr.strip().splitlines()
+    assert last.startswith("error: ") and "a dataset with frames" in last
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+    pack(survey, tmp_path / "packed")
+    done = in_process.call(main, "navigate", "map", "--dataset", tmp_path / "packed", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    craters, expected = (pd.read_parquet(folder / "scene-0000.parquet") for folder in (tmp_path / "out", mapped))
+    pd.testing.assert_frame_equal(craters, expected)

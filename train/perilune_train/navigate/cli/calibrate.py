@@ -19,12 +19,13 @@ def calibrate(
 ) -> None:
     """Fit the covariance that a warp network states to its errors on validation descents; writes covariance.json.
 
-    A training does this at its end. Use it for runs of earlier versions, or for another camera.
+    Refuses test terrain. A training does this at its end. Use it for runs of earlier versions, or for another camera.
     """
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
     from perilune_shared.dataset.manifest import open_dataset
+    from perilune_train.evaluation.provenance import check_calibration, read_provenance, split_terrain
     from perilune_train.navigate.covariance import FILE
     from perilune_train.navigate.covariance import calibrate as fit
     from perilune_train.navigate.data.trajectories import load_split
@@ -36,6 +37,8 @@ def calibrate(
     fusion = fusion_of(best, load_weights(best)["architecture"])
     if fusion != "warp":
         raise UserError(best, "fusion", fusion, "warp; the paper's network states no covariance")
+    opened = open_dataset(dataset)
+    check_calibration(read_provenance(load_weights(best), best), split_terrain(opened, split, "calibrated"), opened)
     network, architecture = load_navigator(best, fusion)
-    fit(run, network, architecture, load_split(open_dataset(dataset), split))
+    fit(run, network, architecture, load_split(opened, split))
     console.print(f"{run / FILE}", soft_wrap=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset, open_dataset
@@ -92,9 +93,12 @@ def _scene_map(
     advance: Callable[[int], object],
 ) -> SceneMap:
     camera, views, images = dataset.info.camera.intrinsics(), [], []
+    rows = pa.table({column: frames[column].tolist() for column in ("frame_id", "png_path")})
+    pngs = dict(dataset.pngs(rows, str(frames["split"].iloc[0])))
     for row in frames.to_dict("records"):
-        png = dataset.store.read(row["png_path"])
-        images.append(decode(png, row["frame_id"], camera.height_px, camera.width_px))
+        where = f"{dataset.store}/{row['png_path']}"
+        png = pngs[row["frame_id"]]
+        images.append(decode(png, where, camera.height_px, camera.width_px, row["png_bytes"]))
         found = above(detect_image(network, images[-1], TILING, advance), threshold)
         pose = Pose(np.array(row["position_m"]), matrix_from_quaternion(row["rotation_wxyz"]))
         views.append(View(camera, pose, Sightings.of_boxes(found.boxes, found.scores)))

@@ -49,7 +49,7 @@ def catalogues_of(dataset: Dataset, scene_ids: list[str], mapped: Mapping[str, C
 
 
 def absolute_errors(dataset: Dataset, descents: list[SeenDescent], catalogues: Catalogues) -> dict[str, pd.DataFrame]:
-    """Errors of each method, one row per frame; methods without a frame to judge are left out.
+    """Errors of each method, one row per frame; methods without any frame are left out.
 
     The filter needs inertial measurements of grade `tactical`; without them there are fixes only.
     """
