@@ -4,8 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-Attention = Literal["none", "cbam", "cbam_identity"]
-"""none: plain Darknet53; cbam: the paper's gates; cbam_identity: gates that are exactly 1 at initialisation."""
+Attention = Literal["none", "cbam", "cbam_identity", "cbam_centred"]
+"""none: plain Darknet53; cbam: the paper's gates; cbam_identity: gates that are exactly 1 at initialisation;
+cbam_centred: spatial gates between 0.5 and 1.5 that cannot become constant."""
 Precision = Literal["auto", "bf16", "float32"]
 """auto: bfloat16 if the hardware supports it."""
 Device = Literal["auto", "cpu", "cuda"]

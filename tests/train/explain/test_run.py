@@ -13,25 +13,25 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.labels.selection import read_labels, selected
 from perilune_shared.labels.thresholds import SELECTIONS
-from perilune_train.data.frames import load_frames
 from perilune_train.detect.cli.evaluate import config_of_run
 from perilune_train.detect.inference.detector import load_detector
 from perilune_train.evaluation.provenance import training_provenance
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.masks import caption, detector_masks, draw_masks, navigator_masks
-from perilune_train.explain.run import detect_frames, explain_run
+from perilune_train.explain.evidence.tables import TABLES
+from perilune_train.explain.inputs import labelled_frames
+from perilune_train.explain.maps.masks import detector_masks
+from perilune_train.explain.page.pictures import CAPTIONS
+from perilune_train.explain.run import explain_run
 from perilune_train.models.navigator import StackNavigator
-from perilune_train.models.yolo import YOLOv3
 from perilune_train.training.runs import save_weights
 
 _BLOCKS = [f"B_{i + 1}{j + 1}" for i, count in enumerate((1, 2, 8, 8, 4)) for j in range(count)]
-_DETECTOR = {"in_channels": 1, "width": 0.125, "attention": "cbam", "strides": [4, 8, 16]}
 _STACK = {
     "fusion": "stack",
     "size_px": 64,
     "in_channels": 1,
     "width": 0.125,
-    "attention": "cbam",
+    "attention": "cbam_centred",
     "hidden": 8,
     "focal_over_width": 1.4,
     "scales": {"mean_m": [0.0] * 3, "spread_m": [1.0] * 3, "rotation_rad": 0.01},
@@ -41,7 +41,7 @@ _STACK = {
 def _store(folder):
     """Untrained networks: their masks are as real as trained ones."""
     torch.manual_seed(0)
-    save_weights(folder / "stack.ckpt", _STACK, StackNavigator(1, 0.125, "cbam", 8))
+    save_weights(folder / "stack.ckpt", _STACK, StackNavigator(1, 0.125, "cbam_centred", 8))
     return store_run(folder, "attention=cbam") / "checkpoints" / "best.ckpt", folder / "stack.ckpt"
 
 
@@ -55,7 +55,18 @@ def checkpoints(dataset_detect, dataset_nav, tmp_path_factory):
 
 
 def _explain(checkpoints, dataset_detect, dataset_nav, folder, n_drawn=2, **options):
-    settings = ExplainConfig(n_frames=3, n_pairs=3, n_drawn=n_drawn, device="cpu")
+    settings = ExplainConfig(
+        n_frames=3,
+        n_pairs=8,
+        n_validation=8,
+        n_changed=2,
+        n_changed_pairs=8,
+        n_attributed=1,
+        n_drawn=n_drawn,
+        integration_steps=2,
+        occlusion_px=48,
+        device="cpu",
+    )
     return explain_run(settings, dataset_detect, dataset_nav, *checkpoints, folder, "t", **options)
 
 
@@ -65,33 +76,56 @@ def _banded(path):
     return red > 150 and max(blue, green) < 80
 
 
-def test_a_run_correlates_every_block(checkpoints, dataset_detect, dataset_nav, tmp_path):
+def test_a_run_writes_values_tests_interventions_claims_and_pictures(
+    checkpoints, dataset_detect, dataset_nav, tmp_path
+):
     run = _explain(checkpoints, dataset_detect, dataset_nav, tmp_path)
-    table = pd.read_parquet(run.root / "correlations.parquet")
-    for measure, count in (("pcc1_background", 3), ("pcc1_craterness", 3), ("pcc2", 6), ("pcc3", 3), ("pcc4", 3)):
-        own = table[table["measure"] == measure]
-        assert list(own["block"]) == _BLOCKS
-        assert (own["count"] == count).all()
+    tables = {name: pd.read_parquet(run.root / f"{name}.parquet") for name in TABLES}
+    gates = tables["values"].query("kind == 'gate'")
+    for measure, count in (("pcc1_craterness", 3), ("pcc1_partial", 3), ("pcc2", 3), ("pcc3", 7), ("pcc4", 7)):
+        own = gates[gates["measure"] == measure]
+        assert list(dict.fromkeys(own["map"])) == _BLOCKS
+        assert (own.groupby("map").size() == count).all()
         assert own["value"].abs().max() <= 1 + 1e-9
     metrics = json.loads(run.metrics.read_text())
-    # The sign: G is 1 on background.
+    # The sign: G is 1 on background. Compare with NumPy.
     config = config_of_run(checkpoints[0].parent.parent, ())
-    frames, truth, _ = detect_frames(ExplainConfig(n_frames=3), config, dataset_detect)
-    masks = detector_masks(load_detector(checkpoints[0]), frames, tmp_path)["B_11"]
-    own = np.mean([np.corrcoef(mask.ravel(), g.ravel())[0, 1] for mask, g in zip(masks, truth, strict=True)])
-    assert metrics["pcc1_background/B_11"] == pytest.approx(own, abs=1e-5)
-    assert metrics["pcc1_craterness/B_11"] == pytest.approx(-own, abs=1e-5)
+    settings = ExplainConfig(n_frames=3)
+    frames, _ = labelled_frames(open_dataset(dataset_detect), "test", config, 3, settings.ring_factors)
+    masks = detector_masks(load_detector(checkpoints[0]), frames.images, tmp_path)["B_11"]
+    pairs = zip(masks, frames.truth, strict=True)
+    mean = np.mean([np.corrcoef(mask.ravel(), g.ravel())[0, 1] for mask, g in pairs])
+    assert metrics["pcc1_background/B_11"] == pytest.approx(mean, abs=1e-5)
+    assert metrics["pcc1_craterness/B_11"] == pytest.approx(-mean, abs=1e-5)
     assert "weaker on craters" in metrics["pcc1_sign"] and metrics["labels/selection"] == "visible"
-    both = table.query("measure == 'pcc4' and block == 'B_11'").iloc[0]
-    assert metrics["pcc4_all_pixels/B_11"] == pytest.approx(both["value_all_pixels"]) != metrics["pcc4/B_11"]
-    for name in ("masks_detect.png", "masks_navigate.png", "pcc_detect.png", "pcc_navigate.png"):
+    # All 23 gates, 5 stages and all together are forced, in both tasks; a forced gate changes something.
+    forced = tables["gates"]
+    assert forced.groupby("task")["scope"].nunique().to_dict() == {"detect": 29, "navigate": 29}
+    assert (forced.groupby("task")["scene_id"].nunique() >= 1).all()
+    nav = forced[(forced["task"] == "navigate") & (forced["scope"] == "all gates")]
+    assert np.isfinite(nav["after"]).all() and (nav["after"] > 0).all()
+    assert set(tables["removal"]["which"]) == {"most", "least", "random", "shifted"}
+    assert set(tables["randomisation"]["direction"]) == {"top_down", "bottom_up"}
+    # One or two scenes allow no interval and no verdict.
+    assert tables["summary"].query("task == 'detect'")["low"].isna().all()
+    assert not tables["tested"]["beats_all"].any()
+    claims = json.loads((run.root / "claims.json").read_text())
+    assert len(claims) == 14 and all(set(one) == set(claims[0]) for one in claims)
+    assert {(run.root / one["picture"]).is_file() for one in claims} == {True}
+    assert "follows craters" in metrics["headline"] and "PCC4" in metrics["headline"]
+    captions = json.loads((run.root / "captions.json").read_text())
+    assert captions == CAPTIONS and {path.name for path in run.root.glob("*.png")} == set(captions)
+    for name in captions:
         assert cv2.imread(str(run.root / name)).std() > 5, name
         assert not _banded(run.root / name), name
     # The detection dataset splits by scene, the navigation dataset by trajectory.
     assert (metrics["detector/terrain/status"], metrics["detector/terrain/mark"]) == ("disjoint", "")
     assert (metrics["navigator/terrain/status"], metrics["navigator/terrain/mark"]) == ("by protocol", "")
-    assert metrics["detector/dataset/protocol"] == "held-out scenes"
-    assert metrics["navigator/dataset/protocol"].startswith("held-out descents, shared terrain")
+    with np.load(run.root / "masks_detect.npz", allow_pickle=False) as stored:
+        assert list(stored["blocks"]) == _BLOCKS and stored["B_11"].dtype == np.uint8
+        assert len(stored["B_54"]) == len(stored["frame_ids"]) > 1
+        low, high = stored["low"][0], stored["high"][0]
+        assert 0 < low < high < 1  # plain gates
     # The same again leaves it alone; other settings or another checkpoint are refused.
     before = {path: path.stat().st_mtime_ns for path in run.root.rglob("*")}
     _explain(checkpoints, dataset_detect, dataset_nav, tmp_path)
@@ -118,20 +152,19 @@ def test_test_terrain_that_a_network_was_fitted_to_is_refused_or_marked(dataset_
     assert (metrics["detector/terrain/status"], metrics["navigator/terrain/status"]) == ("disjoint", "overlap")
     assert "s000 = elsewhere/s000" in metrics["navigator/terrain/mark"]
     marked = {path.name for path in run.root.glob("*.png") if _banded(path)}
-    assert marked == {"masks_navigate.png", "pcc_navigate.png"}
-    table_mark = pq.read_schema(run.root / "correlations.parquet").metadata[b"terrain_mark"].decode()
+    assert marked == {name for name in CAPTIONS if "navigate" in name}
+    table_mark = pq.read_schema(run.root / "summary.parquet").metadata[b"terrain_mark"].decode()
     assert table_mark == f"navigator: {metrics['navigator/terrain/mark']}"
 
 
 def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect):
     """A worn crater and one without contrast are background, though they are labelled."""
-    settings = ExplainConfig(n_frames=8)
     config = config_of_run(checkpoints[0].parent.parent, ())
-    _, truth, reported = detect_frames(settings, config, dataset_detect)
+    frames, _ = labelled_frames(open_dataset(dataset_detect), "test", config, 8, (1.1, 1.2, 1.3, 1.4))
     labels = read_labels(open_dataset(dataset_detect), ["ellipse_cx_px", "ellipse_cy_px"], "test")
     seen = pd.Series(selected(labels, SELECTIONS["visible"]))
     values = {True: [], False: []}
-    for (_, rows), mask in zip(labels.groupby("frame_id"), truth, strict=True):
+    for (_, rows), mask in zip(labels.groupby("frame_id"), frames.truth, strict=True):
         for row in rows.itertuples():
             expected = rows[seen[rows.index]]
             gap = np.hypot(expected["ellipse_cx_px"] - row.ellipse_cx_px, expected["ellipse_cy_px"] - row.ellipse_cy_px)
@@ -139,53 +172,12 @@ def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect)
                 values[bool(seen[row.Index])].append(mask[int(row.ellipse_cy_px), int(row.ellipse_cx_px)])
     assert len(values[True]) > 10 and len(values[False]) > 5
     assert set(values[True]) == {0} and set(values[False]) == {1}
-    assert reported["labels/min_contrast"] == 5
-
-
-def test_masks_are_those_of_the_network_at_the_frames_size(dataset_detect, tmp_path):
-    torch.manual_seed(1)
-    detector = YOLOv3(None, **_DETECTOR).eval()
-    images = load_frames(open_dataset(dataset_detect), "test").images[:2]
-    masks = detector_masks(detector, images, tmp_path)
-    assert list(masks) == _BLOCKS
-    assert all(mask.shape == (2, 96, 96) and mask.min() >= 0 and mask.max() <= 1 for mask in masks.values())
-    pixels = (images[1] - images[1].mean()) / images[1].std()
-    with torch.no_grad():
-        own = detector.backbone.attention_masks(torch.from_numpy(pixels).float()[None, None])["B_21"][0, 0]
-    np.testing.assert_allclose(masks["B_21"][1], cv2.resize(own.numpy(), (96, 96)), atol=1e-4)
-
-
-def test_a_stacked_mask_holds_both_halves(tmp_path):
-    torch.manual_seed(1)
-    navigator = StackNavigator(1, 0.125, "cbam", 8).eval()
-    frame = np.random.default_rng(0).normal(size=(1, 64, 64)).astype(np.float32)
-    flat = np.zeros_like(frame)
-    mask = navigator_masks(navigator, frame, flat, (128, 128), tmp_path)["B_11"][0]
-    assert mask.shape == (256, 128)
-    # The earlier frame is above: noise there, nothing below.
-    assert mask[20:108].std() > 5 * mask[148:236].std()
-
-
-def test_all_gates_of_a_sheet_share_one_scale(tmp_path):
-    """Gates of 0.2, 0.5 and 0.8 get three colours; one that varies has the same colour where it has the same value."""
-    ramp = np.tile(np.linspace(0.2, 0.8, 160, dtype=np.float32), (160, 1))
-    masks = {f"B_{k}": np.full((1, 160, 160), v, np.float32) for k, v in enumerate((0.2, 0.5, 0.8))} | {
-        "B_3": ramp[None]
-    }
-    draw_masks(tmp_path / "sheet.png", np.full((1, 160, 160), 80, np.uint8), masks)
-    sheet = cv2.imread(str(tmp_path / "sheet.png")).astype(int)
-    low, middle, high = (sheet[80, 164 * (k + 1) + 82] for k in range(3))
-    assert np.abs(low - middle).max() > 50 and np.abs(high - middle).max() > 50
-    np.testing.assert_allclose(sheet[80, 164 * 4 + 82], middle, atol=6)
-    # The colour bar below has the whole scale.
-    np.testing.assert_allclose(sheet[-30, [42, -43]], [low, high], atol=6)
-    assert caption("B_1", masks["B_1"][0]) == "B_1 constant 0.500"
-    assert caption("B_3", masks["B_3"][0]) == "B_3 0.200-0.800"
 
 
 def test_what_cannot_be_explained(checkpoints, dataset_detect, dataset_nav, tmp_path):
     detector, stack = checkpoints
     plain = store_run(tmp_path / "plain", "attention=none") / "checkpoints" / "best.ckpt"
+    store_record(plain, training_provenance(open_dataset(dataset_detect)).uses)
     with pytest.raises(UserError, match="attention: got none"):
         _explain((plain, stack), dataset_detect, dataset_nav, tmp_path)
     with pytest.raises(UserError, match="no such file"):

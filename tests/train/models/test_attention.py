@@ -25,7 +25,7 @@ def test_gates_follow_the_equations():
 
 
 def test_identity_form_returns_its_input_exactly_and_still_learns():
-    cbam = CBAM(16, identity=True)
+    cbam = CBAM(16, form="identity")
     x = torch.randn(3, 16, 7, 7)
     assert torch.equal(cbam(x), x)
     cbam(x).square().sum().backward()

@@ -5,18 +5,34 @@ from typing import Annotated
 from pydantic import Field
 
 from perilune_shared.config import Section
-from perilune_train.config import Device
+from perilune_train.config import Count, Device
 
 
 class ExplainConfig(Section):
     """The section `explain`."""
 
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Random seed of nulls, intervals, controls and untrained networks."""
     n_frames: Annotated[int, Field(ge=2)] = 32
-    """Number of test frames, evenly spaced through the split, over which PCC1 and PCC2 are averaged."""
-    n_pairs: Annotated[int, Field(ge=2)] = 32
-    """Number of test pairs, evenly spaced, over which PCC3 and PCC4 are averaged."""
+    """Number of test frames, evenly spaced through the split, for correlations."""
+    n_pairs: Annotated[int, Field(ge=8)] = 48
+    """Number of test pairs for correlations, in runs of 8 consecutive pairs."""
+    n_validation: Annotated[int, Field(ge=8)] = 16
+    """Number of validation frames and of pairs on which signs and gates are chosen."""
+    n_changed: Annotated[int, Field(ge=2)] = 16
+    """Number of these test frames for interventions: gates forced, pixels removed, weights randomised."""
+    n_changed_pairs: Annotated[int, Field(ge=8)] = 24
+    """Number of these test pairs for interventions."""
+    n_attributed: Annotated[int, Field(ge=1)] = 4
+    """Number of these test frames for Grad-CAM, integrated gradients and occlusion."""
     n_drawn: Annotated[int, Field(ge=1, le=8)] = 3
-    """Number of frames and of pairs whose masks are drawn."""
+    """Number of frames and of pairs whose masks are drawn: of high, middle and low altitude."""
+    removed_share: Annotated[float, Field(gt=0, lt=0.5)] = 0.2
+    """Share of the pixels that is replaced."""
+    integration_steps: Count = 8
+    """Points of the integral of integrated gradients."""
+    occlusion_px: Annotated[int, Field(ge=8)] = 32
+    """Side and stride of the square that occlusion sets to grey, pixels."""
     ring_factors: tuple[float, float, float, float] = (1.1, 1.2, 1.3, 1.4)
     """alpha_1 to alpha_4: outer radii of the grey rings in the ground-truth mask, divided by the crater's radius."""
     device: Device = "auto"

@@ -1,5 +1,6 @@
-"""One explain run: attention masks of both networks, their correlations, bar charts."""
+"""One explain run: evidence on the gates of a detector and of a stack navigator, as tables, pictures and claims."""
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -7,35 +8,28 @@ import numpy as np
 import pandas as pd
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.errors import UserError
-from perilune_shared.storage.files import written_aside
+from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import console, progress_bar
+from perilune_shared.terminal import console
 from perilune_train.detect.config import DetectConfig
-from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.split_evaluation import selection_entries
 from perilune_train.detect.finished_run import config_of_run
-from perilune_train.detect.inference.detector import load_detector
+from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
-from perilune_train.explain.bars import DETECT_BARS, DETECT_TITLE, NAVIGATE_BARS, NAVIGATE_TITLE, draw_bars
+from perilune_train.explain import detection, navigation
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.explain.correlation import ground_affine, ground_truth_mask
-from perilune_train.explain.masks import Masks, detector_masks, draw_masks, navigator_masks
-from perilune_train.explain.measures import PCC1_SIGN, detector_correlations, navigator_correlations
-from perilune_train.navigate.data.sequences import pair_sequence
-from perilune_train.navigate.data.trajectories import Trajectory, load_trajectories
+from perilune_train.explain.correlation.measures import PCC1_SIGN
+from perilune_train.explain.evidence.tables import TABLES, Evidence
+from perilune_train.explain.inputs import consecutive_pairs, first_descent, frames_of, labelled_frames
+from perilune_train.explain.maps.masks import Masks, detector_masks
+from perilune_train.explain.page import claims as page
+from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
+from perilune_train.explain.page.viewer import save_masks
 from perilune_train.navigate.network import load_navigator
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.runs import RunFolder, choose_device, load_weights
-
-_TABLE = "correlations.parquet"
-_PICTURES = {
-    "detector": ("masks_detect.png", "pcc_detect.png"),
-    "navigator": ("masks_navigate.png", "pcc_navigate.png"),
-}
-"""Picture files of each network: masks and correlations."""
 
 
 def explain_run(
@@ -49,10 +43,11 @@ def explain_run(
     overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> RunFolder:
-    """Compute and draw the attention masks of two networks on test frames; writes runs/explain/<name>.
+    """Compute the evidence on the attention gates of two networks on test data; writes runs/explain/<name>.
 
     `detector` is checkpoints/best.ckpt in the folder of its run, whose config.yaml defines the selected craters. Leaves
     a finished run of the same settings, datasets and checkpoints unchanged; `overwrite` replaces any existing run.
+    Signs and the gates whose pixels are removed are chosen on the validation splits.
 
     Raises UserError if the existing run has other settings, datasets or checkpoints; if a dataset, a checkpoint or
     config.yaml is missing or invalid; if a network has no attention; or if it was fitted to terrain of its test frames
@@ -65,63 +60,85 @@ def explain_run(
     state = state_of(run, "explain", settings, inputs, overwrite)
     if state == "finished":
         return run
-    device = choose_device(settings.device)
-    network = load_detector(detector).to(device)
     stack, architecture = load_navigator(navigator, "stack")
+    stack = stack.to(choose_device(settings.device))
     marks, terrain = _check_terrain(
         {"detector": (detector, detect_data), "navigator": (navigator, nav_data)}, allow_overlap
     )
     own = config_of_run(detector.parent.parent, ())
-    frames, truth, labels = detect_frames(settings, own, detect_data)
-    test = [trajectory for trajectory in load_trajectories(open_dataset(nav_data)) if trajectory.split == "test"]
-    pairs = _evenly_spaced([(one, step) for one in test for step in range(one.n_pairs)], settings.n_pairs)
+    opened = open_single_scale(detector, own, settings)
+    labelled, flown = open_dataset(detect_data), open_dataset(nav_data)
+    frames, split = labelled_frames(labelled, "test", own, settings.n_frames, settings.ring_factors)
+    known_frames, _ = labelled_frames(labelled, "val", own, settings.n_validation, settings.ring_factors)
+    pairs = consecutive_pairs(flown, "test", settings.n_pairs)
+    known_pairs = consecutive_pairs(flown, "val", settings.n_validation)
+    descent = frames_of(split, first_descent(split), settings.ring_factors)
     start_run(run, "explain", settings, inputs, state)
-    detected = detector_masks(network, frames, detector)
-    draw_masks(run.root / "masks_detect.png", *_to_draw(frames, detected, settings.n_drawn))
-    shrunk = {id(trajectory): trajectory.shrunk(architecture["size_px"]) for trajectory in test}
-    sequences = [pair_sequence(shrunk[id(trajectory)], step, 1, warp=False) for trajectory, step in pairs]
-    size = test[0].images.shape[1:]
-    stacked = navigator_masks(
-        stack.to(device),
-        np.concatenate([s.first for s in sequences]),
-        np.concatenate([s.second for s in sequences]),
-        (size[0], size[1]),
-        navigator,
+
+    found, masks = detection.explain_detector(settings, opened, frames, known_frames, detector)
+    draw_detector(run.root, settings, frames, masks, found)
+    save_masks(
+        run.root / "masks_detect.npz", descent.frame_ids, detector_masks(opened.network, descent.images, detector)
     )
-    both = np.stack([np.concatenate([one.images[step], one.images[step + 1]]) for one, step in pairs])
-    draw_masks(run.root / "masks_navigate.png", *_to_draw(both, stacked, settings.n_drawn))
-    rows = detector_correlations(detected, truth) + _navigator_rows(stacked, pairs)
-    table = pd.DataFrame(rows)
-    with written_aside(run.root / _TABLE) as aside:
-        table.to_parquet(aside, index=False)
-    draw_bars(run.root / "pcc_detect.png", table, DETECT_BARS, DETECT_TITLE)
-    draw_bars(run.root / "pcc_navigate.png", table, NAVIGATE_BARS, NAVIGATE_TITLE)
-    console.print(PCC1_SIGN, markup=False)
-    # pcc1_craterness is undefined whenever pcc1_background is; count them once.
-    counted = table[table["measure"] != "pcc1_craterness"]
-    undefined = int(counted["undefined"].sum())
-    if undefined:
-        console.print(f"{undefined} of {int(counted['count'].sum())} correlations undefined: a mask was constant")
-    metrics: Metrics = {f"{row['measure']}/{row['block']}": row["value"] for row in rows}
+    seen, stacked = navigation.explain_navigator(settings, stack, architecture, pairs, known_pairs, navigator)
+    draw_navigator(run.root, settings, pairs, stacked, seen)
+
+    claims = page.detector_claims(found, _deviations(masks)) + page.navigator_claims(seen, _deviations(stacked))
+    _write_tables(run, {detection.TASK: found, navigation.TASK: seen})
+    write_text(run.root / "claims.json", json.dumps([one.plain() for one in claims], indent=2) + "\n")
+    write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
+    metrics = _figures(found) | _figures(seen) | selection_entries(own, split) | terrain
+    metrics |= {f"mask_deviation/{block}": value for block, value in _deviations(masks).items()}
+    metrics |= {f"mask_deviation_stack/{block}": value for block, value in _deviations(stacked).items()}
     metrics |= {
-        f"{row['measure']}_all_pixels/{row['block']}": row["value_all_pixels"]
-        for row in rows
-        if row["measure"] in ("pcc3", "pcc4")
-    }
-    metrics |= labels | terrain
-    metrics |= {
+        "headline": page.headline(claims),
         "pcc1_sign": PCC1_SIGN,
-        "frames": len(frames),
-        "pairs": len(pairs),
-        "undefined": undefined,
+        "frames": len(frames.images),
+        "pairs": len(pairs.images),
         "detector": detector.as_posix(),
         "navigator": navigator.as_posix(),
     }
     for part, mark in marks.items():
-        mark_files(run.root, _PICTURES[part], mark)
-    mark_files(run.root, [_TABLE], "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark))
+        mark_files(run.root, PICTURES[part], mark)
+    joined = "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark)
+    mark_files(run.root, [f"{name}.parquet" for name in TABLES], joined)
+    console.print(page.headline(claims), markup=False, soft_wrap=True)
     write_metrics(run.root, metrics)
     return run
+
+
+def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainConfig) -> Detector:
+    """Load a detector that runs at scale 1 only, since masks belong to one scale, on the device of `settings`."""
+    evaluation = config.evaluation.model_copy(update={"scales": (1.0,)})
+    return open_detector(checkpoint, config.model_copy(update={"evaluation": evaluation, "device": settings.device}))
+
+
+def _figures(found: Evidence) -> Metrics:
+    """Means of all gates by measure, with their intervals where there are five units or more."""
+    rows = found.summary[found.summary["kind"] == "gate"]
+    metrics: Metrics = {}
+    for row in rows.to_dict("records"):
+        key = f"{row['measure']}/{row['map']}"
+        metrics[key] = float(row["value"])
+        if np.isfinite(row["low"]):
+            metrics |= {f"{key}_low": float(row["low"]), f"{key}_high": float(row["high"])}
+    for tested in found.tested.to_dict("records"):
+        metrics[f"{tested['measure']}_beats_nulls/{tested['map']}"] = bool(tested["beats_all"])
+    metrics[f"{found.values['task'].iloc[0]}/strongest_gate"] = found.strongest
+    metrics[f"{found.values['task'].iloc[0]}/undefined"] = int(rows["undefined"].sum())
+    return metrics
+
+
+def _deviations(masks: Masks) -> dict[str, float]:
+    """Standard deviation of each gate's mask over pixels and images."""
+    return {block: float(found.std()) for block, found in masks.items()}
+
+
+def _write_tables(run: RunFolder, evidence: Mapping[str, Evidence]) -> None:
+    tables = [found.with_task(task) for task, found in evidence.items()]
+    for name in TABLES:
+        with written_aside(run.root / f"{name}.parquet") as aside:
+            pd.concat([one[name] for one in tables], ignore_index=True).to_parquet(aside, index=False)
 
 
 def _check_terrain(networks: Mapping[str, tuple[Path, Address]], allow_overlap: bool) -> tuple[dict[str, str], Metrics]:
@@ -138,51 +155,3 @@ def _check_terrain(networks: Mapping[str, tuple[Path, Address]], allow_overlap: 
         figures = {"dataset/protocol": protocol_of(dataset.info), **check.metrics()}
         metrics |= {f"{part}/{key}": value for key, value in figures.items()}
     return marks, metrics
-
-
-def detect_frames(
-    settings: ExplainConfig, detector: DetectConfig, address: Address
-) -> tuple[np.ndarray, np.ndarray, Metrics]:
-    """Test frames (N, height, width), the paper's masks G of them, float32 (N, height, width), and their selection.
-
-    G contains only craters that the detector's own run selects, so no hardly visible ones.
-    """
-    dataset = open_dataset(address)
-    if dataset.info.kind != "detect":
-        raise UserError(dataset.store, "kind", dataset.info.kind, "detect, a dataset with labels")
-    split = load_split(dataset, "test", detector.labels)
-    chosen = _evenly_spaced(range(len(split)), settings.n_frames)
-    height, width = split.frames.images.shape[1:]
-    masks = []
-    for own in (split.labels[i] for i in chosen):
-        centres, radii = own.ellipses[own.selected, :2], own.radius_px[own.selected]
-        masks.append(ground_truth_mask(width, height, centres, radii, settings.ring_factors).astype(np.float32))
-    return split.frames.images[chosen], np.stack(masks), selection_entries(detector, split)
-
-
-def _navigator_rows(masks: Masks, pairs: list[tuple[Trajectory, int]]) -> list[dict]:
-    affines = []
-    for trajectory, step in pairs:
-        position, rotation = trajectory.position_m, trajectory.rotation_camera_from_site
-        affines.append(
-            ground_affine(trajectory.camera, position[step], rotation[step], position[step + 1], rotation[step + 1])
-        )
-    rows = []
-    with progress_bar() as progress:
-        task = progress.add_task("correlate", total=len(masks), unit="blocks", note="")
-        for block, found in masks.items():
-            rows += navigator_correlations(block, found, affines)
-            progress.advance(task)
-    return rows
-
-
-def _evenly_spaced(items, count: int) -> list:
-    """At most `count` items, evenly spaced."""
-    items = list(items)
-    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, count).astype(int))]
-
-
-def _to_draw(images: np.ndarray, masks: Masks, count: int) -> tuple[np.ndarray, Masks]:
-    """At most `count` of the images (N, height, width), evenly spaced, and their masks."""
-    chosen = _evenly_spaced(range(len(images)), count)
-    return images[chosen], {name: found[chosen] for name, found in masks.items()}

@@ -1,9 +1,13 @@
 """CBAM, the convolutional block attention module (Woo et al. 2018, doi 10.1007/978-3-030-01234-2_1)."""
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+
+Form = Literal["plain", "identity", "centred"]
+AMPLITUDE = 0.5
+"""Largest deviation of a centred spatial gate from 1."""
 
 
 class MeanAndMax(torch.autograd.Function):
@@ -40,20 +44,25 @@ class CBAM(nn.Module):
 
     Plain form: s is the sigmoid. Both gates are between 0 and 1 and start near 0.5, so that one module scales its input
     by about 0.25. Identity form: s is twice the sigmoid, and W1 and f_7x7 start at zero. Both gates are between 0 and 2
-    and exactly 1 at initialisation, so that a pretrained backbone keeps its features.
+    and exactly 1 at initialisation, so that a pretrained backbone keeps its features. Long training drives spatial
+    gates of this form to a constant 2. Centred form: the channel gate of the identity form, and
+    M_s(F') = 1 + 0.5 tanh(n(f_7x7 [avg(F'); max(F')])), where n is a batch norm without weights: over pixels and frames
+    the gate is between 0.5 and 1.5 and centred, and it cannot become constant.
 
     Shape: (N, C, H, W) to the same. The layers have no bias, as in the equations.
     """
 
-    def __init__(self, channels: int, reduction: int = 16, kernel: int = 7, identity: bool = False):
+    def __init__(self, channels: int, reduction: int = 16, kernel: int = 7, form: Form = "plain"):
         super().__init__()
         hidden = max(channels // reduction, 4)
         self.squeeze = nn.Linear(channels, hidden, bias=False)
         self.excite = nn.Linear(hidden, channels, bias=False)
         self.spatial = nn.Conv2d(2, 1, kernel, padding=kernel // 2, bias=False)
-        self.scale = 2.0 if identity else 1.0
-        if identity:
+        self.norm = nn.BatchNorm2d(1, affine=False) if form == "centred" else None
+        self.scale = 1.0 if form == "plain" else 2.0
+        if form != "plain":
             nn.init.zeros_(self.excite.weight)
+        if form == "identity":
             nn.init.zeros_(self.spatial.weight)
 
     def channel_gate(self, x: Tensor) -> Tensor:
@@ -65,7 +74,10 @@ class CBAM(nn.Module):
 
     def spatial_gate(self, x: Tensor) -> Tensor:
         """M_s (N, 1, H, W) of features (N, C, H, W) that have passed the channel gate."""
-        return self.scale * torch.sigmoid(self.spatial(torch.cat(MeanAndMax.apply(x, 1), dim=1)))
+        logits = self.spatial(torch.cat(MeanAndMax.apply(x, 1), dim=1))
+        if self.norm is None:
+            return self.scale * torch.sigmoid(logits)
+        return 1 + AMPLITUDE * torch.tanh(self.norm(logits.float()))
 
     def gated(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Spatial mask M_s (N, 1, H, W) and refined features F'' (N, C, H, W)."""

@@ -6,11 +6,12 @@ from typing import cast
 from torch import Tensor, nn
 
 from perilune_train.config import Attention
-from perilune_train.models.attention import CBAM
+from perilune_train.models.attention import CBAM, Form
 
 UNITS = (1, 2, 8, 8, 4)
 """Residual units in each stage."""
 _STEM_CHANNELS = 32
+_FORMS: dict[Attention, Form] = {"cbam": "plain", "cbam_identity": "identity", "cbam_centred": "centred"}
 
 
 def scaled(channels: int, width: float) -> int:
@@ -69,7 +70,7 @@ class AttentionDarknet53(nn.Module):
                 name = f"B_{i + 1}{j + 1}"
                 self.units[name] = ResidualUnit(channels)
                 if attention != "none":
-                    self.attentions[name] = CBAM(channels, identity=attention == "cbam_identity")
+                    self.attentions[name] = CBAM(channels, form=_FORMS[attention])
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Images (N, in_channels, H, W) to the stages' feature maps (N, channels[i], H / 2^(i+1), W / 2^(i+1))."""

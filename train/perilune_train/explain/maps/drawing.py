@@ -1,75 +1,18 @@
-"""Spatial attention masks of the trained networks, and their pictures."""
+"""Sheets of attention masks beside their images."""
 
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from perilune_shared.errors import UserError
-from perilune_train.data.frames import normalised
 from perilune_train.evaluation.pictures import save_image
-from perilune_train.explain.correlation import is_constant
-from perilune_train.models.darknet import AttentionDarknet53
-from perilune_train.models.navigator import StackNavigator
-from perilune_train.models.yolo import YOLOv3
+from perilune_train.explain.correlation.pearson import is_constant
+from perilune_train.explain.maps.masks import Masks
 
-Masks = dict[str, NDArray[np.float32]]
-"""Block "B_ij" to masks (N, height, width) of N images, resized to the size of the frames."""
-
-_BATCH = 8
 _CELL_PX = 160
 _COLUMNS = 8
 _WHITE = (255, 255, 255)
-
-
-def detector_masks(detector: YOLOv3, images: NDArray[np.uint8], where: Path) -> Masks:
-    """Attention masks (N, height, width) of the detector for frames (N, height, width)."""
-    backbone = detector.backbone
-    channels = next(backbone.parameters()).shape[1]
-    device = next(backbone.parameters()).device
-
-    def network_input(part: NDArray) -> torch.Tensor:
-        return torch.from_numpy(normalised(part))[:, None].expand(-1, channels, -1, -1).to(device)
-
-    return _collected(
-        backbone,
-        [network_input(images[i : i + _BATCH]) for i in range(0, len(images), _BATCH)],
-        images.shape[1:],
-        where,
-    )
-
-
-def navigator_masks(
-    navigator: StackNavigator,
-    first: NDArray[np.float32],
-    second: NDArray[np.float32],
-    size: tuple[int, int],
-    where: Path,
-) -> Masks:
-    """Masks (N, 2 height, width) of stacked pairs, from normalised frames (N, h, w); `size` is height and width."""
-    device = next(navigator.parameters()).device
-    inputs = [
-        navigator.stacked(
-            torch.from_numpy(first[None, i : i + _BATCH]).to(device),
-            torch.from_numpy(second[None, i : i + _BATCH]).to(device),
-        )
-        for i in range(0, len(first), _BATCH)
-    ]
-    return _collected(navigator.backbone, inputs, (2 * size[0], size[1]), where)
-
-
-def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: tuple[int, ...], where: Path) -> Masks:
-    masks: dict[str, list[np.ndarray]] = {}
-    with torch.no_grad():
-        for batch in inputs:
-            for name, mask in backbone.attention_masks(batch).items():
-                own = mask[:, 0].float().cpu().numpy()
-                masks.setdefault(name, []).extend(cv2.resize(m, size[::-1]) for m in own)
-    if not masks:
-        raise UserError(where, "attention", "none", "a checkpoint of a network with attention, cbam or cbam_identity")
-    return {name: np.stack(found) for name, found in masks.items()}
 
 
 def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:

@@ -1,0 +1,1 @@
+"""Effect of single craters, removed from the ground and rendered again."""

@@ -1,0 +1,138 @@
+"""How masks and detections change when single craters are removed.
+
+Three changes of the same frame are compared, in an ellipse around each crater:
+
+- rendered: the crater is removed from the ground and the frame is rendered again. Pixels outside its reach stay equal.
+- inpainted: the same ellipse is filled from its surroundings, which removes the crater's pixels.
+- placebo: an ellipse of the same shape on ground without labelled craters is filled in the same way. The effect of
+  filling alone.
+
+A gate reacts to craters if the rendered change moves its mask and the placebo does not.
+"""
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_train.detect.evaluate.boxes import iou_matrix
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.explain.causal.pairs import CraterPairs
+from perilune_train.explain.maps.masks import Masks
+
+REACH = 1.4
+"""Semi-axes of the region around a crater, divided by the crater's: the outermost ring of the paper's mask G."""
+_INPAINT_RADIUS_PX = 3
+_TRIES = 200
+_MIN_IOU = 0.5
+
+
+def region(shape: tuple[int, ...], crater: pd.Series, shift_px: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.bool_]:
+    """Pixels (height, width) of the region around a crater (a row of `CraterPairs.craters`), moved by `shift_px`."""
+    u, v = np.meshgrid(np.arange(shape[1]) + 0.5, np.arange(shape[0]) + 0.5)
+    x, y = u - crater["ellipse_cx_px"] - shift_px[0], v - crater["ellipse_cy_px"] - shift_px[1]
+    c, s = np.cos(crater["ellipse_theta_rad"]), np.sin(crater["ellipse_theta_rad"])
+    along, across = (c * x + s * y) / crater["ellipse_a_px"], (c * y - s * x) / crater["ellipse_b_px"]
+    return along**2 + across**2 <= REACH**2
+
+
+def empty_shift(crater: pd.Series, occupied: NDArray[np.bool_], rng: np.random.Generator) -> tuple[float, float] | None:
+    """A random shift (x, y), pixels, that moves a crater's region onto free ground in the image; None if none is found.
+
+    `occupied` (height, width) are pixels in or near labelled craters. Shifts are drawn until the region is free.
+    """
+    height, width = occupied.shape
+    reach = REACH * crater["ellipse_a_px"] + 1
+    if 2 * reach >= min(height, width):
+        return None
+    for _ in range(_TRIES):
+        x, y = rng.uniform(reach, width - reach), rng.uniform(reach, height - reach)
+        shift = x - crater["ellipse_cx_px"], y - crater["ellipse_cy_px"]
+        if not (region((height, width), crater, shift) & occupied).any():
+            return shift
+    return None
+
+
+def inpainted(image: NDArray[np.uint8], chosen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The image (height, width) with the chosen pixels filled from their surroundings (Telea 2004)."""
+    filled = cv2.inpaint(image, chosen.astype(np.uint8), _INPAINT_RADIUS_PX, cv2.INPAINT_TELEA)
+    return np.asarray(filled, np.uint8)
+
+
+def filled_frames(
+    pairs: CraterPairs, occupied: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], list[tuple[float, float] | None]]:
+    """Frames with the removed craters inpainted, frames with placebo regions inpainted, and the shifts of these.
+
+    Shapes (N, height, width) and one shift for each row of `pairs.craters`. `occupied` (N, height, width) are pixels in
+    or near labelled craters.
+    """
+    shape = pairs.factual.shape[1:]
+    without, placebo = (np.zeros(pairs.factual.shape, bool) for _ in range(2))
+    shifts = []
+    taken = occupied.copy()
+    for _, crater in pairs.craters.iterrows():
+        image = int(crater["image"])
+        without[image] |= region(shape, crater)
+        shift = empty_shift(crater, taken[image], rng)
+        shifts.append(shift)
+        if shift is not None:
+            chosen = region(shape, crater, shift)
+            placebo[image] |= chosen
+            taken[image] |= chosen
+    fill = [
+        np.stack([inpainted(*one) for one in zip(pairs.factual, chosen, strict=True)]) for chosen in (without, placebo)
+    ]
+    return fill[0], fill[1], shifts
+
+
+def mask_effects(
+    pairs: CraterPairs, masks: dict[str, Masks], shifts: Sequence[tuple[float, float] | None]
+) -> pd.DataFrame:
+    """Change of every gate in the region of every crater, in standard deviations of the gate.
+
+    `masks` has the masks of the versions "factual", "rendered", "inpainted" and "placebo". The change is the mean over
+    the region of the factual mask minus that of the other version: above 0 the gate is stronger with the crater.
+    Columns: those of `pairs.craters`, map, version, change; NaN for a placebo without free ground.
+    """
+    shape, rows = pairs.factual.shape[1:], []
+    for (_, crater), shift in zip(pairs.craters.iterrows(), shifts, strict=True):
+        own, image = region(shape, crater), int(crater["image"])
+        moved = None if shift is None else region(shape, crater, shift)
+        regions = {"rendered": own, "inpainted": own, "placebo": moved}
+        for version, chosen in regions.items():
+            for block, factual in masks["factual"].items():
+                if chosen is None or not chosen.any():
+                    change = np.nan
+                else:
+                    change = float((factual[image] - masks[version][block][image])[chosen].mean())
+                rows.append({"crater": crater.name, "map": block, "version": version, "change": change})
+    table = pd.DataFrame(rows)
+    spread = {block: max(float(found.std()), 1e-9) for block, found in masks["factual"].items()}
+    table["change"] /= table["map"].map(spread)
+    return table.merge(_facts(pairs), left_on="crater", right_index=True)
+
+
+def detection_effects(
+    pairs: CraterPairs, detect: Callable[[NDArray[np.uint8]], list[Detections]], versions: dict[str, NDArray[np.uint8]]
+) -> pd.DataFrame:
+    """Highest score of a detection that matches each crater's box (IoU 0.5), in each version of its frame; 0 if none.
+
+    `versions` are frames (N, height, width) by name. Columns: those of `pairs.craters`, version, score.
+    """
+    boxes = pairs.craters[["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]].to_numpy(np.float64)
+    image, rows = pairs.craters["image"].to_numpy(), []
+    for version, images in versions.items():
+        found = detect(images)
+        for k in range(len(boxes)):
+            own = found[image[k]]
+            overlap = iou_matrix(own.boxes.reshape(-1, 4), boxes[k : k + 1])[:, 0]
+            score = float(own.scores[overlap >= _MIN_IOU].max(initial=0.0))
+            rows.append({"crater": k, "version": version, "score": score})
+    return pd.DataFrame(rows).merge(_facts(pairs), left_on="crater", right_index=True)
+
+
+def _facts(pairs: CraterPairs) -> pd.DataFrame:
+    return pairs.craters[["frame_id", "scene_id", "crater_id", "radius_px", "depth_ratio", "sun_elevation_deg"]]

@@ -1,0 +1,70 @@
+"""The ground plane's homography of the true pose, and images moved by it."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+from perilune_train.navigate.geometry import (
+    apply_homography,
+    pixel_index_homography,
+    plane_homography,
+    relative_poses,
+)
+
+
+def true_homography(
+    camera: Camera,
+    position_1_m: Array,
+    rotation_1_camera_from_site: Array,
+    position_2_m: Array,
+    rotation_2_camera_from_site: Array,
+) -> Array:
+    """Homography (3, 3) from image coordinates, pixels, of frame 1 to those of frame 2, of the true poses.
+
+    Takes positions (3,) in metres, O_L, and rotations (3, 3). The plane is the mean ground, z = 0 of O_L. The paper
+    speaks of "the affine transformation matrix defined by groundtruth pose" without a definition. Deviation: a
+    homography, which is exact on the plane where an affine map is not. Raises ValueError if frame 1 is not above the
+    plane.
+    """
+    if position_1_m[2] <= 0:
+        raise ValueError(f"altitude is {position_1_m[2]} m, not above 0")
+    translation_m, rotation = relative_poses(
+        [position_1_m, position_2_m], [rotation_1_camera_from_site, rotation_2_camera_from_site]
+    )
+    down_c1 = -np.asarray(rotation_1_camera_from_site)[:, 2]
+    return plane_homography(camera.matrix, translation_m[0], rotation[0], down_c1, float(position_1_m[2]))
+
+
+def seen_in_second(shape: tuple[int, int], homography: Array) -> NDArray[np.bool_]:
+    """Which pixels (height, width) of frame 1 see ground that is inside frame 2, which has the same shape."""
+    height, width = shape
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    found = apply_homography(homography, np.stack([u, v], axis=-1))
+    return ((found >= 0) & (found < [width, height])).all(axis=-1)
+
+
+def moved_to_first(image_2: NDArray[np.floating] | NDArray[np.uint8], homography: Array) -> Array:
+    """An image of frame 2 (height, width), resampled bilinearly at the pixels of frame 1; its edge continues outside.
+
+    `homography` (3, 3) maps image coordinates of frame 1 to frame 2.
+    """
+    height, width = image_2.shape
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    moved = cv2.warpPerspective(
+        np.asarray(image_2, np.float32),
+        pixel_index_homography(homography),
+        (width, height),
+        flags=flags,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(moved, np.float64)
+
+
+def warped_to_first(
+    image_2: NDArray[np.floating] | NDArray[np.uint8], homography: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """An image of frame 2 moved to frame 1 (height, width), and which pixels of frame 1 are inside frame 2."""
+    height, width = image_2.shape
+    return moved_to_first(image_2, homography), seen_in_second((height, width), homography)

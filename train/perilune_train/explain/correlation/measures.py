@@ -1,0 +1,124 @@
+"""PCC1 to PCC4 of the paper for each image or pair, as rows of one long table.
+
+Columns: task, kind, map, measure, frame_id, scene_id, value. Means, intervals and tests are computed from these rows.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.frames import Array
+from perilune_train.explain.correlation.homography import moved_to_first, seen_in_second
+from perilune_train.explain.correlation.pearson import (
+    Maps,
+    dot_rows,
+    given_basis,
+    partial_of_rows,
+    residual_rows,
+    standardised_rows,
+)
+from perilune_train.explain.maps.masks import Masks
+
+Kind = Literal["gate", "null", "attribution"]
+COLUMNS = ("task", "kind", "map", "measure", "frame_id", "scene_id", "value")
+"""Columns of the long table."""
+PCC1_SIGN = (
+    "G is 1 on background and 0 in craters: pcc1_background above 0 means that the gate is weaker on craters; "
+    "pcc1_craterness is the correlation with 1 - G, of the opposite sign"
+)
+
+
+def detector_values(
+    masks: Masks,
+    truth: Maps,
+    brightness: Maps,
+    gradient: Maps,
+    frame_ids: Sequence[str],
+    scene_ids: Sequence[str],
+    kind: Kind = "gate",
+    other_scenes: bool = False,
+) -> pd.DataFrame:
+    """The long table of PCC1 and PCC2 for every map; `truth` (N, height, width) are the paper's masks G of N frames.
+
+    pcc1_background is the paper's PCC1, the correlation with G, which is 1 on background: above 0 the map is lower on
+    craters. pcc1_craterness is the correlation with 1 - G: above 0 the map is higher on craters. pcc1_partial is the
+    partial correlation with 1 - G given brightness and gradient (N, height, width). pcc2 of frame n is the mean
+    correlation of the map with the same map of all other frames m, or of those of other scenes if `other_scenes`; the
+    paper uses one unspecified m. Undefined values are NaN.
+    """
+    scenes = np.asarray(scene_ids)
+    paired = scenes[:, None] != scenes[None] if other_scenes else ~np.eye(len(scenes), dtype=bool)
+    craterness, basis = standardised_rows(1 - truth), given_basis([brightness, gradient])
+    residuals = residual_rows(craterness, basis)
+    tables = []
+    for name, found in masks.items():
+        rows = standardised_rows(found)
+        pcc1 = dot_rows(rows, craterness)
+        values = {
+            "pcc1_background": -pcc1,
+            "pcc1_craterness": pcc1,
+            "pcc1_partial": partial_of_rows(rows, residuals, basis),
+            "pcc2": _mean_defined(rows @ rows.T, paired),
+        }
+        tables += [_table("detect", kind, name, *one, frame_ids, scene_ids) for one in values.items()]
+    return pd.concat(tables, ignore_index=True)
+
+
+def pair_values(
+    masks: Masks,
+    homographies: Sequence[Array],
+    pair_ids: Sequence[str],
+    scene_ids: Sequence[str],
+    kind: Kind = "gate",
+    all_pixels: bool = True,
+) -> pd.DataFrame:
+    """The long table of PCC3 and PCC4 for every stacked map (N, 2 height, width) of N pairs; frame_id is the pair's.
+
+    `homographies` (3, 3) map image coordinates of the upper, earlier frame to those of the lower one. pcc3 and pcc4 are
+    over the same pixels, the part of the upper frame that is in the lower one. The paper uses all pixels, at least for
+    PCC3, and does not define the moved map outside the overlap: in pcc3_all_pixels and pcc4_all_pixels it is 0, the
+    default of OpenCV. If one half is constant, both values of that kind (overlap or all pixels) are NaN, because their
+    means must be over the same pairs. pcc4_minus_pcc3 is what the true motion adds, over the overlap. Without
+    `all_pixels` only the measures over the overlap are computed, in half the time.
+    """
+    height, width = (size // part for size, part in zip(next(iter(masks.values())).shape[1:], (2, 1), strict=True))
+    seen = np.stack([seen_in_second((height, width), one) for one in homographies])
+    tables = []
+    for name, found in masks.items():
+        upper, lower = found[:, :height], found[:, height:]
+        moved = np.stack([moved_to_first(one, h) for one, h in zip(lower, homographies, strict=True)])
+        seen_upper = standardised_rows(upper, seen)
+        values = {
+            "pcc3": dot_rows(seen_upper, standardised_rows(lower, seen)),
+            "pcc4": dot_rows(seen_upper, standardised_rows(moved, seen)),
+        }
+        if all_pixels:
+            whole = standardised_rows(upper)
+            values["pcc3_all_pixels"] = dot_rows(whole, standardised_rows(lower))
+            values["pcc4_all_pixels"] = dot_rows(whole, standardised_rows(np.where(seen, moved, 0.0)))
+        for ending in ("", "_all_pixels") if all_pixels else ("",):
+            both = values[f"pcc3{ending}"] + values[f"pcc4{ending}"]
+            for measure in (f"pcc3{ending}", f"pcc4{ending}"):
+                values[measure] = np.where(np.isnan(both), np.nan, values[measure])
+        values["pcc4_minus_pcc3"] = values["pcc4"] - values["pcc3"]
+        tables += [_table("navigate", kind, name, *one, pair_ids, scene_ids) for one in values.items()]
+    return pd.concat(tables, ignore_index=True)
+
+
+def _mean_defined(values: Array, wanted: NDArray[np.bool_]) -> Array:
+    """Mean (N,) over each row of the wanted values (N, M) that are not NaN; NaN if there are none."""
+    used = wanted & ~np.isnan(values)
+    counts = used.sum(1)
+    return np.where(counts > 0, np.where(used, values, 0.0).sum(1) / np.maximum(counts, 1), np.nan)
+
+
+def _table(
+    task: str, kind: Kind, name: str, measure: str, values: Array, ids: Sequence[str], scenes: Sequence[str]
+) -> pd.DataFrame:
+    if not len(values) == len(ids) == len(scenes):
+        raise ValueError(f"{len(values)} maps, {len(ids)} frame names and {len(scenes)} scene names")
+    columns = (task, kind, name, measure, list(ids), list(scenes), np.asarray(values, np.float64))
+    return pd.DataFrame(dict(zip(COLUMNS, columns, strict=True)))

@@ -1,0 +1,114 @@
+"""Pearson correlations of maps, plain and partial."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from perilune_shared.geometry.frames import Array
+
+Maps = NDArray[np.floating]
+"""Maps (N, height, width) of N images."""
+_ROUNDING = 1e-6
+"""Variation below this share of the values is a rounding error of float32."""
+
+
+def pearson(a: ArrayLike, b: ArrayLike, seen: NDArray[np.bool_] | None = None) -> float:
+    """Pearson correlation of two maps over the pixels `seen`; NaN if one is constant or no pixel is seen."""
+    x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    return float(pearson_rows(x[None], y[None], None if seen is None else seen[None])[0])
+
+
+def pearson_rows(maps: Maps, targets: Maps, seen: NDArray[np.bool_] | None = None) -> Array:
+    """Correlation (N,) of each of N maps (N, ...) with its own target (N, ...), over the pixels `seen` (N, ...).
+
+    NaN where one of the two is constant or no pixel is seen. Raises ValueError if the shapes differ.
+    """
+    if maps.shape != targets.shape:
+        raise ValueError(f"shapes {maps.shape} and {targets.shape} differ")
+    return dot_rows(standardised_rows(maps, seen), standardised_rows(targets, seen))
+
+
+def pearson_between(maps: Maps, targets: Maps | None = None) -> Array:
+    """Correlations (N, M) of all maps (N, ...) with all targets (M, ...); with each other if there are none.
+
+    NaN in the rows and columns of constant ones.
+    """
+    rows = standardised_rows(maps)
+    return rows @ (rows if targets is None else standardised_rows(targets)).T
+
+
+def partial_rows(maps: Maps, targets: Maps, givens: Sequence[Maps]) -> Array:
+    """Partial correlation (N,) of each map (N, ...) with its target (N, ...), given the other maps (N, ...).
+
+    Pearson correlation of the residuals after regression of both on the givens and a constant, by least squares. NaN
+    where a residual is constant, which means that the givens determine the map or the target.
+    """
+    basis = given_basis(givens)
+    return partial_of_rows(standardised_rows(maps), residual_rows(standardised_rows(targets), basis), basis)
+
+
+def partial_of_rows(rows: Array, residuals: Array, basis: Sequence[Array]) -> Array:
+    """`partial_rows` of standardised maps (N, P) and the `residual_rows` (N, P) of their targets.
+
+    The residuals are orthogonal to the basis, so that only the length of the map's own residual is needed.
+    """
+    left = np.sqrt(np.maximum(1 - sum((dot_rows(rows, one) ** 2 for one in basis), np.zeros(len(rows))), 0))
+    return dot_rows(rows, residuals) / np.where(left > _ROUNDING, left, np.nan)
+
+
+def dot_rows(a: Array, b: Array) -> Array:
+    """Product (N,) of each row of two arrays (N, P)."""
+    return np.einsum("np,np->n", a, b)
+
+
+def standardised_rows(maps: Maps, seen: NDArray[np.bool_] | None = None) -> Array:
+    """Maps (N, ...) as rows (N, P) of mean 0 and length 1, so that a product is a correlation; 0 where not `seen`.
+
+    NaN if constant or not seen at all.
+    """
+    flat = maps.reshape(len(maps), -1)
+    rows = np.zeros(flat.shape)
+    for n, row in enumerate(rows):
+        keep = slice(None) if seen is None else seen[n].ravel()
+        values = flat[n, keep].astype(np.float64)
+        largest = max(values.max(initial=0), -values.min(initial=0))
+        values -= values.mean() if values.size else 0
+        length = np.sqrt(values @ values)
+        # The same limit as in `is_constant`, without its temporary arrays.
+        if length <= _ROUNDING * np.sqrt(values.size) * max(largest, 1e-30):
+            row[:] = np.nan
+        else:
+            row[keep] = values / length
+    return rows
+
+
+def given_basis(givens: Sequence[Maps]) -> list[Array]:
+    """Orthonormal rows (N, P) that span the centred givens (N, ...); zero where a given depends on those before it."""
+    basis: list[Array] = []
+    for given in givens:
+        rows = _without(np.nan_to_num(standardised_rows(given)), basis)
+        lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+        basis.append(np.where(lengths > _ROUNDING, rows / np.maximum(lengths, _ROUNDING), 0.0))
+    return basis
+
+
+def residual_rows(rows: Array, basis: Sequence[Array]) -> Array:
+    """Residuals (N, P), of length 1, of standardised maps (N, P) after regression on a basis; NaN if constant."""
+    residuals = _without(rows, basis)
+    lengths = np.linalg.norm(residuals, axis=1)
+    return residuals / np.where(lengths > _ROUNDING, lengths, np.nan)[:, None]
+
+
+def is_constant(values: ArrayLike) -> bool:
+    """Whether the standard deviation of the values is at most 1e-6 of the largest absolute value, a rounding error."""
+    array = np.asarray(values, np.float64)
+    return bool(np.std(array) <= _ROUNDING * max(float(np.abs(array).max()), 1e-30))
+
+
+def _without(rows: Array, basis: Sequence[Array]) -> Array:
+    """Rows (N, P) without their components along the basis; twice, against rounding."""
+    for _ in range(2):
+        for one in basis:
+            rows = rows - dot_rows(rows, one)[:, None] * one
+    return rows

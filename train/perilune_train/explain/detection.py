@@ -1,0 +1,148 @@
+"""Evidence on the detector's gates: correlations, nulls, interventions, localisation, stability."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from perilune_shared.terminal import console
+from perilune_train.data.frames import normalised
+from perilune_train.detect.data.batches import network_input
+from perilune_train.detect.inference.detector import Detector
+from perilune_train.explain.config import ExplainConfig
+from perilune_train.explain.correlation.measures import detector_values
+from perilune_train.explain.evidence.gates import forced_gates, gate_means
+from perilune_train.explain.evidence.localisation import localisation
+from perilune_train.explain.evidence.nulls import detector_nulls
+from perilune_train.explain.evidence.performance import DetectionPerformance
+from perilune_train.explain.evidence.randomisation import randomised
+from perilune_train.explain.evidence.removal import removal_effect
+from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary, validation_signs
+from perilune_train.explain.evidence.stability import stability
+from perilune_train.explain.evidence.tables import Evidence
+from perilune_train.explain.evidence.untrained import measure_statistics
+from perilune_train.explain.inputs import LabelledFrames, evenly_spaced
+from perilune_train.explain.maps.attributions import DetectorTarget, grad_cam, integrated_gradients, occlusion
+from perilune_train.explain.maps.baselines import baseline_maps, brightness_map, gradient_map
+from perilune_train.explain.maps.masks import Masks, detector_masks
+from perilune_train.models.yolo import YOLOv3
+
+TASK = "detect"
+SHALLOW_STAGES = "123"
+"""Stages up to stride 8."""
+
+
+def explain_detector(
+    settings: ExplainConfig, detector: Detector, frames: LabelledFrames, validation: LabelledFrames, where: Path
+) -> tuple[Evidence, Masks]:
+    """All tables of the detector, and its masks of the test frames (N, height, width).
+
+    Signs, and the gate whose pixels are removed, are chosen on the validation frames. Raises UserError if the network
+    has no attention.
+    """
+    network = detector.network
+    rng = np.random.default_rng([settings.seed, 1])
+    masks, known = (detector_masks(network, one.images, where) for one in (frames, validation))
+    untrained = untrained_detector(detector, validation.images, settings.seed)
+    blank, known_blank = (detector_masks(untrained, one.images, where) for one in (frames, validation))
+    console.print("detector: masks and null maps", markup=False)
+    before = _values(validation, known, known_blank, rng)
+    signs = validation_signs(before)
+    plain = {name: int(sign) for (_, measure, name), sign in signs.items() if measure == "pcc1_craterness"}
+    strongest = strongest_gate(before, plain)
+    values = _values(frames, masks, blank, rng)
+    differences = null_differences(values, signs, rng)
+
+    some = evenly_spaced(len(frames.images), settings.n_attributed)
+    attributed = attributions(settings, network, frames.images[some])
+    chosen = pd.DataFrame({"frame_id": frames.frame_ids, "scene_id": frames.scene_ids})
+    stage = strongest[2]
+    nulls = {name: one for name, one in baseline_maps(frames.images).items() if name.endswith(f"/stage_{stage}")}
+    plain |= dict.fromkeys(attributed, 1)
+    values = pd.concat(
+        [
+            values,
+            _attribution_values(frames, some, attributed),
+            localisation(masks, frames.craters, plain, chosen, TASK, "gate"),
+            localisation(nulls, frames.craters, plain, chosen, TASK, "null"),
+            localisation(attributed, frames.craters[some], plain, chosen.iloc[some], TASK, "attribution"),
+        ],
+        ignore_index=True,
+    )
+    changed = evenly_spaced(len(frames.images), settings.n_changed)
+    images, ids = frames.images[changed], chosen.iloc[changed].reset_index(drop=True)
+    measure = DetectionPerformance(detector, [frames.labels[i] for i in changed], frames.radius_px)
+    gates = forced_gates(network.backbone, gate_means(known), images, measure, "force gates of the detector")
+    to_remove = {strongest: masks[strongest][changed], f"edge/stage_{stage}": nulls[f"edge/stage_{stage}"][changed]}
+    console.print(f"detector: remove pixels by {strongest}, chosen on validation frames, and by edges", markup=False)
+    removal = removal_effect(images, to_remove, plain, measure, rng, settings.removed_share)
+
+    def masks_of(given: NDArray[np.uint8]) -> Masks:
+        return detector_masks(network, given, where)
+
+    few = frames.images[evenly_spaced(len(frames.images), max(2, settings.n_changed // 2))]
+    evidence = Evidence(
+        values,
+        summary(values, rng),
+        differences,
+        against_nulls(differences),
+        gates.merge(ids, left_on="image", right_index=True),
+        removal.merge(ids, left_on="frame_index", right_index=True),
+        randomised(network, masks_of, few, settings.seed),
+        stability(masks_of, few, rng),
+        plain,
+        strongest,
+    )
+    return evidence, masks
+
+
+def untrained_detector(detector: Detector, images: NDArray[np.uint8], seed: int) -> YOLOv3:
+    """A network of the same form with random weights; its batch statistics are measured on `images` (N, h, w)."""
+    trained, config = detector.network, detector.config
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = YOLOv3(None, config.in_channels, config.width, config.attention, trained.strides)
+    network.to(detector.device)
+    measure_statistics(network, network_input(normalised(images), config.in_channels).to(detector.device))
+    return network
+
+
+def strongest_gate(validation: pd.DataFrame, signs: Mapping[str, int]) -> str:
+    """The gate up to stride 8 of the largest mean craterness, by its sign, on validation frames.
+
+    A gate without a defined correlation is never chosen, unless there is no other.
+    """
+    own = validation[(validation["kind"] == "gate") & (validation["measure"] == "pcc1_craterness")]
+    own = own[own["map"].str[2].isin(list(SHALLOW_STAGES))]
+    means = own.groupby("map", sort=False)["value"].mean()
+    strength = means * pd.Series(signs).reindex(means.index)
+    return str(strength.idxmax()) if strength.notna().any() else str(means.index[0])
+
+
+def attributions(settings: ExplainConfig, network: YOLOv3, images: NDArray[np.uint8]) -> Masks:
+    """Grad-CAM, integrated gradients and occlusion (N, height, width) of the detector's objectness."""
+    target, given = DetectorTarget(network), normalised(images)
+    console.print("detector: Grad-CAM, integrated gradients, occlusion", markup=False)
+    return {
+        "grad_cam": grad_cam(target, given),
+        "integrated_gradients": integrated_gradients(target, given, settings.integration_steps),
+        "occlusion": occlusion(target, given, settings.occlusion_px, settings.occlusion_px),
+    }
+
+
+def _values(frames: LabelledFrames, masks: Masks, untrained: Masks, rng: np.random.Generator) -> pd.DataFrame:
+    brightness, gradient = brightness_map(frames.images), gradient_map(frames.images)
+    own = frames.truth, brightness, gradient, frames.frame_ids, frames.scene_ids
+    return pd.concat(
+        [detector_values(masks, *own), detector_nulls(frames.images, masks, untrained, *own, rng)], ignore_index=True
+    )
+
+
+def _attribution_values(frames: LabelledFrames, some: list[int], maps: Masks) -> pd.DataFrame:
+    images = frames.images[some]
+    ids, scenes = ([own[i] for i in some] for own in (frames.frame_ids, frames.scene_ids))
+    maps_of = brightness_map(images), gradient_map(images)
+    return detector_values(maps, frames.truth[some], *maps_of, ids, scenes, "attribution")

@@ -1,0 +1,1 @@
+"""Tests of what the maps mean: nulls, interventions, localisation, stability."""

@@ -1,0 +1,74 @@
+"""Attention gates forced to their mean: what the output loses without a gate's pattern.
+
+A gate whose pattern matters changes the output when its spatial mask is replaced by one number, its mean over pixels
+and frames. The channel gates stay. A mask that follows craters may still have no effect; a correlation cannot tell.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from torch import Tensor
+
+from perilune_shared.terminal import progress_bar
+from perilune_train.explain.maps.masks import Masks
+from perilune_train.models.darknet import AttentionDarknet53
+
+ALL = "all gates"
+
+
+def gate_means(masks: Masks) -> dict[str, float]:
+    """Mean of each gate's mask over pixels and images."""
+    return {block: float(found.mean()) for block, found in masks.items()}
+
+
+def scopes(blocks: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """What is forced together: each gate alone, the gates of each stage ("stage 3"), and all gates."""
+    stages = sorted({block[2] for block in blocks})
+    alone = {block: (block,) for block in blocks}
+    together = {f"stage {stage}": tuple(block for block in blocks if block[2] == stage) for stage in stages}
+    return {**alone, **together, ALL: tuple(blocks)}
+
+
+@contextmanager
+def forced(backbone: AttentionDarknet53, means: Mapping[str, float]) -> Iterator[None]:
+    """Replace the spatial masks of some gates by constants while the block runs."""
+
+    def constant(value: float) -> Callable[[Tensor], Tensor]:
+        return lambda x: x.new_full((len(x), 1, *x.shape[2:]), value)
+
+    gates = {block: backbone.attentions[block] for block in means}
+    try:
+        for block, gate in gates.items():
+            # An instance attribute hides the method of the class until it is deleted.
+            object.__setattr__(gate, "spatial_gate", constant(means[block]))
+        yield
+    finally:
+        for gate in gates.values():
+            gate.__dict__.pop("spatial_gate", None)
+
+
+def forced_gates(
+    backbone: AttentionDarknet53,
+    means: Mapping[str, float],
+    images: NDArray[np.uint8],
+    measure: Callable[[NDArray[np.uint8]], NDArray[np.float64]],
+    label: str,
+) -> pd.DataFrame:
+    """Performance of each image with all gates, and with the gates of each scope forced to their means.
+
+    `measure` gives one value per image. Columns: scope, image (index), before, after.
+    """
+    before, tables = measure(images), []
+    chosen = scopes(list(means))
+    with progress_bar() as progress:
+        task = progress.add_task(label, total=len(chosen), unit="gates", note="")
+        for scope, blocks in chosen.items():
+            with forced(backbone, {block: means[block] for block in blocks}):
+                after = measure(images)
+            columns = {"scope": scope, "image": np.arange(len(images)), "before": before, "after": after}
+            tables.append(pd.DataFrame(columns))
+            progress.advance(task)
+    return pd.concat(tables, ignore_index=True)

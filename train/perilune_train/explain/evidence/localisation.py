@@ -1,0 +1,79 @@
+"""Localisation of maps on craters: pointing game, relevance mass and ROC-AUC, each with its chance level."""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from perilune_train.explain.correlation.pearson import is_constant
+
+TOLERANCE_PX = 3
+"""Distance to a crater's pixel within which the top pixel of a map is a hit, pixels."""
+
+
+def localisation(
+    maps: Mapping[str, NDArray[np.floating]],
+    craters: NDArray[np.bool_],
+    sign: Mapping[str, int],
+    frames: pd.DataFrame,
+    task: str,
+    kind: str,
+) -> pd.DataFrame:
+    """Long table of the localisation of each map (N, height, width) on the craters' pixels (N, height, width).
+
+    `sign` is 1, or -1 for a map that is weaker on craters; determine it on validation frames. `frames` has columns
+    frame_id and scene_id in the order of the maps. Columns of the table: task, kind, map, measure, frame_id, scene_id,
+    value. Measures: pointing, relevance_mass, auc, pointing_chance, relevance_mass_chance; the chance level of auc is
+    0.5. Values are NaN where the map is constant, or no pixel or every pixel is a crater's.
+    """
+    rows = []
+    for name, found in maps.items():
+        for i, (one, inside) in enumerate(zip(found, craters, strict=True)):
+            values = localised(sign[name] * one.astype(np.float64), inside)
+            frame = {"frame_id": frames["frame_id"].iloc[i], "scene_id": frames["scene_id"].iloc[i]}
+            rows += [{"map": name, "measure": measure, **frame, "value": value} for measure, value in values.items()]
+    table = pd.DataFrame(rows, columns=["map", "measure", "frame_id", "scene_id", "value"])
+    table.insert(0, "task", task)
+    table.insert(1, "kind", kind)
+    return table
+
+
+def localised(relevance: NDArray[np.floating], craters: NDArray[np.bool_]) -> dict[str, float]:
+    """Measures of one map (height, width), larger on craters, against the craters' pixels (height, width).
+
+    pointing: 1 if the map's largest pixel is within TOLERANCE_PX of a crater, else 0 (Zhang et al. 2018, doi
+    10.1007/s11263-017-1059-x); with ties, the share of the tied pixels. Its chance level is the area share of the
+    craters with the tolerance around them. relevance_mass: share of the map, shifted to minimum 0, within craters
+    (Arras et al. 2022, doi 10.1016/j.inffus.2021.11.008); its chance level is the craters' area share. auc: probability
+    that a crater's pixel is larger than another pixel, ties count half.
+    """
+    near = within(craters, TOLERANCE_PX)
+    if is_constant(relevance) or craters.all() or not craters.any():
+        names = ("pointing", "relevance_mass", "auc", "pointing_chance", "relevance_mass_chance")
+        return dict.fromkeys(names, float("nan"))
+    shifted = relevance - relevance.min()
+    return {
+        "pointing": float(near[relevance == relevance.max()].mean()),
+        "relevance_mass": float(shifted[craters].sum() / shifted.sum()),
+        "auc": area_under_curve(relevance, craters),
+        "pointing_chance": float(near.mean()),
+        "relevance_mass_chance": float(craters.mean()),
+    }
+
+
+def within(craters: NDArray[np.bool_], distance_px: float) -> NDArray[np.bool_]:
+    """Pixels (height, width) whose centre is at most a distance from that of a crater's pixel."""
+    if not craters.any():
+        return craters
+    distance = cv2.distanceTransform((~craters).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distance <= distance_px)
+
+
+def area_under_curve(relevance: NDArray[np.floating], craters: NDArray[np.bool_]) -> float:
+    """ROC-AUC of the pixels by the Mann-Whitney statistic; ties have their mean rank."""
+    inside = int(craters.sum())
+    ranks = rankdata(relevance.ravel())[craters.ravel()]
+    return float((ranks.sum() - inside * (inside + 1) / 2) / (inside * (craters.size - inside)))

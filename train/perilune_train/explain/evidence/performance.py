@@ -1,0 +1,74 @@
+"""Performance of a network on single images: what an intervention changes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from perilune_train.detect.data.labels import FrameLabels
+from perilune_train.detect.evaluate.matching import match_split
+from perilune_train.detect.evaluate.metrics import curve
+from perilune_train.detect.inference.detector import Detector
+from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.explain.maps.masks import stacked_input
+from perilune_train.models.navigator import StackNavigator
+
+Values = NDArray[np.float64]
+_BATCH = 8
+
+
+@dataclass(frozen=True)
+class DetectionPerformance:
+    """Average precision of a detector on each of some labelled frames."""
+
+    detector: Detector
+    """The detector, at scale 1 only: attention masks belong to one scale."""
+    labels: Sequence[FrameLabels]
+    """Labels of the N frames."""
+    radius_px: tuple[float, float]
+    """Range of radii that is evaluated, pixels."""
+
+    def __call__(self, images: NDArray[np.uint8]) -> Values:
+        """AP at IoU 0.5 (the paper's sum) of each frame, from images (N, height, width): (N,), NaN without labels."""
+        found = []
+        for start in range(0, len(images), _BATCH):
+            boxes, scores = self.detector.predict(images[start : start + _BATCH])
+            found += detections_of(boxes, scores, self.detector.config.evaluation)
+        size = images.shape[2], images.shape[1]
+        match_iou = self.detector.config.evaluation.match_iou
+        values = [
+            curve(match_split([one], [labels], size, match_iou, self.radius_px)).ap_paper()
+            if labels.selected.any()
+            else np.nan
+            for one, labels in zip(found, self.labels, strict=True)
+        ]
+        return np.array(values)
+
+
+@dataclass(frozen=True)
+class MotionPerformance:
+    """Position error of a stack navigator on runs of consecutive pairs, each run from the initial state of the LSTM."""
+
+    navigator: StackNavigator
+    """The network, in evaluation mode."""
+    translation_m: Values
+    """True translations (runs, pairs, 3), metres, O_C of the earlier frame."""
+    mean_m: Values
+    """Mean translation of the training set (3,), metres."""
+    spread_m: Values
+    """Standard deviation of the translations of the training set (3,), metres."""
+    size_px: int
+    """Width of the network's frames."""
+
+    def __call__(self, images: NDArray[np.uint8]) -> Values:
+        """Position error (n,), metres, of n = runs * pairs stacked pairs (n, 2 height, width)."""
+        runs, pairs = self.translation_m.shape[:2]
+        first, second = stacked_input(images, self.size_px)
+        device = next(self.navigator.parameters()).device
+        halves = [torch.from_numpy(half).unflatten(0, (runs, pairs)).to(device) for half in (first, second)]
+        with torch.no_grad():
+            output = torch.cat([self.navigator(*(half[k : k + 1] for half in halves))[0] for k in range(runs)])
+        found = self.mean_m + self.spread_m * output[..., :3].double().cpu().numpy()
+        return np.linalg.norm(found - self.translation_m, axis=-1).ravel()

@@ -1,0 +1,168 @@
+"""Removal of the pixels that a map attends to, against two controls and the least attended pixels."""
+
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+Which = Literal["most", "least"]
+How = Literal["inpaint", "mean"]
+Measure = Callable[[NDArray[np.uint8]], NDArray[np.floating]]
+"""One value (N,) for each image (N, height, width), NaN if undefined."""
+CONTROLS = ("random", "shifted")
+BLOCK_PX = 8
+"""Side of the blocks that are removed, so that inpainting cannot restore single pixels."""
+_BINS = 10
+_INPAINT_RADIUS_PX = 3
+_WINDOW_PX = 31
+
+
+def chosen_pixels(
+    map_: NDArray[np.floating],
+    share: float,
+    which: Which,
+    sign: int,
+    rng: np.random.Generator,
+    block_px: int = BLOCK_PX,
+) -> NDArray[np.bool_]:
+    """The blocks with the largest ("most") or smallest ("least") means of sign * map, as pixels (height, width).
+
+    Their number is the share of all blocks, rounded. Ties, as where a gate is at its bound, are broken at random.
+    """
+    means = sign * block_means(map_, block_px).ravel()
+    order = np.lexsort((rng.random(means.size), -means if which == "most" else means))
+    return _pixels(order[: round(share * means.size)], map_.shape, block_px)
+
+
+def random_like(
+    image: NDArray[np.uint8], chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: int = BLOCK_PX
+) -> NDArray[np.bool_]:
+    """Random blocks of an image (height, width) of the same brightness as the chosen ones.
+
+    From each decile of the image's block means come as many blocks as in `chosen`. Chosen blocks may be drawn again,
+    so that the control depends on brightness only; this makes it the harder to beat.
+    """
+    means = block_means(image, block_px).ravel()
+    decile = np.empty(means.size, int)
+    decile[np.lexsort((rng.random(means.size), means))] = np.arange(means.size) * _BINS // means.size
+    taken = block_means(chosen, block_px).ravel() > 0.5
+    drawn = [
+        rng.choice(np.flatnonzero(decile == one), int((taken & (decile == one)).sum()), replace=False)
+        for one in range(_BINS)
+    ]
+    return _pixels(np.concatenate(drawn), image.shape, block_px)
+
+
+def shifted_like(chosen: NDArray[np.bool_], rng: np.random.Generator, block_px: int = BLOCK_PX) -> NDArray[np.bool_]:
+    """The chosen blocks flipped, turned and shifted circularly at random, so that their shape is the same elsewhere.
+
+    Images that are not square are turned by 0 or 180 degrees.
+    """
+    blocks = block_means(chosen, block_px) > 0.5
+    height, width = blocks.shape
+    turns = int(rng.integers(4)) if height == width else 2 * int(rng.integers(2))
+    moved = np.rot90(blocks[:, ::-1] if rng.integers(2) else blocks, turns)
+    moved = np.roll(moved, (int(rng.integers(height)), int(rng.integers(width))), axis=(0, 1))
+    return _pixels(np.flatnonzero(moved), chosen.shape, block_px)
+
+
+def removed(image: NDArray[np.uint8], chosen: NDArray[np.bool_], how: How) -> NDArray[np.uint8]:
+    """The image (height, width) with the chosen pixels replaced.
+
+    "inpaint": by Telea's method (2004, doi 10.1080/10867651.2004.10487596), radius 3 px. "mean": by the mean of the
+    pixels not chosen in a window of 31 px, or in the image if the window has none.
+    """
+    if not chosen.any() or chosen.all():
+        raise ValueError(f"{int(chosen.sum())} of {chosen.size} pixels chosen, expected some but not all")
+    if how == "inpaint":
+        return np.asarray(cv2.inpaint(image, chosen.astype(np.uint8), _INPAINT_RADIUS_PX, cv2.INPAINT_TELEA), np.uint8)
+    kept = (~chosen).astype(np.float64)
+    total, count = (
+        cv2.boxFilter(part, -1, (_WINDOW_PX, _WINDOW_PX), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for part in (kept * image, kept)
+    )
+    mean = np.where(count > 0.5, total / np.maximum(count, 1), image[~chosen].mean())
+    return np.where(chosen, np.rint(mean), image).astype(np.uint8)
+
+
+def removal_effect(
+    images: NDArray[np.uint8],
+    maps: Mapping[str, NDArray[np.floating]],
+    sign: Mapping[str, int],
+    measure: Measure,
+    rng: np.random.Generator,
+    share: float = 0.2,
+    hows: tuple[How, ...] = ("inpaint", "mean"),
+    block_px: int = BLOCK_PX,
+) -> pd.DataFrame:
+    """Values of a measure before and after removal of a share of the pixels of images (N, height, width).
+
+    `maps` are (N, height, width); `sign` is 1, or -1 for a map that is weaker on craters. `measure` runs once, and once
+    for each combination of map, which and how. Columns: map, which ("most", "least", "random": blocks of the brightness
+    of "most", "shifted": blocks of the shape of "most"), how, frame_index, overlap (share of the removed pixels that
+    are among the most attended ones), before, after. In images of two frames stacked in height, replacements at the
+    seam use pixels of both.
+    """
+    before = np.asarray(measure(images))
+    tables = []
+    for name, found in maps.items():
+        most, least = (
+            [chosen_pixels(one, share, which, sign[name], rng, block_px) for one in found]
+            for which in ("most", "least")
+        )
+        choices = {
+            "most": most,
+            "least": least,
+            "random": [random_like(*pair, rng, block_px) for pair in zip(images, most, strict=True)],
+            "shifted": [shifted_like(one, rng, block_px) for one in most],
+        }
+        for which, chosen in choices.items():
+            overlap = [(one & first).sum() / one.sum() for one, first in zip(chosen, most, strict=True)]
+            for how in hows:
+                changed = np.stack([removed(*pair, how) for pair in zip(images, chosen, strict=True)])
+                values = {"overlap": overlap, "before": before, "after": measure(changed)}
+                index = np.arange(len(images))
+                tables.append(pd.DataFrame({"map": name, "which": which, "how": how, "frame_index": index, **values}))
+    return pd.concat(tables, ignore_index=True)
+
+
+def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFrame:
+    """Mean harm of each removal, and its ratio to the harm of the stronger control, by map and how.
+
+    `effects` is the table of `removal_effect`. Harm is the mean over frames of before - after, or of after - before if
+    lower values are better. Columns: map, how, most, least, random, shifted (harms), control (the control that harms
+    more), ratio (most / control; NaN unless the control's harm is above 0), overlap (mean share of the control's pixels
+    that are among the most attended ones; where the other pixels do no harm, the ratio is about 1 / overlap).
+    """
+    change = effects["before"] - effects["after"]
+    harm = effects.assign(harm=change if higher_is_better else -change)
+    table = harm.pivot_table(index=["map", "how"], columns="which", values="harm", sort=False).reset_index()
+    table.columns.name = None
+    controls = table[list(CONTROLS)]
+    table["control"] = controls.fillna(-np.inf).idxmax(axis=1)
+    table["ratio"] = (table["most"] / controls.max(axis=1)).where(controls.max(axis=1) > 0)
+    overlaps = effects.groupby(["map", "how", "which"])["overlap"].mean()
+    table["overlap"] = [overlaps[key] for key in zip(table["map"], table["how"], table["control"], strict=True)]
+    return table
+
+
+def block_means(values: NDArray, block_px: int) -> NDArray[np.float64]:
+    """Means (height / block_px, width / block_px) of the blocks of values (height, width).
+
+    Raises ValueError if a side is not a multiple of block_px.
+    """
+    height, width = values.shape
+    if height % block_px or width % block_px:
+        raise ValueError(f"image of {height} x {width} px, expected sides that are multiples of {block_px} px")
+    blocks = values.reshape(height // block_px, block_px, width // block_px, block_px)
+    return blocks.mean(axis=(1, 3), dtype=np.float64)
+
+
+def _pixels(blocks: NDArray[np.integer], shape: tuple[int, ...], block_px: int) -> NDArray[np.bool_]:
+    """The pixels (height, width) of blocks given by their flat numbers."""
+    chosen = np.zeros((shape[0] // block_px, shape[1] // block_px), bool)
+    chosen.flat[blocks] = True
+    return chosen.repeat(block_px, axis=0).repeat(block_px, axis=1)

@@ -1,0 +1,236 @@
+"""Means, intervals and tests against null maps, from the long table of values of each frame."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.stats import false_discovery_control
+
+from perilune_train.evaluation.spread import MIN_UNITS, Array, Resamples, Rows, draw_resamples, spreads
+
+Signs = Mapping[tuple[str, str, str], float]
+"""Sign of the mean on validation frames, 1 or -1, by task, measure and map."""
+LEVEL = 0.05
+"""False discovery rate."""
+UNDECIDED = f"undecided: fewer than {MIN_UNITS} scenes"
+UNDEFINED = "undefined: the mask is constant"
+BEATS = "beats every null"
+_FLIPS = 4096
+"""Sign flips; all of them with up to 12 units."""
+_GROUP = ["task", "kind", "map", "measure"]
+
+
+def summary(table: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """One row for each task, kind, map and measure: value, low, high, n_units, unit, undefined, count.
+
+    `value` is the mean over the frames where it is defined, `low` and `high` its 95 % interval by bootstrap over units.
+    The unit is the scene; the trajectory, the part of frame_id before its last "/", if there is one scene. NaN with
+    fewer than 5 units. `undefined` is the number of NaN among the `count` values.
+    """
+    rows = []
+    for _, task in table.groupby("task", sort=False):
+        frames = _Frames.of(task, rng)
+        for key, own in task.groupby(_GROUP, sort=False):
+            values = frames.aligned(own)
+            mean = frames.mean(values)
+            missing = {"undefined": int(own["value"].isna().sum()), "count": len(own)}
+            rows.append(dict(zip(_GROUP, key, strict=True)) | mean.columns("value") | missing)
+    return pd.DataFrame(rows)
+
+
+def validation_signs(table: pd.DataFrame) -> dict[tuple[str, str, str], float]:
+    """Sign, 1 or -1, of the mean of every PCC1 on validation frames, by task, measure and map; 1 if undefined."""
+    own = table[table["measure"].str.startswith("pcc1")]
+    means = own.groupby(["task", "measure", "map"], as_index=False)["value"].mean()
+    keys = zip(means["task"], means["measure"], means["map"], strict=True)
+    return {key: -1.0 if mean < 0 else 1.0 for key, mean in zip(keys, means["value"], strict=True)}
+
+
+def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator, kind: str = "gate") -> pd.DataFrame:
+    """One row for each map of `kind` and each null that applies to it: the difference map - null, paired over frames.
+
+    Columns: task, measure, map, null, value and null_value (means over all frames of the map), difference, low, high,
+    n_units, unit, p_bootstrap, p. "edge/stage_3" applies to the gates of stage 3, "untrained/B_11" to B_11, a name
+    without "/" to all. Frames where one of the two is undefined are left out. A null without any value is left out.
+
+    PCC1 may have either sign: each map's values are multiplied by its sign on validation frames, `signs`. So a map is
+    compared by the strength that it was expected to have, and no sign is chosen on the frames of the table.
+
+    p_bootstrap: one-sided, (1 + resampled differences at most 0) / 1001 over units. Its resolution is 0.001, but with S
+    units it can be that small by chance with probability 2^-S, and is too small for S below about 20. p: one-sided
+    sign-flip test over units, exact if differences are symmetric around 0; all 2^S flips up to 12 units, else 4096. Its
+    resolution is 2^-S: 0.031 with 5 scenes, 0.002 with 9. Use p for decisions.
+
+    Raises ValueError if a sign of a PCC1 is missing.
+    """
+    rows = []
+    for name, task in table.groupby("task", sort=False):
+        frames = _Frames.of(task, rng)
+        for measure, own in task.groupby("measure", sort=False):
+            values = {str(one): frames.aligned(part) for one, part in own.groupby("map", sort=False)}
+            signed = {one: _sign(signs, str(name), str(measure), one) * found for one, found in values.items()}
+            nulls = [one for one in own.loc[own["kind"] == "null", "map"].unique() if np.isfinite(values[one]).any()]
+            for gate in own.loc[own["kind"] == kind, "map"].unique():
+                for null in (one for one in nulls if _applies(one, gate)):
+                    difference = signed[gate] - signed[null]
+                    means = {"value": _mean(signed[gate]), "null_value": _mean(signed[null])}
+                    p_values = {"p_bootstrap": frames.bootstrap_p(difference), "p": frames.sign_flip_p(difference)}
+                    who = {"task": name, "measure": measure, "map": gate, "null": null.partition("/")[0]}
+                    rows.append(who | means | frames.mean(difference).columns("difference") | p_values)
+    return pd.DataFrame(rows)
+
+
+def against_nulls(differences: pd.DataFrame) -> pd.DataFrame:
+    """One row for each task, measure and gate: value, n_units, unit, p, p_adjusted, beats_all, verdict.
+
+    Takes the rows of `null_differences`. p is the largest over all nulls, which is a test of "beats all of them"
+    without a correction for their number (Berger 1982, doi 10.1080/00401706.1982.10487790). p_adjusted is corrected for
+    the number of gates of the task and measure (Benjamini & Hochberg 1995, doi 10.1111/j.2517-6161.1995.tb02031.x); an
+    undefined p counts as 1. `beats_all`: p_adjusted is below 0.05, the gate's mean is larger than that of each null,
+    and at least 5 scenes have values; trajectories of one scene are not enough.
+
+    With S scenes p is at least 2^-S. One gate out of 23 can pass alone with 9 scenes or more; with 5 scenes at least 15
+    gates have to pass together.
+    """
+    rows = []
+    for (task, measure), family in differences.groupby(["task", "measure"], sort=False):
+        gates = [(str(gate), own) for gate, own in family.groupby("map", sort=False)]
+        largest = [float(own["p"].fillna(1.0).max()) for _, own in gates]
+        for (gate, own), p, adjusted in zip(gates, largest, false_discovery_control(largest), strict=True):
+            beats, verdict = _verdict(own, float(adjusted))
+            rows.append(
+                {
+                    "task": task,
+                    "measure": measure,
+                    "map": gate,
+                    "value": float(own["value"].iloc[0]),
+                    "n_units": int(own["n_units"].min()),
+                    "unit": own["unit"].iloc[0],
+                    "p": p,
+                    "p_adjusted": float(adjusted),
+                    "beats_all": beats,
+                    "verdict": verdict,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+@dataclass(frozen=True)
+class _Mean:
+    value: float
+    """Mean over frames."""
+    low: float
+    """Lower end of the 95 % interval; NaN if there is none."""
+    high: float
+    """Upper end of the 95 % interval; NaN if there is none."""
+    n_units: int
+    """Number of units with a value."""
+    unit: str
+    """scene, trajectory or image."""
+
+    def columns(self, name: str) -> dict[str, object]:
+        ends = {"low": self.low, "high": self.high}
+        return {name: self.value, **ends, "n_units": self.n_units, "unit": self.unit}
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The frames of one task and their units, in one order for all maps."""
+
+    ids: pd.Index
+    """Names of the N frames."""
+    resamples: Resamples
+    """Resamples of their units."""
+    flips: Array
+    """Signs, 1 or -1, of the units (flips, U); the first row is all 1."""
+
+    @classmethod
+    def of(cls, task: pd.DataFrame, rng: np.random.Generator) -> "_Frames":
+        frames = task[["frame_id", "scene_id"]].drop_duplicates()
+        ids, scenes = [str(one) for one in frames["frame_id"]], [str(one) for one in frames["scene_id"]]
+        if len(set(ids)) < len(ids):
+            raise ValueError("a frame is in two scenes")
+        resamples = draw_resamples(scenes, [one.rpartition("/")[0] for one in ids], ids, rng)
+        units = resamples.count
+        if 2**units <= _FLIPS:
+            flips = 1.0 - 2.0 * (np.arange(2**units)[:, None] >> np.arange(units) & 1)
+        else:
+            flips = np.vstack([np.ones(units), rng.choice([-1.0, 1.0], (_FLIPS - 1, units))])
+        return cls(pd.Index(ids), resamples, flips)
+
+    def aligned(self, own: pd.DataFrame) -> Array:
+        """Values (N,) of one map and measure; NaN where a frame has none."""
+        values = own["value"].to_numpy(np.float64)
+        found = np.full(len(self.ids), np.nan)
+        places = self.ids.get_indexer(pd.Index(own["frame_id"].astype(str)))
+        if len(np.unique(places)) < len(places):
+            raise ValueError(f"two values of one frame for {own['map'].iloc[0]}, {own['measure'].iloc[0]}")
+        found[places] = values
+        return found
+
+    def mean(self, values: Array) -> _Mean:
+        """Mean of the defined values (N,) and its interval; none for images, which are not independent."""
+        rows = np.flatnonzero(np.isfinite(values))
+        found = spreads(lambda drawn: {"mean": _ratio(drawn, rows, values)}, rows, self.resamples)["mean"]
+        unit, n_units = self.resamples.unit, len(np.unique(self.resamples.of_row[rows]))
+        low, high = found.interval if found.interval and unit != "image" else (np.nan, np.nan)
+        return _Mean(_mean(values), low, high, n_units, unit)
+
+    def bootstrap_p(self, values: Array) -> float:
+        """One-sided p of a mean above 0 of the defined values (N,), by bootstrap; NaN with fewer than 5 units."""
+        rows = self._tested(values)
+        if not len(rows):
+            return float("nan")
+        drawn = _ratio(self.resamples, rows, values)
+        return float((1 + (drawn <= 0).sum()) / (1 + len(drawn)))
+
+    def sign_flip_p(self, values: Array) -> float:
+        """One-sided p of a mean above 0 of the defined values (N,), by sign flips; NaN with fewer than 5 units."""
+        rows = self._tested(values)
+        if not len(rows):
+            return float("nan")
+        sums = np.bincount(self.resamples.of_row[rows], weights=values[rows], minlength=self.resamples.count)
+        return float(np.mean(self.flips @ sums >= sums.sum() - 1e-12 * np.abs(sums).sum()))
+
+    def _tested(self, values: Array) -> Rows:
+        rows = np.flatnonzero(np.isfinite(values))
+        enough = self.resamples.unit != "image" and len(np.unique(self.resamples.of_row[rows])) >= MIN_UNITS
+        return rows if enough else rows[:0]
+
+
+def _ratio(drawn: Resamples, rows: Rows, values: Array) -> Array:
+    """Mean of values (N,) over `rows` in every resample (R,); NaN where a resample has none of them."""
+    counts = drawn.totals(rows)
+    return np.where(counts > 0, drawn.totals(rows, values[rows]) / np.maximum(counts, 1), np.nan)
+
+
+def _mean(values: Array) -> float:
+    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+
+
+def _sign(signs: Signs, task: str, measure: str, name: str) -> float:
+    if not measure.startswith("pcc1"):
+        return 1.0
+    if (task, measure, name) not in signs:
+        raise ValueError(f"no sign of {name} on validation frames for {task}, {measure}")
+    return signs[task, measure, name]
+
+
+def _applies(null: str, gate: str) -> bool:
+    _, _, target = null.partition("/")
+    return target in ("", gate) or (target.startswith("stage_") and gate.startswith(f"B_{target[6:]}"))
+
+
+def _verdict(own: pd.DataFrame, p_adjusted: float) -> tuple[bool, str]:
+    """Whether a gate beats all its nulls, and the verdict; `own` are its differences."""
+    if own["value"].isna().all():
+        return False, UNDEFINED
+    if own["unit"].iloc[0] != "scene" or own["n_units"].min() < MIN_UNITS:
+        return False, UNDECIDED
+    weaker = (own["p"] >= LEVEL) | (own["difference"] <= 0)
+    if p_adjusted < LEVEL and not weaker.any():
+        return True, BEATS
+    # If only the correction for the number of gates fails, name the null with the largest p.
+    names = own.loc[weaker if weaker.any() else own["p"] == own["p"].max(), "null"]
+    return False, "does not beat: " + ", ".join(sorted(set(names)))

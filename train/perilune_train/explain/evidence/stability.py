@@ -1,0 +1,103 @@
+"""Similarity of masks under noise and shifts of the image, and between two renderings of the same poses."""
+
+from collections.abc import Callable, Mapping
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_train.explain.correlation.pearson import pearson_rows
+from perilune_train.explain.maps.masks import Masks
+
+SIGMAS_DN = (2.0, 5.0)
+"""Standard deviations of the added noise, grey values of 255."""
+SHIFTS_PX = ((1, 0), (0, 1), (3, -2))
+"""Shifts to the right and down, pixels."""
+
+
+def noisy(images: NDArray[np.uint8], sigma_dn: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Images with Gaussian noise of a standard deviation in grey values, rounded and limited to 0..255."""
+    return np.clip(np.rint(images + rng.normal(0, sigma_dn, images.shape)), 0, 255).astype(np.uint8)
+
+
+def shifted(images: NDArray, dx: int, dy: int) -> NDArray:
+    """Images (..., height, width) moved dx pixels to the right and dy down; edge pixels fill what becomes free."""
+    height, width = images.shape[-2:]
+    rows = np.clip(np.arange(height) - dy, 0, height - 1)
+    columns = np.clip(np.arange(width) - dx, 0, width - 1)
+    return images[..., rows[:, None], columns]
+
+
+def stability(
+    masks_of: Callable[[NDArray[np.uint8]], Masks],
+    images: NDArray[np.uint8],
+    rng: np.random.Generator,
+    sigmas_dn: tuple[float, ...] = SIGMAS_DN,
+    shifts_px: tuple[tuple[int, int], ...] = SHIFTS_PX,
+    stacked: int = 1,
+) -> pd.DataFrame:
+    """Pearson correlation of the masks of images (N, height, width) with those of the changed images.
+
+    Columns: map, change ("noise 2 DN", "shift 3 -2 px"), frame_index, pearson (NaN if a mask is constant). A shift is
+    undone before masks are compared, over the pixels that both images show. `stacked` is the number of frames stacked
+    in height in each image; each of them is shifted.
+    """
+    before = masks_of(images)
+    tables = []
+    for sigma_dn in sigmas_dn:
+        tables.append(between(before, masks_of(noisy(images, sigma_dn, rng)), f"noise {sigma_dn:g} DN"))
+    for dx, dy in shifts_px:
+
+        def moved(values: NDArray, dx: int = dx, dy: int = dy) -> NDArray:
+            frames = values.reshape(-1, values.shape[1] // stacked, values.shape[2])
+            return shifted(frames, dx, dy).reshape(values.shape)
+
+        after = {name: moved(found, -dx, -dy) for name, found in masks_of(moved(images)).items()}
+        # A pixel is in both images if its place was not filled in, there and back.
+        inside = np.zeros((images.shape[1] // stacked, images.shape[2]), bool)
+        height, width = inside.shape
+        inside[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)] = True
+        seen = np.broadcast_to(np.tile(inside, (stacked, 1)), images.shape)
+        tables.append(_compared(before, after, f"shift {dx} {dy} px", seen))
+    return pd.concat(tables, ignore_index=True)
+
+
+def between(
+    masks_a: Mapping[str, NDArray[np.floating]],
+    masks_b: Mapping[str, NDArray[np.floating]],
+    change: str,
+    map_x: NDArray[np.float32] | None = None,
+    map_y: NDArray[np.float32] | None = None,
+) -> pd.DataFrame:
+    """Pearson correlation of masks (N, height, width) of the same poses rendered twice.
+
+    Columns as in `stability`, with `change` as the change's name.
+
+    For another lens, `map_x` and `map_y` (height, width) are the column and row in b of each pixel of a, as for
+    cv2.remap (0 is the centre of the first pixel). Only pixels of a that are in b are compared.
+    """
+    if map_x is None or map_y is None:
+        return _compared(masks_a, masks_b, change, None)
+    first = next(iter(masks_b.values()))
+    height, width = first.shape[1:]
+    inside = (map_x >= 0) & (map_x <= width - 1) & (map_y >= 0) & (map_y <= height - 1)
+    remapped = {
+        name: np.stack([cv2.remap(one, map_x, map_y, cv2.INTER_LINEAR) for one in found])
+        for name, found in masks_b.items()
+    }
+    return _compared(masks_a, remapped, change, np.broadcast_to(inside, (len(first), *inside.shape)))
+
+
+def _compared(
+    masks_a: Mapping[str, NDArray[np.floating]],
+    masks_b: Mapping[str, NDArray[np.floating]],
+    change: str,
+    seen: NDArray[np.bool_] | None,
+) -> pd.DataFrame:
+    tables = []
+    for name, found in masks_a.items():
+        values = pearson_rows(found, masks_b[name], seen)
+        columns = {"frame_index": np.arange(len(found)), "pearson": values}
+        tables.append(pd.DataFrame({"map": name, "change": change, **columns}))
+    return pd.concat(tables, ignore_index=True)

@@ -1,0 +1,124 @@
+"""Images that an explain run uses: labelled frames of the detector, pairs of the stack navigator."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.labels import FrameLabels
+from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.explain.correlation.ground_truth import ground_truth_mask
+from perilune_train.explain.correlation.homography import true_homography
+from perilune_train.navigate.data import trajectories as navigation
+
+RUN_PAIRS = 8
+"""Consecutive pairs of a run, which starts from the initial state of the LSTM, as in training; fewer over short
+descents."""
+
+
+@dataclass(frozen=True)
+class LabelledFrames:
+    """N labelled frames."""
+
+    images: NDArray[np.uint8]
+    """Frames (N, height, width)."""
+    truth: NDArray[np.float32]
+    """The paper's masks G (N, height, width): 1 on background, 0 in craters."""
+    labels: Sequence[FrameLabels]
+    """Labels of each frame."""
+    radius_px: tuple[float, float]
+    """Range of radii that is evaluated, pixels."""
+    frame_ids: list[str]
+    """Ids of the frames."""
+    scene_ids: list[str]
+    """Scene of each frame."""
+
+    @property
+    def craters(self) -> NDArray[np.bool_]:
+        """Pixels in craters (N, height, width)."""
+        return self.truth == 0
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """N pairs of consecutive frames, in runs of consecutive pairs."""
+
+    images: NDArray[np.uint8]
+    """The pairs (N, 2 height, width), the earlier frame above."""
+    homographies: NDArray[np.float64]
+    """True homographies (N, 3, 3) of the ground plane, from pixels of the earlier frame to those of the later one."""
+    translation_m: NDArray[np.float64]
+    """True translations (runs, pairs of a run, 3), metres, O_C of the earlier frame."""
+    pair_ids: list[str]
+    """Scene, trajectory and step of each pair, separated by "/"."""
+    scene_ids: list[str]
+    """Scene of each pair."""
+
+
+def labelled_frames(
+    dataset: Dataset, split: str, detector: DetectConfig, count: int, ring_factors: tuple[float, ...]
+) -> tuple[LabelledFrames, DetectSplit]:
+    """At most `count` frames of a split, evenly spaced, and the whole split.
+
+    G contains only craters that the detector's own run selects, so no hardly visible ones. Raises UserError if the
+    dataset is of another kind, or if the split is empty or damaged.
+    """
+    if dataset.info.kind != "detect":
+        raise UserError(dataset.store, "kind", dataset.info.kind, "detect, a dataset with labels")
+    whole = load_split(dataset, split, detector.labels)
+    return frames_of(whole, evenly_spaced(len(whole), count), ring_factors), whole
+
+
+def frames_of(split: DetectSplit, chosen: Sequence[int], ring_factors: tuple[float, ...]) -> LabelledFrames:
+    """Some frames of a split by their indices."""
+    labels = [split.labels[i] for i in chosen]
+    height, width = split.frames.images.shape[1:]
+    truth = [
+        ground_truth_mask(width, height, own.ellipses[own.selected, :2], own.radius_px[own.selected], ring_factors)
+        for own in labels
+    ]
+    table = split.frames.table.iloc[list(chosen)]
+    return LabelledFrames(
+        split.frames.images[list(chosen)],
+        np.stack(truth).astype(np.float32),
+        labels,
+        split.radius_px,
+        table["frame_id"].tolist(),
+        table["scene_id"].tolist(),
+    )
+
+
+def first_descent(split: DetectSplit) -> list[int]:
+    """Indices of the frames of the split's first trajectory."""
+    ids = split.frames.table[["scene_id", "trajectory_id"]]
+    return np.flatnonzero((ids == ids.iloc[0]).all(axis=1)).tolist()
+
+
+def consecutive_pairs(dataset: Dataset, split: str, count: int) -> Pairs:
+    """At most `count` pairs of a split in runs of at most RUN_PAIRS, spread evenly over trajectories and altitudes.
+
+    Raises UserError if the dataset is of another kind or the split is empty.
+    """
+    descents = navigation.load_split(dataset, split)
+    length = min(RUN_PAIRS, *(one.n_pairs for one in descents))
+    places = [(one, start) for one in descents for start in range(0, one.n_pairs - length + 1, length)]
+    runs = [places[i] for i in evenly_spaced(len(places), max(1, count // length))]
+    images, homographies, translations, ids, scenes = [], [], [], [], []
+    for one, start in runs:
+        translations.append(one.motion[0][start : start + length])
+        for step in range(start, start + length):
+            images.append(np.concatenate([one.images[step], one.images[step + 1]]))
+            poses = [(one.position_m[k], one.rotation_camera_from_site[k]) for k in (step, step + 1)]
+            homographies.append(true_homography(one.camera, *poses[0], *poses[1]))
+            ids.append("/".join([*one.ids, str(step)]))
+            scenes.append(one.ids[0])
+    return Pairs(np.stack(images), np.stack(homographies), np.stack(translations), ids, scenes)
+
+
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """At most `count` indices below `total`, evenly spaced."""
+    return np.unique(np.linspace(0, total - 1, count).astype(int)).tolist()

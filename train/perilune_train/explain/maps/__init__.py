@@ -1,0 +1,1 @@
+"""Maps over images: attention masks, baselines, attributions, and their pictures."""

@@ -1,0 +1,115 @@
+"""Evidence on the gates of the stack navigator: correlations of the halves, nulls, interventions, stability."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from perilune_shared.terminal import console
+from perilune_train.explain.config import ExplainConfig
+from perilune_train.explain.correlation.measures import pair_values
+from perilune_train.explain.detection import SHALLOW_STAGES
+from perilune_train.explain.evidence.gates import forced_gates, gate_means
+from perilune_train.explain.evidence.nulls import pair_nulls
+from perilune_train.explain.evidence.performance import MotionPerformance
+from perilune_train.explain.evidence.randomisation import randomised
+from perilune_train.explain.evidence.removal import removal_effect
+from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary
+from perilune_train.explain.evidence.stability import stability
+from perilune_train.explain.evidence.tables import Evidence
+from perilune_train.explain.evidence.untrained import measure_statistics
+from perilune_train.explain.inputs import Pairs, evenly_spaced
+from perilune_train.explain.maps.baselines import baseline_maps
+from perilune_train.explain.maps.masks import Masks, navigator_masks, stacked_input
+from perilune_train.models.navigator import StackNavigator
+
+TASK = "navigate"
+
+
+def explain_navigator(
+    settings: ExplainConfig,
+    navigator: StackNavigator,
+    architecture: dict[str, Any],
+    pairs: Pairs,
+    validation: Pairs,
+    where: Path,
+) -> tuple[Evidence, Masks]:
+    """All tables of the stack navigator, and its masks of the test pairs (N, 2 height, width).
+
+    The gate whose pixels are removed is chosen on the validation pairs. Raises UserError if the network has no
+    attention.
+    """
+    size_px = architecture["size_px"]
+    rng = np.random.default_rng([settings.seed, 2])
+
+    def masks_of(given: NDArray[np.uint8]) -> Masks:
+        return navigator_masks(navigator, given, size_px, where)
+
+    masks, known = masks_of(pairs.images), masks_of(validation.images)
+    untrained = untrained_navigator(navigator, architecture, validation.images, settings.seed)
+    blank = navigator_masks(untrained, pairs.images, size_px, where)
+    console.print("navigator: masks and null maps", markup=False)
+    strongest = strongest_gate(known, validation)
+    homographies, ids_of_pairs, scenes = list(pairs.homographies), pairs.pair_ids, pairs.scene_ids
+    halves = np.split(pairs.images, 2, axis=1)
+    scale = pairs.images.shape[2] / size_px
+    nulls = pair_nulls(halves[0], halves[1], masks, blank, homographies, ids_of_pairs, scenes, rng, scale)
+    values = pd.concat([pair_values(masks, homographies, ids_of_pairs, scenes), nulls], ignore_index=True)
+    differences = null_differences(values, {}, rng)
+
+    length = pairs.translation_m.shape[1]
+    runs = evenly_spaced(len(pairs.translation_m), max(1, settings.n_changed_pairs // length))
+    changed = [length * run + k for run in runs for k in range(length)]
+    images = pairs.images[changed]
+    ids = pd.DataFrame({"frame_id": pairs.pair_ids, "scene_id": pairs.scene_ids}).iloc[changed].reset_index(drop=True)
+    scales = architecture["scales"]
+    measure = MotionPerformance(
+        navigator, pairs.translation_m[runs], np.array(scales["mean_m"]), np.array(scales["spread_m"]), size_px
+    )
+    gates = forced_gates(navigator.backbone, gate_means(known), images, measure, "force gates of the navigator")
+    edge = f"edge/stage_{strongest[2]}"
+    halved = [baseline_maps(half[changed], scale)[edge] for half in halves]
+    to_remove = {strongest: masks[strongest][changed], edge: np.concatenate(halved, axis=1)}
+    console.print(f"navigator: remove pixels by {strongest}, chosen on validation pairs, and by edges", markup=False)
+    removal = removal_effect(images, to_remove, dict.fromkeys(to_remove, 1), measure, rng, settings.removed_share)
+
+    few = images[: max(2, settings.n_changed // 2)]
+    evidence = Evidence(
+        values,
+        summary(values, rng),
+        differences,
+        against_nulls(differences),
+        gates.merge(ids, left_on="image", right_index=True),
+        removal.merge(ids, left_on="frame_index", right_index=True),
+        randomised(navigator, masks_of, few, settings.seed),
+        stability(masks_of, few, rng, stacked=2),
+        dict.fromkeys(masks, 1),
+        strongest,
+    )
+    return evidence, masks
+
+
+def untrained_navigator(
+    trained: StackNavigator, architecture: dict[str, Any], pairs: NDArray[np.uint8], seed: int
+) -> StackNavigator:
+    """A network of the same form with random weights; its batch statistics are measured on pairs (N, 2 h, w)."""
+    form = (architecture[key] for key in ("in_channels", "width", "attention", "hidden"))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = StackNavigator(*form)
+    device = next(trained.parameters()).device
+    network.to(device)
+    first, second = stacked_input(pairs, architecture["size_px"])
+    measure_statistics(network, torch.from_numpy(first[None]).to(device), torch.from_numpy(second[None]).to(device))
+    return network
+
+
+def strongest_gate(masks: Masks, validation: Pairs) -> str:
+    """The gate up to stride 8 of the largest mean PCC4 on validation pairs; the first gate if none is defined."""
+    values = pair_values(masks, list(validation.homographies), validation.pair_ids, validation.scene_ids)
+    own = values[(values["measure"] == "pcc4") & values["map"].str[2].isin(list(SHALLOW_STAGES))]
+    means = own.groupby("map", sort=False)["value"].mean()
+    return str(means.idxmax()) if means.notna().any() else str(means.index[0])

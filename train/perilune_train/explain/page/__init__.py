@@ -1,0 +1,1 @@
+"""Pictures, claims and verdicts of an explain run."""

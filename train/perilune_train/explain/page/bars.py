@@ -1,0 +1,146 @@
+"""Bar charts of every gate: correlations with intervals and nulls, effects of forced gates, randomised weights."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from perilune_train.evaluation.pictures import save_figure
+
+BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#999999"
+"""Colours that the colour-blind can tell apart (Okabe & Ito 2008)."""
+_MARKERS = {
+    "untrained": ("o", "#000000"),
+    "edge": ("^", ORANGE),
+    "contrast": ("s", GREEN),
+    "brightness": ("v", RED),
+    "other frame": ("x", "#CC79A7"),
+    "other pair": ("x", "#CC79A7"),
+}
+
+
+def draw_correlations(
+    path: Path, summary: pd.DataFrame, differences: pd.DataFrame, tested: pd.DataFrame, measures: Mapping[str, str]
+) -> None:
+    """Draw one row for each measure: bars of the gates with 95 % intervals, and the means of their nulls as markers.
+
+    A filled bar beats every null, an open one does not; a missing bar means that the mask is constant in every image.
+    PCC1 of nulls is drawn with the sign that the gate was expected to have, so that strengths compare. `measures` maps
+    names to labels; the three tables are those of `Evidence`.
+    """
+    figure = Figure(figsize=(12, 3.3 * len(measures)), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(len(measures), 1))
+    for axis, (measure, label) in zip(axes, measures.items(), strict=True):
+        own = summary[(summary["kind"] == "gate") & (summary["measure"] == measure)].reset_index(drop=True)
+        verdicts = tested[tested["measure"] == measure].set_index("map")["beats_all"]
+        beats = [bool(verdicts.get(block, False)) for block in own["map"]]
+        place = np.arange(len(own))
+        colours = [BLUE if one else "white" for one in beats]
+        axis.bar(place, own["value"], 0.7, color=colours, edgecolor=BLUE, linewidth=1.2)
+        errors = np.abs(np.vstack([own["value"] - own["low"], own["high"] - own["value"]]))
+        if np.isfinite(errors).any():
+            axis.errorbar(place, own["value"], errors, fmt="none", ecolor="black", capsize=2, linewidth=1)
+        _draw_nulls(axis, own, differences[differences["measure"] == measure])
+        axis.set_xticks(place, own["map"], rotation=60)
+        axis.axhline(0, color="black", linewidth=0.8)
+        axis.set(ylabel=label, xlim=(-0.6, len(own) - 0.4))
+        axis.grid(axis="y", alpha=0.3)
+    handles, names = axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        names,
+        ncols=6,
+        loc="outside upper center",
+        fontsize=9,
+        title="Bars: gates (filled: beats every null). Markers: nulls",
+    )
+    save_figure(path, figure, dpi=110)
+
+
+def _draw_nulls(axis: Axes, own: pd.DataFrame, differences: pd.DataFrame) -> None:
+    # A gate whose expected sign is -1 is drawn below 0; so are its nulls.
+    side = np.where(own["value"] < 0, -1.0, 1.0) if own["measure"].iloc[0].startswith("pcc1") else np.ones(len(own))
+    for null, rows in differences.groupby("null", sort=False):
+        values = rows.set_index("map")["null_value"].reindex(own["map"]).to_numpy()
+        marker, colour = _MARKERS.get(str(null), ("d", GREY))
+        axis.plot(np.arange(len(own)), side * values, marker, color=colour, markersize=4, label=str(null))
+
+
+def draw_gates(path: Path, gates: pd.DataFrame, unit: str, higher_is_better: bool) -> None:
+    """Draw the mean harm of forcing each gate, stage, and all gates to their means; dots are the means of scenes."""
+    harm = (gates["before"] - gates["after"]) * (1 if higher_is_better else -1)
+    table = gates.assign(harm=harm)
+    scopes = list(dict.fromkeys(table["scope"]))
+    mean = table.groupby("scope")["harm"].mean().reindex(scopes)
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    axis = figure.subplots()
+    colours = [BLUE if scope.startswith("B_") else ORANGE for scope in scopes]
+    axis.bar(np.arange(len(scopes)), mean, 0.7, color=colours)
+    for scene, rows in table.groupby("scene_id"):
+        values = rows.groupby("scope")["harm"].mean().reindex(scopes)
+        axis.plot(np.arange(len(scopes)), values, ".", color="black", markersize=4, label=str(scene))
+    axis.set_xticks(np.arange(len(scopes)), scopes, rotation=60)
+    axis.axhline(0, color="black", linewidth=0.8)
+    axis.set_ylabel(f"harm: {unit}", fontsize=9)
+    axis.grid(axis="y", alpha=0.3)
+    save_figure(path, figure, dpi=110)
+
+
+def draw_removal(path: Path, removal: pd.DataFrame, unit: str, higher_is_better: bool) -> None:
+    """Draw the mean harm of removing pixels, by map and way of filling, for the four choices of pixels."""
+    harm = (removal["before"] - removal["after"]) * (1 if higher_is_better else -1)
+    means = removal.assign(harm=harm).groupby(["map", "how", "which"], sort=False)["harm"].mean()
+    groups = list(dict.fromkeys((name, how) for name, how, _ in means.index))
+    figure = Figure(figsize=(1.6 + 2.2 * len(groups), 3.6), layout="constrained")
+    axis = figure.subplots()
+    kinds = {
+        "most": ("most attended", BLUE, ""),
+        "random": ("random, same brightness", GREY, "//"),
+        "shifted": ("same shape elsewhere", ORANGE, ".."),
+        "least": ("least attended", "white", ""),
+    }
+    for k, (which, (label, colour, hatch)) in enumerate(kinds.items()):
+        values = [means.get((*group, which), np.nan) for group in groups]
+        axis.bar(
+            np.arange(len(groups)) + 0.2 * k, values, 0.19, color=colour, edgecolor="black", hatch=hatch, label=label
+        )
+    axis.set_xticks(np.arange(len(groups)) + 0.3, [f"{name}\n{how}" for name, how in groups], fontsize=8)
+    axis.axhline(0, color="black", linewidth=0.8)
+    axis.set_ylabel(f"harm: {unit}", fontsize=9)
+    axis.legend(fontsize=8)
+    save_figure(path, figure, dpi=110)
+
+
+def draw_randomisation(path: Path, randomisation: pd.DataFrame) -> None:
+    """Draw the rank correlation of each gate's mask with the trained one as stages are randomised, both cascades."""
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    for axis, (direction, rows) in zip(
+        figure.subplots(1, 2, sharey=True), randomisation.groupby("direction", sort=False), strict=True
+    ):
+        table = rows.pivot_table(index="map", columns="step", values="spearman", sort=False, dropna=False)
+        picture = axis.imshow(table.to_numpy(np.float64).T, cmap="cividis", vmin=-1, vmax=1, aspect="auto")
+        axis.set_xticks(np.arange(len(table)), table.index, rotation=90, fontsize=7)
+        axis.set_yticks(np.arange(table.shape[1]), table.columns, fontsize=8)
+        axis.set_title(f"{str(direction).replace('_', ' ')}: Spearman correlation with the trained mask", fontsize=9)
+        figure.colorbar(picture, ax=axis)
+    save_figure(path, figure, dpi=110)
+
+
+def draw_localisation(path: Path, summary: pd.DataFrame) -> None:
+    """Draw the ROC-AUC of every map on crater pixels: gates, nulls and attribution methods; chance is 0.5."""
+    own = summary[summary["measure"] == "auc"].reset_index(drop=True)
+    colours = own["kind"].map({"gate": BLUE, "null": GREY, "attribution": ORANGE})
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    axis = figure.subplots()
+    axis.bar(np.arange(len(own)), own["value"] - 0.5, 0.7, bottom=0.5, color=colours)
+    errors = np.abs(np.vstack([own["value"] - own["low"], own["high"] - own["value"]]))
+    if np.isfinite(errors).any():
+        axis.errorbar(np.arange(len(own)), own["value"], errors, fmt="none", ecolor="black", capsize=2, linewidth=1)
+    axis.axhline(0.5, color="black", linewidth=0.8)
+    axis.set_xticks(np.arange(len(own)), own["map"], rotation=75, fontsize=8)
+    axis.set_ylabel("ROC-AUC on crater pixels")
+    axis.grid(axis="y", alpha=0.3)
+    save_figure(path, figure, dpi=110)
