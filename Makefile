@@ -38,12 +38,12 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
 	@echo
-	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port  RUN=folder  SCENES=number  ELEVATION=folder  DRAWS=number  SCENARIO=name'
+	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port  RUN=folder  SCENES=number  ELEVATION=folder  DRAWS=number  SCENARIO=name  REPORT=demo|paper|benchmark'
 	@echo
 	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""
@@ -59,15 +59,17 @@ $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pypr
 	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[export,geo]" -r requirements-dev.txt
 	@touch $@
 
-demo: setup ## run all steps: set-up, datasets, detection, navigation, explanation (PRESET=small)
+demo: setup ## run all steps: set-up, datasets, detection, navigation, explanation, report (PRESET=small)
 	@$(MAKE) --no-print-directory train-detect
 	@$(MAKE) --no-print-directory train-nav
 	@$(MAKE) --no-print-directory explain
+	@$(MAKE) --no-print-directory report
 	@echo
 	@echo "Datasets    $(DATA)/detect  $(DATA)/nav           pictures: overview.png"
 	@echo "Detection   $(RUNS)/detect/$(NAME)                metrics.json, *.png, detections.parquet"
 	@echo "Navigation  $(RUNS)/navigate/$(NAME)[-stack]      metrics.json, *.png, navigation.parquet"
 	@echo "Explanation $(RUNS)/explain/$(NAME)               metrics.json, *.png, correlations.parquet"
+	@echo "Report      $(RUNS)/report/$(NAME)                report.html (open it in a browser), summary.md"
 
 dataset: setup ## render the preset's datasets (KIND=detect|nav for one); run again to resume
 	@$(RENDER) --kind $(KIND)
@@ -166,6 +168,22 @@ train-nav-baseline: nav-frames ## the same networks without attention, into <nam
 explain: ## attention masks and correlations of the trained networks
 	@test -f "$(NAVIGATE)" -a -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-nav
 	@$(BIN)/perilune-train explain $(TRAIN) --dataset "$(DATA)" $(OVER)
+
+# The experiment and the benchmark have folders of their own.
+REPORT ?= demo
+REPORTED = $(if $(filter demo,$(REPORT)),--name $(NAME) --dataset "$(DATA)" --runs "$(RUNS)" --out "$(RUNS)/report/$(NAME)")
+report: setup ## one HTML page of datasets, runs and frames, and a summary (REPORT=demo|paper|benchmark); writes runs/report/
+	@$(BIN)/perilune-train report --kind $(call quoted,$(REPORT)) $(REPORTED)
+
+# The navigator's poses need all frames of a descent, without its craters.
+STACK := $(RUNS)/navigate/$(NAME)-stack
+explain-causal: detect-frames ## remove single craters from the ground of the test scenes, render again, and measure what they do to masks, detections and poses; writes runs/explain/<name>-causal
+	@test -f "$(DETECT)" || $(MAKE) --no-print-directory OVERWRITE= train-detect
+	@$(BIN)/perilune-render counterfactual --manifest "$(DATA)/detect" --craters-per-scene 12 --out "$(DATA)/causal"
+	@$(BIN)/perilune-render counterfactual --manifest "$(DATA)/detect" --craters-per-scene 0 --sun-azimuth-offset-deg 40 --out "$(DATA)/turned"
+	@$(if $(wildcard $(STACK)/metrics.json),$(BIN)/perilune-render counterfactual --manifest "$(DATA)/nav" --craters-per-scene 12 --frames-per-trajectory 1000 --out "$(DATA)/causal-nav")
+	@$(BIN)/perilune-train causal $(COMMON) --runs $(call quoted,$(RUNS)) --name $(NAME) --dataset "$(DATA)/detect" --counterfactual "$(DATA)/causal" \
+	  --turned "$(DATA)/turned" $(if $(wildcard $(STACK)/metrics.json),--nav-dataset "$(DATA)/nav" --nav-counterfactual "$(DATA)/causal-nav") $(OVER)
 
 JOBS ?= 2
 test: setup ## run all tests, in JOBS=2 processes

@@ -15,8 +15,9 @@ ROOMS = {
         "geometry dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
-        "processor config_values config_terrain config_survey config streams provenance terrain flight imaging labels "
-        "frame_source blender dataset jobs cli_options cli_dataset cli_survey cli_status cli"
+        "processor config_values config_terrain config_survey config_counterfactual config streams provenance terrain "
+        "flight imaging labels frame_source blender dataset jobs cli_options cli_dataset cli_survey cli_counterfactual "
+        "cli_status cli"
     ),
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
@@ -26,7 +27,7 @@ ROOMS = {
         "job records identity steps work_list report scene_renderer worker local here ray_actors run status estimate"
     ),
     "train/perilune_train": (
-        "config cli_options data evaluation models training shipped detect navigate explain paper cli"
+        "config cli_options data evaluation models training shipped detect navigate explain paper report cli"
     ),
     "train/perilune_train/detect": (
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"

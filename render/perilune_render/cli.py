@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 import perilune_shared as ps
+from perilune_render.cli_counterfactual import counterfactual
 from perilune_render.cli_dataset import dataset
 from perilune_render.cli_options import (
     Catalogue,
@@ -54,6 +55,7 @@ def config(
 app.command()(dataset)
 app.command()(status)
 app.command()(survey)
+app.command()(counterfactual)
 
 
 @app.command()

@@ -63,6 +63,9 @@ def resolved_config(
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
     if resolved.survey is not None:
         raise UserError("configuration", "dataset.survey", "set", "null; `perilune-render survey` renders from orbit")
+    if resolved.counterfactual is not None:
+        expected = "null; `perilune-render counterfactual` changes the scenes of a dataset"
+        raise UserError("configuration", "dataset.counterfactual", "set", expected)
     paths = {name: str(path) for name, path in (("dem", dem), ("catalogue", catalogue)) if path is not None}
     terrain = resolved.terrain.model_copy(update=paths)
     if terrain.catalogue is not None and terrain.dem is None:

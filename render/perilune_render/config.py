@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from perilune_render.config_counterfactual import CounterfactualConfig
 from perilune_render.config_survey import SurveyConfig
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
@@ -286,6 +287,8 @@ class DatasetConfig(Section):
     """Dataset for navigation."""
     survey: SurveyConfig | None = None
     """Images from orbit in place of the descents, over the same ground; `perilune-render survey` sets it."""
+    counterfactual: CounterfactualConfig | None = None
+    """Craters removed from the ground, or another Sun; `perilune-render counterfactual` sets it."""
 
     @model_validator(mode="after")
     def _same_ground(self) -> "DatasetConfig":
@@ -299,6 +302,10 @@ class DatasetConfig(Section):
     def kind(self, name: str) -> KindConfig:
         """Settings of the dataset `detect` or `nav`."""
         return self.detect if name == "detect" else self.nav
+
+    def removed_from(self, scene_seed: int) -> tuple[int, ...]:
+        """Ids of the craters that are removed from the ground of a scene, given by its random seed."""
+        return self.counterfactual.removed.get(scene_seed, ()) if self.counterfactual is not None else ()
 
     def ground_flight(self, kind: str) -> FlightConfig:
         """Flight settings that set the ground of `detect` or `nav`; with `shared_terrain`, both kinds' combined."""

@@ -91,11 +91,20 @@ def test_a_navigator_is_trained_on_a_dataset_at_an_address(bucket, tmp_path):
 
 
 def test_masks_are_explained_on_datasets_at_an_address(networks, bucket, few, dataset_nav, tmp_path):
-    settings, checkpoint = ExplainConfig(n_frames=2, n_pairs=2, n_drawn=1, device="cpu"), networks[0] / "checkpoints"
+    few_images = {
+        "n_frames": 2,
+        "n_pairs": 2,
+        "n_validation": 2,
+        "n_changed": 2,
+        "n_changed_pairs": 2,
+        "n_attributed": 1,
+    }
+    settings = ExplainConfig(**few_images, n_drawn=1, integration_steps=1, occlusion_px=48, device="cpu")
+    checkpoint = networks[0] / "checkpoints"
     found = []
     for name, data in (("local", (few, dataset_nav)), ("remote", (f"{bucket}/detect", f"{bucket}/nav"))):
         run = explain_run(settings, *data, checkpoint / "best.ckpt", networks[1], tmp_path, name)
-        found.append(pd.read_parquet(run.root / "correlations.parquet"))
+        found.append(pd.read_parquet(run.root / "summary.parquet"))
     assert len(found[0]) > 0 and found[0].equals(found[1])
 
 

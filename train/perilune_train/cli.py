@@ -10,11 +10,13 @@ from perilune_shared.errors import run_command_line
 from perilune_train.cli_options import ConfigFile, Preset, Settings
 from perilune_train.detect.cli.main import app as detect
 from perilune_train.detect.config import DetectConfig
+from perilune_train.explain.causal.command import causal
 from perilune_train.explain.command import explain
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.navigate.cli.main import app as navigate
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.paper.command import paper
+from perilune_train.report.command import report
 from perilune_train.shipped.models import shipped_models
 
 SECTIONS: dict[str, type[Section]] = {"detect": DetectConfig, "navigate": NavigateConfig, "explain": ExplainConfig}
@@ -27,7 +29,9 @@ app = typer.Typer(
 app.add_typer(detect, name="detect")
 app.add_typer(navigate, name="navigate")
 app.command("explain")(explain)
+app.command("causal")(causal)
 app.command("paper")(paper)
+app.command("report")(report)
 
 
 @app.command()

@@ -43,7 +43,7 @@ def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
             "craters",
             {
                 "scene_id": [scene_id] * len(craters),
-                "crater_id": np.arange(len(craters)),
+                "crater_id": scene.crater_id,
                 "x_m": craters.x_m,
                 "y_m": craters.y_m,
                 "z_m": rims.z_m,

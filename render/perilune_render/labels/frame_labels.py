@@ -77,7 +77,7 @@ class RimCircles:
     def of_scene(cls, scene: Scene) -> "RimCircles":
         """All craters of a generated scene."""
         centres = np.stack([scene.craters.x_m, scene.craters.y_m, scene.rims.z_m], axis=1)
-        return cls(np.arange(len(scene.craters)), centres, scene.rims.normal, scene.craters.diameter_m / 2)
+        return cls(scene.crater_id, centres, scene.rims.normal, scene.craters.diameter_m / 2)
 
     @classmethod
     def from_table(cls, rows: pd.DataFrame) -> "RimCircles":

@@ -13,6 +13,7 @@ from perilune_shared.errors import UserError
 
 _FILES = ("dem", "catalogue")
 _SPEED = ("threads", "cache_gib")
+_OPTIONAL = ("survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
@@ -27,7 +28,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, those of the other kind unless the kinds share terrain, and those of a survey if there is none.
+    speed, those of the other kind unless the kinds share terrain, and those of a survey or a counterfactual if there is
+    none.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -35,8 +37,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
             plain["terrain"][name] = Path(plain["terrain"][name]).name
     for name in _SPEED:
         del plain["render"][name]
-    if config.survey is None:
-        del plain["survey"]
+    for name in _OPTIONAL:
+        if plain[name] is None:
+            del plain[name]
     if not config.shared_terrain:
         del plain[_OTHER[kind]]
     return plain

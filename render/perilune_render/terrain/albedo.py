@@ -15,9 +15,9 @@ from perilune_shared.geometry.frames import Array
 
 _PATCHES = ((600.0, 0.10), (150.0, 0.07), (40.0, 0.05), (12.0, 0.04), (4.0, 0.03))
 """Wavelengths, metres, and relative amplitudes of the patches."""
-_RAYS_REACH = 9.0
+RAYS_REACH = 9.0
 """Length of the longest ray from the centre, crater radii."""
-_RAYED_WEAR = 0.004
+RAYED_WEAR = 0.004
 """Wear K/R^2 of a crater at which its rays have vanished."""
 
 
@@ -37,19 +37,32 @@ def brightness(craters: Craters) -> Array:
     return 0.5 * np.exp(-wear / 0.004) * (craters.origin != 2)
 
 
-def add_rays(albedo: Array, grid: Grid, craters: Craters, n_rayed: int, strength: float, seed: int) -> None:
-    """Brighten albedo (n_vertices,) along the rays of the `n_rayed` largest fresh craters, in place."""
+def add_rays(
+    albedo: Array,
+    grid: Grid,
+    craters: Craters,
+    n_rayed: int,
+    strength: float,
+    seed: int,
+    removed: np.ndarray | None = None,
+) -> None:
+    """Brighten albedo (n_vertices,) along the rays of the `n_rayed` largest fresh craters, in place.
+
+    The rays of `removed` craters (indices) are drawn like the others, but not added.
+    """
     rng = stream(seed, "rays")
     wear = craters.wear_m2 / (craters.diameter_m / 2) ** 2
     local = grid.spacing_at(np.maximum(np.abs(craters.x_m), np.abs(craters.y_m)))
-    able = np.flatnonzero((wear < _RAYED_WEAR) & (craters.diameter_m > 12 * local) & (craters.origin == 0))
+    able = np.flatnonzero((wear < RAYED_WEAR) & (craters.diameter_m > 12 * local) & (craters.origin == 0))
     # The largest ones: rays of a small crater would be only a few pixels long.
     for k in able[np.argsort(-craters.diameter_m[able], kind="stable")][:n_rayed]:
         n_rays = int(rng.integers(7, 15))
         direction = rng.uniform(0, 2 * np.pi, n_rays)
         width = rng.uniform(0.05, 0.16, n_rays)
-        length = rng.uniform(3.0, _RAYS_REACH, n_rays)
-        fresh = strength * 0.35 * (1 - wear[k] / _RAYED_WEAR)
+        length = rng.uniform(3.0, RAYS_REACH, n_rays)
+        if removed is not None and k in removed:
+            continue
+        fresh = strength * 0.35 * (1 - wear[k] / RAYED_WEAR)
         _add_rays(
             albedo,
             grid.n_half,

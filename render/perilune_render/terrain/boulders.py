@@ -9,6 +9,7 @@ the crater's diameter.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -59,12 +60,15 @@ class Boulders:
         return ground_m + (0.5 - _BURIED_SHARE) * self.diameter_m
 
 
-def draw_boulders(config: BouldersConfig, grid: Grid, craters: Craters, seed: int) -> Boulders:
+def draw_boulders(
+    config: BouldersConfig, grid: Grid, craters: Craters, seed: int, removed: Sequence[int] | np.ndarray = ()
+) -> Boulders:
     """Draw the boulders of a scene: a uniform density on the plain, and fields around young craters.
 
     Fields surround primary craters of at least 10 m. At the rim of a newly formed crater the density of its field is
     `field_density` times that of the plain. It falls with distance as exp(-(x - 1) / 0.7), x = r/R, with age as
     (1 - age / 4 Gyr)^3, and with the crater's wear as exp(-K / 0.05 R^2), our choice.
+    The fields of `removed` craters (indices) are drawn like the others and then left out.
     """
     rng = stream(seed, "boulders")
     smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
@@ -77,18 +81,20 @@ def draw_boulders(config: BouldersConfig, grid: Grid, craters: Craters, seed: in
     plain = draw_diameters(law, edges, np.square(2 * half), rng)
     reach = half[np.clip(np.searchsorted(edges, plain, side="right") - 1, 0, len(half) - 1)]
     x, y = rng.uniform(-1, 1, (2, len(plain))) * reach
-    field_x, field_y, field = _fields(config, law, grid, craters, rng)
+    field_x, field_y, field, host = _fields(config, law, grid, craters, rng)
     x, y, diameter = np.concatenate([x, field_x]), np.concatenate([y, field_y]), np.concatenate([plain, field])
     shape = rng.integers(0, config.n_shapes, len(diameter))
     rotation = rng.normal(size=(len(diameter), 4))
     rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
-    return Boulders(x, y, diameter, shape, np.where(rotation[:, :1] < 0, -rotation, rotation))
+    drawn = Boulders(x, y, diameter, shape, np.where(rotation[:, :1] < 0, -rotation, rotation))
+    on_plain = np.ones(len(plain), bool)
+    return drawn.chosen(np.concatenate([on_plain, ~np.isin(host, removed)])) if len(removed) else drawn
 
 
 def _fields(
     config: BouldersConfig, law: BoulderLaw, grid: Grid, craters: Craters, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
-    """x, y and diameters of the boulders around young craters."""
+) -> tuple[Array, Array, Array, np.ndarray]:
+    """x, y and diameters of the boulders around young craters, and the index of each one's crater."""
     radius = craters.diameter_m / 2
     age = np.nan_to_num(craters.age_myr, nan=4000.0)
     young = np.clip(1 - age / 4000, 0, 1) ** 3 * np.exp(-craters.wear_m2 / (0.05 * radius**2))
@@ -111,7 +117,7 @@ def _fields(
     x, y = craters.x_m[host] + distance * np.cos(angle), craters.y_m[host] + distance * np.sin(angle)
     on_grid = np.maximum(np.abs(x), np.abs(y)) < grid.extent_m / 2
     inside = (diameter >= config.min_diameter_spacings * grid.spacing_under(x, y)) & on_grid
-    return x[inside], y[inside], diameter[inside]
+    return x[inside], y[inside], diameter[inside], host[inside]
 
 
 def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:

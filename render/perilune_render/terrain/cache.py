@@ -52,6 +52,7 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
         "albedo_variation": config.light.albedo_variation,
         "view": [view.height_m.tolist(), view.reach_m.tolist(), view.focal_px],
         "seed": seed,
+        "removed": list(config.removed_from(seed)),
     }
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

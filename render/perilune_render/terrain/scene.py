@@ -1,6 +1,6 @@
 """A scene: ground, craters and boulders of one site as plain data."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +10,9 @@ from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.base import base_of
 from perilune_render.terrain.boulders import Boulders, draw_boulders
 from perilune_render.terrain.craters.population import Craters, draw_craters
+from perilune_render.terrain.craters.removal import indices_of, near
 from perilune_render.terrain.craters.rims import Rims, measure_rims
-from perilune_render.terrain.craters.stamp import stamp_craters
+from perilune_render.terrain.craters.stamp import Stamped, stamp_craters
 from perilune_render.terrain.elevation.catalogue import read_catalogue
 from perilune_render.terrain.elevation.model import ElevationModel, read_elevation, refuse_beyond, remarks, resolved_m
 from perilune_render.terrain.envelope import ViewEnvelope
@@ -45,7 +46,7 @@ class Scene:
     albedo: np.ndarray
     """Factor on the reflectance (n_vertices,) float32, about 1."""
     craters: Craters
-    """Craters of a catalogue, then generated ones that are still visible, oldest first; crater_id is the index."""
+    """Craters of a catalogue, then generated ones that are still visible, oldest first, without removed ones."""
     rims: Rims
     """Rims of the same craters, measured on the finished ground."""
     boulders: Boulders
@@ -58,12 +59,23 @@ class Scene:
     """Whether each vertex (n_vertices,) is on known ground of the elevation model; false on procedural ground."""
     view: ViewEnvelope | None = None
     """The views that the ground was made for; None allows one mesh only (`perilune_render.terrain.levels`)."""
+    removed: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+    """crater_id (N,) of the craters that were removed from the ground, ascending."""
+
+    @property
+    def crater_id(self) -> np.ndarray:
+        """Ids of `craters`: their indices in the scene from which no crater is removed."""
+        everything = np.arange(len(self.craters) + len(self.removed))
+        return np.delete(everything, self.removed)
 
 
 def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     """Generate the scene of a seed: base, relief, craters from oldest to youngest, boulders.
 
-    Raises UserError if frames of `view` need too many vertices.
+    Craters that the configuration removes are left out, with their rays and boulders. Everything is drawn as if they
+    were there, and the heights keep their zero. Beyond `craters.removal.REACH_RADII` of them the heights are those of
+    the scene with all craters. Raises UserError if frames of `view` need too many vertices, or if the scene has no such
+    crater.
     """
     check_levels(config.terrain, view)
     terrain = config.terrain
@@ -72,21 +84,34 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     base = base_of(model, grid, terrain, seed)
     height = base.height_m
     base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
-    craters = base.permitted(draw_craters(terrain.craters, grid, seed, base.largest_m))
+    drawn = base.permitted(draw_craters(terrain.craters, grid, seed, base.largest_m))
     albedo = np.ones(grid.n_vertices)
-    variation = config.light.albedo_variation
-    if variation > 0:
-        add_patches(albedo, grid, variation, seed)
-        add_rays(albedo, grid, craters, terrain.craters.n_rayed, variation, seed)
-    stamped = stamp_craters(height, albedo, grid, craters, variation * brightness(craters), terrain.craters.profile)
-    base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
-    visible = stamped.rim_left >= _LEAST_RIM
-    craters, sag = craters.chosen(visible), stamped.sag_m[visible]
+    if config.light.albedo_variation > 0:
+        add_patches(albedo, grid, config.light.albedo_variation, seed)
+    wanted = config.removed_from(seed)
+    uncratered = (height.copy(), albedo.copy()) if wanted else (height, albedo)
+    stamped = _stamp(config, height, albedo, grid, drawn, seed)
+    visible = np.flatnonzero(stamped.rim_left >= _LEAST_RIM)
+    craters, sag = drawn.chosen(visible), stamped.sag_m[visible]
+    n_real = 0
     if model is not None and terrain.catalogue is not None:
         real = read_catalogue(Path(terrain.catalogue), model, grid, terrain.craters, resolved_m(model))
-        craters, sag = real.joined(craters), np.concatenate([np.zeros(len(real)), sag])
-    height -= value_at(height, grid, 0.0, 0.0)
-    boulders = draw_boulders(terrain.boulders, grid, craters, seed)
+        craters, sag, n_real = real.joined(craters), np.concatenate([np.zeros(len(real)), sag]), len(real)
+    removed = indices_of(wanted, n_real, len(craters), seed)
+    raised_m = 0.0
+    if len(removed):
+        again = _stamp(config, *uncratered, grid, drawn, seed, visible[removed - n_real])
+        places = craters.chosen(removed)
+        changed = near(*grid.vertices_xy(), places)
+        before_m = _at_site(height, grid)
+        height[changed], albedo[:] = uncratered[0][changed], uncratered[1]
+        raised_m = float(_at_site(height, grid) - before_m)
+        sag[n_real:] = np.where(near(craters.x_m, craters.y_m, places)[n_real:], again.sag_m[visible], sag[n_real:])
+    base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
+    height -= _at_site(height, grid) - raised_m
+    boulders = draw_boulders(terrain.boulders, grid, craters, seed, removed)
+    kept = np.delete(np.arange(len(craters)), removed)
+    craters, sag = craters.chosen(kept), sag[kept]
     return Scene(
         seed,
         *_place(config, model),
@@ -100,7 +125,35 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
         "procedural" if model is None else model.source,
         base.beyond_m == 0,
         view,
+        removed,
     )
+
+
+def _stamp(
+    config: DatasetConfig,
+    height_m: Array,
+    albedo: Array,
+    grid: Grid,
+    craters: Craters,
+    seed: int,
+    removed: np.ndarray | None = None,
+) -> Stamped:
+    """Add rays and stamp craters except the `removed` ones (indices), in place; their results in `Stamped` are 0."""
+    kept = np.arange(len(craters)) if removed is None else np.delete(np.arange(len(craters)), removed)
+    variation, own = config.light.albedo_variation, craters.chosen(kept)
+    if variation > 0:
+        add_rays(albedo, grid, craters, config.terrain.craters.n_rayed, variation, seed, removed)
+    stamped = stamp_craters(height_m, albedo, grid, own, variation * brightness(own), config.terrain.craters.profile)
+    if removed is None:
+        return stamped
+    sag, rim_left = np.zeros(len(craters)), np.zeros(len(craters))
+    sag[kept], rim_left[kept] = stamped.sag_m, stamped.rim_left
+    return Stamped(sag, rim_left)
+
+
+def _at_site(height_m: Array, grid: Grid) -> Array:
+    """The height of the ground at the site, metres ()."""
+    return value_at(height_m, grid, 0.0, 0.0)
 
 
 def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:

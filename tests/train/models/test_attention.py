@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from perilune_train.models.attention import CBAM, MeanAndMax
+from perilune_train.models.fold import FlightCBAM
 
 
 def test_gates_follow_the_equations():
@@ -57,3 +58,36 @@ def test_pooling_and_its_gradient(memory_format):
     assert torch.autograd.gradcheck(lambda v: MeanAndMax.apply(v.flatten(2), 2), x)
     (grad,) = torch.autograd.grad(largest.sum(), x)
     assert grad.is_contiguous(memory_format=memory_format)
+
+
+def test_centred_form_is_bounded_centred_and_never_constant():
+    """Over pixels and frames the gate has a mean near 1 and a deviation, however large its logits grow."""
+    torch.manual_seed(3)
+    cbam = CBAM(16, form="centred")
+    x = torch.randn(8, 16, 12, 12).abs()
+    for factor in (1e-3, 1.0, 1e3):
+        with torch.no_grad():
+            cbam.spatial.weight.copy_(factor * torch.randn_like(cbam.spatial.weight))
+            mask = cbam.spatial_mask(x)
+        assert mask.min() >= 0.5 and mask.max() <= 1.5
+        assert abs(float(mask.mean()) - 1) < 0.1 and float(mask.std()) > 0.1
+    # A constant added to all logits, which drives a sigmoid to its bound, has no effect.
+    logits = torch.randn(2, 1, 6, 6)
+    torch.testing.assert_close(cbam.norm(logits + 50), cbam.norm(logits), atol=1e-4, rtol=0)
+
+
+def test_centred_form_follows_its_equation_and_is_equal_when_folded():
+    torch.manual_seed(4)
+    cbam = CBAM(16, form="centred")
+    for _ in range(30):
+        cbam(torch.randn(4, 16, 10, 10))
+    cbam.eval()
+    x = torch.randn(2, 16, 10, 10)
+    gated = x * cbam.channel_gate(x)
+    logits = torch.nn.functional.conv2d(
+        torch.stack([gated.mean(1), gated.amax(1)], dim=1), cbam.spatial.weight, padding=3
+    )
+    standard = (logits - cbam.norm.running_mean) / torch.sqrt(cbam.norm.running_var + cbam.norm.eps)
+    expected = 1 + 0.5 * torch.tanh(standard)
+    torch.testing.assert_close(cbam.spatial_mask(x), expected)
+    torch.testing.assert_close(FlightCBAM(cbam)(x), gated * expected)

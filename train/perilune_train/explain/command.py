@@ -42,13 +42,13 @@ def explain(
     allow_overlap: AllowOverlap = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Draw the attention masks of both networks and compute their correlations: PCC1 to PCC4 of the paper.
+    """Test what the attention gates of both networks show: nulls, interventions, localisation, stability.
 
-    PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
+    Correlations (PCC1 to PCC4 of the paper) stand beside those of null maps; a gate counts only if it beats all of
+    them. PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
 
-    Writes runs/explain/<name>/ with config.yaml, masks_detect.png, masks_navigate.png, pcc_detect.png,
-    pcc_navigate.png, correlations.parquet and metrics.json. Leaves a finished run of the same settings, datasets and
-    checkpoints unchanged; --overwrite replaces it.
+    Writes runs/explain/<name>/ with claims.json, metrics.json, the tables of all values and pictures. Leaves a finished
+    run of the same settings, datasets and checkpoints unchanged; --overwrite replaces it.
     """
     settings = resolve(ExplainConfig, "explain", "perilune_train", preset, config, tuple(set_ or ()))
     # Importing torch and Lightning takes seconds; check the settings first.
@@ -66,4 +66,4 @@ def explain(
         overwrite,
         allow_overlap,
     )
-    console.print(f"{run.root}: metrics.json, masks_detect.png, masks_navigate.png, pcc_detect.png, pcc_navigate.png")
+    console.print(f"{run.root}: claims.json, metrics.json, *.parquet, *.png")

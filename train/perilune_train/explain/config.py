@@ -15,13 +15,13 @@ class ExplainConfig(Section):
     """Random seed of nulls, intervals, controls and untrained networks."""
     n_frames: Annotated[int, Field(ge=2)] = 32
     """Number of test frames, evenly spaced through the split, for correlations."""
-    n_pairs: Annotated[int, Field(ge=8)] = 48
-    """Number of test pairs for correlations, in runs of 8 consecutive pairs."""
-    n_validation: Annotated[int, Field(ge=8)] = 16
+    n_pairs: Annotated[int, Field(ge=2)] = 48
+    """Number of test pairs for correlations, in runs of at most 8 consecutive pairs; at least one run."""
+    n_validation: Annotated[int, Field(ge=2)] = 16
     """Number of validation frames and of pairs on which signs and gates are chosen."""
     n_changed: Annotated[int, Field(ge=2)] = 16
     """Number of these test frames for interventions: gates forced, pixels removed, weights randomised."""
-    n_changed_pairs: Annotated[int, Field(ge=8)] = 24
+    n_changed_pairs: Annotated[int, Field(ge=2)] = 24
     """Number of these test pairs for interventions."""
     n_attributed: Annotated[int, Field(ge=1)] = 4
     """Number of these test frames for Grad-CAM, integrated gradients and occlusion."""

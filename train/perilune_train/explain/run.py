@@ -11,25 +11,23 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
-from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.evaluate.split_evaluation import selection_entries
 from perilune_train.detect.finished_run import config_of_run
-from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
-from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
 from perilune_train.explain import detection, navigation
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import PCC1_SIGN
 from perilune_train.explain.evidence.tables import TABLES, Evidence
 from perilune_train.explain.inputs import consecutive_pairs, first_descent, frames_of, labelled_frames
 from perilune_train.explain.maps.masks import Masks, detector_masks
+from perilune_train.explain.networks import open_single_scale, terrain_marks
 from perilune_train.explain.page import claims as page
 from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
 from perilune_train.explain.page.viewer import save_masks
 from perilune_train.navigate.network import load_navigator
 from perilune_train.training.begin import hashes_of, start_run, state_of
-from perilune_train.training.runs import RunFolder, choose_device, load_weights
+from perilune_train.training.runs import RunFolder, choose_device
 
 
 def explain_run(
@@ -62,7 +60,7 @@ def explain_run(
         return run
     stack, architecture = load_navigator(navigator, "stack")
     stack = stack.to(choose_device(settings.device))
-    marks, terrain = _check_terrain(
+    marks, terrain = terrain_marks(
         {"detector": (detector, detect_data), "navigator": (navigator, nav_data)}, allow_overlap
     )
     own = config_of_run(detector.parent.parent, ())
@@ -107,12 +105,6 @@ def explain_run(
     return run
 
 
-def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainConfig) -> Detector:
-    """Load a detector that runs at scale 1 only, since masks belong to one scale, on the device of `settings`."""
-    evaluation = config.evaluation.model_copy(update={"scales": (1.0,)})
-    return open_detector(checkpoint, config.model_copy(update={"evaluation": evaluation, "device": settings.device}))
-
-
 def _figures(found: Evidence) -> Metrics:
     """Means of all gates by measure, with their intervals where there are five units or more."""
     rows = found.summary[found.summary["kind"] == "gate"]
@@ -139,19 +131,3 @@ def _write_tables(run: RunFolder, evidence: Mapping[str, Evidence]) -> None:
     for name in TABLES:
         with written_aside(run.root / f"{name}.parquet") as aside:
             pd.concat([one[name] for one in tables], ignore_index=True).to_parquet(aside, index=False)
-
-
-def _check_terrain(networks: Mapping[str, tuple[Path, Address]], allow_overlap: bool) -> tuple[dict[str, str], Metrics]:
-    """Marks and entries of metrics.json by network, from each network's checkpoint and dataset.
-
-    Raises UserError if a network was fitted to terrain of its dataset's test frames, unless `allow_overlap`.
-    """
-    marks: dict[str, str] = {}
-    metrics: Metrics = {}
-    for part, (checkpoint, address) in networks.items():
-        dataset = open_dataset(address)
-        check = check_terrain(read_provenance(load_weights(checkpoint), checkpoint), dataset, "test", allow_overlap)
-        marks[part] = check.mark
-        figures = {"dataset/protocol": protocol_of(dataset.info), **check.metrics()}
-        metrics |= {f"{part}/{key}": value for key, value in figures.items()}
-    return marks, metrics

@@ -6,6 +6,7 @@ from typing import Any
 
 import lightning
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor, nn
 
 from perilune_train.detect.config import DetectConfig
@@ -17,6 +18,7 @@ from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.train.distill import Teacher, distill_loss
 from perilune_train.detect.train.loss import detection_loss
+from perilune_train.detect.train.preview_images import preview_images
 from perilune_train.evaluation.provenance import RECORD
 from perilune_train.models.yolo import YOLOv3
 
@@ -220,3 +222,7 @@ class DetectTask(lightning.LightningModule):
         points = curve(matches)
         _, recall, f1 = at_threshold(matches, points.best_threshold())
         self.log_dict({"val/ap50_paper": points.ap_paper(), "val/f1": f1, "val/recall": recall})
+        if isinstance(self.logger, TensorBoardLogger) and self.process[0] == 0:
+            images = preview_images(split, self.detections, points.best_threshold())
+            for name, image in images.items():
+                self.logger.experiment.add_image(f"val/{name}", image, self.global_step, dataformats="HWC")

@@ -1,22 +1,23 @@
 """Frames with and without single craters, and where these craters are."""
 
+import io
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
-from perilune_shared.labels.selection import selected
+from perilune_shared.labels.selection import read_labels, selected
 from perilune_shared.labels.thresholds import Selection
+from perilune_shared.storage.store import Address, open_store
 from perilune_train.data.frames import frame_table, load_images
 
-REMOVED = "removed.parquet"
 _LABELS = ["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px", "ellipse_theta_rad"]
 _BOX = ["bbox_x0_px", "bbox_y0_px", "bbox_x1_px", "bbox_y1_px"]
-_THRESHOLDED = ["radius_px", "visible_fraction", "sunlit_fraction", "contrast"]
+_REMOVED = ["scene_id", "crater_id", "depth_ratio"]
+_MOST_BYTES = 64 * 2**20
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,13 @@ class CraterPairs:
     crater_id, ellipse and box in pixels, radius_px, depth_ratio, sun_elevation_deg."""
 
 
-def crater_pairs(factual: Dataset, counterfactual: Dataset, split: str, selection: Selection) -> CraterPairs:
+def crater_pairs(
+    factual: Dataset, counterfactual: Dataset, removed: pd.DataFrame, split: str, selection: Selection
+) -> CraterPairs:
     """Load the frames of a counterfactual dataset and the same frames of the dataset that it was rendered from.
 
-    Only craters that `selection` accepts in the factual frame, whole in the image, are listed. Raises UserError if the
-    second dataset has no table of removed craters, or frames that the first does not have.
+    `removed` is the table of `read_removed`. Only craters that `selection` accepts in the factual frame, whole in the
+    image, are listed. Raises UserError if the second dataset has frames that the first does not have.
     """
     rows = frame_table(counterfactual, split)
     whole = frame_table(factual, split)
@@ -47,22 +50,34 @@ def crater_pairs(factual: Dataset, counterfactual: Dataset, split: str, selectio
         found = f"{len(rows)} frames, {len(known)} of them in {factual.store}"
         raise UserError(counterfactual.store, "frames", found, "frames of the dataset that it was rendered from")
     images = load_images(factual, known, split), load_images(counterfactual, rows, split)
-    return CraterPairs(*images, rows[["frame_id", "scene_id"]], _shown(factual, counterfactual, rows, selection))
+    return CraterPairs(*images, rows[["frame_id", "scene_id"]], _shown(factual, removed, rows, split, selection))
 
 
-def _shown(factual: Dataset, counterfactual: Dataset, rows: pd.DataFrame, selection: Selection) -> pd.DataFrame:
-    if not counterfactual.store.exists(REMOVED):
-        expected = "a dataset of `perilune-render counterfactual`"
-        raise UserError(counterfactual.store, REMOVED, "no such file", expected)
-    removed = pd.read_parquet(pa.BufferReader(counterfactual.store.read(REMOVED)))
-    names = list(dict.fromkeys(["frame_id", "crater_id", *_LABELS, *_BOX, *_THRESHOLDED]))
-    tables = []
-    for scene_id, own in removed.groupby("scene_id"):
-        labels = factual.table("labels", names, scene_id=str(scene_id)).to_pandas()
-        labels = labels[labels["crater_id"].isin(own["crater_id"]) & labels["frame_id"].isin(rows["frame_id"])]
-        labels = labels[np.asarray(selected(labels, selection))]
-        tables.append(labels.assign(scene_id=str(scene_id)).merge(own[["crater_id", "depth_ratio"]], on="crater_id"))
-    craters = pd.concat(tables, ignore_index=True)
+def read_removed(address: Address) -> pd.DataFrame:
+    """The table of removed craters beside a counterfactual dataset, <dataset>.removed.parquet.
+
+    Raises UserError if it is missing, is damaged or has no craters.
+    """
+    above, _, name = f"{str(address).rstrip('/')}.removed.parquet".rpartition("/")
+    store = open_store(above or ".")
+    if not store.exists(name):
+        raise UserError(store.at(name), "table", "no such file", "that of `perilune-render counterfactual`")
+    try:
+        table = pd.read_parquet(io.BytesIO(store.read(name, most_bytes=_MOST_BYTES)), columns=_REMOVED)
+    except (ValueError, OSError) as error:
+        raise UserError(store.at(name), "table", str(error).splitlines()[0], ", ".join(_REMOVED)) from None
+    if table.empty:
+        raise UserError(store.at(name), "rows", 0, "removed craters; render with --craters-per-scene above 0")
+    return table
+
+
+def _shown(
+    factual: Dataset, removed: pd.DataFrame, rows: pd.DataFrame, split: str, selection: Selection
+) -> pd.DataFrame:
+    labels = read_labels(factual, [*_LABELS, *_BOX], split)
+    labels = labels[labels["frame_id"].isin(rows["frame_id"]) & selected(labels, selection)]
+    keys = ["scene_id", "crater_id"]
+    craters = labels.merge(removed[[*keys, "depth_ratio"]], on=keys)
     camera = factual.info.camera
     inside = (craters["bbox_x0_px"] >= 0) & (craters["bbox_x1_px"] <= camera.width_px)
     inside &= (craters["bbox_y0_px"] >= 0) & (craters["bbox_y1_px"] <= camera.height_px)

@@ -1,0 +1,237 @@
+"""Content of the report: marks, masks, provenance, what is missing, hostile names, damaged files."""
+
+import base64
+import io
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from tests.helpers import in_process
+from tests.helpers.drawn_dataset import seal
+from tests.helpers.hostile import rewrite
+from tests.train.report.conftest import BLOCKS, HOSTILE
+
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.errors import UserError, run_command_line
+from perilune_train.report.detection import detection_section
+from perilune_train.report.explanation import explanation_section
+from perilune_train.report.frames import read_masks
+from perilune_train.report.ground import shaded_ground
+from perilune_train.report.navigation import navigation_section
+from perilune_train.report.page import SUMMARY, gather, json_block, write_report
+from perilune_train.report.pictures import drawing, svg_of
+from perilune_train.report.sources import read_run
+from perilune_train.report.summary import summary_of
+
+
+def data_of(page: Path) -> dict:
+    """The viewer's data of a page."""
+    return json.loads(re.search(r'<script type="application/json"[^>]*>(.*?)</script>', page.read_text(), re.S)[1])
+
+
+def image_of(uri: str) -> Image.Image:
+    return Image.open(io.BytesIO(base64.b64decode(uri.partition(",")[2])))
+
+
+def test_the_viewer_has_the_frames_labels_and_detections_of_the_dataset(page, report_data):
+    dataset = open_dataset(str(report_data / "detect"))
+    frames = data_of(page)["frames"]
+    assert [frame["name"] for frame in frames] == [f"s004/t004/{k:06d}" for k in range(4)]
+    for frame in frames:
+        true = dataset[frame["name"]]
+        np.testing.assert_array_equal(np.asarray(image_of(frame["image"])), true.image)
+        rows = true.labels
+        assert len(frame["labels"]) == len(rows)
+        expected = rows[["ellipse_cx_px", "ellipse_cy_px", "ellipse_a_px", "ellipse_b_px"]].to_numpy()
+        np.testing.assert_allclose([mark[1:5] for mark in frame["labels"]], expected, atol=0.006)
+        degrees = np.degrees(rows["ellipse_theta_rad"].to_numpy())
+        np.testing.assert_allclose([mark[5] for mark in frame["labels"]], degrees, atol=0.006)
+        # The one false detection of each frame is a box of 40 x 10 px.
+        wide = [mark for mark in frame["detections"] if mark[3:5] == [40, 10]]
+        assert [mark[1:3] for mark in wide] == [[1, 2]] and wide[0][0] in ("false", "unjudged")
+    kinds = {mark[0] for frame in frames for mark in frame["labels"]}
+    # Every fourth crater is eroded, so that it is not evaluated; every second label is found.
+    assert kinds == {"found", "missed", "ignored"}
+    matched = sum(mark[0] == "matched" for frame in frames for mark in frame["detections"])
+    assert matched == sum(mark[0] == "found" for frame in frames for mark in frame["labels"]) > 5
+
+
+def test_masks_are_drawn_from_dark_to_bright(page):
+    masks = data_of(page)["masks"]
+    assert [mask["block"] for mask in masks] == list(BLOCKS)
+    picture = image_of(masks[0]["images"][0])
+    assert picture.size == (48, 48) and (masks[0]["low"], masks[0]["high"]) == (0, 2)
+    colours = np.asarray(picture.convert("RGB"))
+    assert colours[0, 0].tolist() == [0, 34, 78]  # the ends of cividis
+    assert colours[0, -1].tolist() == [254, 232, 56]
+
+
+def test_each_figure_states_its_source(report, page):
+    assert all(figure.sources for section in report.sections for figure in section.figures)
+    text = page.read_text()
+    n_figures = len(re.findall(r"<figcaption>", text))
+    assert n_figures > 12
+    assert len(re.findall(r'<figcaption>(?:(?!</figcaption>).)*class="source"', text, re.S)) == n_figures
+    assert f"dataset {'ab' * 6}" in text and "ab" * 32 in text
+
+
+def test_missing_parts_are_named_and_left_out(report_data, report_runs, page, tmp_path):
+    assert "methods demo-methods" in page.read_text()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "detect").symlink_to(report_data / "detect")
+    out = write_report("demo", "other", tmp_path / "data", report_runs, tmp_path / "out")
+    text = out.read_text()
+    assert "detect run other: no finished run" in text and "dataset nav" in text
+    assert "Crater detection" not in text and "Dataset for detection" in text
+    assert {mark[0] for frame in data_of(out)["frames"] for mark in frame["labels"]} == {"found", "ignored"}
+
+
+def test_the_summary_has_the_figures(report):
+    text = summary_of(report)
+    assert "- demo: AP 0.750, precision 0.750, recall 0.750, F1 0.750" in text
+    assert "| stack | 2.000 |" in text
+    assert "| gates see craters | 0.3 | - | - | holds | pcc\\_detect.png |" in text.replace("craters  |", "craters |")
+
+
+def test_hostile_names_stay_texts(hostile_page):
+    text = hostile_page.read_text()
+    assert "window.hacked" in text
+    assert not re.search(r"<script>window|<img src=x", text)
+    assert "\u2028" not in re.search(r"<script type=.application/json.*?</script>", text, re.S)[0]
+    assert data_of(hostile_page)["frames"][0]["name"].startswith(HOSTILE)
+    # In the recipe, the configuration, claims, captions, methods, names and title.
+    assert text.count("window.hacked") > 20
+    assert "<script" not in (hostile_page.parent / SUMMARY).read_text().replace("\\<", "")
+
+
+def test_json_cannot_end_its_element():
+    content = {"a": "</script><!--", "b": "\u2028\u2029&"}
+    text = json_block(content)
+    assert not set("<>&\u2028\u2029") & set(text) and json.loads(text) == content
+
+
+def test_svg_has_no_styles_and_the_colour_of_the_text():
+    with drawing() as figure:
+        figure.subplots().plot([0, 1], [0, 1], label="<b>$x$", linestyle="--")
+        figure.legend()
+        made = svg_of(figure, 'a "quote"'), svg_of(figure, "second")
+    assert "style=" not in made[0] and "<style" not in made[0] and "<b>" not in made[0]
+    assert "currentColor" in made[0] and "stroke-dasharray" in made[0] and "font-size" in made[0]
+    ids = [set(re.findall(r'id="([^"]+)"', one)) for one in made]
+    assert ids[0] and not ids[0] & ids[1]
+    for one, own in zip(made, ids, strict=True):
+        assert set(re.findall(r"url\(#([^)]+)\)", one)) | set(re.findall(r'href="#([^"]+)"', one)) <= own
+
+
+def test_the_side_of_a_bowl_that_faces_the_sun_is_bright():
+    crater = pd.DataFrame({"x_m": [0.0], "y_m": [0.0], "diameter_m": [100.0], "depth_m": [10.0]})
+    east = np.array([np.cos(np.radians(30)), 0, np.sin(np.radians(30))])
+    image = shaded_ground(crater, east, 100.0, 100).astype(int)
+    # The Sun is at positive x: the wall at negative x faces it. Slope of the parabola at half the radius: 0.2.
+    flat = round(255 * 0.6)
+    assert image[2, 2] == pytest.approx(flat, abs=2)
+    lit = 255 * 0.6 * (east[2] + 0.2 * east[0]) / np.hypot(1, 0.2) / east[2]
+    assert image[50, 37] == pytest.approx(lit, abs=4)
+    assert image[50, 62] < flat - 30
+
+
+@pytest.mark.parametrize(
+    ("damage", "field"),
+    [
+        (lambda c: c.pop("low"), "low"),
+        (lambda c: c.update(low=np.zeros(5, np.float32)), "low"),
+        (lambda c: c.update(B_11=np.zeros((4, 8, 8))), "B_11"),
+        (lambda c: c.update(B_11=np.zeros((3, 8, 8), np.uint8)), "B_11"),
+        (lambda c: c.update(frame_ids=np.array([{}], object)), "masks"),
+        (lambda c: c.update(frame_ids=np.array([], str)), "frame_ids"),
+    ],
+)
+def test_damaged_masks_are_refused(report_runs, tmp_path, damage, field):
+    with np.load(report_runs / "explain/demo/masks_detect.npz") as file:
+        content = dict(file)
+    damage(content)
+    np.savez(tmp_path / "masks.npz", **content)
+    with pytest.raises(UserError) as raised:
+        read_masks(tmp_path / "masks.npz")
+    assert raised.value.field == field
+
+
+def _explain(runs: Path) -> object:
+    run = read_run(runs / "explain/demo", runs)
+    assert run is not None
+    return explanation_section(run, "key", "title")
+
+
+def _detect(runs: Path) -> object:
+    run = read_run(runs / "detect/demo", runs)
+    assert run is not None
+    return detection_section([run], None)
+
+
+def _navigate(runs: Path) -> object:
+    run = read_run(runs / "navigate/demo-stack", runs)
+    assert run is not None
+    return navigation_section([run], None)
+
+
+@pytest.mark.parametrize(
+    ("read", "name", "content"),
+    [
+        (_explain, "explain/demo/claims.json", "{"),
+        (_explain, "explain/demo/claims.json", '["a"]'),
+        (_explain, "explain/demo/captions.json", "[]"),
+        (_explain, "explain/demo/pcc_detect.png", "no picture"),
+        (_detect, "detect/demo/precision_recall.parquet", "no table"),
+        (_detect, "detect/demo/inputs.json", "[]"),
+        (_detect, "detect/demo/metrics.json", "["),
+        (_navigate, "navigate/demo-stack/errors.parquet", "no table"),
+    ],
+)
+def test_a_damaged_file_is_named_in_one_line(report_runs, tmp_path, read, name, content):
+    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    (runs / name).write_text(content)
+    with pytest.raises(UserError, match=Path(name).name) as raised:
+        read(runs)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_damaged_file_leaves_no_report(report_data, report_runs, tmp_path):
+    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    (runs / "detect/demo/detections.parquet").write_text("no table")
+    with pytest.raises(UserError, match=r"detections\.parquet"):
+        write_report("demo", "demo", report_data, runs, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command(report_data, report_runs, tmp_path):
+    import typer
+
+    from perilune_train.report.command import report
+
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(report)
+
+    def call(*arguments: object):
+        return in_process.call(lambda: run_command_line(app), *arguments)
+
+    given = ["--dataset", report_data, "--runs", report_runs, "--out", tmp_path / "out"]
+    done = call("--name", "demo", *given)
+    assert done.returncode == 0 and (tmp_path / "out/report.html").is_file(), done.stderr
+    done = call("--name", "../demo", *given)
+    assert done.returncode == 2 and "--name" in done.stderr and done.stderr.count("\n") == 1
+    nothing = tmp_path / "nothing"
+    done = call("--kind", "paper", "--dataset", nothing, "--runs", nothing, "--out", tmp_path / "none")
+    assert done.returncode == 2 and "no dataset" in done.stderr and not (tmp_path / "none").exists()
+
+
+def test_hostile_names_of_frames_are_refused(report_data, report_runs, tmp_path):
+    data = Path(shutil.copytree(report_data, tmp_path / "data"))
+    rewrite(data / "detect", "frames", lambda rows: [row.update(frame_id=f"{HOSTILE}/t/000000") for row in rows])
+    seal(data / "detect")
+    with pytest.raises(UserError, match="frame_id"):
+        gather("demo", "demo", data, report_runs)

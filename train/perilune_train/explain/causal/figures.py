@@ -1,0 +1,131 @@
+"""Tables and pictures of the effects of removed craters."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from perilune_train.evaluation.pictures import save_figure, save_image
+from perilune_train.evaluation.spread import draw_resamples, spreads
+from perilune_train.explain.causal.effects import region
+from perilune_train.explain.causal.pairs import CraterPairs
+from perilune_train.explain.page.bars import BLUE, GREY, ORANGE
+
+VERSIONS = {"rendered": ("crater removed, rendered again", BLUE), "inpainted": ("crater inpainted", ORANGE)} | {
+    "placebo": ("empty ground inpainted", GREY)
+}
+BINS = {
+    "radius_px": ("radius, px", (0, 3, 5, 10, 80)),
+    "depth_ratio": ("depth / diameter", (0, 0.05, 0.1, 0.15, 1)),
+    "sun_elevation_deg": ("Sun, degrees", (0, 20, 35, 50, 90)),
+}
+"""Label and edges of the bins of each property of a crater."""
+_CELL_PX = 256
+
+
+def by_gate(effects: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
+    """Mean change of every gate and version, with a 95 % interval over scenes: map, version, change, low, high, n.
+
+    `effects` is the table of `mask_effects`. low and high are NaN with fewer than five scenes. n is the number of
+    crater views.
+    """
+    rows = []
+    for (block, version), own in effects.dropna(subset="change").groupby(["map", "version"], sort=False):
+        values, scenes = own["change"].to_numpy(), own["scene_id"].tolist()
+        resamples = draw_resamples(scenes, [""] * len(scenes), own["frame_id"].tolist(), rng)
+        every = np.arange(len(values))
+
+        def mean(drawn, every=every, values=values):
+            return {"mean": drawn.totals(every, values) / np.maximum(drawn.totals(every), 1)}
+
+        interval = spreads(mean, every, resamples)["mean"].interval if resamples.unit == "scene" else None
+        low, high = interval or (np.nan, np.nan)
+        rows.append(
+            {"map": block, "version": version, "change": values.mean(), "low": low, "high": high, "n": len(own)}
+        )
+    return pd.DataFrame(rows)
+
+
+def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
+    """Means of a column by bins of radius, freshness and Sun: property, bin, version, value, n, and map if present."""
+    parts, keys = [], [name for name in ("map", "version") if name in table]
+    for name, (label, edges) in BINS.items():
+        bins = pd.cut(table[name], edges).astype(str)
+        grouped = table.assign(bin=bins).dropna(subset=value).groupby([*keys, "bin"], sort=False)[value]
+        means = grouped.agg(["mean", "size"]).reset_index()
+        parts.append(means.rename(columns={"mean": "value", "size": "n"}).assign(property=label))
+    return pd.concat(parts, ignore_index=True)
+
+
+def draw_gate_effects(path: Path, gates: pd.DataFrame) -> None:
+    """Draw the mean change of every gate in each version, with intervals where there are any."""
+    blocks = list(dict.fromkeys(gates["map"]))
+    figure = Figure(figsize=(12, 3.8), layout="constrained")
+    axis = figure.subplots()
+    for k, (version, (label, colour)) in enumerate(VERSIONS.items()):
+        own = gates[gates["version"] == version].set_index("map").reindex(blocks)
+        place = np.arange(len(blocks)) + 0.27 * k
+        axis.bar(place, own["change"], 0.26, color=colour, label=label)
+        errors = np.abs(np.vstack([own["change"] - own["low"], own["high"] - own["change"]]))
+        if np.isfinite(errors).any():
+            axis.errorbar(place, own["change"], errors, fmt="none", ecolor="black", capsize=1.5, linewidth=0.8)
+    axis.set_xticks(np.arange(len(blocks)) + 0.27, blocks, rotation=60)
+    axis.axhline(0, color="black", linewidth=0.8)
+    axis.set_ylabel("mask with crater - without,\nstandard deviations of the gate", fontsize=9)
+    axis.legend(fontsize=8)
+    axis.grid(axis="y", alpha=0.3)
+    save_figure(path, figure)
+
+
+def draw_bins(path: Path, table: pd.DataFrame, label: str) -> None:
+    """Draw the means of `binned` as bars, one panel for each property; the number of crater views is below each bin."""
+    figure = Figure(figsize=(12, 3.6), layout="constrained")
+    for axis, (title, edges) in zip(figure.subplots(1, len(BINS), sharey=True), BINS.values(), strict=True):
+        names = [str(one) for one in pd.cut(pd.Series([], dtype=float), edges).cat.categories]
+        own = table[table["property"] == title]
+        versions = list(dict.fromkeys(own["version"]))
+        for k, version in enumerate(versions):
+            rows = own[own["version"] == version].set_index("bin").reindex(names)
+            name, colour = VERSIONS.get(version, ("with the crater", "black"))
+            axis.bar(np.arange(len(names)) + 0.2 * k, rows["value"], 0.19, color=colour, label=name)
+        counts = own.groupby("bin")["n"].max().reindex(names).fillna(0).astype(int)
+        ticks = [f"{one}\nn = {n}" for one, n in zip(names, counts, strict=True)]
+        axis.set_xticks(np.arange(len(names)) + 0.2, ticks, fontsize=8)
+        axis.axhline(0, color="black", linewidth=0.8)
+        axis.set_xlabel(title)
+    figure.axes[0].set_ylabel(label, fontsize=9)
+    handles, names = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, ncols=4, loc="outside upper center", fontsize=8)
+    save_figure(path, figure)
+
+
+def draw_pair(path: Path, pairs: CraterPairs, masks: dict[str, NDArray[np.floating]], image: int, gate: str) -> None:
+    """Draw a PNG: a frame with its removed craters outlined, the frame without them, and one gate's masks of both.
+
+    `masks` are one gate's masks (N, height, width) of the versions "factual" and "rendered".
+    """
+    own = pairs.craters[pairs.craters["image"] == image]
+    frames = [cv2.cvtColor(one[image], cv2.COLOR_GRAY2BGR) for one in (pairs.factual, pairs.counterfactual)]
+    low, high = (float(getattr(masks["factual"][image], end)()) for end in ("min", "max"))
+    for version in ("factual", "rendered"):
+        level = np.clip(255 * (masks[version][image] - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
+        frames.append(cv2.applyColorMap(level, cv2.COLORMAP_CIVIDIS))
+    cells = []
+    for cell, text in zip(
+        frames, ("before", "without outlined craters", f"{gate} before", f"{gate} without"), strict=True
+    ):
+        picture = np.asarray(cell, np.uint8).copy()
+        for _, crater in own.iterrows():
+            outline, _ = cv2.findContours(
+                region(picture.shape[:2], crater).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+            )
+            cv2.drawContours(picture, outline, -1, (0, 159, 230), 1)
+        picture = cv2.resize(picture, (_CELL_PX, _CELL_PX), interpolation=cv2.INTER_NEAREST)
+        picture = cv2.copyMakeBorder(picture, 2, 20, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+        where = 4, picture.shape[0] - 5
+        cv2.putText(picture, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+        cells.append(picture)
+    save_image(path, np.hstack(cells))

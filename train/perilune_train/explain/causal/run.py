@@ -1,0 +1,218 @@
+"""One causal run: what single craters do to masks, detections and poses, from frames rendered without them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import write_text, written_aside
+from perilune_shared.storage.store import Address
+from perilune_shared.terminal import console
+from perilune_train.detect.data.split import load_split
+from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.inference.detector import Detector
+from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.metrics_file import Metrics, write_metrics
+from perilune_train.explain.causal import figures
+from perilune_train.explain.causal.effects import detection_effects, filled_frames, mask_effects
+from perilune_train.explain.causal.pairs import CraterPairs, crater_pairs, read_removed
+from perilune_train.explain.causal.pose import pose_effects
+from perilune_train.explain.config import ExplainConfig
+from perilune_train.explain.evidence.stability import between
+from perilune_train.explain.inputs import frames_of
+from perilune_train.explain.maps.masks import detector_masks
+from perilune_train.explain.networks import open_single_scale, terrain_marks
+from perilune_train.navigate.network import load_navigator
+from perilune_train.training.begin import hashes_of, start_run, state_of
+from perilune_train.training.runs import RunFolder, choose_device
+
+CAPTIONS = {
+    "gates_causal.png": "Change of each gate's mask around single craters: crater removed from the ground and rendered"
+    " again; the same pixels inpainted; empty ground inpainted.",
+    "detections_causal.png": "Share of craters that the detector finds at its threshold, with and without the crater.",
+    "gate_causal.png": "Change of the headline's gate by size, freshness and Sun.",
+    "before_after_causal.png": "A frame with craters, the same frame rendered without the outlined ones, and one"
+    " gate's mask of both.",
+}
+_BATCH = 8
+
+
+def causal_run(
+    settings: ExplainConfig,
+    dataset: Address,
+    counterfactual: Address,
+    checkpoint: Path,
+    gate: str,
+    runs: Path,
+    name: str,
+    split: str = "test",
+    turned: Address | None = None,
+    pose: tuple[Address, Address, Path] | None = None,
+    overwrite: bool = False,
+    allow_overlap: bool = False,
+) -> RunFolder:
+    """Measure what removed craters change in masks, detections and poses; writes runs/explain/<name>-causal.
+
+    `gate` is the gate of the headline, chosen elsewhere. `counterfactual` is a dataset of
+    `perilune-render counterfactual`, rendered from `dataset`; `turned` another one, with all craters and another Sun;
+    `pose` a navigation dataset, its counterfactual and a stack navigator's best.ckpt. Leaves a finished run of the same
+    inputs unchanged; `overwrite` replaces any.
+
+    Raises UserError if the existing run has other settings or inputs; if an input is missing or invalid; or if the
+    network was fitted to terrain of the frames (unless `allow_overlap`).
+    """
+    run = RunFolder(runs / "explain" / f"{name}-causal")
+    inputs = hashes_of(
+        {
+            "detection dataset": dataset,
+            "counterfactual": counterfactual,
+            "turned Sun": turned,
+            "detector": checkpoint,
+            **dict(zip(("navigation dataset", "navigation counterfactual", "navigator"), pose or (), strict=False)),
+        }
+    )
+    state = state_of(run, "explain", settings, inputs, overwrite)
+    if state == "finished":
+        return run
+    folder = checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
+    config, threshold = config_of_run(folder, ()), chosen_threshold(folder)
+    removed, opened = read_removed(counterfactual), open_dataset(dataset)
+    marks, terrain = terrain_marks({"detector": (checkpoint, dataset)}, allow_overlap, split)
+    detector = open_single_scale(checkpoint, config, settings)
+    if gate not in detector.network.backbone.attentions:
+        raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
+    pairs = crater_pairs(opened, open_dataset(counterfactual), removed, split, config.labels)
+    start_run(run, "explain", settings, inputs, state)
+    rng = np.random.default_rng([settings.seed, 3])
+    versions, shifts = _versions(opened, pairs, split, config.labels, settings, rng)
+    console.print(f"{len(pairs.craters)} views of {len(removed)} removed craters in {len(pairs.factual)} frames")
+    masks = {version: detector_masks(detector.network, images, checkpoint) for version, images in versions.items()}
+    moved = mask_effects(pairs, masks, shifts)
+    found = detection_effects(pairs, lambda images: _detect(detector, images), versions)
+    found = found.assign(found=(found["score"] >= threshold).astype(float))
+    gates = figures.by_gate(moved, rng)
+    tables = {"mask_effects": moved, "detection_effects": found, "gate_effects": gates}
+    tables |= {"mask_bins": figures.binned(moved, "change"), "detection_bins": figures.binned(found, "found")}
+    if turned is not None:
+        tables["turned_sun"] = _turned(detector, opened, open_dataset(turned), split, checkpoint)
+    if pose is not None:
+        navigator, architecture = load_navigator(pose[2], "stack")
+        navigator = navigator.to(choose_device(settings.device))
+        tables["pose_effects"] = pose_effects(
+            navigator, architecture, open_dataset(pose[0]), open_dataset(pose[1]), split
+        )
+    for title, table in tables.items():
+        with written_aside(run.root / f"{title}.parquet") as aside:
+            table.to_parquet(aside, index=False)
+    _draw(run.root, pairs, masks, tables, gate)
+    mark_files(run.root, list(CAPTIONS), marks["detector"])
+    metrics = _metrics(tables, gate) | terrain
+    claims = _claims(metrics, gates, gate)
+    write_text(run.root / "claims.json", json.dumps(claims, indent=2) + "\n")
+    write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
+    for claim in claims:
+        console.print(f"{claim['claim']}: {claim['figure']}: {claim['verdict']}", markup=False, soft_wrap=True)
+    write_metrics(run.root, metrics | {"split": split, "threshold": threshold, "detector": checkpoint.as_posix()})
+    return run
+
+
+def _versions(
+    dataset: Dataset, pairs: CraterPairs, split: str, labels, settings: ExplainConfig, rng: np.random.Generator
+) -> tuple[dict[str, NDArray[np.uint8]], list[tuple[float, float] | None]]:
+    """All versions of the frames by name, and the shifts of the placebo regions."""
+    whole = load_split(dataset, split, labels)
+    place = {frame_id: index for index, frame_id in enumerate(whole.frames.table["frame_id"])}
+    frames = frames_of(whole, [place[one] for one in pairs.frames["frame_id"]], settings.ring_factors)
+    inpainted, placebo, shifts = filled_frames(pairs, frames.truth < 1, rng)
+    names = ("factual", "rendered", "inpainted", "placebo")
+    return dict(zip(names, (pairs.factual, pairs.counterfactual, inpainted, placebo), strict=True)), shifts
+
+
+def _detect(detector: Detector, images: NDArray[np.uint8]) -> list[Detections]:
+    found = []
+    for start in range(0, len(images), _BATCH):
+        boxes, scores = detector.predict(images[start : start + _BATCH])
+        found += detections_of(boxes, scores, detector.config.evaluation)
+    return found
+
+
+def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, checkpoint: Path) -> pd.DataFrame:
+    """Similarity of the masks of the same poses under both Suns: map, change, frame_index, pearson."""
+    labels = detector.config.labels
+    one, other = (load_split(dataset, split, labels).frames for dataset in (factual, turned))
+    place = {frame_id: index for index, frame_id in enumerate(one.table["frame_id"])}
+    same = one.images[[place[frame_id] for frame_id in other.table["frame_id"]]]
+    masks = [detector_masks(detector.network, images, checkpoint) for images in (same, other.images)]
+    return between(masks[0], masks[1], "turned Sun")
+
+
+def _draw(folder: Path, pairs: CraterPairs, masks: dict, tables: dict[str, pd.DataFrame], gate: str) -> None:
+    figures.draw_gate_effects(folder / "gates_causal.png", tables["gate_effects"])
+    figures.draw_bins(folder / "detections_causal.png", tables["detection_bins"], "share of craters that are found")
+    own = tables["mask_bins"][tables["mask_bins"]["map"] == gate]
+    label = f"change of {gate},\nstandard deviations of the gate"
+    figures.draw_bins(folder / "gate_causal.png", own, label)
+    image = int(np.bincount(pairs.craters["image"].to_numpy()).argmax())
+    both = {version: masks[version][gate] for version in ("factual", "rendered")}
+    figures.draw_pair(folder / "before_after_causal.png", pairs, both, image, gate)
+
+
+def _metrics(tables: dict[str, pd.DataFrame], gate: str) -> Metrics:
+    metrics: Metrics = {"gate": gate, "crater_views": int(tables["mask_effects"]["crater"].nunique())}
+    for row in tables["gate_effects"].to_dict("records"):
+        metrics[f"{row['version']}/{row['map']}"] = float(row["change"])
+        if np.isfinite(row["low"]):
+            metrics[f"{row['version']}/{row['map']}_low"] = float(row["low"])
+            metrics[f"{row['version']}/{row['map']}_high"] = float(row["high"])
+    for version, share in tables["detection_effects"].groupby("version", sort=False)["found"].mean().items():
+        metrics[f"found/{version}"] = float(share)
+    if "pose_effects" in tables:
+        pose = tables["pose_effects"]
+        metrics |= {f"pose/{name}": float(np.sqrt((pose[name] ** 2).mean())) for name in ("before", "after", "moved_m")}
+    if "turned_sun" in tables:
+        means = tables["turned_sun"].groupby("map", sort=False)["pearson"].mean()
+        metrics |= {f"turned_sun/{block}": float(value) for block, value in means.items()}
+    return metrics
+
+
+def _claims(metrics: Metrics, gates: pd.DataFrame, gate: str) -> list[dict[str, str]]:
+    own = gates[gates["map"] == gate].set_index("version")
+    rendered, placebo = own.loc["rendered"], own.loc["placebo"] if "placebo" in own.index else None
+    known = bool(np.isfinite(rendered["low"]))
+    outside = known and (rendered["low"] > 0 or rendered["high"] < 0)
+    nulls = (
+        "-" if placebo is None else f"placebo {placebo['change']:.2f} ({placebo['low']:.2f} to {placebo['high']:.2f})"
+    )
+    beyond = placebo is None or abs(rendered["change"]) > abs(placebo["change"])
+    verdict = "undecided: fewer than 5 scenes" if not known else "holds" if outside and beyond else "does not hold"
+    found = {version: metrics.get(f"found/{version}") for version in ("factual", "rendered", "inpainted", "placebo")}
+    claims = [
+        {
+            "claim": f"{gate}, reacts to the crater and not only to its pixels (standard deviations of the gate)",
+            "figure": f"{rendered['change']:.2f}",
+            "interval": f"{rendered['low']:.2f} to {rendered['high']:.2f}" if known else "none: fewer than 5 scenes",
+            "nulls": nulls,
+            "verdict": verdict,
+            "picture": "gates_causal.png",
+        },
+        {
+            "claim": "The detector finds a crater because of the crater: found with it, not without it",
+            "figure": f"{found['factual']:.2f} with, {found['rendered']:.2f} without",
+            "interval": "by scene in detection_effects.parquet",
+            "nulls": f"inpainted {found['inpainted']:.2f}, other ground inpainted {found['placebo']:.2f}",
+            "verdict": "holds" if _below(found["rendered"], found["factual"]) else "does not hold",
+            "picture": "detections_causal.png",
+        },
+    ]
+    return claims
+
+
+def _below(share: object, other: object) -> bool:
+    """Whether a share is less than a tenth of another."""
+    return isinstance(share, float) and isinstance(other, float) and share < 0.1 * other

@@ -1,0 +1,44 @@
+"""`perilune-train report`."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import is_plain
+from perilune_shared.terminal import console
+
+
+def report(
+    kind: Annotated[
+        Literal["demo", "paper", "benchmark"],
+        typer.Option(help="What to show: a demo, the paper's experiment, a score."),
+    ] = "demo",
+    name: Annotated[
+        str | None, typer.Option(help="Name of the runs and of the report. [default: small, paper or benchmark]")
+    ] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="Folder that holds the datasets. [default: data/<name>; data/benchmark]")
+    ] = None,
+    runs: Annotated[
+        Path | None, typer.Option(help="Folder that holds all runs. [default: runs; runs/<name> for paper]")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the report. [default: runs/report/<name>]")] = None,
+) -> None:
+    """Write the report of a demo, a paper run or a benchmark: one HTML file, and a summary in Markdown.
+
+    report.html needs no server and no network. It shows datasets, detection, navigation, explanation and the source of
+    each figure, and a viewer of one descent. What does not exist is left out and named.
+    """
+    # matplotlib and pandas take seconds to load.
+    from perilune_train.report.page import SUMMARY, write_report
+
+    chosen = name or {"demo": "small", "paper": "paper", "benchmark": "benchmark"}[kind]
+    if not is_plain(chosen) or "/" in chosen:
+        raise UserError("command line", "--name", chosen, "a plain name, without folders")
+    data = dataset or Path("data") / ("benchmark" if kind == "benchmark" else chosen)
+    root = runs or (Path("runs") / chosen if kind == "paper" else Path("runs"))
+    page = write_report(kind, chosen, data, root, out or Path("runs/report") / chosen)
+    megabytes = page.stat().st_size / 1e6
+    console.print(f"{page}: {megabytes:.1f} MB, open it in a browser; {SUMMARY} has the tables", soft_wrap=True)

@@ -1,0 +1,169 @@
+"""The content of a report: sections of figures, tables and labelled frames. Plain data, without HTML of its own."""
+
+from dataclasses import dataclass, field
+
+from markupsafe import Markup
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a figure was made from."""
+
+    source: str
+    """Folder of the run below the folder of all runs, or name of the dataset."""
+    settings_sha256: str = ""
+    """SHA-256 of config.yaml, or of the dataset's recipes; empty if there is none."""
+    inputs: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of the inputs by name: datasets (of dataset.json) and checkpoints."""
+    commit: str = ""
+    """Commit of the code; empty if not recorded."""
+    date: str = ""
+    """Start date, UTC; empty if not recorded."""
+    command: str = ""
+    """Command line; empty if not recorded."""
+    hardware: str = ""
+    """Processor and memory; empty if not recorded."""
+    seed: str = ""
+    """Random seed; empty if there is none."""
+    versions: str = ""
+    """Versions of packages; empty if not recorded."""
+    settings: str = ""
+    """Content of config.yaml, or the dataset's recipes."""
+
+    @property
+    def line(self) -> str:
+        """One line below a figure: source, short hashes, commit and date."""
+        parts = [self.source]
+        if self.settings_sha256:
+            parts.append(f"configuration {self.settings_sha256[:12]}")
+        parts += [f"{name} {sha256[:12]}" for name, sha256 in self.inputs.items()]
+        if self.commit:
+            commit, _, modified = self.commit.partition(" ")
+            parts.append(f"commit {commit[:12]} {modified}".rstrip())
+        return " · ".join([*parts, *([self.date] if self.date else [])])
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture with its caption."""
+
+    html: Markup
+    """An inline SVG or an image as a data URI, from pictures.py."""
+    caption: str
+    """What is drawn, with units."""
+    sources: tuple[Provenance, ...]
+    """What it was made from."""
+    wide: bool = False
+    """Whether it takes the whole width of the page."""
+    key: str = ""
+    """Anchor in the page; empty for none."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of texts and links."""
+
+    caption: str
+    """What the rows are."""
+    head: tuple[str, ...]
+    """Titles of the columns."""
+    rows: tuple[tuple[str, ...], ...]
+    """Cells, row by row; Markup for a link."""
+    sources: tuple[Provenance, ...]
+    """What it was made from."""
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A crater or a detection on a frame: an ellipse, or a box with two axes along the image's."""
+
+    kind: str
+    """found, missed or ignored (labels); matched, false or unjudged (detections)."""
+    shape: tuple[float, float, float, float, float]
+    """Ellipse: centre x and y, semi-axes, pixels, direction, degrees. Box: x0, y0, width, height, pixels, score."""
+
+
+@dataclass(frozen=True)
+class FramePicture:
+    """A frame with its labels and detections."""
+
+    name: str
+    """frame_id."""
+    image: str
+    """The frame as a data URI."""
+    width_px: int
+    """Width of the frame, in whose pixels the marks are."""
+    height_px: int
+    """Height of the frame."""
+    about: str
+    """Altitude, Sun and counts."""
+    labels: tuple[Mark, ...]
+    """Ellipses."""
+    detections: tuple[Mark, ...] = ()
+    """Boxes."""
+    sources: tuple[Provenance, ...] = ()
+    """What it was made from."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the report."""
+
+    key: str
+    """Its anchor in the page."""
+    title: str
+    """Its heading."""
+    lead: tuple[str, ...] = ()
+    """First lines: the answer, then how it was obtained."""
+    tables: tuple[Table, ...] = ()
+    """Tables, before the figures."""
+    figures: tuple[Figure, ...] = ()
+    """Figures, in order."""
+    frames: tuple[FramePicture, ...] = ()
+    """Labelled frames, after the figures."""
+
+
+@dataclass(frozen=True)
+class MaskStack:
+    """Attention masks of one gate over the frames of the viewer."""
+
+    block: str
+    """Name of the gate, such as B_11."""
+    low: float
+    """Attention drawn darkest."""
+    high: float
+    """Attention drawn brightest."""
+    images: tuple[str, ...]
+    """One data URI for each frame, empty where there is none."""
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """One descent to look through."""
+
+    trajectory: str
+    """scene_id/trajectory_id."""
+    frames: tuple[FramePicture, ...]
+    """Frames from high to low."""
+    masks: tuple[MaskStack, ...]
+    """Gates; empty if there is no explain run."""
+    sources: tuple[Provenance, ...]
+    """What frames, detections and masks were made from."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """All parts of a report."""
+
+    title: str
+    """Heading of the page."""
+    summary: tuple[str, ...]
+    """Headline figures, one line each."""
+    sections: tuple[Section, ...]
+    """In the order of the page."""
+    viewer: Viewer | None
+    """None without a detection dataset with frames."""
+    provenance: tuple[Provenance, ...]
+    """All sources, each once."""
+    missing: tuple[str, ...]
+    """Parts that do not exist, and were left out."""

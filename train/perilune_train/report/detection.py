@@ -1,0 +1,192 @@
+"""The section of crater detection: figures, curves, bins, best and worst frames."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from perilune_shared.errors import UserError
+from perilune_train.evaluation.spread import MIN_UNITS, read_spread
+from perilune_train.report.content import Figure, FramePicture, Section, Table
+from perilune_train.report.frames import LabelledFrames
+from perilune_train.report.pictures import COLOURS, DASHES, drawing, label_axes, picture_of, plain, svg_of
+from perilune_train.report.sources import Run, sources_of
+
+_ROWS = {
+    "ap50_paper": "AP",
+    "edge/ap50_paper": "AP, edge account",
+    "strict/ap50_paper": "AP, strict account",
+    "precision": "precision",
+    "recall": "recall",
+    "f1": "F1",
+}
+_BIN = re.compile(r"(.*?)(radius|altitude|sun)_([0-9.e+]+)_([0-9.e+]+|inf)(?:_(\w+))?/ap50_paper")
+_PANELS = {"radius": "radius (px)", "altitude": "altitude (m)", "sun": "Sun elevation (degrees)"}
+_EXTREMES = 2
+_HATCHES = ("", "///", "...", "xxx")
+_CURVE = "precision_recall.parquet"
+_COLUMNS = ("score", "precision", "recall")
+
+
+def detection_section(runs: Sequence[Run], frames: LabelledFrames | None) -> Section:
+    """Show the runs of detection; `frames` are the test frames with the detections of the last one."""
+    pictures = () if frames is None else tuple(extremes(frames))
+    return _section(runs, "test/", "detection", "Crater detection", pictures)
+
+
+def scores_section(scores: Sequence[Run]) -> Section:
+    """Show scores of detectors on the locked benchmark."""
+    section = _section(scores, "visible/", "benchmark-detection", "Detection on the locked benchmark", ())
+    pictures = [
+        Figure(picture_of(path, caption), caption, (score.provenance,), wide=True)
+        for score in scores
+        for path in sorted((score.folder / "visible").glob("detections.png"))
+        for caption in [f"{score.name}: best, typical and worst frames of the benchmark."]
+    ]
+    return Section(
+        section.key, section.title, section.lead, section.tables, (*section.figures, *pictures), section.frames
+    )
+
+
+def headline(run: Run, prefix: str = "test/") -> str:
+    """AP, precision, recall and F1 of a run in one line."""
+    texts = [f"{title} {_value(run, prefix + key)}" for key, title in list(_ROWS.items())[:1] + list(_ROWS.items())[3:]]
+    return f"{run.name}: {', '.join(texts)}"
+
+
+def extremes(frames: LabelledFrames) -> list[FramePicture]:
+    """The two frames of highest and the two of lowest F1, each two of different trajectories where possible."""
+    f1 = frames.f1()
+    order = [int(place) for place in np.argsort(f1, kind="stable") if np.isfinite(f1[place])]
+    table = frames.split.frames.table
+    chosen: list[tuple[str, int]] = []
+    for word, ranked in (("best", order[::-1]), ("worst", order)):
+        own: list[int] = []
+        for others_too in (False, True):
+            for place in ranked:
+                seen = [(table["scene_id"][k], table["trajectory_id"][k]) for k in own]
+                fresh = (table["scene_id"][place], table["trajectory_id"][place]) not in seen
+                used = own + [k for _, k in chosen]
+                if len(own) < _EXTREMES and place not in used and (fresh or others_too):
+                    own.append(place)
+        chosen += [(word, place) for place in own]
+    return [frames.picture(place, f"{word}, F1 {f1[place]:.2f}: ") for word, place in chosen]
+
+
+def _section(
+    runs: Sequence[Run], prefix: str, key: str, title: str, pictures: tuple[FramePicture, ...]
+) -> Section:  # fmt: skip
+    units = runs[-1].metrics.get(f"{prefix}intervals_units")
+    unit = runs[-1].metrics.get(f"{prefix}intervals_over")
+    spread = (
+        f"95 % intervals over {units} {'trajectories' if unit == 'trajectory' else f'{unit}s'}"
+        if isinstance(units, int) and units >= MIN_UNITS
+        else f"the value of each {unit or 'unit'}, since they are too few for an interval"
+    )
+    lead = (*(headline(run, prefix) for run in runs), f"In brackets: {spread}. AP is the paper's definition, IoU 0.5.")
+    rows = tuple(
+        (text, *(_value(run, prefix + name, spread=True) for run in runs))
+        for name, text in _ROWS.items()
+        if any(prefix + name in run.metrics for run in runs)
+    )
+    table = Table("Figures of detection", ("figure", *(run.name for run in runs)), rows, sources_of(runs))
+    return Section(key, title, lead, (table,), tuple([*_curves(runs, prefix), *_bins(runs, prefix)]), pictures)
+
+
+def _value(run: Run, key: str, *, spread: bool = False) -> str:
+    value = run.metrics.get(key)
+    if not isinstance(value, int | float):
+        return "-"
+    return read_spread(run.metrics, key).text(float(value)) if spread else f"{value:.3f}"
+
+
+def _curves(runs: Sequence[Run], prefix: str) -> list[Figure]:
+    """Precision against recall of all runs in one figure; runs without a curve are left out."""
+    folder = {"visible/": "visible"}.get(prefix, ".")
+    drawn = [run for run in runs if (run.folder / folder / _CURVE).is_file()]
+    if not drawn:
+        return []
+    with drawing(height_in=3.8) as figure:
+        axes = figure.subplots()
+        for number, run in enumerate(drawn):
+            curve = read_columns(run.folder / folder / _CURVE, _COLUMNS)
+            colour, dash = COLOURS[number % 6], DASHES[number % 6]
+            label = f"{plain(run.name)}, IoU 0.5"
+            axes.plot(curve["recall"], curve["precision"], color=colour, linestyle=dash, label=label)
+            point = [run.metrics.get(f"{prefix}{name}") for name in ("recall", "precision")]
+            if all(isinstance(value, int | float) for value in point):
+                axes.plot(*point, "o", color=colour, markersize=7)  # type: ignore[arg-type]
+        axes.set(xlim=(0, 1), ylim=(0, 1.02))
+        label_axes(axes, "Precision against recall", "recall", "precision")
+        axes.legend(loc="lower left")
+        html = svg_of(figure, "Precision against recall on the test split")
+    caption = "Precision against recall at IoU 0.5. The dot is the threshold chosen on validation."
+    return [Figure(html, caption, sources_of(drawn))]
+
+
+def read_columns(path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns of a run's table as arrays. Raises UserError if one is missing or the file is damaged."""
+    try:
+        table = pq.read_table(path, columns=list(columns))
+        return {name: table[name].to_numpy() for name in columns}
+    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+        raise UserError(path, "table", error, f"the columns {', '.join(columns)}") from None
+
+
+def _bins(runs: Sequence[Run], prefix: str) -> list[Figure]:
+    """AP by radius, altitude and Sun elevation, as bars beside each other for the runs."""
+    found: dict[str, dict[str, tuple[float, float, str]]] = {by: {} for by in _PANELS}
+    for run in runs:
+        for key in run.metrics:
+            match = _BIN.fullmatch(key)
+            if match and match.group(1) == prefix:
+                low, high = float(match.group(3)), float(match.group(4))
+                found[match.group(2)][key] = (low, high, key)
+    figures = []
+    for by, x in _PANELS.items():
+        bins = sorted(found[by].values())
+        if not bins:
+            continue
+        with drawing(height_in=3.2) as figure:
+            axes = figure.subplots()
+            width = 0.8 / len(runs)
+            for number, run in enumerate(runs):
+                for place, (_, _, key) in enumerate(bins):
+                    _bar(axes, run, key, place - 0.4 + (number + 0.5) * width, width, number)
+            labels = [
+                f"{low:g}–{high:g}" if np.isfinite(high) else f"above {low:g}" for low, high, _ in bins
+            ]  # fmt: skip
+            axes.set_xticks(range(len(bins)), labels)
+            axes.set_ylim(0, 1.05)
+            axes.grid(False, axis="x")
+            label_axes(axes, f"AP by {x.split(' (')[0]}", x, "AP")
+            if len(runs) > 1:
+                figure.legend(loc="outside lower center", ncols=2)
+            html = svg_of(figure, f"Average precision by {x}")
+        names = ", ".join(f"{low:g} to {high:g}" for low, high, _ in bins)
+        caption = (
+            f"AP in the bins {names} of {x}, with 95 % intervals, or a dot for each unit if there are fewer than "
+            f"{MIN_UNITS}."
+        )
+        figures.append(Figure(html, caption, sources_of(runs)))
+    return figures
+
+
+def _bar(axes, run: Run, key: str, x: float, width: float, number: int) -> None:
+    value = run.metrics.get(key)
+    if not isinstance(value, int | float):
+        return
+    label = plain(run.name) if key not in axes.get_legend_handles_labels()[1] else None
+    shown = [text for text in axes.get_legend_handles_labels()[1] if text == label]
+    axes.bar(
+        x, value, width, color=COLOURS[number % 6], hatch=_HATCHES[number % 4], edgecolor="white", linewidth=0.3,
+        label=None if shown else label,
+    )  # fmt: skip
+    spread = read_spread(run.metrics, key)
+    if spread.interval is not None:
+        axes.vlines(x, *spread.interval, color="#888888", linewidth=2)
+    elif spread.by_unit:
+        axes.plot([x] * len(spread.by_unit), list(spread.by_unit.values()), "o", color="#888888", markersize=4)
+    axes.text(x, 0.02, f"{value:.2f}", ha="center", va="bottom", color="white", fontsize=8.5, fontweight="bold")

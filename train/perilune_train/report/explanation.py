@@ -1,0 +1,108 @@
+"""The section of explanation: claims with verdicts, mosaics, bars with nulls, interventions; and the paper's page."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from markupsafe import Markup
+
+from perilune_shared.errors import UserError
+from perilune_train.report.content import Figure, Provenance, Section, Table
+from perilune_train.report.pictures import picture_of
+from perilune_train.report.sources import Run, read_json
+
+CLAIMS_FILE, CAPTIONS_FILE = "claims.json", "captions.json"
+_COLUMNS = ("claim", "figure", "interval", "nulls", "verdict")
+_CAPTIONS = {
+    "masks_detect.png": "Attention masks of the detector over test frames.",
+    "masks_navigate.png": "Attention masks of the navigator over pairs of test frames.",
+    "pcc_detect.png": "Correlations of the detector's masks, gate by gate.",
+    "pcc_navigate.png": "Correlations of the navigator's masks, gate by gate.",
+}
+_ORDER = ("masks_", "pcc_", "gates_", "removal_", "before_after_")
+
+
+def explanation_section(run: Run, key: str, title: str) -> Section:
+    """Show an explain run: its claims as a table, all of its pictures with their captions."""
+    claims = read_claims(run.folder / CLAIMS_FILE)
+    captions = _captions(run.folder / CAPTIONS_FILE)
+    pictures = {path.name: f"{key}-picture-{number}" for number, path in enumerate(_ordered(run.folder))}
+    tables = [_claims_table(claims, pictures, run.provenance)] if claims else []
+    figures = [
+        Figure(picture_of(path, caption), caption, (run.provenance,), wide=True, key=pictures[path.name])
+        for path in _ordered(run.folder)
+        for caption in [captions.get(path.name) or _CAPTIONS.get(path.name) or _words(path)]
+    ]
+    lead = (f"Claims: {_counted([claim['verdict'] for claim in claims])}.",)
+    return Section(key, title, lead if claims else (), tuple(tables), tuple(figures))
+
+
+def paper_section(folder: Path, run: Run) -> Section:
+    """The paper's claims with verdicts and pictures, from paper.json (`run`) in the folder of the experiment."""
+    rows, place = [], 1
+    while f"verdict/{place}/claim" in run.metrics:
+        rows.append(tuple(str(run.metrics.get(f"verdict/{place}/{part}")) for part in ("claim", "measured", "answer")))
+        place += 1
+    lead = (f"Claims of the paper: {_counted([answer for _, _, answer in rows])}.",)
+    table = Table("Claims of the paper", ("claim", "measured here", "verdict"), tuple(rows), (run.provenance,))
+    captions = {
+        "detections.png": "Detections of both networks: truth red, detections cyan.",
+        "learning.png": "Learning curves.",
+        "trajectory.png": "Errors along a test trajectory.",
+    }
+    figures = [
+        Figure(picture_of(folder / name, caption), caption, (run.provenance,), wide=True)
+        for name, caption in captions.items()
+        if (folder / name).is_file()
+    ]
+    return Section("paper", "The paper's experiment", lead, (table,), tuple(figures))
+
+
+def _counted(verdicts: list[str]) -> str:
+    """Number of claims, and of each verdict."""
+    counts = {verdict: verdicts.count(verdict) for verdict in dict.fromkeys(verdicts)}
+    return f"{len(verdicts)}; {', '.join(f'{verdict}: {count}' for verdict, count in counts.items())}"
+
+
+def read_claims(path: Path) -> list[dict[str, str]]:
+    """Read claims.json: a list of objects of texts; empty if there is no such file. Raises UserError on other content.
+
+    Keys: claim, figure, interval, nulls, verdict, picture; a missing one is "-".
+    """
+    if not path.is_file():
+        return []
+    content = read_json(path)
+    if not isinstance(content, list) or not all(isinstance(one, dict) for one in content):
+        raise UserError(path, "claims", type(content).__name__, "a list of objects")
+    return [{key: str(one.get(key) or "-") for key in (*_COLUMNS, "picture")} for one in content]
+
+
+def _captions(path: Path) -> dict[str, str]:
+    if not path.is_file():
+        return {}
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise UserError(path, "captions", type(content).__name__, "an object of captions by file name")
+    return {str(name): str(caption) for name, caption in content.items()}
+
+
+def _claims_table(claims: list[dict[str, str]], pictures: Mapping[str, str], provenance: Provenance) -> Table:
+    rows = tuple((*(claim[key] for key in _COLUMNS), _link(claim["picture"], pictures)) for claim in claims)
+    return Table("Claims", ("claim", "figure", "95 % interval", "nulls", "verdict", "picture"), rows, (provenance,))
+
+
+def _link(name: str, pictures: Mapping[str, str]) -> str:
+    """A link to the picture of a claim; its name if there is no such picture."""
+    return Markup('<a href="#{}">{}</a>').format(pictures[name], name) if name in pictures else name
+
+
+def _ordered(folder: Path) -> list[Path]:
+    """All pictures of the folder: masks, bars, gates, removal, interventions, then others, each by name."""
+
+    def rank(path: Path) -> tuple[int, str]:
+        return next((k for k, start in enumerate(_ORDER) if path.name.startswith(start)), len(_ORDER)), path.name
+
+    return sorted(folder.glob("*.png"), key=rank)
+
+
+def _words(path: Path) -> str:
+    return path.stem.replace("_", " ").capitalize() + "."

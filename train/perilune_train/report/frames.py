@@ -1,0 +1,210 @@
+"""Frames with labels and detections, and the descent of the viewer with its attention masks."""
+
+import io
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from perilune_shared.errors import UserError
+from perilune_train.detect.data.frame_facts import facts_of
+from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.evaluate.matching import FALSE, FOUND, Detections, Matches, find_overlaps
+from perilune_train.report.content import FramePicture, Mark, MaskStack, Provenance, Viewer
+from perilune_train.report.pictures import image_uri, png_uri
+
+MASKS_FILE = "masks_detect.npz"
+_MATCH_IOU = 0.5
+_MOST_FRAMES = 60
+_LARGEST_SIDE_PX = 512
+_LARGEST_MASKS_BYTES = 2**28
+_KINDS = {FOUND: "matched", FALSE: "false"}
+
+
+@dataclass(frozen=True)
+class LabelledFrames:
+    """The test frames of a dataset with labels, and with a run's detections if there is one."""
+
+    split: DetectSplit
+    """Frames and labels."""
+    found: list[Detections]
+    """Detections above the threshold, one entry for each frame; all empty without a run."""
+    matches: Matches
+    """Detections matched at IoU 0.5."""
+    first_label: NDArray[np.intp]
+    """Row of the first label of each frame in the matches (N,)."""
+    has_detections: bool
+    """Whether there is a run."""
+    provenance: Provenance
+    """Of the run, or of the dataset without one."""
+
+    def f1(self) -> NDArray[np.float64]:
+        """F1 of each frame (N,) at the run's threshold; NaN without selected labels."""
+        count = len(self.split)
+        hits, false = (np.bincount(self.matches.frame[self.matches.outcome == k], minlength=count) for k in _KINDS)
+        labels = np.bincount(self.matches.selected_frame, minlength=count)
+        return np.divide(2 * hits, hits + false + labels, out=np.full(count, np.nan), where=labels > 0)
+
+    def picture(self, index: int, first_words: str = "") -> FramePicture:
+        """One frame with its marks."""
+        own = self.split.labels[index]
+        rows = np.flatnonzero(self.matches.frame == index)
+        missed = own.selected.copy()
+        hit = self.matches.label[rows]
+        missed[hit[hit >= 0] - self.first_label[index]] = False
+        labels = []
+        for (cx, cy, a, b, theta), selected, lost in zip(own.ellipses, own.selected, missed, strict=True):
+            kind = "ignored" if not selected else "missed" if lost and self.has_detections else "found"
+            labels.append(Mark(kind, (_px(cx), _px(cy), _px(a), _px(b), _px(np.degrees(theta)))))
+        labels = [mark for mark, labelled in zip(labels, own.labelled, strict=True) if labelled]
+        detections = []
+        # Rows of the matches are in the order of the detections of each frame.
+        for (x0, y0, x1, y1), score, outcome in zip(
+            self.found[index].boxes, self.found[index].scores, self.matches.outcome[rows], strict=True
+        ):
+            shape = (_px(x0), _px(y0), _px(x1 - x0), _px(y1 - y0), round(float(score), 3))
+            detections.append(Mark(_KINDS.get(int(outcome), "unjudged"), shape))
+        image = self.split.frames.images[index]
+        height, width = image.shape
+        return FramePicture(
+            self.split.frames.table["frame_id"][index],
+            frame_uri(image),
+            width,
+            height,
+            first_words + self._about(index, int(own.selected.sum())),
+            tuple(labels),
+            tuple(detections),
+            (self.provenance,),
+        )
+
+    def _about(self, index: int, n_labels: int) -> str:
+        facts = facts_of(self.split.frames)
+        text = f"{facts.altitude_m[index]:.0f} m, Sun {facts.sun_elevation_deg[index]:.0f}°, {n_labels} labels"
+        if not self.has_detections:
+            return text
+        outcome = self.matches.outcome[self.matches.frame == index]
+        return text + f", {np.sum(outcome == FOUND)} found, {np.sum(outcome == FALSE)} false"
+
+    def places_of(self, trajectory: str) -> list[int]:
+        """Indices of the frames of one trajectory, scene_id/trajectory_id, in order."""
+        return [place for place, own in enumerate(facts_of(self.split.frames).trajectory) if own == trajectory]
+
+    def trajectories(self) -> list[str]:
+        """Names of the trajectories, scene_id/trajectory_id, in order."""
+        return list(dict.fromkeys(facts_of(self.split.frames).trajectory))
+
+
+def labelled_frames(split: DetectSplit, found: list[Detections] | None, provenance: Provenance) -> LabelledFrames:
+    """Match a run's detections, above its threshold, to the labels of a split; None without a run."""
+    nothing = Detections(np.empty((0, 4)), np.empty(0))
+    detections = [nothing] * len(split) if found is None else found
+    height, width = split.frames.images.shape[1:]
+    overlaps = find_overlaps(detections, list(split.labels), np.tile([width, height], (len(split), 1)))
+    matches = overlaps.match(_MATCH_IOU, split.radius_px)
+    first = np.searchsorted(overlaps.label_frame, np.arange(len(split)))
+    # `found` is in the order of each frame's scores, as the matches are.
+    ordered = [_best_first(own) for own in detections]
+    return LabelledFrames(split, ordered, matches, first, found is not None, provenance)
+
+
+def frame_uri(image: NDArray[np.uint8]) -> str:
+    """A frame as a data URI: an exact PNG up to 512 px, else reduced to 512 px as WebP."""
+    if max(image.shape) <= _LARGEST_SIDE_PX:
+        return _png(Image.fromarray(image))
+    picture = Image.fromarray(image)
+    picture.thumbnail((_LARGEST_SIDE_PX, _LARGEST_SIDE_PX))
+    return image_uri(picture)
+
+
+def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Provenance | None) -> Viewer:
+    """The descent of the viewer: that of the masks, else the first test trajectory; at most 60 frames of it.
+
+    Raises UserError if the file of masks is damaged or of other frames.
+    """
+    names = frames.split.frames.table["frame_id"].tolist()
+    content = None if masks is None else read_masks(masks)
+    if content is None:
+        trajectory = frames.trajectories()[0]
+    else:
+        first = str(content["frame_ids"][0])
+        if first not in names:
+            raise UserError(masks, "frame_ids", first, "a test frame of the detection dataset")
+        trajectory = facts_of(frames.split.frames).trajectory[names.index(first)]
+    places = frames.places_of(trajectory)
+    if len(places) > _MOST_FRAMES:
+        places = [places[k] for k in np.linspace(0, len(places) - 1, _MOST_FRAMES).astype(int)]
+    chosen = [names[place] for place in places]
+    stacks = () if content is None else tuple(_stacks(content, chosen))
+    sources = [frames.provenance, *([mask_provenance] if stacks and mask_provenance else [])]
+    return Viewer(trajectory, tuple(frames.picture(place) for place in places), stacks, tuple(sources))
+
+
+def read_masks(path: Path) -> dict[str, NDArray[Any]]:
+    """Read masks_detect.npz: frame_ids (N,), blocks (B,), low and high (B,), and uint8 (N, h, w) for each block.
+
+    Raises UserError if an array is missing, has another shape or type, or if the file is damaged or too large.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(item.file_size for item in archive.infolist())
+        if size > _LARGEST_MASKS_BYTES:
+            raise UserError(path, "size", f"{size} bytes", f"at most {_LARGEST_MASKS_BYTES} bytes")
+        with np.load(path, allow_pickle=False) as file:
+            content = {name: file[name] for name in file.files}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        raise UserError(path, "masks", error, "arrays of NumPy, without pickled objects") from None
+    missing = {"frame_ids", "blocks", "low", "high"} - content.keys()
+    if missing:
+        raise UserError(path, min(missing), "nothing", "an array")
+    count, blocks = len(np.atleast_1d(content["frame_ids"])), np.atleast_1d(content["blocks"])
+    if not count:
+        raise UserError(path, "frame_ids", "no frames", "the frames of one trajectory")
+    for name in ("low", "high"):
+        if content[name].shape != blocks.shape or content[name].dtype.kind != "f":
+            raise UserError(path, name, f"{content[name].dtype} {content[name].shape}", f"floats {blocks.shape}")
+    for block in blocks:
+        own = content.get(str(block))
+        if own is None or own.dtype != np.uint8 or own.ndim != 3 or len(own) != count or 0 in own.shape:
+            found = "nothing" if own is None else f"{own.dtype} {own.shape}"
+            raise UserError(path, str(block), found, f"uint8 ({count}, height, width)")
+    return content
+
+
+def _stacks(content: dict[str, NDArray[Any]], names: Sequence[str]) -> list[MaskStack]:
+    place_of = {str(name): place for place, name in enumerate(np.atleast_1d(content["frame_ids"]))}
+    colours = (matplotlib.colormaps["cividis"](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
+    stacks = []
+    for number, block in enumerate(np.atleast_1d(content["blocks"])):
+        images = []
+        for name in names:
+            place = place_of.get(name)
+            if place is None:
+                images.append("")
+                continue
+            picture = Image.fromarray(content[str(block)][place]).convert("P")
+            picture.putpalette(colours.tobytes())
+            images.append(_png(picture))
+        low, high = (float(content[key][number]) for key in ("low", "high"))
+        stacks.append(MaskStack(str(block), low, high, tuple(images)))
+    return stacks
+
+
+def _best_first(own: Detections) -> Detections:
+    order = np.argsort(-own.scores, kind="stable")
+    return Detections(own.boxes[order], own.scores[order])
+
+
+def _png(picture: Image.Image) -> str:
+    stream = io.BytesIO()
+    picture.save(stream, "PNG", optimize=True)
+    return png_uri(stream.getvalue())
+
+
+def _px(value: float) -> float:
+    return round(float(value), 2)

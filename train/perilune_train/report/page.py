@@ -1,0 +1,246 @@
+"""Write a report: read datasets and runs, render report.html and summary.md, and put both into place together."""
+
+import base64
+import hashlib
+import importlib.metadata
+import importlib.resources
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import jinja2
+from markupsafe import Markup
+
+from perilune_shared.dataset.info_file import INFO_NAME
+from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import sha256_of, write_text
+from perilune_train.detect.config import LabelSettings
+from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.paper.detections import read_detections
+from perilune_train.report import detection, explanation, navigation
+from perilune_train.report.content import Provenance, Report, Section, Viewer
+from perilune_train.report.dataset import dataset_section
+from perilune_train.report.frames import MASKS_FILE, LabelledFrames, labelled_frames, viewer_of
+from perilune_train.report.sources import (
+    SCORE_FILE,
+    Folders,
+    Kind,
+    Run,
+    folders_of,
+    provenance_of,
+    provenance_of_dataset,
+    read_run,
+)
+from perilune_train.report.summary import summary_of
+
+PAGE, SUMMARY = "report.html", "summary.md"
+_TITLES: dict[Kind, str] = {"demo": "Demo", "paper": "The paper's experiment", "benchmark": "Locked benchmark"}
+_VERSIONS = ("perilune-train", "numpy", "pandas", "pyarrow", "matplotlib", "jinja2", "torch", "lightning")
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """Datasets and runs that exist."""
+
+    datasets: dict[Path, Dataset]
+    """Complete datasets with frames, by folder."""
+    detect: list[Run]
+    """Finished runs of detection."""
+    navigate: list[Run]
+    """Finished runs of navigation."""
+    explain: list[Run]
+    """Finished runs of explanation."""
+    scores: list[Run]
+    """Scores on the locked benchmark."""
+    missing: tuple[str, ...]
+    """What does not exist."""
+
+
+def write_report(kind: Kind, name: str, dataset: Path, runs: Path, out: Path) -> Path:
+    """Write report.html and summary.md of a demo, a paper run or a benchmark into `out`; returns the page.
+
+    `dataset` is the folder of the datasets and `runs` that of all runs (sources.py). What does not exist is left out
+    and named on the page. Raises UserError if nothing exists, or if a file is damaged; then nothing is written.
+    """
+    report = gather(kind, name, dataset, runs)
+    page, summary = html_of(report), summary_of(report)
+    write_text(out / SUMMARY, summary)
+    write_text(out / PAGE, page)
+    return out / PAGE
+
+
+def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
+    """Read everything that a report shows. Raises UserError like `write_report`."""
+    folders = folders_of(kind, name, dataset, runs)
+    opened = _open(folders, runs)
+    sections: list[Section] = []
+    frames: LabelledFrames | None = None
+    for folder, own in opened.datasets.items():
+        split: DetectSplit | None = None
+        if own.info.kind == "detect" and "test" in own.table("frames", ["split"])["split"].unique().to_pylist():
+            detect = opened.detect[-1] if opened.detect else None
+            found = None
+            if detect is not None:
+                read = read_detections(detect.folder, str(folder))
+                split, found = read.split, read.found
+            else:
+                split = load_split(own, "test", LabelSettings())
+            source = provenance_of_dataset(own) if detect is None else detect.provenance
+            frames = frames or labelled_frames(split, found, source)
+        sections.append(dataset_section(own, f"dataset-{len(sections)}", split))
+    sections += _run_sections(folders, opened, frames, runs)
+    if not sections:
+        raise UserError(dataset, "report", "no dataset and no finished run", f"the datasets and runs of a {kind}")
+    viewer = _viewer(frames, opened)
+    return Report(
+        f"{_TITLES[kind]}: {name}",
+        tuple(_headlines(opened)),
+        tuple(sections),
+        viewer,
+        _provenance(sections, viewer),
+        opened.missing,
+    )
+
+
+def _open(folders: Folders, root: Path) -> _Opened:
+    datasets, missing = {}, []
+    for folder in folders.datasets:
+        if not (folder / INFO_NAME).is_file():
+            missing.append(f"dataset {folder.name}")
+            continue
+        dataset = open_dataset(str(folder))
+        if dataset.info.complete and dataset.info.images in ("files", "packed") and len(dataset):
+            datasets[folder] = dataset
+        else:
+            missing.append(f"dataset {folder.name}: not complete, or without frames")
+    runs: dict[str, list[Run]] = {}
+    for part in ("detect", "navigate", "explain"):
+        paths: Sequence[Path] = getattr(folders, part)
+        read = {path: read_run(path, root) for path in paths}
+        runs[part] = [run for run in read.values() if run is not None]
+        missing += [f"{part} run {path.name}: no finished run" for path, run in read.items() if run is None]
+    scores = [read_run(path, root, SCORE_FILE) for path in folders.scores]
+    missing += [f"methods {path.name}" for path in folders.methods if not (path / "navigation.parquet").is_file()]
+    return _Opened(datasets, **runs, scores=[one for one in scores if one is not None], missing=tuple(missing))
+
+
+def _run_sections(folders: Folders, opened: _Opened, frames: LabelledFrames | None, root: Path) -> list[Section]:
+    sections = []
+    if folders.page is not None and (page := read_run(folders.page, root, "paper.json")):
+        sections.append(explanation.paper_section(folders.page, page))
+    if opened.detect:
+        sections.append(detection.detection_section(opened.detect, frames))
+    scored = [one for one in opened.scores if "visible/ap50_paper" in one.metrics]
+    if scored:
+        sections.append(detection.scores_section(scored))
+    if opened.navigate:
+        nav = next((one for one in opened.datasets.values() if one.info.kind == "nav"), None)
+        sections.append(navigation.navigation_section(opened.navigate, nav))
+    others = [one for one in opened.scores if one not in scored]
+    if others:
+        sections.append(navigation.scores_section(others))
+    for folder in folders.methods:
+        if (folder / "navigation.parquet").is_file():
+            # The folder has no record of its own.
+            table = {"navigation.parquet": sha256_of(folder / "navigation.parquet")}
+            source = replace(provenance_of(folder, root, {}), inputs=table)
+            sections.append(navigation.methods_section(folder, (source,)))
+    for number, run in enumerate(opened.explain):
+        title = "Explanation: rendered interventions" if run.name.endswith("-causal") else "Explanation"
+        sections.append(explanation.explanation_section(run, f"explanation-{number}", title))
+    return sections
+
+
+def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
+    if frames is None:
+        return None
+    masked = next((run for run in opened.explain if (run.folder / MASKS_FILE).is_file()), None)
+    return viewer_of(
+        frames, None if masked is None else masked.folder / MASKS_FILE, None if masked is None else masked.provenance
+    )
+
+
+def _headlines(opened: _Opened) -> list[str]:
+    lines = [detection.headline(run) for run in opened.detect]
+    lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
+    return lines + [navigation.headline(run) for run in opened.navigate]
+
+
+def _provenance(sections: Sequence[Section], viewer: Viewer | None) -> tuple[Provenance, ...]:
+    found: dict[str, Provenance] = {}
+    for section in sections:
+        groups = (section.tables, section.figures, section.frames)
+        found |= {own.source: own for group in groups for one in group for own in one.sources}
+    found |= {own.source: own for own in (viewer.sources if viewer else ())}
+    return tuple(found.values())
+
+
+def html_of(report: Report) -> str:
+    """The page: styles, script and data are inside, and a security policy allows no others and no connections.
+
+    Names from files are escaped by Jinja2, and in the viewer's data by `json_block`.
+    """
+    files = importlib.resources.files("perilune_train.report") / "templates"
+    style, script = ((files / name).read_text(encoding="utf-8") for name in ("style.css", "viewer.js"))
+    environment = jinja2.Environment(
+        loader=jinja2.DictLoader({name: (files / name).read_text(encoding="utf-8") for name in _TEMPLATES}),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    data = None if report.viewer is None else json_block(viewer_data(report.viewer))
+    return environment.get_template(_TEMPLATES[0]).render(
+        report=report,
+        style=Markup(style),
+        script=Markup(script),
+        style_hash=_hash(style),
+        script_hash=_hash(script),
+        data=data,
+        versions=_versions(),
+    )
+
+
+_TEMPLATES = ("page.html.j2", "parts.html.j2")
+
+
+def viewer_data(viewer: Viewer) -> dict[str, object]:
+    """The viewer's data as plain lists: frames with marks, masks by gate."""
+    frames = [
+        {
+            "name": frame.name,
+            "about": frame.about,
+            "image": frame.image,
+            "width": frame.width_px,
+            "height": frame.height_px,
+            "labels": [[mark.kind, *mark.shape] for mark in frame.labels],
+            "detections": [[mark.kind, *mark.shape] for mark in frame.detections],
+        }
+        for frame in viewer.frames
+    ]
+    return {"frames": frames, "masks": [asdict(mask) for mask in viewer.masks]}
+
+
+def json_block(content: object) -> Markup:
+    """JSON that cannot end the script element that holds it, nor a line in it."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":"), ensure_ascii=True)
+    # JSON allows an escape for each of these characters; ensure_ascii escapes U+2028 and U+2029.
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return Markup(text)
+
+
+def _hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _versions() -> str:
+    found = []
+    for name in _VERSIONS:
+        try:
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return ", ".join(found)

@@ -1,0 +1,163 @@
+"""Pictures that are part of a page: inline SVG of matplotlib figures, images as data URIs."""
+
+import base64
+import io
+import itertools
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import matplotlib
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Drawing
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from numpy.typing import NDArray
+from PIL import Image
+
+from perilune_shared.dataset.metadata import LARGEST_IMAGE_PX
+from perilune_shared.errors import UserError, one_line, shortened
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's colours that are legible on white and on black."""
+DASHES: tuple[str | tuple[float, tuple[float, ...]], ...] = (
+    "-", "--", "-.", ":", (0, (7, 2, 1, 2, 1, 2)), (0, (2, 1)),
+)  # fmt: skip
+"""One pattern for each colour, so that lines differ without colour."""
+WIDTH_IN = 5.0
+"""Width of a figure, inches: half of a wide page, all of a narrow one, where its text is still legible."""
+_INK, _INK_RGB = "#010203", re.compile(r"#010203")
+_SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+_FONT = re.compile(r"(?:^|\s)(\d+(?:\.\d+)?)px")
+_STYLE = {
+    "svg.fonttype": "none",
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": _INK,
+    "axes.labelcolor": _INK,
+    "axes.titlecolor": _INK,
+    "text.color": _INK,
+    "text.parse_math": False,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "axes.titlesize": 10,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "legend.framealpha": 0.0,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.7,
+}
+_LARGEST_SIDE_PX = 1400
+_QUALITY = 82
+_numbers = itertools.count()
+ElementTree.register_namespace("", _SVG)
+ElementTree.register_namespace("xlink", _LINK)
+
+
+@contextmanager
+def drawing(width_in: float = WIDTH_IN, height_in: float = 3.4) -> Iterator[Drawing]:
+    """Yield an empty figure in the report's style, to draw on and to pass to `svg_of` within the block."""
+    with matplotlib.rc_context(_STYLE):
+        yield Drawing(figsize=(width_in, height_in), layout="constrained")
+
+
+def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
+    """Set a title and both labels. Names from data are drawn as they are: text.parse_math is off."""
+    axes.set(title=title, xlabel=x, ylabel=y)
+
+
+def logarithmic(axes: Axes, *which: Literal["x", "y"]) -> None:
+    """Make axes logarithmic, with plain numbers at the powers of ten, or more often within two decades."""
+    for name in which:
+        (axes.set_xscale if name == "x" else axes.set_yscale)("log")
+        axis = axes.xaxis if name == "x" else axes.yaxis
+        low, high = axis.get_view_interval()
+        few = low > 0 and high / low < 100
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,)))
+        # The usual labels are mathematical text, which is off for the sake of names from files.
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+        axis.set_minor_locator(NullLocator())
+
+
+def svg_of(figure: Drawing, description: str) -> Markup:
+    """Return a figure as inline SVG whose text and axes have the colour of the page's text.
+
+    Styles become presentation attributes, since the page's security policy allows no inline styles. Identifiers are
+    unique in this process.
+    """
+    stream = io.StringIO()
+    figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
+    root = ElementTree.fromstring(stream.getvalue())
+    prefix = f"f{next(_numbers)}-"
+    for parent in root.iter():
+        for child in list(parent):
+            if child.tag in (f"{{{_SVG}}}style", f"{{{_SVG}}}metadata"):
+                parent.remove(child)
+    for element in root.iter():
+        for name, value in _presentation(element.attrib.pop("style", "")).items():
+            element.set(name, value)
+        for name, value in list(element.attrib.items()):
+            value = _INK_RGB.sub("currentColor", value)
+            value = value.replace("url(#", f"url(#{prefix}")
+            if name == "id" or (name == f"{{{_LINK}}}href" and value.startswith("#")):
+                value = f"#{prefix}{value[1:]}" if value.startswith("#") else prefix + value
+            element.set(name, value)
+    root.set("role", "img")
+    root.set("aria-label", description)
+    root.set("class", "plot")
+    for size in ("width", "height"):
+        root.attrib.pop(size, None)
+    return Markup(ElementTree.tostring(root, encoding="unicode"))
+
+
+def _presentation(style: str) -> dict[str, str]:
+    """Presentation attributes of a CSS style; `font` gives the size only."""
+    found = {}
+    for part in style.split(";"):
+        name, _, value = (text.strip() for text in part.partition(":"))
+        if name == "font" and (size := _FONT.search(value)):
+            found["font-size"] = size.group(1)
+        elif name and name != "font":
+            found[name] = value
+    return found
+
+
+def png_uri(content: bytes) -> str:
+    """A data URI of a PNG."""
+    return "data:image/png;base64," + base64.b64encode(content).decode()
+
+
+def image_uri(image: Image.Image | NDArray[np.uint8], quality: int = _QUALITY) -> str:
+    """A data URI of an image as WebP; arrays are grey (height, width)."""
+    stream = io.BytesIO()
+    (Image.fromarray(image) if isinstance(image, np.ndarray) else image).save(stream, "WEBP", quality=quality)
+    return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode()
+
+
+def img(uri: str, description: str) -> Markup:
+    """An `img` element."""
+    return Markup('<img src="{}" alt="{}">').format(uri, description)
+
+
+def picture_of(path: Path, description: str) -> Markup:
+    """A run's PNG as an `img` element, reduced to at most 1400 px. Raises UserError if it is damaged or too large."""
+    try:
+        with Image.open(path, formats=["PNG"]) as picture:
+            if picture.width * picture.height > LARGEST_IMAGE_PX:
+                raise ValueError(f"{picture.width} x {picture.height} pixels")
+            colours = picture.convert("RGB")
+    except (ValueError, SyntaxError, Image.DecompressionBombError, Image.UnidentifiedImageError) as error:
+        raise UserError(path, "picture", error, f"a PNG of at most {LARGEST_IMAGE_PX} pixels") from None
+    # A dimension too large for the page is reduced; a small picture is not enlarged.
+    colours.thumbnail((_LARGEST_SIDE_PX, 4 * _LARGEST_SIDE_PX))
+    return img(image_uri(colours), description)
+
+
+def plain(text: object) -> str:
+    """A name from a file for a figure: one printable line of at most 60 characters."""
+    return shortened(one_line(text), 60)

@@ -1,0 +1,155 @@
+"""Where figures come from: provenance of runs and of datasets, and the datasets and runs of each kind of report."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from perilune_shared.config import read_config_file
+from perilune_shared.dataset.info_file import INFO_NAME
+from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
+from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
+from perilune_train.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
+from perilune_train.report.content import Provenance
+
+Kind = Literal["demo", "paper", "benchmark"]
+SCORE_FILE = "benchmark.json"
+LARGEST_JSON_BYTES = 16 * 2**20
+"""Largest JSON file that is read, bytes."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run, or a score on the locked benchmark."""
+
+    folder: Path
+    """Its folder."""
+    name: str
+    """Name in figures: the folder's."""
+    metrics: Metrics
+    """Flat keys of metrics.json, or of benchmark.json."""
+    provenance: Provenance
+    """Configuration, inputs, commit."""
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Folders of a report; any may be absent."""
+
+    datasets: tuple[Path, ...]
+    """Datasets, detection before navigation."""
+    detect: tuple[Path, ...]
+    """Runs of detection."""
+    navigate: tuple[Path, ...]
+    """Runs of navigation."""
+    methods: tuple[Path, ...]
+    """All methods of navigation over a split."""
+    explain: tuple[Path, ...]
+    """Runs of explanation, and of rendered interventions."""
+    scores: tuple[Path, ...] = ()
+    """Scores on the locked benchmark."""
+    page: Path | None = None
+    """Folder with paper.json and pictures of the paper's experiment."""
+
+
+def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:
+    """The folders of a report by its kind.
+
+    demo: `dataset` has detect and nav, and runs are <runs>/<task>/<name>. paper: the same with the networks' names,
+    below the folder of the experiment. benchmark: `dataset` has the benchmark's datasets; all scores below
+    <runs>/benchmark are shown.
+    """
+    both = (dataset / "detect", dataset / "nav")
+    if kind == "demo":
+        navigate = runs / "navigate"
+        return Folders(
+            both,
+            (runs / "detect" / name,),
+            (navigate / name, navigate / f"{name}-stack"),
+            (navigate / f"{name}-methods",),
+            (runs / "explain" / name, runs / "explain" / f"{name}-causal"),
+        )
+    if kind == "paper":
+        return Folders(
+            both,
+            tuple(runs / "detect" / own for own in DETECTORS.values()),
+            tuple(runs / "navigate" / f"{own}-stack" for own in NAVIGATORS.values()),
+            (),
+            (runs / "explain" / EXPLAINED, runs / "explain" / f"{EXPLAINED}-causal"),
+            _scores(runs),
+            runs,
+        )
+    found = sorted(path.parent for path in dataset.glob(f"benchmark-*/{INFO_NAME}"))
+    return Folders(tuple(found), (), (), (), (), _scores(runs))
+
+
+def _scores(runs: Path) -> tuple[Path, ...]:
+    return tuple(sorted(path.parent for path in (runs / "benchmark").glob(f"*/{SCORE_FILE}")))
+
+
+def read_run(folder: Path, root: Path, file: str = METRICS_FILE) -> Run | None:
+    """Read a run; None if it is absent or not finished. Raises UserError if a file of it is damaged.
+
+    `root` is the folder of all runs, which names in the report do not contain.
+    """
+    if not (folder / file).is_file():
+        return None
+    metrics = read_metrics(folder, file)
+    provenance = provenance_of(folder, root, metrics)
+    return Run(folder, folder.name, metrics, provenance)
+
+
+def sources_of(runs: Sequence[Run]) -> tuple[Provenance, ...]:
+    """Provenance of several runs."""
+    return tuple(run.provenance for run in runs)
+
+
+def provenance_of(folder: Path, root: Path, metrics: Mapping[str, Any]) -> Provenance:
+    """Provenance of a run's folder: config.yaml, inputs.json and the entries run/... of its metrics, as far as known.
+
+    Raises UserError if a file is damaged.
+    """
+    recorded = {key: str(metrics.get(f"run/{key}") or "") for key in ("commit", "date", "command", "hardware")}
+    inputs: dict[str, str] = {}
+    if (folder / "inputs.json").is_file():
+        content = read_json(folder / "inputs.json")
+        if not isinstance(content, dict):
+            raise UserError(folder / "inputs.json", "content", type(content).__name__, "an object of hashes")
+        inputs = {str(name): str(sha256) for name, sha256 in content.items() if sha256}
+    text, sha256, seed = "", "", ""
+    if (folder / "config.yaml").is_file():
+        sections = read_config_file(folder / "config.yaml")
+        seeds = {str(own["seed"]) for own in sections.values() if isinstance(own, dict) and "seed" in own}
+        content_bytes = (folder / "config.yaml").read_bytes()
+        text, sha256 = content_bytes.decode(), hashlib.sha256(content_bytes).hexdigest()
+        seed = ", ".join(sorted(seeds))
+    source = folder.relative_to(root).as_posix() if folder.is_relative_to(root) else folder.name
+    return Provenance(source, sha256, inputs, seed=seed, settings=text, **recorded)
+
+
+def provenance_of_dataset(dataset: Dataset) -> Provenance:
+    """Provenance of a dataset: hash of its dataset.json, random seeds, versions and settings of its recipes."""
+    recipes = list(dataset.info.recipes.values())
+    settings = json.dumps([recipe.config for recipe in recipes], indent=2, sort_keys=True)
+    versions = {f"{name} {version}" for recipe in recipes for name, version in recipe.versions.items()}
+    return Provenance(
+        f"dataset {dataset.info.name}",
+        hashlib.sha256(settings.encode()).hexdigest(),
+        {"dataset.json": dataset.store.sha256(INFO_NAME)},
+        seed=", ".join(sorted({str(recipe.seed) for recipe in recipes})),
+        versions=", ".join(sorted(versions)),
+        settings=settings,
+    )
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file of a run. Raises UserError if it is damaged or too large."""
+    if path.stat().st_size > LARGEST_JSON_BYTES:
+        raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {LARGEST_JSON_BYTES} bytes")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UserError(path, "content", error, "JSON") from None
