@@ -18,6 +18,7 @@ from perilune_train.explain.evidence.gates import forced_gates, gate_means
 from perilune_train.explain.evidence.localisation import localisation
 from perilune_train.explain.evidence.nulls import detector_nulls
 from perilune_train.explain.evidence.performance import DetectionPerformance
+from perilune_train.explain.evidence.permutation import detector_permutations
 from perilune_train.explain.evidence.randomisation import randomised
 from perilune_train.explain.evidence.removal import removal_effect
 from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary, validation_signs
@@ -54,7 +55,9 @@ def explain_detector(
     plain = {name: int(sign) for (_, measure, name), sign in signs.items() if measure == "pcc1_craterness"}
     strongest = strongest_gate(before, plain)
     values = _values(frames, masks, blank, rng)
-    differences = null_differences(values, signs, rng)
+    maps = frames.truth, brightness_map(frames.images), gradient_map(frames.images)
+    permutations = detector_permutations(masks, *maps, frames.scene_ids, signs, rng)
+    differences = pd.concat([null_differences(values, signs, rng), permutations], ignore_index=True)
 
     some = evenly_spaced(len(frames.images), settings.n_attributed)
     attributed = attributions(settings, network, frames.images[some])

@@ -15,6 +15,7 @@ from perilune_train.explain.detection import SHALLOW_STAGES
 from perilune_train.explain.evidence.gates import forced_gates, gate_means
 from perilune_train.explain.evidence.nulls import pair_nulls
 from perilune_train.explain.evidence.performance import MotionPerformance
+from perilune_train.explain.evidence.permutation import pair_permutations
 from perilune_train.explain.evidence.randomisation import randomised
 from perilune_train.explain.evidence.removal import removal_effect
 from perilune_train.explain.evidence.significance import against_nulls, null_differences, summary
@@ -58,7 +59,8 @@ def explain_navigator(
     scale = pairs.images.shape[2] / size_px
     nulls = pair_nulls(halves[0], halves[1], masks, blank, homographies, ids_of_pairs, scenes, rng, scale)
     values = pd.concat([pair_values(masks, homographies, ids_of_pairs, scenes), nulls], ignore_index=True)
-    differences = null_differences(values, {}, rng)
+    permutations = pair_permutations(masks, homographies, scenes, rng)
+    differences = pd.concat([null_differences(values, {}, rng), permutations], ignore_index=True)
 
     length = pairs.translation_m.shape[1]
     runs = evenly_spaced(len(pairs.translation_m), max(1, settings.n_changed_pairs // length))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perilune_train.explain.evidence.stability import between, noisy, shifted, stability
+from perilune_train.explain.evidence.stability import between, lens_map, noisy, shifted, stability
 
 
 @pytest.fixture
@@ -52,24 +52,46 @@ def test_a_mask_that_follows_the_image_is_stable_under_shifts_and_one_fixed_to_t
 def test_both_frames_of_a_stacked_pair_are_shifted(images):
     pairs = np.concatenate([images, images[::-1]], axis=1)
     table = stability(
-        lambda given: {"half": given.astype(np.float32)}, pairs, np.random.default_rng(0), (), ((0, 5),), stacked=2
+        lambda given: {"half": given.astype(np.float32)}, pairs, np.random.default_rng(0), (), ((0, 5),), (), stacked=2
     )
     np.testing.assert_allclose(table["pearson"], 1)
     seen = []
-    stability(lambda given: {"half": seen.append(given) or given}, pairs, np.random.default_rng(0), (), ((0, 5),), 2)
+    stability(
+        lambda given: {"half": seen.append(given) or given}, pairs, np.random.default_rng(0), (), ((0, 5),), (), 2
+    )
     np.testing.assert_array_equal(seen[1][:, 69:], pairs[:, 64:-5])
     np.testing.assert_array_equal(seen[1][:, 64:69], np.repeat(pairs[:, 64:65], 5, axis=1))
 
 
-def test_between_renderings_of_another_lens(images):
+def test_a_lens_by_hand():
+    column, row = lens_map(65, 65, -0.1)
+    assert (column[32, 32], row[32, 32]) == (32, 32)
+    # At the edge of the new image, r' = 32 / 32.5 half widths.
+    assert column[32, 64] == pytest.approx(32 + 32 * (1 + 0.1 * (32 / 32.5) ** 2))
+    assert row[32, 64] == 32
+
+
+def test_a_mask_that_follows_the_image_is_stable_under_another_lens_and_one_fixed_to_the_frame_is_not(images):
+    fixed = cv2.GaussianBlur(np.random.default_rng(2).normal(size=(128, 128)), (0, 0), 1)
+    large = np.stack([cv2.resize(one, (128, 128)) for one in images])
+    pairs = np.concatenate([large, large[::-1]], axis=1)
+
+    def masks_of(given):
+        doubled = np.concatenate([fixed, fixed])
+        return {"brightness": given.astype(np.float32), "fixed": np.stack([doubled] * len(given))}
+
+    table = stability(masks_of, pairs, np.random.default_rng(0), (), (), (-0.08, 0.08), stacked=2)
+    assert set(table["change"]) == {"lens -8 %", "lens +8 %"}
+    values = table.groupby("map")["pearson"]
+    assert values.min()["brightness"] > 0.99
+    assert values.max()["fixed"] < 0.8
+
+
+def test_between_two_renderings(images):
     masks_a = {"B_11": images.astype(np.float32)}
-    x, y = np.meshgrid(np.arange(64, dtype=np.float32), np.arange(64, dtype=np.float32))
-    # Lens b shows the point of pixel x of a at 64 - x, so pixel 0 of a is outside b.
     masks_b = {"B_11": np.roll(masks_a["B_11"][:, :, ::-1], 1, axis=2)}
-    mapped = between(masks_a, masks_b, "lens", 64 - x, y)
-    np.testing.assert_allclose(mapped["pearson"], 1, atol=1e-6)
-    assert mapped["frame_index"].tolist() == [0, 1, 2] and set(mapped["change"]) == {"lens"}
-    plain = between(masks_a, masks_b, "lens")
+    plain = between(masks_a, masks_b, "turned Sun")
+    assert plain["frame_index"].tolist() == [0, 1, 2] and set(plain["change"]) == {"turned Sun"}
     expected = [np.corrcoef(masks_a["B_11"][i].ravel(), masks_b["B_11"][i].ravel())[0, 1] for i in range(3)]
     np.testing.assert_allclose(plain["pearson"], expected)
     assert (plain["pearson"].abs() < 0.5).all()

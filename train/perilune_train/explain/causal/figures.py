@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from perilune_train.evaluation.pictures import save_figure, save_image
-from perilune_train.evaluation.spread import draw_resamples, spreads
+from perilune_train.evaluation.spread import Resamples, draw_resamples, spreads
 from perilune_train.explain.causal.effects import region
 from perilune_train.explain.causal.pairs import CraterPairs
 from perilune_train.explain.page.bars import BLUE, GREY, ORANGE
@@ -34,19 +34,24 @@ def by_gate(effects: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """
     rows = []
     for (block, version), own in effects.dropna(subset="change").groupby(["map", "version"], sort=False):
-        values, scenes = own["change"].to_numpy(), own["scene_id"].tolist()
-        resamples = draw_resamples(scenes, [""] * len(scenes), own["frame_id"].tolist(), rng)
-        every = np.arange(len(values))
-
-        def mean(drawn, every=every, values=values):
-            return {"mean": drawn.totals(every, values) / np.maximum(drawn.totals(every), 1)}
-
-        interval = spreads(mean, every, resamples)["mean"].interval if resamples.unit == "scene" else None
-        low, high = interval or (np.nan, np.nan)
-        rows.append(
-            {"map": block, "version": version, "change": values.mean(), "low": low, "high": high, "n": len(own)}
-        )
+        low, high = scene_interval(own["change"].to_numpy(), own["scene_id"].tolist(), own["frame_id"].tolist(), rng)
+        change = own["change"].mean()
+        rows.append({"map": block, "version": version, "change": change, "low": low, "high": high, "n": len(own)})
     return pd.DataFrame(rows)
+
+
+def scene_interval(
+    values: NDArray[np.float64], scene_ids: list[str], frame_ids: list[str], rng: np.random.Generator
+) -> tuple[float, float]:
+    """95 % interval of the mean of values (N,) by bootstrap over scenes; NaN with fewer than five scenes."""
+    resamples = draw_resamples(scene_ids, [""] * len(scene_ids), frame_ids, rng)
+    every = np.arange(len(values))
+
+    def mean(drawn: Resamples) -> dict[str, NDArray[np.float64]]:
+        return {"mean": drawn.totals(every, values) / np.maximum(drawn.totals(every), 1)}
+
+    interval = spreads(mean, every, resamples)["mean"].interval if resamples.unit == "scene" else None
+    return interval or (float("nan"), float("nan"))
 
 
 def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:

@@ -114,6 +114,8 @@ def causal_run(
     mark_files(run.root, list(CAPTIONS), marks["detector"])
     metrics = _metrics(tables, gate) | terrain
     claims = _claims(metrics, gates, gate)
+    if pose is not None:
+        claims.append(_pose_claim(tables["pose_effects"], rng))
     write_text(run.root / "claims.json", json.dumps(claims, indent=2) + "\n")
     write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
     for claim in claims:
@@ -211,6 +213,21 @@ def _claims(metrics: Metrics, gates: pd.DataFrame, gate: str) -> list[dict[str, 
         },
     ]
     return claims
+
+
+def _pose_claim(effects: pd.DataFrame, rng: np.random.Generator) -> dict[str, str]:
+    before, after, moved_m = (np.sqrt((effects[name] ** 2).mean()) for name in ("before", "after", "moved_m"))
+    harm = (effects["after"] - effects["before"]).to_numpy()
+    low, high = figures.scene_interval(harm, effects["scene_id"].tolist(), effects["frame_id"].tolist(), rng)
+    known = bool(np.isfinite(low))
+    return {
+        "claim": "Navigator: single craters matter (position error of a step without the removed craters)",
+        "figure": f"r.m.s. {before:.3f} m with, {after:.3f} m without; estimates move by {moved_m:.3f} m",
+        "interval": f"mean increase {low:.3f} to {high:.3f} m" if known else "none: fewer than 5 scenes",
+        "nulls": "-",
+        "verdict": "undecided: fewer than 5 scenes" if not known else "holds" if low > 0 else "does not hold",
+        "picture": "before_after_causal.png",
+    }
 
 
 def _below(share: object, other: object) -> bool:

@@ -8,16 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 
 from perilune_shared.geometry.frames import Array
 from perilune_train.explain.correlation.measures import detector_values, pair_values
 from perilune_train.explain.correlation.pearson import Maps
 from perilune_train.explain.maps.baselines import Images, baseline_maps
 from perilune_train.explain.maps.masks import Masks
-
-DRAWS = 1000
-"""Permutations of `permutation_p`."""
 
 
 def detector_nulls(
@@ -88,30 +84,3 @@ def other_rows(scene_ids: Sequence[str], rng: np.random.Generator) -> np.ndarray
     rows = np.arange(len(scenes))
     alone = len(np.unique(scenes)) == 1
     return np.array([rng.choice(rows[rows != n] if alone else rows[scenes != scenes[n]]) for n in rows])
-
-
-def permutation_p(
-    correlations: ArrayLike, scene_ids: Sequence[str], rng: np.random.Generator, n_draws: int = DRAWS
-) -> float:
-    """One-sided p of the mean of the diagonal of correlations (N, N) of mask n with ground truth m.
-
-    Exchanges the ground truth of whole scenes, which are the independent units. A frame gets the frame at the same
-    relative position in the other scene's frames, so that altitudes stay alike. p is (1 + draws that reach the observed
-    mean) / (1 + n_draws) (Phipson & Smyth 2010, doi 10.2202/1544-6115.1585). With S scenes it is about 1 / S! at least.
-    For a gate that is weaker on craters, pass the negative. NaN values are left out; NaN if no diagonal value is
-    defined.
-    """
-    values = np.asarray(correlations, np.float64)
-    if np.isnan(np.diagonal(values)).all():
-        return float("nan")
-    _, of_row = np.unique(np.asarray(scene_ids), return_inverse=True)
-    members = [np.flatnonzero(of_row == scene) for scene in range(of_row.max() + 1)]
-    everyone = np.arange(len(values))
-    observed, reached = np.nanmean(np.diagonal(values)), 0
-    for _ in range(n_draws):
-        partner = everyone.copy()
-        for own, to in zip(members, rng.permutation(len(members)), strict=True):
-            partner[own] = members[to][np.arange(len(own)) * len(members[to]) // len(own)]
-        drawn = values[everyone, partner]
-        reached += bool(np.isfinite(drawn).any() and np.nanmean(drawn) >= observed - 1e-12)
-    return (1 + reached) / (1 + n_draws)

@@ -1,4 +1,4 @@
-"""Similarity of masks under noise and shifts of the image, and between two renderings of the same poses."""
+"""Similarity of masks under noise, shifts, another lens, and between two renderings of the same poses."""
 
 from collections.abc import Callable, Mapping
 
@@ -14,6 +14,8 @@ SIGMAS_DN = (2.0, 5.0)
 """Standard deviations of the added noise, grey values of 255."""
 SHIFTS_PX = ((1, 0), (0, 1), (3, -2))
 """Shifts to the right and down, pixels."""
+LENSES = (-0.05, 0.05)
+"""Radial distortions: relative change of the distance from the middle at half the image's width. Below 0: barrel."""
 
 
 def noisy(images: NDArray[np.uint8], sigma_dn: float, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -29,19 +31,33 @@ def shifted(images: NDArray, dx: int, dy: int) -> NDArray:
     return images[..., rows[:, None], columns]
 
 
+def lens_map(height: int, width: int, distortion: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Column and row (height, width) in an image of the pixel that another lens shows at each pixel.
+
+    r = r' (1 - distortion r'^2), with r' the distance from the middle through the new lens, in half widths, and r that
+    through the old one. 0 is the middle of the first pixel, as for cv2.remap.
+    """
+    x, y = np.meshgrid(np.arange(width) - (width - 1) / 2, np.arange(height) - (height - 1) / 2)
+    factor = 1 - distortion * (x**2 + y**2) / (width / 2) ** 2
+    column, row = x * factor + (width - 1) / 2, y * factor + (height - 1) / 2
+    return column.astype(np.float32), row.astype(np.float32)
+
+
 def stability(
     masks_of: Callable[[NDArray[np.uint8]], Masks],
     images: NDArray[np.uint8],
     rng: np.random.Generator,
     sigmas_dn: tuple[float, ...] = SIGMAS_DN,
     shifts_px: tuple[tuple[int, int], ...] = SHIFTS_PX,
+    lenses: tuple[float, ...] = LENSES,
     stacked: int = 1,
 ) -> pd.DataFrame:
     """Pearson correlation of the masks of images (N, height, width) with those of the changed images.
 
-    Columns: map, change ("noise 2 DN", "shift 3 -2 px"), frame_index, pearson (NaN if a mask is constant). A shift is
-    undone before masks are compared, over the pixels that both images show. `stacked` is the number of frames stacked
-    in height in each image; each of them is shifted.
+    Columns: map, change ("noise 2 DN", "shift 3 -2 px", "lens -5 %"), frame_index, pearson (NaN if a mask is constant).
+    A shift is undone before masks are compared, over the pixels that both images show. For another lens, the image is
+    resampled, and so is the mask of the original (`lens_map`). `stacked` is the number of frames stacked in height in
+    each image; each of them is changed.
     """
     before = masks_of(images)
     tables = []
@@ -60,33 +76,30 @@ def stability(
         inside[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)] = True
         seen = np.broadcast_to(np.tile(inside, (stacked, 1)), images.shape)
         tables.append(_compared(before, after, f"shift {dx} {dy} px", seen))
+    for distortion in lenses:
+        maps = lens_map(images.shape[1] // stacked, images.shape[2], distortion)
+
+        def bent(values: NDArray, maps: tuple = maps) -> NDArray:
+            frames = values.reshape(-1, *maps[0].shape)
+            x, y = maps
+            changed = [cv2.remap(one, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in frames]
+            return np.stack(changed).reshape(values.shape)
+
+        inside = (maps[0] >= 0) & (maps[0] <= images.shape[2] - 1) & (maps[1] >= 0) & (maps[1] <= len(maps[0]) - 1)
+        seen = np.broadcast_to(np.tile(inside, (stacked, 1)), images.shape)
+        expected = {name: bent(found) for name, found in before.items()}
+        tables.append(_compared(expected, masks_of(bent(images)), f"lens {100 * distortion:+g} %", seen))
     return pd.concat(tables, ignore_index=True)
 
 
 def between(
-    masks_a: Mapping[str, NDArray[np.floating]],
-    masks_b: Mapping[str, NDArray[np.floating]],
-    change: str,
-    map_x: NDArray[np.float32] | None = None,
-    map_y: NDArray[np.float32] | None = None,
+    masks_a: Mapping[str, NDArray[np.floating]], masks_b: Mapping[str, NDArray[np.floating]], change: str
 ) -> pd.DataFrame:
     """Pearson correlation of masks (N, height, width) of the same poses rendered twice.
 
     Columns as in `stability`, with `change` as the change's name.
-
-    For another lens, `map_x` and `map_y` (height, width) are the column and row in b of each pixel of a, as for
-    cv2.remap (0 is the centre of the first pixel). Only pixels of a that are in b are compared.
     """
-    if map_x is None or map_y is None:
-        return _compared(masks_a, masks_b, change, None)
-    first = next(iter(masks_b.values()))
-    height, width = first.shape[1:]
-    inside = (map_x >= 0) & (map_x <= width - 1) & (map_y >= 0) & (map_y <= height - 1)
-    remapped = {
-        name: np.stack([cv2.remap(one, map_x, map_y, cv2.INTER_LINEAR) for one in found])
-        for name, found in masks_b.items()
-    }
-    return _compared(masks_a, remapped, change, np.broadcast_to(inside, (len(first), *inside.shape)))
+    return _compared(masks_a, masks_b, change, None)
 
 
 def _compared(

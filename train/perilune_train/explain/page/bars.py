@@ -19,6 +19,7 @@ _MARKERS = {
     "brightness": ("v", RED),
     "other frame": ("x", "#CC79A7"),
     "other pair": ("x", "#CC79A7"),
+    "permutation": ("+", "#56B4E9"),
 }
 
 

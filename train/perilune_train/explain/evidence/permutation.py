@@ -1,0 +1,124 @@
+"""The permutation null: how large a correlation is if masks and targets of different scenes are exchanged."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from perilune_shared.geometry.frames import Array
+from perilune_train.evaluation.spread import MIN_UNITS
+from perilune_train.explain.correlation.homography import moved_to_first, seen_in_second
+from perilune_train.explain.correlation.pearson import (
+    Maps,
+    given_basis,
+    pearson_rows,
+    residual_rows,
+    standardised_rows,
+)
+from perilune_train.explain.evidence.significance import Signs
+from perilune_train.explain.maps.masks import Masks
+
+NULL = "permutation"
+"""Name of the null in the table of differences."""
+DRAWS = 1000
+"""Permutations of a test."""
+_PAIR_STEP = 4
+"""Pixels from one sample of a stacked mask to the next one, in both directions."""
+
+
+def permuted(
+    correlations: ArrayLike, scene_ids: Sequence[str], rng: np.random.Generator, n_draws: int = DRAWS
+) -> tuple[float, float]:
+    """Mean over permutations, and one-sided p, of the mean of the diagonal of correlations (N, N).
+
+    Element (n, m) is the correlation of mask n with target m. Exchanges the targets of whole scenes, which are the
+    independent units. A frame gets the frame at the same relative position in the other scene's frames, so that
+    altitudes stay alike. p is (1 + draws that reach the observed mean) / (1 + n_draws) (Phipson & Smyth 2010, doi
+    10.2202/1544-6115.1585). With S scenes it is about 1 / S! at least. For a gate that is weaker on craters, pass the
+    negative. NaN values are left out; both are NaN if no diagonal value is defined.
+    """
+    values = np.asarray(correlations, np.float64)
+    if np.isnan(np.diagonal(values)).all():
+        return float("nan"), float("nan")
+    _, of_row = np.unique(np.asarray(scene_ids), return_inverse=True)
+    members = [np.flatnonzero(of_row == scene) for scene in range(of_row.max() + 1)]
+    everyone = np.arange(len(values))
+    observed, means = np.nanmean(np.diagonal(values)), []
+    for _ in range(n_draws):
+        partner = everyone.copy()
+        for own, to in zip(members, rng.permutation(len(members)), strict=True):
+            partner[own] = members[to][np.arange(len(own)) * len(members[to]) // len(own)]
+        drawn = values[everyone, partner]
+        if np.isfinite(drawn).any():
+            means.append(np.nanmean(drawn))
+    reached = sum(mean >= observed - 1e-12 for mean in means)
+    return float(np.mean(means)) if means else float("nan"), (1 + reached) / (1 + n_draws)
+
+
+def detector_permutations(
+    masks: Masks,
+    truth: Maps,
+    brightness: Maps,
+    gradient: Maps,
+    scene_ids: Sequence[str],
+    signs: Signs,
+    rng: np.random.Generator,
+) -> pd.DataFrame:
+    """Rows of the permutation null for pcc1_craterness and pcc1_partial, with the columns of `null_differences`.
+
+    The maps are (N, height, width), as in `detector_values`; `signs` are those of `validation_signs`. PCC2 has no such
+    null: it does not depend on the order of the frames.
+    """
+    basis = given_basis([brightness, gradient])
+    craterness = standardised_rows(1 - truth)
+    residuals = residual_rows(craterness, basis)
+    rows = []
+    for gate, found in masks.items():
+        own = standardised_rows(found)
+        matrices = {"pcc1_craterness": own @ craterness.T, "pcc1_partial": residual_rows(own, basis) @ residuals.T}
+        for measure, matrix in matrices.items():
+            signed = signs["detect", measure, gate] * matrix
+            rows.append(_row("detect", measure, gate, signed, scene_ids, rng))
+    return pd.DataFrame(rows)
+
+
+def pair_permutations(
+    masks: Masks, homographies: Sequence[Array], scene_ids: Sequence[str], rng: np.random.Generator
+) -> pd.DataFrame:
+    """Rows of the permutation null for pcc3, pcc4 and pcc4_minus_pcc3, with the columns of `null_differences`.
+
+    Upper halves are compared with the lower halves of the pairs of other scenes, moved by the homography of their own
+    pair. Stacked masks (N, 2 height, width) are sampled every fourth pixel, since all N x N combinations are computed;
+    values therefore differ slightly from those of `pair_values`.
+    """
+    scale = np.diag([1 / _PAIR_STEP, 1 / _PAIR_STEP, 1.0])
+    small = [scale @ one @ np.linalg.inv(scale) for one in homographies]
+    rows = []
+    for gate, found in masks.items():
+        upper, lower = np.split(found, 2, axis=1)
+        upper, lower = (one[:, _PAIR_STEP // 2 :: _PAIR_STEP, _PAIR_STEP // 2 :: _PAIR_STEP] for one in (upper, lower))
+        matrices: dict[str, list[Array]] = {"pcc3": [], "pcc4": []}
+        for mask, homography in zip(upper, small, strict=True):
+            seen = np.broadcast_to(seen_in_second(mask.shape, homography), lower.shape)
+            same = np.broadcast_to(mask, lower.shape)
+            matrices["pcc3"].append(pearson_rows(same, lower, seen))
+            moved = np.stack([moved_to_first(one, homography) for one in lower])
+            matrices["pcc4"].append(pearson_rows(same, moved, seen))
+        both = {measure: np.stack(own) for measure, own in matrices.items()}
+        both["pcc4_minus_pcc3"] = both["pcc4"] - both["pcc3"]
+        rows += [_row("navigate", measure, gate, matrix, scene_ids, rng) for measure, matrix in both.items()]
+    return pd.DataFrame(rows)
+
+
+def _row(
+    task: str, measure: str, gate: str, matrix: Array, scene_ids: Sequence[str], rng: np.random.Generator
+) -> dict[str, object]:
+    own = np.diagonal(matrix)
+    value = float(np.nanmean(own)) if np.isfinite(own).any() else float("nan")
+    null_value, p = permuted(matrix, scene_ids, rng)
+    scenes = len(set(np.asarray(scene_ids)[np.isfinite(own)].tolist()))
+    names = {"task": task, "measure": measure, "map": gate, "null": NULL, "value": value, "null_value": null_value}
+    interval = {"difference": value - null_value, "low": float("nan"), "high": float("nan")}
+    tested = {"p_bootstrap": float("nan"), "p": p if scenes >= MIN_UNITS else float("nan")}
+    return names | interval | {"n_units": scenes, "unit": "scene"} | tested
