@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-gates bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -68,7 +68,7 @@ demo: setup ## run all steps: set-up, datasets, detection, navigation, explanati
 	@echo "Datasets    $(DATA)/detect  $(DATA)/nav           pictures: overview.png"
 	@echo "Detection   $(RUNS)/detect/$(NAME)                metrics.json, *.png, detections.parquet"
 	@echo "Navigation  $(RUNS)/navigate/$(NAME)[-stack]      metrics.json, *.png, navigation.parquet"
-	@echo "Explanation $(RUNS)/explain/$(NAME)               metrics.json, *.png, correlations.parquet"
+	@echo "Explanation $(RUNS)/explain/$(NAME)               claims.json, metrics.json, *.png, *.parquet"
 	@echo "Report      $(RUNS)/report/$(NAME)                report.html (open it in a browser), summary.md"
 
 dataset: setup ## render the preset's datasets (KIND=detect|nav for one); run again to resume
@@ -254,6 +254,10 @@ bench-truth: setup ## depth and normals of EXRs, compared with cast rays; writes
 
 bench-contrast: setup ## AUC of contrast for the craters that the detector finds; writes runs/bench/contrast.json
 	@$(BIN)/python -m benchmarks.train.contrast "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"
+
+GATES ?= "$(RUNS)/detect/$(NAME)"
+bench-gates: detect-frames ## AP and variation of attention masks of detect runs on the validation split (GATES="runs/detect/a runs/detect/b"); writes runs/bench/gates.json
+	@$(BIN)/python -m benchmarks.train.gates "$(DATA)/detect" $(GATES)
 
 bench-infer: setup ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer

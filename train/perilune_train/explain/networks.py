@@ -13,6 +13,11 @@ from perilune_train.explain.config import ExplainConfig
 from perilune_train.training.runs import load_weights
 
 
+def folder_of(checkpoint: Path) -> Path:
+    """The folder with config.yaml of a checkpoint: its run's, or that of an installed network's weights."""
+    return checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
+
+
 def open_single_scale(checkpoint: Path, config: DetectConfig, settings: ExplainConfig) -> Detector:
     """Load a detector that runs at scale 1 only, since masks belong to one scale, on the device of `settings`."""
     evaluation = config.evaluation.model_copy(update={"scales": (1.0,)})

@@ -21,7 +21,7 @@ from perilune_train.explain.correlation.measures import PCC1_SIGN
 from perilune_train.explain.evidence.tables import TABLES, Evidence
 from perilune_train.explain.inputs import consecutive_pairs, first_descent, frames_of, labelled_frames
 from perilune_train.explain.maps.masks import Masks, detector_masks
-from perilune_train.explain.networks import open_single_scale, terrain_marks
+from perilune_train.explain.networks import folder_of, open_single_scale, terrain_marks
 from perilune_train.explain.page import claims as page
 from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
 from perilune_train.explain.page.viewer import save_masks
@@ -43,8 +43,9 @@ def explain_run(
 ) -> RunFolder:
     """Compute the evidence on the attention gates of two networks on test data; writes runs/explain/<name>.
 
-    `detector` is checkpoints/best.ckpt in the folder of its run, whose config.yaml defines the selected craters. Leaves
-    a finished run of the same settings, datasets and checkpoints unchanged; `overwrite` replaces any existing run.
+    `detector` is checkpoints/best.ckpt of a run, or the weights of an installed network: the config.yaml of its folder
+    defines the selected craters. Leaves a finished run of the same settings, datasets and checkpoints unchanged;
+    `overwrite` replaces any existing run.
     Signs and the gates whose pixels are removed are chosen on the validation splits.
 
     Raises UserError if the existing run has other settings, datasets or checkpoints; if a dataset, a checkpoint or
@@ -63,7 +64,7 @@ def explain_run(
     marks, terrain = terrain_marks(
         {"detector": (detector, detect_data), "navigator": (navigator, nav_data)}, allow_overlap
     )
-    own = config_of_run(detector.parent.parent, ())
+    own = config_of_run(folder_of(detector), ())
     opened = open_single_scale(detector, own, settings)
     labelled, flown = open_dataset(detect_data), open_dataset(nav_data)
     frames, split = labelled_frames(labelled, "test", own, settings.n_frames, settings.ring_factors)
@@ -116,8 +117,16 @@ def _figures(found: Evidence) -> Metrics:
             metrics |= {f"{key}_low": float(row["low"]), f"{key}_high": float(row["high"])}
     for tested in found.tested.to_dict("records"):
         metrics[f"{tested['measure']}_beats_nulls/{tested['map']}"] = bool(tested["beats_all"])
-    metrics[f"{found.values['task'].iloc[0]}/strongest_gate"] = found.strongest
-    metrics[f"{found.values['task'].iloc[0]}/undefined"] = int(rows["undefined"].sum())
+    task = str(found.values["task"].iloc[0])
+    harm = page.removal_row(found, higher_is_better=task == detection.TASK)
+    metrics |= {f"{task}/removal_{name}": float(harm[name]) for name in ("most", "least", "random", "shifted")}
+    # Without harm by a control there is no ratio.
+    metrics[f"{task}/removal_ratio"] = float(harm["ratio"]) if np.isfinite(harm["ratio"]) else 0.0
+    metrics[f"{task}/strongest_gate"] = found.strongest
+    for measure in ("pcc1_craterness", "pcc1_partial") if task == detection.TASK else ("pcc4", "pcc4_minus_pcc3"):
+        metrics[f"{task}/{measure}_beating_to_stride_8"] = len(page.beating_gates(found, measure))
+        metrics[f"{task}/{measure}_beating"] = len(page.beating_gates(found, measure, "12345"))
+    metrics[f"{task}/undefined"] = int(rows["undefined"].sum())
     return metrics
 
 

@@ -27,7 +27,7 @@ from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.stability import between
 from perilune_train.explain.inputs import frames_of
 from perilune_train.explain.maps.masks import detector_masks
-from perilune_train.explain.networks import open_single_scale, terrain_marks
+from perilune_train.explain.networks import folder_of, open_single_scale, terrain_marks
 from perilune_train.navigate.network import load_navigator
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.runs import RunFolder, choose_device
@@ -80,7 +80,7 @@ def causal_run(
     state = state_of(run, "explain", settings, inputs, overwrite)
     if state == "finished":
         return run
-    folder = checkpoint.parent.parent if checkpoint.parent.name == "checkpoints" else checkpoint.parent
+    folder = folder_of(checkpoint)
     config, threshold = config_of_run(folder, ()), chosen_threshold(folder)
     removed, opened = read_removed(counterfactual), open_dataset(dataset)
     marks, terrain = terrain_marks({"detector": (checkpoint, dataset)}, allow_overlap, split)

@@ -71,5 +71,5 @@ def _collected(backbone: AttentionDarknet53, inputs: list[torch.Tensor], size: t
                 own = mask[:, 0].float().cpu().numpy()
                 masks.setdefault(name, []).extend(cv2.resize(m, size[::-1]) for m in own)
     if not masks:
-        raise UserError(where, "attention", "none", "a checkpoint of a network with attention, cbam or cbam_identity")
+        raise UserError(where, "attention", "none", "a checkpoint of a network with attention gates")
     return {name: np.stack(found) for name, found in masks.items()}

@@ -122,7 +122,7 @@ def _against_nulls(found: Evidence, measure: str, gate: str, claim: str, picture
 def _shallow(found: Evidence) -> Claim:
     own = found.tested[(found.tested["measure"] == "pcc1_craterness")]
     shallow = own[own["map"].str[2].isin(["1", "2", "3"])]
-    beating = shallow.loc[shallow["beats_all"], "map"].tolist()
+    beating = beating_gates(found, "pcc1_craterness")
     stages = [str(k) for k in (1, 2, 3) if any(block[2] == str(k) for block in beating)]
     verdict = "holds" if len(stages) == 3 else "does not hold"
     undecided = bool(shallow["verdict"].str.startswith("undecided").any())
@@ -175,17 +175,25 @@ def _located(found: Evidence) -> Claim:
     )
 
 
-def _removal(found: Evidence, task: str, unit: str, *, higher_is_better: bool) -> Claim:
-    effects = found.removal.rename(columns={"image": "frame_index"})
-    table = removal_summary(effects, higher_is_better)
+def removal_row(found: Evidence, *, higher_is_better: bool) -> pd.Series:
+    """Harm of removing the strongest gate's pixels (a row of `removal_summary`), by the less favourable filling."""
+    table = removal_summary(found.removal, higher_is_better)
     own = table[table["map"] == found.strongest]
-    # The least favourable way of filling is the headline.
-    ratio = own["ratio"].fillna(-np.inf)
-    row = own.iloc[int(np.argmin(ratio.to_numpy()))]
+    return own.iloc[int(np.argmin(own["ratio"].fillna(-np.inf).to_numpy()))]
+
+
+def beating_gates(found: Evidence, measure: str, stages: str = "123") -> list[str]:
+    """Gates of some stages that beat every null in a measure, corrected for all 23 gates."""
+    own = found.tested[(found.tested["measure"] == measure) & found.tested["beats_all"]]
+    return own.loc[own["map"].str[2].isin(list(stages)), "map"].tolist()
+
+
+def _removal(found: Evidence, task: str, unit: str, *, higher_is_better: bool) -> Claim:
+    row = removal_row(found, higher_is_better=higher_is_better)
     controls = (
         f"random {row['random']:.3f}, same shape elsewhere {row['shifted']:.3f}, least attended {row['least']:.3f}"
     )
-    scenes = effects["scene_id"].nunique()
+    scenes = found.removal["scene_id"].nunique()
     if math.isfinite(row["ratio"]):
         times = f"{row['ratio']:.1f} times the stronger control"
     else:
