@@ -90,6 +90,9 @@ class LossSettings(Section):
     """Weight of negative predictors within L_obj."""
     lambda_teacher: Positive = 1.0
     """Weight of the distillation loss from `teacher`; its box and objectness terms have the weights above."""
+    lambda_guide: Annotated[float, Field(ge=0)] = 0.0
+    """Weight of the guidance of attention gates: 1 - correlation with the labelled craters of the masks of B_11, B_22
+    and B_38, the last gates of the stages up to stride 8. 0: gates learn from detection alone (the paper)."""
 
 
 class EvaluationSettings(Section):
@@ -125,7 +128,8 @@ class DetectConfig(Section):
     width: Annotated[float, Field(ge=0.125, le=2)] = 1.0
     """Factor on all channel counts; 1 is the paper's network."""
     attention: Attention = "cbam"
-    """none (the baseline), cbam (the paper's), or cbam_identity (gates that start at exactly 1)."""
+    """none (the baseline), cbam (the paper's), cbam_identity (gates that start at exactly 1), or cbam_centred (gates
+    between 0.5 and 1.5 that cannot become constant)."""
     in_channels: Literal[1, 3] = 3
     """Input channels. 3: the grey frame three times, as in the paper's RGB network."""
     strides: tuple[int, int, int] = (8, 16, 32)
@@ -202,4 +206,6 @@ class DetectConfig(Section):
             raise ValueError("expected strides 8, 16, 32 or 4, 8, 16")
         if self.frozen_epochs >= self.epochs:
             raise ValueError("frozen_epochs must be less than epochs")
+        if self.loss.lambda_guide > 0 and self.attention == "none":
+            raise ValueError("loss.lambda_guide above 0 needs attention gates, attention is none")
         return self

@@ -78,9 +78,12 @@ class AttentionDarknet53(nn.Module):
 
     def attention_masks(self, x: Tensor) -> dict[str, Tensor]:
         """Spatial attention masks "B_ij": (N, 1, h, w) of images (N, in_channels, H, W); empty without attention."""
+        return self.features_and_masks(x)[1]
+
+    def features_and_masks(self, x: Tensor) -> tuple[list[Tensor], dict[str, Tensor]]:
+        """The results of `forward` and of `attention_masks`."""
         masks: dict[str, Tensor] = {}
-        self._run(x, masks)
-        return masks
+        return self._run(x, masks), masks
 
     def _run(self, x: Tensor, masks: dict[str, Tensor] | None) -> list[Tensor]:
         features = []

@@ -71,7 +71,14 @@ class YOLOv3(nn.Module):
 
         H and W are multiples of 32.
         """
-        features = self.backbone(images)
+        return self._outputs(self.backbone(images))
+
+    def outputs_and_masks(self, images: Tensor) -> tuple[list[Tensor], dict[str, Tensor]]:
+        """The result of `forward`, and the spatial attention masks "B_ij" (N, 1, h, w)."""
+        features, masks = self.backbone.features_and_masks(images)
+        return self._outputs(features), masks
+
+    def _outputs(self, features: list[Tensor]) -> list[Tensor]:
         outputs: list[Tensor] = []
         above = None
         for index in range(len(_STRIDES) - 1, _STRIDES.index(self.strides[0]) - 1, -1):

@@ -17,6 +17,7 @@ from perilune_train.detect.evaluate.matching import Detections, joined, match_sp
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.detect.train.distill import Teacher, distill_loss
+from perilune_train.detect.train.guide import guide_loss
 from perilune_train.detect.train.loss import detection_loss
 from perilune_train.detect.train.preview_images import preview_images
 from perilune_train.evaluation.provenance import RECORD
@@ -160,11 +161,18 @@ class DetectTask(lightning.LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         images, targets = batch
         self.images_seen += len(images) * self.process[1]
-        outputs = self.network(images)
-        settings = self.config.loss
+        settings, masks = self.config.loss, {}
+        if settings.lambda_guide > 0:
+            outputs, masks = self.network.outputs_and_masks(images)
+        else:
+            outputs = self.network(images)
         box, confidence = detection_loss(outputs, targets, self.network.anchors, self.network.strides, settings)
         self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(images))
         loss = settings.lambda_iou * box + settings.lambda_obj * confidence
+        if settings.lambda_guide > 0:
+            guide = guide_loss(masks, targets, (images.shape[2], images.shape[3]))
+            self.log("train/guide", guide, batch_size=len(images))
+            loss = loss + settings.lambda_guide * guide
         if self.teacher is not None:
             teacher_outputs = self.teacher(images)
             box, confidence = distill_loss(outputs, teacher_outputs, self.network.anchors, self.network.strides)
