@@ -6,12 +6,20 @@ from typing import cast
 from torch import Tensor, nn
 
 from perilune_train.config import Attention
-from perilune_train.models.attention import CBAM, Form
+from perilune_train.models.attention import AMPLITUDE, CBAM, Form
 
 UNITS = (1, 2, 8, 8, 4)
 """Residual units in each stage."""
 _STEM_CHANNELS = 32
-_FORMS: dict[Attention, Form] = {"cbam": "plain", "cbam_identity": "identity", "cbam_centred": "centred"}
+_FORMS: dict[Attention, Form] = {
+    "cbam": "plain",
+    "cbam_identity": "identity",
+    "cbam_centred": "centred",
+    "cbam_narrow": "centred",
+    "cbam_last": "centred",
+}
+_NARROW = 0.1
+"""Amplitude of the gates of cbam_narrow."""
 
 
 def scaled(channels: int, width: float) -> int:
@@ -69,8 +77,10 @@ class AttentionDarknet53(nn.Module):
             for j in range(UNITS[i]):
                 name = f"B_{i + 1}{j + 1}"
                 self.units[name] = ResidualUnit(channels)
-                if attention != "none":
-                    self.attentions[name] = CBAM(channels, form=_FORMS[attention])
+                last_only = attention == "cbam_last"
+                if attention != "none" and (j == UNITS[i] - 1 or not last_only):
+                    amplitude = _NARROW if attention == "cbam_narrow" else AMPLITUDE
+                    self.attentions[name] = CBAM(channels, form=_FORMS[attention], amplitude=amplitude)
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Images (N, in_channels, H, W) to the stages' feature maps (N, channels[i], H / 2^(i+1), W / 2^(i+1))."""
