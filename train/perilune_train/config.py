@@ -4,10 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-Attention = Literal["none", "cbam", "cbam_identity", "cbam_centred", "cbam_narrow", "cbam_last"]
+Attention = Literal["none", "cbam", "cbam_identity", "cbam_centred", "cbam_last"]
 """none: plain Darknet53; cbam: the paper's gates; cbam_identity: gates that are exactly 1 at initialisation;
-cbam_centred: spatial gates between 0.5 and 1.5 that cannot become constant; cbam_narrow: the same, between 0.9 and 1.1;
-cbam_last: centred gates after the last unit of each stage, 5 in place of 23."""
+cbam_centred: spatial gates between 0.5 and 1.5 that cannot become constant; cbam_last: the same after the last unit of
+each stage only, 5 gates in place of 23."""
 Precision = Literal["auto", "bf16", "float32"]
 """auto: bfloat16 if the hardware supports it."""
 Device = Literal["auto", "cpu", "cuda"]

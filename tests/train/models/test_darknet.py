@@ -64,6 +64,13 @@ def test_identity_attention_keeps_the_plain_backbones_features():
         assert torch.equal(a, b)
 
 
+def test_cbam_last_has_one_gate_in_each_stage():
+    gated = AttentionDarknet53(1, 0.125, "cbam_last").eval()
+    assert list(gated.attention_masks(torch.randn(1, 1, 64, 64))) == ["B_11", "B_22", "B_38", "B_48", "B_54"]
+    features, masks = gated.features_and_masks(torch.zeros(1, 1, 64, 64))
+    assert len(features) == len(masks) == 5
+
+
 def test_without_attention_there_are_no_masks():
     assert AttentionDarknet53(1, 0.125).eval().attention_masks(torch.zeros(1, 1, 32, 32)) == {}
 

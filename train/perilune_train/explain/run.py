@@ -13,6 +13,7 @@ from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
 from perilune_train.detect.evaluate.split_evaluation import selection_entries
 from perilune_train.detect.finished_run import config_of_run
+from perilune_train.detect.train.guide import GUIDED
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.explain import detection, navigation
@@ -82,7 +83,8 @@ def explain_run(
     seen, stacked = navigation.explain_navigator(settings, stack, architecture, pairs, known_pairs, navigator)
     draw_navigator(run.root, settings, pairs, stacked, seen)
 
-    claims = page.detector_claims(found, _deviations(masks)) + page.navigator_claims(seen, _deviations(stacked))
+    guided = GUIDED if own.loss.lambda_guide > 0 else ()
+    claims = page.detector_claims(found, _deviations(masks), guided) + page.navigator_claims(seen, _deviations(stacked))
     _write_tables(run, {detection.TASK: found, navigation.TASK: seen})
     write_text(run.root / "claims.json", json.dumps([one.plain() for one in claims], indent=2) + "\n")
     write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
@@ -90,6 +92,7 @@ def explain_run(
     metrics |= {f"mask_deviation/{block}": value for block, value in _deviations(masks).items()}
     metrics |= {f"mask_deviation_stack/{block}": value for block, value in _deviations(stacked).items()}
     metrics |= {
+        "detect/guided_gates": " ".join(guided),
         "headline": page.headline(claims),
         "pcc1_sign": PCC1_SIGN,
         "frames": len(frames.images),

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 Form = Literal["plain", "identity", "centred"]
 AMPLITUDE = 0.5
-"""Default of the largest deviation of a centred spatial gate from 1."""
+"""Largest deviation of a centred spatial gate from 1."""
 
 
 class MeanAndMax(torch.autograd.Function):
@@ -46,22 +46,14 @@ class CBAM(nn.Module):
     by about 0.25. Identity form: s is twice the sigmoid, and W1 and f_7x7 start at zero. Both gates are between 0 and 2
     and exactly 1 at initialisation, so that a pretrained backbone keeps its features. Long training drives spatial
     gates of this form to a constant 2. Centred form: the channel gate of the identity form, and
-    M_s(F') = 1 + a tanh(n(f_7x7 [avg(F'); max(F')])), where n is a batch norm without weights and a the amplitude: over
-    pixels and frames the gate is between 1 - a and 1 + a and centred, and it cannot become constant.
+    M_s(F') = 1 + 0.5 tanh(n(f_7x7 [avg(F'); max(F')])), where n is a batch norm without weights: over pixels and frames
+    the gate is between 0.5 and 1.5 and centred, and it cannot become constant.
 
     Shape: (N, C, H, W) to the same. The layers have no bias, as in the equations.
     """
 
-    def __init__(
-        self,
-        channels: int,
-        reduction: int = 16,
-        kernel: int = 7,
-        form: Form = "plain",
-        amplitude: float = AMPLITUDE,
-    ):
+    def __init__(self, channels: int, reduction: int = 16, kernel: int = 7, form: Form = "plain"):
         super().__init__()
-        self.amplitude = amplitude
         hidden = max(channels // reduction, 4)
         self.squeeze = nn.Linear(channels, hidden, bias=False)
         self.excite = nn.Linear(hidden, channels, bias=False)
@@ -85,7 +77,7 @@ class CBAM(nn.Module):
         logits = self.spatial(torch.cat(MeanAndMax.apply(x, 1), dim=1))
         if self.norm is None:
             return self.scale * torch.sigmoid(logits)
-        return 1 + self.amplitude * torch.tanh(self.norm(logits.float()))
+        return 1 + AMPLITUDE * torch.tanh(self.norm(logits.float()))
 
     def gated(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Spatial mask M_s (N, 1, H, W) and refined features F'' (N, C, H, W)."""

@@ -6,7 +6,7 @@ from typing import cast
 from torch import Tensor, nn
 
 from perilune_train.config import Attention
-from perilune_train.models.attention import AMPLITUDE, CBAM, Form
+from perilune_train.models.attention import CBAM, Form
 
 UNITS = (1, 2, 8, 8, 4)
 """Residual units in each stage."""
@@ -15,11 +15,8 @@ _FORMS: dict[Attention, Form] = {
     "cbam": "plain",
     "cbam_identity": "identity",
     "cbam_centred": "centred",
-    "cbam_narrow": "centred",
     "cbam_last": "centred",
 }
-_NARROW = 0.1
-"""Amplitude of the gates of cbam_narrow."""
 
 
 def scaled(channels: int, width: float) -> int:
@@ -55,7 +52,8 @@ class AttentionDarknet53(nn.Module):
 
     At width 1 with 3 input channels and 5 stages it has 52 convolutions and 40,620,640 floats in Darknet's count
     (weights, and scale, bias, mean and variance of each batch norm), without attention. Residual unit j of stage i is
-    `units["B_ij"]`, its CBAM `attentions["B_ij"]` (i = 1..5, j = 1..1, 2, 8, 8, 4), named as in the paper.
+    `units["B_ij"]`, its CBAM `attentions["B_ij"]` (i = 1..5, j = 1..1, 2, 8, 8, 4), named as in the paper. The form
+    cbam_last has a CBAM after the last unit of each stage only: B_11, B_22, B_38, B_48, B_54.
 
     Deviation from the original at widths other than 1: channels are rounded to multiples of 8.
     """
@@ -77,10 +75,9 @@ class AttentionDarknet53(nn.Module):
             for j in range(UNITS[i]):
                 name = f"B_{i + 1}{j + 1}"
                 self.units[name] = ResidualUnit(channels)
-                last_only = attention == "cbam_last"
-                if attention != "none" and (j == UNITS[i] - 1 or not last_only):
-                    amplitude = _NARROW if attention == "cbam_narrow" else AMPLITUDE
-                    self.attentions[name] = CBAM(channels, form=_FORMS[attention], amplitude=amplitude)
+                # The form cbam_last has gates after the last units only.
+                if attention != "none" and (attention != "cbam_last" or j == UNITS[i] - 1):
+                    self.attentions[name] = CBAM(channels, form=_FORMS[attention])
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """Images (N, in_channels, H, W) to the stages' feature maps (N, channels[i], H / 2^(i+1), W / 2^(i+1))."""

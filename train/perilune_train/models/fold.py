@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from perilune_train.models.attention import CBAM
+from perilune_train.models.attention import AMPLITUDE, CBAM
 
 
 class FlightCBAM(nn.Module):
@@ -13,7 +13,7 @@ class FlightCBAM(nn.Module):
     def __init__(self, cbam: CBAM):
         super().__init__()
         self.squeeze, self.excite = _as_convolution(cbam.squeeze), _as_convolution(cbam.excite)
-        self.scale, self.centred, self.amplitude = cbam.scale, cbam.norm is not None, cbam.amplitude
+        self.scale, self.centred = cbam.scale, cbam.norm is not None
         self.spatial = cbam.spatial if cbam.norm is None else fuse_conv_bn_eval(cbam.spatial, cbam.norm)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -22,7 +22,7 @@ class FlightCBAM(nn.Module):
         x = x * (self.scale * torch.sigmoid(self.excite(squeezed)))
         pooled = torch.cat([x.mean(1, keepdim=True), x.amax(1, keepdim=True)], dim=1)
         logits = self.spatial(pooled)
-        return x * (1 + self.amplitude * torch.tanh(logits) if self.centred else self.scale * torch.sigmoid(logits))
+        return x * (1 + AMPLITUDE * torch.tanh(logits) if self.centred else self.scale * torch.sigmoid(logits))
 
 
 def fold(network: nn.Module) -> None:

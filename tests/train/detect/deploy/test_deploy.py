@@ -35,8 +35,9 @@ def lively(attention="cbam_identity", strides=(4, 8, 16), in_channels=1):
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = 0.8
-            nn.init.uniform_(module.weight, 0.5, 1.5)
-            nn.init.uniform_(module.bias, -0.5, 0.5)
+            if module.affine:
+                nn.init.uniform_(module.weight, 0.5, 1.5)
+                nn.init.uniform_(module.bias, -0.5, 0.5)
         elif isinstance(module, nn.Linear) or (isinstance(module, nn.Conv2d) and not module.weight.any()):
             nn.init.normal_(module.weight, std=0.1)
     for head in network.heads.values():
@@ -54,7 +55,8 @@ def images(dataset_detect):
 
 
 @pytest.mark.parametrize(
-    ("attention", "strides"), [("none", (8, 16, 32)), ("cbam", (4, 8, 16)), ("cbam_identity", (4, 8, 16))]
+    ("attention", "strides"),
+    [("none", (8, 16, 32)), ("cbam", (4, 8, 16)), ("cbam_identity", (4, 8, 16)), ("cbam_last", (4, 8, 16))],
 )
 def test_folding_changes_nothing(attention, strides, images):
     network = lively(attention, strides)

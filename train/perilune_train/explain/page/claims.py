@@ -1,6 +1,7 @@
 """Statements on the gates, each with its figure, interval, nulls, verdict and picture."""
 
 import math
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -42,19 +43,18 @@ class Claim:
         return asdict(self)
 
 
-def detector_claims(found: Evidence, deviations: dict[str, float]) -> list[Claim]:
-    """Claims on the detector; `deviations` are the standard deviations of the masks over pixels and images."""
+def detector_claims(found: Evidence, deviations: dict[str, float], guided: Collection[str] = ()) -> list[Claim]:
+    """Claims on the detector; `deviations` are the standard deviations of the masks over pixels and images.
+
+    `guided` are gates whose masks were trained to follow labels; the claims say so.
+    """
     strongest = found.strongest
+    follows = f"Detector: the mask of {strongest} follows craters"
+    trained = ", as it was trained to" if strongest in guided else ""
     return [
+        _against_nulls(found, "pcc1_craterness", strongest, follows + trained, "pcc_detect.png"),
         _against_nulls(
-            found, "pcc1_craterness", strongest, f"Detector: the mask of {strongest} follows craters", "pcc_detect.png"
-        ),
-        _against_nulls(
-            found,
-            "pcc1_partial",
-            strongest,
-            f"Detector: the mask of {strongest} follows craters beyond brightness and gradient",
-            "pcc_detect.png",
+            found, "pcc1_partial", strongest, f"{follows} beyond brightness and gradient{trained}", "pcc_detect.png"
         ),
         _shallow(found),
         _deep_alike(found),
@@ -130,21 +130,22 @@ def _shallow(found: Evidence) -> Claim:
         "Detector: every stage up to stride 8 has a gate that beats every null (paper: shallow gates follow craters)",
         f"{len(beating)} of {len(shallow)} gates, stages {', '.join(stages) or 'none'}",
         "-",
-        "untrained, edge, contrast, brightness, other frame; Benjamini-Hochberg over 23 gates",
+        f"untrained, edge, contrast, brightness, other frame, permutation; Benjamini-Hochberg over {len(own)} gates",
         "undecided: fewer than 5 scenes" if undecided else verdict,
         "pcc_detect.png",
     )
 
 
 def _deep_alike(found: Evidence) -> Claim:
-    rows = [_row(found, "pcc2", gate) for gate in DEEP_GATES]
+    gates = [gate for gate in DEEP_GATES if gate in set(found.summary["map"])]
+    rows = [_row(found, "pcc2", gate) for gate in gates]
     values = [float(row["value"]) for row in rows]
-    untrained = [_null_value(found, "pcc2", gate, "untrained") for gate in DEEP_GATES]
+    untrained = [_null_value(found, "pcc2", gate, "untrained") for gate in gates]
     holds = all(value > DEEP_ALIKE for value in values)
     trivial = holds and all(value > DEEP_ALIKE for value in untrained)
     verdict = "does not hold" if not holds else "holds, as in the untrained network" if trivial else "holds"
     return Claim(
-        f"Paper: PCC2 of {', '.join(DEEP_GATES)} is above {DEEP_ALIKE}",
+        f"Paper: PCC2 of {', '.join(gates)} is above {DEEP_ALIKE}",
         ", ".join(f"{value:.2f}" for value in values),
         "; ".join(_interval(row) for row in rows[:1]),
         "untrained " + ", ".join(f"{value:.2f}" for value in untrained),
