@@ -8,8 +8,10 @@ from perilune_train.detect.data.assign import Targets
 
 GUIDED = ("B_11", "B_22", "B_38")
 """The last gates of the stages of stride 2, 4 and 8."""
-_RINGS = ((1.0, 1.0), (1.1, 0.8), (1.2, 0.6), (1.3, 0.4), (1.4, 0.2))
-"""Outer radius, divided by the crater's, and value: 1 - G of the paper's mask G."""
+_REACHES, _LEVELS = (1.0, 1.1, 1.2, 1.3, 1.4), (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
+"""Outer radii of crater and rings, divided by the crater's, and 1 - G of the paper's mask G inside each and beyond."""
+_WINDOWS = (4.0, 16.0)
+"""Largest reaches, pixels of the map, of the craters that are painted together."""
 _TINY = 1e-6
 
 
@@ -24,22 +26,33 @@ def craterness(targets: Targets, frames: int, height: int, width: int, stride: i
     frame = torch.cat([found.places[0] for found in targets])
     # Several predictors learn a label.
     rows = torch.unique(torch.cat([frame[:, None].float(), boxes], 1), dim=0)
-    frame, boxes = rows[:, 0].long(), rows[:, 1:]
-    v, u = torch.meshgrid(
-        (torch.arange(height, device=boxes.device) + 0.5) * stride,
-        (torch.arange(width, device=boxes.device) + 0.5) * stride,
-        indexing="ij",
-    )
-    centre, half = (boxes[:, :2] + boxes[:, 2:]) / 2, ((boxes[:, 2:] - boxes[:, :2]) / 2).clamp(min=_TINY)
-    x = ((u[0] - centre[:, :1]) / half[:, :1]).square()
-    y = ((v[:, :1].T - centre[:, 1:]) / half[:, 1:]).square()
-    distance = (x[:, None, :] + y[:, :, None]).sqrt()
-    value = torch.zeros_like(distance)
-    for reach, level in reversed(_RINGS):
-        value = torch.where(distance <= reach, level, value)
-    found = torch.zeros(frames, height * width, device=boxes.device)
-    value = value.flatten(1)
-    return found.scatter_reduce_(0, frame[:, None].expand_as(value), value, "amax").view(frames, 1, height, width)
+    rows = torch.cat([rows[:, :1], rows[:, 1:] / stride], 1)
+    found = torch.zeros(frames, height, width, device=boxes.device)
+    reach = (rows[:, 3:] - rows[:, 1:3]).amax(1) / 2 * _REACHES[-1]
+    # Most craters are small, so windows save nearly all of the work; a training step waits for it.
+    smaller = torch.zeros_like(reach, dtype=torch.bool)
+    for largest in (*_WINDOWS, float("inf")):
+        own = (reach <= largest) & ~smaller
+        if own.any():
+            _paint(found, rows[own], int(2 * float(reach[own].max())) + 2)
+        smaller |= own
+    return found[:, None]
+
+
+def _paint(found: Tensor, rows: Tensor, side: int) -> None:
+    """Paint craters (N, 5), frame and box in pixels of the map, into `found`, each in a window of `side` pixels."""
+    _, height, width = found.shape
+    centre, half = (rows[:, 1:3] + rows[:, 3:]) / 2, ((rows[:, 3:] - rows[:, 1:3]) / 2).clamp(min=_TINY)
+    first = (centre - side / 2).ceil().long()
+    steps = torch.arange(side, device=rows.device)
+    u, v = first[:, :1] + steps, first[:, 1:] + steps
+    x = ((u + 0.5 - centre[:, :1]) / half[:, :1]).square()
+    y = ((v + 0.5 - centre[:, 1:]) / half[:, 1:]).square()
+    edges, levels = torch.tensor(_REACHES, device=rows.device).square(), torch.tensor(_LEVELS, device=rows.device)
+    value = levels[torch.bucketize(x[:, None, :] + y[:, :, None], edges)]
+    place = (rows[:, :1].long() * height + v)[:, :, None] * width + u[:, None, :]
+    inside = ((v >= 0) & (v < height))[:, :, None] & ((u >= 0) & (u < width))[:, None, :]
+    found.view(-1).scatter_reduce_(0, place[inside], value[inside], "amax")
 
 
 def guide_loss(masks: dict[str, Tensor], targets: Targets, size_px: tuple[int, int]) -> Tensor:
