@@ -120,9 +120,9 @@ paper: setup ## the paper's experiment: tables, figures and verdicts in runs/pap
 	  $(if $(ATTITUDE),--attitude) $(if $(DARKNET),--darknet $(call quoted,$(DARKNET)))
 
 # Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
-ABLATION ?= none:attention=none cbam:attention=cbam strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
+ABLATION ?= none:attention=none cbam:attention=cbam identity:attention=cbam_identity unguided:loss.lambda_guide=0 strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0
 ABLATED = "$(RUNS)/detect/$(NAME)" $(foreach one,$(ABLATION),"$(RUNS)/detect/$(NAME)-$(firstword $(subst :, ,$(one)))")
-ablate-detect: train-detect ## train with one change each (no attention, plain CBAM, other strides, other widths) and compare
+ablate-detect: train-detect ## train with one change each (other attention, no guidance, other strides, other widths) and compare
 	@$(foreach one,$(ABLATION),$(BIN)/perilune-train detect train $(COMMON) --set detect.$(lastword $(subst :, ,$(one))) \
 	  --out "$(RUNS)" --name $(NAME)-$(firstword $(subst :, ,$(one))) --dataset "$(DATA)/detect" $(OVER) &&) true
 	@$(BIN)/perilune-train detect compare $(ABLATED) --out "$(RUNS)/detect/$(NAME)-ablation"

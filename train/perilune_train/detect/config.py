@@ -92,7 +92,8 @@ class LossSettings(Section):
     """Weight of the distillation loss from `teacher`; its box and objectness terms have the weights above."""
     lambda_guide: Annotated[float, Field(ge=0)] = 0.0
     """Weight of the guidance of attention gates: 1 - correlation with the labelled craters of the masks of B_11, B_22
-    and B_38, the last gates of the stages up to stride 8. 0: gates learn from detection alone (the paper)."""
+    and B_38, the last gates of the stages up to stride 8. 0: gates learn from detection alone (the paper). No effect
+    without attention."""
 
 
 class EvaluationSettings(Section):
@@ -206,6 +207,4 @@ class DetectConfig(Section):
             raise ValueError("expected strides 8, 16, 32 or 4, 8, 16")
         if self.frozen_epochs >= self.epochs:
             raise ValueError("frozen_epochs must be less than epochs")
-        if self.loss.lambda_guide > 0 and self.attention == "none":
-            raise ValueError("loss.lambda_guide above 0 needs attention gates, attention is none")
         return self

@@ -66,6 +66,21 @@ def test_guided_steps_make_the_masks_follow_craters(dataset_detect, tmp_path):
     assert found[-1] < 0.75 * found[0]
 
 
-def test_guidance_needs_gates():
-    with pytest.raises(ValueError, match="lambda_guide above 0 needs attention gates"):
-        DetectConfig(attention="none", loss=LossSettings(lambda_guide=1.0))
+def test_guidance_has_no_effect_without_gates(dataset_detect, tmp_path):
+    split = load_split(open_dataset(dataset_detect), "train", LabelSettings())
+    losses = []
+    for weight in (0.0, 5.0):
+        config = DetectConfig(
+            width=0.125,
+            in_channels=1,
+            strides=(4, 8, 16),
+            attention="none",
+            batch_size=2,
+            loss=LossSettings(lambda_guide=weight),
+        )
+        torch.manual_seed(0)
+        task = DetectTask(build_network(config, split.label_sizes_px, tmp_path), config, split, split, 0)
+        task.log_dict = lambda *_, **__: None
+        batch = next(iter(training_loader(split, config, task.network.anchors)))
+        losses.append(task.training_step(task.transfer_batch_to_device(batch, torch.device("cpu"), 0), 0).item())
+    assert losses[0] == losses[1]

@@ -162,14 +162,15 @@ class DetectTask(lightning.LightningModule):
         images, targets = batch
         self.images_seen += len(images) * self.process[1]
         settings, masks = self.config.loss, {}
-        if settings.lambda_guide > 0:
+        guided = settings.lambda_guide > 0 and self.config.attention != "none"
+        if guided:
             outputs, masks = self.network.outputs_and_masks(images)
         else:
             outputs = self.network(images)
         box, confidence = detection_loss(outputs, targets, self.network.anchors, self.network.strides, settings)
         self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(images))
         loss = settings.lambda_iou * box + settings.lambda_obj * confidence
-        if settings.lambda_guide > 0:
+        if guided:
             guide = guide_loss(masks, targets, (images.shape[2], images.shape[3]))
             self.log("train/guide", guide, batch_size=len(images))
             loss = loss + settings.lambda_guide * guide
