@@ -11,7 +11,7 @@ from perilune_train.explain.correlation.pearson import is_constant
 from perilune_train.explain.maps.masks import Masks
 
 _CELL_PX = 160
-_COLUMNS = 8
+_MOST_COLUMNS = 8
 _WHITE = (255, 255, 255)
 
 
@@ -23,6 +23,7 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
     """
     low = min(float(found.min()) for found in masks.values())
     high = max(float(found.max()) for found in masks.values())
+    columns = min(_MOST_COLUMNS, 1 + len(masks))
     sheet = []
     for n, image in enumerate(images):
         height = round(_CELL_PX * image.shape[0] / image.shape[1])
@@ -32,8 +33,8 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
         for name, found in masks.items():
             mask = cv2.resize(found[n], (_CELL_PX, height))
             cells.append(_labelled(_coloured(mask, low, high), caption(name, found[n])))
-        cells += [np.full_like(cells[0], 255)] * (-len(cells) % _COLUMNS)
-        sheet += [np.hstack(cells[i : i + _COLUMNS]) for i in range(0, len(cells), _COLUMNS)]
+        cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
+        sheet += [np.hstack(cells[i : i + columns]) for i in range(0, len(cells), columns)]
     sheet.append(_colour_bar(sheet[0].shape[1], low, high))
     save_image(path, np.vstack(sheet))
 
@@ -47,7 +48,7 @@ def caption(block: str, mask: NDArray[np.floating]) -> str:
 def _coloured(values: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
     """Convert values to colours of the sheet's scale, (height, width, 3) BGR."""
     level = np.clip(255 * (values - low) / max(high - low, 1e-9), 0, 255).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_TURBO), np.uint8)
+    return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS), np.uint8)
 
 
 def _colour_bar(width_px: int, low: float, high: float) -> NDArray[np.uint8]:
