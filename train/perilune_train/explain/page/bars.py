@@ -119,7 +119,7 @@ def draw_randomisation(path: Path, randomisation: pd.DataFrame) -> None:
     """Draw the rank correlation of each gate's mask with the trained one as stages are randomised, both cascades."""
     figure = Figure(figsize=(12, 4), layout="constrained")
     for axis, (direction, rows) in zip(
-        figure.subplots(1, 2, sharey=True), randomisation.groupby("direction", sort=False), strict=True
+        figure.subplots(1, 2), randomisation.groupby("direction", sort=False), strict=True
     ):
         table = rows.pivot_table(index="map", columns="step", values="spearman", sort=False, dropna=False)
         picture = axis.imshow(table.to_numpy(np.float64).T, cmap="cividis", vmin=-1, vmax=1, aspect="auto")
