@@ -39,7 +39,8 @@ def point(dataset: Dataset, root: Path, n_frames: int) -> dict[str, Any]:
     except (KeyError, TypeError, ValueError):
         expected = "the metrics of a finished run with a validation split"
         raise UserError(root / "metrics.json", "val", "no number", expected) from None
-    own = {"run": root.name, "attention": config.attention, "seed": config.seed, **found}
+    form = config.attention + (", guided" if config.loss.lambda_guide > 0 else "")
+    own = {"run": root.name, "form": form, "seed": config.seed, **found}
     if config.attention == "none":
         return own | {"deviations": {}, "constant": 0, "least_deviation": None}
     frames, _ = labelled_frames(dataset, "val", config, n_frames, ExplainConfig().ring_factors)
@@ -53,7 +54,7 @@ def point(dataset: Dataset, root: Path, n_frames: int) -> dict[str, Any]:
 def by_form(points: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Mean AP over the runs of each form, its smallest and largest value, and the constant gates of the worst run."""
     result = {}
-    for form, own in pd.DataFrame(points).groupby("attention", sort=False):
+    for form, own in pd.DataFrame(points).groupby("form", sort=False):
         result[str(form)] = {"runs": float(len(own)), "constant_worst": float(own["constant"].max())}
         for name in _KEYS:
             values = own[name].to_numpy(np.float64)
@@ -66,17 +67,20 @@ def draw(points: list[dict[str, Any]], path: Path) -> None:
     """Plot strict AP against the number of constant gates, and the deviation of each gate of each run."""
     figure = Figure(figsize=(12, 4), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 2))
-    forms = list(dict.fromkeys(one["attention"] for one in points))
+    blocks = list(dict.fromkeys(sorted(block for one in points for block in one["deviations"])))
+    forms = list(dict.fromkeys(one["form"] for one in points))
     for form, colour in zip(forms, _COLOURS, strict=False):
-        own = [one for one in points if one["attention"] == form]
+        own = [one for one in points if one["form"] == form]
         left.plot([one["constant"] for one in own], [one["ap_strict"] for one in own], "o", color=colour, label=form)
         for one in own:
-            right.plot(list(one["deviations"]), list(one["deviations"].values()), ".-", color=colour, linewidth=0.8)
+            place = [blocks.index(block) for block in one["deviations"]]
+            right.plot(place, list(one["deviations"].values()), ".-", color=colour, linewidth=0.8)
     left.set(xlabel="constant gates, of 23", ylabel="AP, strict account, validation split")
     left.legend(fontsize=8)
     right.axhline(LEAST_DEVIATION, color="black", linestyle="--", linewidth=0.8)
-    right.set(yscale="symlog", ylabel="standard deviation of the mask", ylim=(0, None))
     right.set_yscale("symlog", linthresh=LEAST_DEVIATION)
+    right.set(ylabel="standard deviation of the mask", ylim=(0, None))
+    right.set_xticks(range(len(blocks)), blocks)
     right.tick_params(axis="x", rotation=60)
     for axis in (left, right):
         axis.grid(alpha=0.3)
