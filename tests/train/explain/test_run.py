@@ -112,6 +112,8 @@ def test_a_run_writes_values_tests_interventions_claims_and_pictures(
     claims = json.loads((run.root / "claims.json").read_text())
     assert len(claims) == 14 and all(set(one) == set(claims[0]) for one in claims)
     assert {(run.root / one["picture"]).is_file() for one in claims} == {True}
+    verdicts = [one["verdict"] for one in claims if "is constant" not in one["claim"]]
+    assert all(verdict.startswith("undecided") for verdict in verdicts)
     assert "follows craters" in metrics["headline"] and "PCC4" in metrics["headline"]
     captions = json.loads((run.root / "captions.json").read_text())
     assert captions == CAPTIONS and {path.name for path in run.root.glob("*.png")} == set(captions)

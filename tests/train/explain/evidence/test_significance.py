@@ -11,6 +11,7 @@ from perilune_train.explain.evidence.significance import (
     against_nulls,
     null_differences,
     summary,
+    unit_sign_flip_p,
     validation_signs,
 )
 
@@ -144,3 +145,10 @@ def test_two_values_of_one_frame_are_refused():
     table = _table({"B_11": _noisy(0.5)})
     with pytest.raises(ValueError, match="two values of one frame for B_11, pcc1_craterness"):
         summary(pd.concat([table, table]), np.random.default_rng(0))
+
+
+def test_sign_flips_of_units_by_hand():
+    # Of eight flips only the observed one reaches the sum.
+    assert unit_sign_flip_p(np.array([1.0, 2.0, 3.0])) == pytest.approx(1 / 8)
+    assert unit_sign_flip_p(np.array([1.0, 2.0, -4.0])) == pytest.approx(5 / 8)
+    assert unit_sign_flip_p(np.full(20, 1.0)) == pytest.approx(1 / 4096)

@@ -81,6 +81,22 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
     return pd.DataFrame(rows)
 
 
+def unit_sign_flip_p(values: Array) -> float:
+    """One-sided p of a mean above 0 of the values (U,) of independent units, by sign flips.
+
+    All 2^U flips up to 12 units, else 4096 random ones of a fixed seed.
+    """
+    flips = _flips(len(values), np.random.default_rng(0))
+    return float(np.mean(flips @ values >= values.sum() - 1e-12 * np.abs(values).sum()))
+
+
+def _flips(units: int, rng: np.random.Generator) -> Array:
+    """Signs, 1 or -1, of units (flips, units): all, or 4096 with the first row all 1."""
+    if 2**units <= _FLIPS:
+        return 1.0 - 2.0 * (np.arange(2**units)[:, None] >> np.arange(units) & 1)
+    return np.vstack([np.ones(units), rng.choice([-1.0, 1.0], (_FLIPS - 1, units))])
+
+
 def against_nulls(differences: pd.DataFrame) -> pd.DataFrame:
     """One row for each task, measure and gate: value, n_units, unit, p, p_adjusted, beats_all, verdict.
 
@@ -152,12 +168,7 @@ class _Frames:
         if len(set(ids)) < len(ids):
             raise ValueError("a frame is in two scenes")
         resamples = draw_resamples(scenes, [one.rpartition("/")[0] for one in ids], ids, rng)
-        units = resamples.count
-        if 2**units <= _FLIPS:
-            flips = 1.0 - 2.0 * (np.arange(2**units)[:, None] >> np.arange(units) & 1)
-        else:
-            flips = np.vstack([np.ones(units), rng.choice([-1.0, 1.0], (_FLIPS - 1, units))])
-        return cls(pd.Index(ids), resamples, flips)
+        return cls(pd.Index(ids), resamples, _flips(resamples.count, rng))
 
     def aligned(self, own: pd.DataFrame) -> Array:
         """Values (N,) of one map and measure; NaN where a frame has none."""

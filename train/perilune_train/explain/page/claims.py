@@ -7,8 +7,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import pandas as pd
 
+from perilune_train.evaluation.spread import MIN_UNITS
+from perilune_train.explain.evidence.gates import ALL
 from perilune_train.explain.evidence.removal import removal_summary
-from perilune_train.explain.evidence.significance import BEATS
+from perilune_train.explain.evidence.significance import BEATS, LEVEL, UNDECIDED, unit_sign_flip_p
 from perilune_train.explain.evidence.tables import Evidence
 
 STILL_FROM = 37
@@ -94,6 +96,16 @@ def headline(claims: list[Claim]) -> str:
     return "; ".join(parts) + "."
 
 
+def _decided(holds: bool, scenes: int) -> str:
+    """The verdict on a statement that was measured over a number of scenes."""
+    return UNDECIDED if scenes < MIN_UNITS else "holds" if holds else "does not hold"
+
+
+def _scenes(rows: pd.DataFrame) -> int:
+    """The number of scenes behind rows of a summary: 1 if their units are trajectories of one scene."""
+    return int(rows["n_units"].min()) if len(rows) and (rows["unit"] == "scene").all() else 1
+
+
 def _row(found: Evidence, measure: str, gate: str) -> pd.Series:
     own = found.summary[(found.summary["measure"] == measure) & (found.summary["map"] == gate)]
     return own.iloc[0]
@@ -131,7 +143,7 @@ def _shallow(found: Evidence) -> Claim:
         f"{len(beating)} of {len(shallow)} gates, stages {', '.join(stages) or 'none'}",
         "-",
         f"untrained, edge, contrast, brightness, other frame, permutation; Benjamini-Hochberg over {len(own)} gates",
-        "undecided: fewer than 5 scenes" if undecided else verdict,
+        UNDECIDED if undecided else verdict,
         "pcc_detect.png",
     )
 
@@ -143,7 +155,8 @@ def _deep_alike(found: Evidence) -> Claim:
     untrained = [_null_value(found, "pcc2", gate, "untrained") for gate in gates]
     holds = all(value > DEEP_ALIKE for value in values)
     trivial = holds and all(value > DEEP_ALIKE for value in untrained)
-    verdict = "does not hold" if not holds else "holds, as in the untrained network" if trivial else "holds"
+    verdict = _decided(holds, _scenes(pd.DataFrame(rows)))
+    verdict = "holds, as in the untrained network" if verdict == "holds" and trivial else verdict
     return Claim(
         f"Paper: PCC2 of {', '.join(gates)} is above {DEEP_ALIKE}",
         ", ".join(f"{value:.2f}" for value in values),
@@ -171,7 +184,7 @@ def _located(found: Evidence) -> Claim:
         f"{row['value']:.2f}",
         _interval(row),
         "chance 0.50, " + ", ".join(f"{name} {own[name]:.2f}" for name in methods),
-        "holds" if holds else "does not hold",
+        _decided(bool(holds), _scenes(row.to_frame().T)),
         "localisation_detect.png",
     )
 
@@ -205,7 +218,7 @@ def _removal(found: Evidence, task: str, unit: str, *, higher_is_better: bool) -
         f"{row['most']:.3f}; {times} (filled by {row['how']}, the less favourable)",
         f"none: ratio over {scenes} scenes",
         controls,
-        "holds" if math.isfinite(row["ratio"]) and row["ratio"] >= HARM_RATIO and row["most"] > 0 else "does not hold",
+        _decided(math.isfinite(row["ratio"]) and row["ratio"] >= HARM_RATIO and row["most"] > 0, scenes),
         f"removal_{'detect' if task == 'Detector' else 'navigate'}.png",
     )
 
@@ -214,12 +227,15 @@ def _forced(found: Evidence, task: str, unit: str, *, higher_is_better: bool) ->
     change = (found.gates["before"] - found.gates["after"]) * (1 if higher_is_better else -1)
     harm = found.gates.assign(harm=change).groupby("scope", sort=False)["harm"].mean()
     single = harm[harm.index.str.startswith("B_")]
+    every = found.gates.assign(harm=change)[found.gates["scope"] == ALL]
+    scenes = every.groupby("scene_id")["harm"].mean().to_numpy()
+    p = unit_sign_flip_p(scenes)
     return Claim(
         f"{task}: the pattern of the masks matters (all gates forced to their means: {unit})",
-        f"harm {harm['all gates']:.3f}",
-        f"none: {found.gates['scene_id'].nunique()} scenes; by scene in gates.parquet",
+        f"harm {harm[ALL]:.3f}",
+        f"{scenes.min():.3f} to {scenes.max():.3f} over {len(scenes)} scenes, p {p:.3f}",
         f"largest single gate {single.idxmax()} {single.max():.3f}; median gate {single.median():.3f}",
-        "holds" if harm["all gates"] > 0 else "does not hold",
+        _decided(p < LEVEL, len(scenes)),
         f"gates_{'detect' if task == 'Detector' else 'navigate'}.png",
     )
 
@@ -252,6 +268,6 @@ def _motion(found: Evidence, *, moving: bool) -> Claim:
         f"{int(fit.sum())} of {len(own)} gates; median difference {own['value'].median():.2f}",
         "by gate in pcc_navigate.png",
         f"edge map {edge['null_value'].mean():.2f}" if len(edge) else "-",
-        "holds" if bool(fit.all()) else "does not hold",
+        _decided(bool(fit.all()), _scenes(own)),
         "pcc_navigate.png",
     )
