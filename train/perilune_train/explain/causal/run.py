@@ -188,15 +188,15 @@ def _claims(metrics: Metrics, gates: pd.DataFrame, gate: str) -> list[dict[str, 
     rendered, placebo = own.loc["rendered"], own.loc["placebo"] if "placebo" in own.index else None
     known = bool(np.isfinite(rendered["low"]))
     outside = known and (rendered["low"] > 0 or rendered["high"] < 0)
-    nulls = (
-        "-" if placebo is None else f"placebo {placebo['change']:.2f} ({placebo['low']:.2f} to {placebo['high']:.2f})"
-    )
+    nulls = f"crater inpainted {own.loc['inpainted', 'change']:.2f}"
+    if placebo is not None:
+        nulls += f"; empty ground inpainted {placebo['change']:.2f} ({placebo['low']:.2f} to {placebo['high']:.2f})"
     beyond = placebo is None or abs(rendered["change"]) > abs(placebo["change"])
     verdict = "undecided: fewer than 5 scenes" if not known else "holds" if outside and beyond else "does not hold"
     found = {version: metrics.get(f"found/{version}") for version in ("factual", "rendered", "inpainted", "placebo")}
     claims = [
         {
-            "claim": f"{gate}, reacts to the crater and not only to its pixels (standard deviations of the gate)",
+            "claim": f"Detector: {gate} reacts to single craters (mask with - without one, deviations of the gate)",
             "figure": f"{rendered['change']:.2f}",
             "interval": f"{rendered['low']:.2f} to {rendered['high']:.2f}" if known else "none: fewer than 5 scenes",
             "nulls": nulls,
