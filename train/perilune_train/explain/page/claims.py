@@ -233,7 +233,7 @@ def _forced(found: Evidence, task: str, unit: str, *, higher_is_better: bool) ->
     return Claim(
         f"{task}: the pattern of the masks matters (all gates forced to their means: {unit})",
         f"harm {harm[ALL]:.3f}",
-        f"{scenes.min():.3f} to {scenes.max():.3f} over {len(scenes)} scenes, p {p:.3f}",
+        f"{scenes.min():.3f} to {scenes.max():.3f} over {len(scenes)} scenes, p {p:.4f}",
         f"largest single gate {single.idxmax()} {single.max():.3f}; median gate {single.median():.3f}",
         _decided(p < LEVEL, len(scenes)),
         f"gates_{'detect' if task == 'Detector' else 'navigate'}.png",
