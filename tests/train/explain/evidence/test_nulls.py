@@ -59,5 +59,19 @@ def test_pair_nulls_of_a_still_camera():
     assert len(table) == (15 + 2) * 3 * 8
 
 
+def test_one_frame_has_no_other_frame():
+    """As the validation split of a tiny dataset: the null is undefined, and nothing fails."""
+    rng = np.random.default_rng(1)
+    masks = {"B_11": rng.random((1, 64, 64))}
+    common = rng.random((1, 64, 64)), *rng.random((2, 1, 64, 64)), ["s/t/0"], ["s"]
+    table = detector_nulls(_images(count=1), masks, masks, *common, rng)
+    assert table.loc[table["map"] == "other frame/B_11", "value"].isna().all()
+    assert table.loc[(table["map"] == "edge/stage_1") & (table["measure"] == "pcc1_craterness"), "value"].notna().all()
+    stacked = {"B_11": rng.random((1, 128, 64))}
+    pair = _images(count=1), _images(seed=1, count=1), stacked, stacked, [np.eye(3)], ["s/t/0"], ["s"], rng
+    table = pair_nulls(*pair)
+    assert table.loc[table["map"] == "other pair/B_11", "value"].isna().all()
+
+
 def test_renamed_nulls_belong_to_their_gate():
     assert list(renamed("untrained", {"B_11": np.zeros((1, 2, 2), np.float32)})) == ["untrained/B_11"]
