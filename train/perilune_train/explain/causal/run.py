@@ -188,7 +188,7 @@ def _claims(metrics: Metrics, gates: pd.DataFrame, gate: str) -> list[dict[str, 
     rendered, placebo = own.loc["rendered"], own.loc["placebo"] if "placebo" in own.index else None
     known = bool(np.isfinite(rendered["low"]))
     outside = known and (rendered["low"] > 0 or rendered["high"] < 0)
-    nulls = f"crater inpainted {own.loc['inpainted', 'change']:.2f}"
+    nulls = f"crater inpainted {float(own['change']['inpainted']):.2f}"
     if placebo is not None:
         nulls += f"; empty ground inpainted {placebo['change']:.2f} ({placebo['low']:.2f} to {placebo['high']:.2f})"
     beyond = placebo is None or abs(rendered["change"]) > abs(placebo["change"])
