@@ -206,7 +206,15 @@ def test_calibration_on_training_frames_of_the_own_dataset_is_fine(dataset_detec
 
 def test_navigation_refuses_a_backbone_that_knows_the_test_terrain(dataset_nav, tmp_path):
     detector = stored(tmp_path / "detector", uses_of(dataset_nav, "test")) / "checkpoints" / "best.ckpt"
-    network = {"size_px": 64, "width": 0.125, "hidden": 16, "coarse_epochs": 0, "fine_epochs": 1, "learning_rate": 1e-3}
+    network = {
+        "size_px": 64,
+        "width": 0.125,
+        "hidden": 16,
+        "attention": "cbam_last",
+        "coarse_epochs": 0,
+        "fine_epochs": 1,
+        "learning_rate": 1e-3,
+    }
     expected = NavigateConfig(device="cpu", warp=network, stack=network)
     with pytest.raises(UserError, match=r"s000 = elsewhere/s000"):
         navigate_run(expected, dataset_nav, tmp_path, "a", detector, False)
