@@ -2,8 +2,8 @@
 
 `python -m benchmarks.train.gates DATASET RUN...` takes the dataset of the runs and folders of finished detect runs. For
 each run: AP on the validation split (from its metrics.json), and for each gate the standard deviation of its mask over
-pixels and validation frames. Means over runs of the same form stand beside, and their gain in strict
-AP over the form of the first run. Writes gates.json and gates.png.
+pixels and validation frames. For each form: mean AP over its runs, and the gain in strict AP over the form of the first
+run. Writes gates.json and gates.png.
 """
 
 import json

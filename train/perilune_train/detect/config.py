@@ -129,8 +129,8 @@ class DetectConfig(Section):
     width: Annotated[float, Field(ge=0.125, le=2)] = 1.0
     """Factor on all channel counts; 1 is the paper's network."""
     attention: Attention = "cbam"
-    """none (the baseline), cbam (the paper's), cbam_identity (gates that start at exactly 1), or cbam_centred (gates
-    between 0.5 and 1.5 that cannot become constant)."""
+    """none (the baseline), cbam (the paper's), cbam_identity (gates that start at exactly 1), cbam_centred (gates
+    between 0.5 and 1.5 that cannot become constant), or cbam_last (centred gates, one in each stage)."""
     in_channels: Literal[1, 3] = 3
     """Input channels. 3: the grey frame three times, as in the paper's RGB network."""
     strides: tuple[int, int, int] = (8, 16, 32)

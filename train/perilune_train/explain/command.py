@@ -44,8 +44,8 @@ def explain(
 ) -> None:
     """Test what the attention gates of both networks show: nulls, interventions, localisation, stability.
 
-    Correlations (PCC1 to PCC4 of the paper) stand beside those of null maps; a gate counts only if it beats all of
-    them. PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
+    Computes the paper's correlations PCC1 to PCC4 of each gate and of null maps. A gate counts only if it beats every
+    null. PCC1 above 0 means that a gate is weaker on craters; pcc1_craterness has the opposite sign.
 
     Writes runs/explain/<name>/ with claims.json, metrics.json, the tables of all values and pictures. Leaves a finished
     run of the same settings, datasets and checkpoints unchanged; --overwrite replaces it.

@@ -2,7 +2,8 @@
 
 Three changes of the same frame are compared, in an ellipse around each crater:
 
-- rendered: the crater is removed from the ground and the frame is rendered again. Pixels outside its reach stay equal.
+- rendered: the crater is removed from the ground and the frame is rendered again. Pixels
+  outside its reach stay equal, except for one or two grey values where the automatic exposure changes.
 - inpainted: the same ellipse is filled from its surroundings, which removes the crater's pixels.
 - placebo: an ellipse of the same shape on ground without labelled craters is filled in the same way. The effect of
   filling alone.

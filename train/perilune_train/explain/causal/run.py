@@ -83,7 +83,8 @@ def causal_run(
     folder = folder_of(checkpoint)
     config, threshold = config_of_run(folder, ()), chosen_threshold(folder)
     removed, opened = read_removed(counterfactual), open_dataset(dataset)
-    marks, terrain = terrain_marks({"detector": (checkpoint, dataset)}, allow_overlap, split)
+    fitted = {"detector": (checkpoint, dataset)} | ({} if pose is None else {"navigator": (pose[2], pose[0])})
+    marks, terrain = terrain_marks(fitted, allow_overlap, split)
     detector = open_single_scale(checkpoint, config, settings)
     if gate not in detector.network.backbone.attentions:
         raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
@@ -111,7 +112,7 @@ def causal_run(
         with written_aside(run.root / f"{title}.parquet") as aside:
             table.to_parquet(aside, index=False)
     _draw(run.root, pairs, masks, tables, gate)
-    mark_files(run.root, list(CAPTIONS), marks["detector"])
+    mark_files(run.root, list(CAPTIONS), "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark))
     metrics = _metrics(tables, gate) | terrain
     claims = _claims(metrics, gates, gate)
     if pose is not None:
