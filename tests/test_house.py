@@ -111,7 +111,14 @@ def test_the_distributions_have_one_version():
     assert f"\nversion: {version}\n" in citation
 
 
-OWN_MODULES = ["perilune_shared.config", "perilune_render.cli", "perilune_train.detect.train.run", "tests.test_house"]
+OWN_MODULES = [
+    "perilune_shared.config", "perilune_render.cli.main", "perilune_train.detect.train.run", "tests.test_house",
+]
+    "perilune_shared.config",
+    "perilune_render.cli.main",
+    "perilune_train.detect.train.run",
+    "tests.test_house",
+]
 OWN_MODULES += [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in (ROOT / "benchmarks").rglob("*.py")]
 
 

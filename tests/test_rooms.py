@@ -16,9 +16,9 @@ ROOMS = {
     ),
     "render/perilune_render": (
         "processor config_values config_terrain config_survey config_counterfactual config streams provenance terrain "
-        "flight imaging labels frame_source blender dataset jobs cli_options cli_dataset cli_survey cli_counterfactual "
-        "cli_status cli"
+        "flight imaging labels frame_source blender dataset jobs cli"
     ),
+    "render/perilune_render/cli": "options dataset status survey counterfactual main",
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
         "level_ground cache export"

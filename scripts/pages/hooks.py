@@ -12,7 +12,7 @@ from scripts.pages.command_page import command_page
 from scripts.pages.configuration_page import configuration_page
 from scripts.pages.notebook_page import notebook_page
 
-from perilune_render.cli import app as render
+from perilune_render.cli.main import app as render
 from perilune_render.config import DatasetConfig
 from perilune_shared.cli.main import app as manifest
 from perilune_train.cli import SECTIONS

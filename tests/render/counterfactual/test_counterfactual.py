@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from tests.helpers import in_process
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.terrain.craters.removal import REACH_RADII
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.camera import camera_from_site

@@ -5,7 +5,7 @@ import re
 import pytest
 from tests.helpers import in_process
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.labels.selection import read_labels, selected
 from perilune_shared.labels.thresholds import SELECTIONS

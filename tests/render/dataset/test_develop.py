@@ -15,7 +15,7 @@ import pytest
 from tests.helpers import in_process
 from tests.helpers.s3_server import uploaded
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.dataset.work import committed
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.ellipse import project_circles
@@ -41,7 +41,7 @@ def developed(tiny, tmp_path_factory):
     out = tmp_path_factory.mktemp("developed") / "new"
     arguments = ["develop", "--dataset", str(tiny / "detect"), "--out", str(out)]
     program = (
-        "import sys; from perilune_render.cli import app\n"
+        "import sys; from perilune_render.cli.main import app\n"
         f"app({arguments!r}, standalone_mode=False)\n"
         "assert 'perilune_render.dataset.develop' in sys.modules and 'bpy' not in sys.modules"
     )

@@ -7,7 +7,7 @@ from rich.progress import Progress
 from tests.helpers import in_process
 from tests.helpers.elevation_models import POLAR, write
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.export.card import write_card
 

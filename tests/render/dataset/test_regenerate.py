@@ -17,7 +17,7 @@ import pytest
 from rich.progress import Progress
 from tests.helpers import in_process
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.dataset.regenerate import exr_outlier_share, png_outlier_share, regenerate, spread
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.schema import TABLES

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from tests.helpers import in_process
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.imaging.exr import CHANNELS, read_exr
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.helpers import in_process
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.camera import camera_from_site
 from perilune_shared.geometry.ellipse import project_circles

@@ -18,7 +18,7 @@ sys.modules["bpy"] = None
 try:
     import perilune_render.blender.renderer
 except ImportError:
-    from perilune_render.cli import main
+    from perilune_render.cli.main import main
     main()
 """
 PLAN = ["plan", "--preset", "tiny", "--set", "dataset.terrain.spacing_px=2.0", "--set", "dataset.detect.n_scenes=3"]

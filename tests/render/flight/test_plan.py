@@ -5,7 +5,7 @@ import pytest
 from tests.helpers import in_process
 from tests.helpers.scenes import config_with
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.config import CameraConfig, DistortionConfig, KindConfig
 from perilune_render.flight.plan import camera_of, make_plan
 from perilune_render.streams import derived_seed, stream

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.helpers.scenes import config_with, flat_scene
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.config import KindConfig
 from perilune_render.flight import pose_checks
 from perilune_render.flight.plan import make_plan

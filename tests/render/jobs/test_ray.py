@@ -9,7 +9,7 @@ import pytest
 from rich.progress import Progress
 from tests.helpers import in_process
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.jobs.run import render_job
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store

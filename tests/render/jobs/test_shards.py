@@ -11,7 +11,7 @@ import pytest
 from rich.progress import Progress
 from tests.helpers import in_process
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.jobs.estimate import estimate
 from perilune_render.jobs.here import Here
 from perilune_render.jobs.run import Shard

@@ -9,7 +9,7 @@ from tests.helpers import in_process
 from tests.helpers.flat_engine import FlatEngine
 from tests.helpers.scenes import config_with, flat_scene, round_craters
 
-from perilune_render.cli import main
+from perilune_render.cli.main import main
 from perilune_render.config import CameraConfig, KindConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.trajectory import render_trajectory

@@ -8,9 +8,9 @@ import typer
 from rich.console import Console
 
 import perilune_shared as ps
-from perilune_render.cli_counterfactual import counterfactual
-from perilune_render.cli_dataset import dataset
-from perilune_render.cli_options import (
+from perilune_render.cli.counterfactual import counterfactual
+from perilune_render.cli.dataset import dataset
+from perilune_render.cli.options import (
     Catalogue,
     Config,
     Dem,
@@ -22,8 +22,8 @@ from perilune_render.cli_options import (
     resolved_config,
     warn_of_size,
 )
-from perilune_render.cli_status import status
-from perilune_render.cli_survey import survey
+from perilune_render.cli.status import status
+from perilune_render.cli.survey import survey
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml

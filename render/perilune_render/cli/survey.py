@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 
 import perilune_shared as ps
-from perilune_render.cli_dataset import How, made_or_exit
+from perilune_render.cli.dataset import How, made_or_exit
 from perilune_render.config_survey import SurveyConfig
 from perilune_shared.config import resolve_over
 from perilune_shared.errors import UserError

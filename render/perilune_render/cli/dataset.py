@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 import perilune_shared as ps
-from perilune_render.cli_options import (
+from perilune_render.cli.options import (
     Catalogue,
     Config,
     Dem,
