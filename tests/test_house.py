@@ -112,8 +112,6 @@ def test_the_distributions_have_one_version():
 
 
 OWN_MODULES = [
-    "perilune_shared.config", "perilune_render.cli.main", "perilune_train.detect.train.run", "tests.test_house",
-]
     "perilune_shared.config",
     "perilune_render.cli.main",
     "perilune_train.detect.train.run",
