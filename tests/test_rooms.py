@@ -15,10 +15,10 @@ ROOMS = {
         "geometry dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
-        "processor config_values config_terrain config_survey config_counterfactual config streams provenance terrain "
-        "flight imaging labels frame_source blender dataset jobs cli"
+        "processor config_values config_terrain config_survey config_counterfactual config_scene config streams "
+        "provenance terrain flight poses imaging labels frame_source blender dataset jobs cli"
     ),
-    "render/perilune_render/cli": "options dataset status survey counterfactual main",
+    "render/perilune_render/cli": "options dataset frames status survey counterfactual main",
     "render/perilune_render/terrain": (
         "envelope grid interpolation levels noise relief size_frequency craters albedo boulders elevation base scene "
         "level_ground cache export"

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from perilune_render.config_counterfactual import CounterfactualConfig
+from perilune_render.config_scene import SceneConfig
 from perilune_render.config_survey import SurveyConfig
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
@@ -285,6 +286,8 @@ class DatasetConfig(Section):
     """Dataset for crater detection."""
     nav: KindConfig
     """Dataset for navigation."""
+    scene: SceneConfig | None = None
+    """One scene whose poses are given, in place of drawn scenes and descents; `perilune-render frames` reads it."""
     survey: SurveyConfig | None = None
     """Images from orbit in place of the descents, over the same ground; `perilune-render survey` sets it."""
     counterfactual: CounterfactualConfig | None = None

@@ -10,6 +10,7 @@ from rich.console import Console
 import perilune_shared as ps
 from perilune_render.cli.counterfactual import counterfactual
 from perilune_render.cli.dataset import dataset
+from perilune_render.cli.frames import frames
 from perilune_render.cli.options import (
     Catalogue,
     Config,
@@ -53,6 +54,7 @@ def config(
 
 
 app.command()(dataset)
+app.command()(frames)
 app.command()(status)
 app.command()(survey)
 app.command()(counterfactual)

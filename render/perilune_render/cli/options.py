@@ -57,10 +57,21 @@ def warn_of_size(config: DatasetConfig) -> None:
 
 
 def resolved_config(
-    preset: str, config: Path | None, setting: list[str] | None, dem: Path | None, catalogue: Path | None
+    preset: str,
+    config: Path | None,
+    setting: list[str] | None,
+    dem: Path | None,
+    catalogue: Path | None,
+    *,
+    given_scene: bool = False,
 ) -> DatasetConfig:
-    """The settings of a preset with the user's changes. Raises UserError on invalid ones."""
+    """The settings of a preset with the user's changes. Raises UserError on invalid ones.
+
+    `given_scene`: whether the command takes poses from outside, and so may have settings of `dataset.scene`.
+    """
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
+    if resolved.scene is not None and not given_scene:
+        raise UserError("configuration", "dataset.scene", "set", "null; `perilune-render frames` renders given poses")
     if resolved.survey is not None:
         raise UserError("configuration", "dataset.survey", "set", "null; `perilune-render survey` renders from orbit")
     if resolved.counterfactual is not None:

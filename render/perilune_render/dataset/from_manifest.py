@@ -17,7 +17,7 @@ from perilune_render.flight.motion import Motion, draw_motion
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
 from perilune_render.flight.survey import survey_camera
 from perilune_render.flight.trajectories import Flight
-from perilune_render.flight.view import view_envelope
+from perilune_render.flight.view import view_of
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
@@ -50,7 +50,7 @@ def plan_from_manifest(
     config = config_of(recipe, where, dem, catalogue)
     _check_dem(manifest, config)
     lander = camera_of(config.camera)
-    view = view_envelope(lander.covering_pinhole(), config.ground_flight(recipe.kind))
+    view = view_of(config, lander.covering_pinhole(), recipe.kind)
     camera = lander if config.survey is None else survey_camera(config.survey, float(view.reach_m[-1]))
     if camera != info.camera.intrinsics():
         raise UserError(where, "camera", info.camera.intrinsics(), f"that of its recipe, {camera}")

@@ -22,7 +22,7 @@ from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.flight.plan import camera_of
 from perilune_render.flight.pose_checks import Poses, check_poses
-from perilune_render.flight.view import view_envelope
+from perilune_render.flight.view import view_of
 from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.imaging.exr import local_exr, read_exr
@@ -129,7 +129,7 @@ def _of_scene(
     config = config_of(recipe, where, dem, catalogue)
     ground_config = _ground_config(recipe, config, where)
     camera, exr_camera = camera_of(config.camera), camera_of(ground_config.camera).covering_pinhole()
-    view = view_envelope(exr_camera, ground_config.ground_flight(recipe.kind))
+    view = view_of(ground_config, exr_camera, recipe.kind)
     if camera != dataset.camera:
         raise UserError(where, "camera", dataset.camera, f"that of its recipe, {camera}")
     with interrupts_held():

@@ -1,8 +1,9 @@
-"""The view envelope of a flight: how far its frames reach from each altitude."""
+"""The view envelope of a flight or of a given scene: how far its frames reach from each altitude."""
 
 import numpy as np
 
-from perilune_render.config import FlightConfig
+from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config_scene import SceneConfig
 from perilune_render.terrain.envelope import SeenGround, ViewEnvelope
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
@@ -11,6 +12,24 @@ from perilune_shared.geometry.frames import Array
 _N_ALTITUDES = 400
 _N_HEIGHTS = 100
 _WIDEST_RAD = np.radians(80)
+
+
+def view_of(config: DatasetConfig, camera: Camera, kind: str) -> ViewEnvelope:
+    """The views that the ground of a configuration is made for, for a pinhole `camera`.
+
+    Raises UserError if frames of the flights of `kind` could show the horizon, or if a given scene has no views.
+    """
+    if config.scene is not None:
+        return scene_view(config.scene, camera)
+    return view_envelope(camera, config.ground_flight(kind))
+
+
+def scene_view(scene: SceneConfig, camera: Camera) -> ViewEnvelope:
+    """The views of a given scene, for a pinhole `camera`. Raises UserError if it has none."""
+    if not scene.views:
+        raise UserError("configuration", "dataset.scene.views", "none", "at least one height_m with its reach_m")
+    height, reach = (np.array([getattr(view, name) for view in scene.views]) for name in ("height_m", "reach_m"))
+    return ViewEnvelope(height, reach, max(camera.fx_px, camera.fy_px))
 
 
 def view_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:

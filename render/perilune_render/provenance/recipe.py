@@ -13,7 +13,7 @@ from perilune_shared.errors import UserError
 
 _FILES = ("dem", "catalogue")
 _SPEED = ("threads", "cache_gib")
-_OPTIONAL = ("survey", "counterfactual")
+_OPTIONAL = ("scene", "survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
@@ -28,8 +28,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, those of the other kind unless the kinds share terrain, and those of a survey or a counterfactual if there is
-    none.
+    speed, those of the other kind unless the kinds share terrain, and those of a given scene, a survey or a
+    counterfactual if there is none.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:

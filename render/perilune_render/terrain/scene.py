@@ -173,6 +173,12 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
             read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters, resolved_m(model))
 
 
+def site_of(config: DatasetConfig) -> tuple[float, float]:
+    """Latitude and longitude of the site, degrees. Raises UserError if the elevation model cannot be read."""
+    dem = config.terrain.dem
+    return _place(config, read_elevation(Path(dem)) if dem is not None else None)
+
+
 def _place(config: DatasetConfig, model: ElevationModel | None) -> tuple[float, float]:
     if model is None:
         return config.terrain.latitude_deg, config.terrain.longitude_deg

@@ -1,0 +1,83 @@
+"""The command `perilune-render frames`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from perilune_render.cli.dataset import How, made_or_exit
+from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
+from perilune_render.config import CameraConfig
+from perilune_shared.config import resolve_over
+from perilune_shared.dataset.names import Kind
+from perilune_shared.errors import UserError
+from perilune_shared.storage.store import open_store
+from perilune_shared.yaml_text import parse_yaml
+
+Scene = Annotated[
+    Path | None,
+    typer.Option(help="YAML file whose section `dataset` overrides the preset; `dataset.scene` has the Sun."),
+]
+CameraFile = Annotated[
+    Path | None, typer.Option(help="YAML file with the settings of `dataset.camera`, in place of those of --scene.")
+]
+
+
+def frames(
+    poses: Annotated[Path, typer.Option(help="Poses: .csv, .parquet or .tum, with the frame stated in its header.")],
+    out: Annotated[str, typer.Option(help="Folder or address of the new dataset.")],
+    scene: Scene = None,
+    camera: CameraFile = None,
+    preset: Preset = "small",
+    setting: Setting = None,
+    dem: Dem = None,
+    catalogue: Catalogue = None,
+    kind: Annotated[Kind, typer.Option(help="What the dataset is for: crater detection or navigation.")] = "nav",
+    workers: Annotated[
+        int | None, typer.Option(min=0, max=1024, help="Worker processes. [default: one for each core]")
+    ] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Threads of each process. [default: cores / workers]")
+    ] = None,
+) -> None:
+    """Render frames at given poses: an ordinary dataset with labels, over one scene.
+
+    A trajectory of the poses is the unit of work: an interrupted one starts again. Run the same command again to
+    resume.
+    """
+    how = How.of("local", None, workers, threads, None, finish=False, dry_run=False)
+    config = resolved_config(preset, scene, setting, dem, catalogue, given_scene=True)
+    if camera is not None:
+        config = config.model_copy(update={"camera": read_camera(camera)})
+    store = open_store(out)
+    from perilune_render.dataset.begin import new_info
+    from perilune_render.jobs.job import Job
+    from perilune_render.poses.file import read_poses
+    from perilune_render.poses.plan import given_plan
+    from perilune_render.provenance.recipe import recipe_of
+    from perilune_render.terrain.scene import site_of
+
+    given = read_poses(poses, *site_of(config))
+    plan, config = given_plan(given, config, kind, poses)
+    begun = new_info(config, plan, recipe_of(config, kind, preset))
+    made = made_or_exit(Job(plan, config, begun, str(poses)), store, how)
+    if made is not None:
+        counts = made.info.counts
+        Console().print(
+            f"{made.store}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}",
+            soft_wrap=True,
+        )
+
+
+def read_camera(path: Path) -> CameraConfig:
+    """The camera of a YAML file that has the settings of `dataset.camera`. Raises UserError."""
+    if not path.is_file():
+        raise UserError(path, "camera", "no such file", "a YAML file")
+    try:
+        content = parse_yaml(path.read_text(encoding="utf-8"), path)
+    except UnicodeDecodeError:
+        raise UserError(path, "camera", "bytes that are not UTF-8", "a YAML file") from None
+    if not isinstance(content, dict):
+        raise UserError(path, "camera", type(content).__name__, "settings of dataset.camera, such as width_px")
+    return resolve_over(CameraConfig, "camera", str(path), content)

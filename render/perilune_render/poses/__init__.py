@@ -1,0 +1,1 @@
+"""Poses that a user gives: their files, and the plan of the frames that are rendered from them."""

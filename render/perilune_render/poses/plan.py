@@ -1,0 +1,143 @@
+"""The plan of given poses: one ground, a trajectory for each of the user's, the views that the ground is made for."""
+
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from perilune_render.config import DatasetConfig
+from perilune_render.config_scene import SceneConfig, ViewConfig
+from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
+from perilune_render.flight.trajectories import Flight
+from perilune_render.flight.view import scene_view
+from perilune_render.poses.file import GivenPoses
+from perilune_render.streams import derived_seed
+from perilune_shared.dataset.names import Kind
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
+
+SAME_SUN_DEG = 0.05
+"""Frames whose Suns differ by less share the Sun of the first of them: a tenth of the Sun's diameter."""
+_MOST_SCENES = 1000
+_N_VIEWS = 24
+_LOWER = 0.9
+"""Ground may rise towards a camera by a tenth of its height: the share of the height that the views allow for."""
+_WIDER = 1.05
+_SPLIT = "test"
+
+
+def scene_seed(config: DatasetConfig) -> int:
+    """Random seed of the ground under given poses."""
+    return derived_seed(config.seed, config.name, "given", "scene", 0)
+
+
+def views_of(poses: GivenPoses, camera: Camera, where: object) -> tuple[ViewConfig, ...]:
+    """Views that hold all poses of a pinhole `camera`, with margins for relief, rounded to three digits.
+
+    The ground is taken to be at most a tenth of a camera's height above or below the plane z = 0. Raises UserError for
+    a pose that is not above the plane or that shows the horizon.
+    """
+    height = poses.position_m[:, 2]
+    _refuse(height <= 0, poses, where, lambda n: f"z {height[n]:.1f} m", "above 0, the height of the site")
+    corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
+    rays = np.einsum("nji,sj->nsi", matrix_from_quaternion(poses.rotation_wxyz), corners)
+    _refuse(
+        (rays[..., 2] > -0.01 * np.linalg.norm(rays, axis=-1)).any(axis=1),
+        poses,
+        where,
+        lambda n: "a view with the horizon",
+        "a view of the ground alone; state dataset.scene.views for others",
+    )
+    lowest = -0.1 * height[:, None, None]
+    way = (lowest - poses.position_m[:, None, 2:]) / rays[..., 2:]
+    reach = _WIDER * np.abs(poses.position_m[:, None, :2] + way * rays[..., :2]).max(axis=(1, 2))
+    edges = np.geomspace(_LOWER * height.min(), _LOWER * height.max() * 1.001, _N_VIEWS + 1)
+    found: list[ViewConfig] = []
+    for low, high in pairwise(edges):
+        farthest = _rounded(reach[_LOWER * height <= high].max(), np.ceil)
+        lowest_m = _rounded(low, np.floor)
+        if not found or (farthest > found[-1].reach_m and lowest_m > found[-1].height_m):
+            found.append(ViewConfig(height_m=lowest_m, reach_m=farthest))
+    return tuple(found)
+
+
+def _rounded(value: float, towards) -> float:
+    """Three significant digits, rounded up or down."""
+    digit = 10.0 ** (np.floor(np.log10(value)) - 2)
+    return float(f"{towards(value / digit) * digit:.6g}")
+
+
+def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: object) -> tuple[Plan, DatasetConfig]:
+    """The plan of given poses, and the configuration with the views and the hash of the poses.
+
+    Frames whose Suns differ by SAME_SUN_DEG or more are in different scenes over the same ground. Raises UserError if
+    the poses fit no ground, or for more than _MOST_SCENES Suns.
+    """
+    scene = config.scene or SceneConfig()
+    camera = camera_of(config.camera)
+    pinhole = camera.covering_pinhole()
+    views = scene.views or views_of(poses, pinhole, where)
+    scene = scene.model_copy(update={"views": views, "poses_sha256": poses.sha256})
+    suns, lit_by = _suns(poses, scene)
+    if len(suns) > _MOST_SCENES:
+        found = f"{len(suns)} Suns that differ by {SAME_SUN_DEG} degrees"
+        raise UserError(where, "sun_azimuth_deg", found, f"at most {_MOST_SCENES}")
+    seed = scene_seed(config)
+    scenes = tuple(ScenePlan(f"scene-{k:04d}", seed, *map(float, sun)) for k, sun in enumerate(suns))
+    trajectories: list[TrajectoryPlan] = []
+    places: dict[str, range] = {}
+    for k, one in enumerate(scenes):
+        first = len(trajectories)
+        for number in np.unique(poses.trajectory[lit_by == k]).tolist():
+            rows = np.flatnonzero((poses.trajectory == number) & (lit_by == k))
+            trajectories.append(_trajectory(poses, rows, one, number))
+        places[one.scene_id] = range(first, len(trajectories))
+    view = scene_view(scene, pinhole)
+    plan = Plan(camera, pinhole, view, scenes, tuple(trajectories), places)
+    return plan, config.model_copy(update={"scene": scene})
+
+
+def _suns(poses: GivenPoses, scene: SceneConfig) -> tuple[list[Array], np.ndarray]:
+    """Azimuth and elevation of each different Sun, degrees, and the index (N,) of that of each frame."""
+    if poses.sun_deg is None:
+        return [np.array([scene.sun_azimuth_deg, scene.sun_elevation_deg])], np.zeros(len(poses), int)
+    suns: list[Array] = []
+    index = np.empty(len(poses), int)
+    for n, sun in enumerate(poses.sun_deg):
+        turn = (sun[0] - suns[-1][0] + 180) % 360 - 180 if suns else np.inf
+        if not suns or max(abs(turn) * np.cos(np.radians(sun[1])), abs(sun[1] - suns[-1][1])) >= SAME_SUN_DEG:
+            suns.append(sun)
+        index[n] = len(suns) - 1
+    return suns, index
+
+
+def _trajectory(poses: GivenPoses, rows: np.ndarray, scene: ScenePlan, number: int) -> TrajectoryPlan:
+    name = f"trajectory-{number:04d}"
+    part = partial(_flight, poses, rows)
+    seed = derived_seed(scene.seed, "given", "trajectory", number)
+    # The index goes on where the Sun changes, so that frames of one trajectory have independent noise.
+    begin = int(rows[0] - np.flatnonzero(poses.trajectory == number)[0])
+    index = range(begin, begin + len(rows))
+    return TrajectoryPlan(scene.scene_id, name, seed, index, (_SPLIT,) * len(rows), part, is_drawn=False)
+
+
+def _flight(poses: GivenPoses, rows: np.ndarray) -> Flight:
+    """The flight through some of the poses; its nominal trajectory is a straight line from the first to the last."""
+    time, position = poses.time_s[rows] - poses.time_s[rows[0]], poses.position_m[rows]
+    duration = float(time[-1])
+    speed = (position[-1] - position[0]) / duration if duration > 0 else np.zeros(3)
+    nominal = NominalTrajectory(_three(position[0]), _three(speed), (0.0, 0.0, 0.0), duration or 1.0)
+    return Flight(nominal, time, position, poses.velocity_mps[rows], poses.rotation_wxyz[rows])
+
+
+def _three(values: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _refuse(wrong: np.ndarray, poses: GivenPoses, where: object, found, expected: str) -> None:
+    if wrong.any():
+        n = int(np.argmax(wrong))
+        raise UserError(where, f"pose {n} at {poses.time_s[n]:g} s", found(n), expected)
