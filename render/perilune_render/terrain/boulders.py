@@ -29,8 +29,10 @@ _BURIED_SHARE = 0.3
 """Share of a boulder's height that is below the ground."""
 _FIELD_DECAY = 0.7
 """Decay length of a boulder field's density beyond the crater's rim, crater radii."""
-_FULL_SPACINGS = 5.0
+FULL_SPACINGS = 5.0
 """Smallest diameter, in vertex spacings, of a boulder with the finer mesh."""
+N_POINTS, N_FEW_POINTS = 60, 14
+"""Numbers of points of a rock's finer and coarser mesh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +122,7 @@ def _fields(
     return x[inside], y[inside], diameter[inside], host[inside]
 
 
-def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:
+def rock(shape_id: int, seed: int, n_points: int = N_POINTS) -> trimesh.Trimesh:
     """A convex rock of mean diameter 1 centred on the origin; every third one has fracture faces.
 
     Fewer points make the same kind of rock with fewer faces, for boulders only a few pixels wide.
@@ -150,16 +152,16 @@ def rock(shape_id: int, seed: int, n_points: int = 60) -> trimesh.Trimesh:
 def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """All boulders as one mesh: vertices (V, 3) float32 in O_L, metres, and triangles (F, 3) int32.
 
-    Every boulder is a copy of one of the seed's rocks; boulders below _FULL_SPACINGS local vertex spacings use the rock
+    Every boulder is a copy of one of the seed's rocks; boulders below FULL_SPACINGS local vertex spacings use the rock
     with fewer faces. All are one mesh, since each object adds to the time of every frame in Cycles.
     """
     local = grid.spacing_under(boulders.x_m, boulders.y_m)
-    full = boulders.diameter_m >= _FULL_SPACINGS * local
+    full = boulders.diameter_m >= FULL_SPACINGS * local
     rotations = matrix_from_quaternion(boulders.rotation_wxyz.reshape(-1, 4))
     centres = np.stack([boulders.x_m, boulders.y_m, z_m], axis=-1)
     vertices, faces, n_before = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.int32)], 0
     for shape_id in np.unique(boulders.shape_id):
-        for n_points, which in ((60, full), (14, ~full)):
+        for n_points, which in ((N_POINTS, full), (N_FEW_POINTS, ~full)):
             chosen = np.flatnonzero((boulders.shape_id == shape_id) & which)
             if not len(chosen):
                 continue

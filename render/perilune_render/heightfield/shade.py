@@ -1,0 +1,110 @@
+"""What each ray of an image sees: the hit, its shading, and whether the Sun reaches it."""
+
+import numpy as np
+
+from perilune_render.heightfield.cast import first_hit
+from perilune_render.heightfield.surface import place_of, vertex
+from perilune_render.provenance.kernels import njit
+
+_LIFT = 1e-9
+"""Start of a shadow ray, metres: its own triangle and boulder are left out, so it needs no margin."""
+_TERMINATOR = 0.1
+"""Cosine between ground and Sun below which Cycles moves the start of a shadow ray from the facet to the curved
+surface that its vertex normals describe (its shadow terminator geometry offset, at its default)."""
+
+
+@njit()
+def ground_at(ground, shading, part, row, column, triangle, x, y, facet, curve):
+    """Shading at a place of a triangle: normal, albedo.
+
+    Writes the facet's unit normal into `facet` (3,), and into `curve` (3,) the vector from the facet to the curved
+    surface of the vertex normals, by a quadratic patch through the three vertices.
+    """
+    n, half, height = ground.n_half, ground.half_widths_m, ground.height_m
+    a, b = (1, 2) if triangle == 0 else (2, 3)
+    v0, v1, v2 = (
+        vertex(part, row, column, 0, n),
+        vertex(part, row, column, a, n),
+        vertex(part, row, column, b, n),
+    )
+    x0, y0 = place_of(part, row, column, 0, n, half)
+    x1, y1 = place_of(part, row, column, a, n, half)
+    x2, y2 = place_of(part, row, column, b, n, half)
+    e1x, e1y, e1z = x1 - x0, y1 - y0, float(height[v1] - height[v0])
+    e2x, e2y, e2z = x2 - x0, y2 - y0, float(height[v2] - height[v0])
+    area = e1x * e2y - e1y * e2x
+    v = ((x - x0) * e2y - (y - y0) * e2x) / area
+    w = (e1x * (y - y0) - e1y * (x - x0)) / area
+    u = 1 - v - w
+    fx, fy, fz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, area
+    length = 1 / np.sqrt(fx * fx + fy * fy + fz * fz)
+    facet[0], facet[1], facet[2] = fx * length, fy * length, fz * length
+    ax, ay, az = float(shading[v0, 0]), float(shading[v0, 1]), float(shading[v0, 2])
+    bx, by, bz = float(shading[v1, 0]), float(shading[v1, 1]), float(shading[v1, 2])
+    cx, cy, cz = float(shading[v2, 0]), float(shading[v2, 1]), float(shading[v2, 2])
+    nx, ny, nz = u * ax + v * bx + w * cx, u * ay + v * by + w * cy, u * az + v * bz + w * cz
+    # A patch that is normal to the vertex normals bulges over an edge by its length times the change of slope.
+    edge_1 = (bx - ax) * e1x + (by - ay) * e1y + (bz - az) * e1z
+    edge_2 = (cx - ax) * e2x + (cy - ay) * e2y + (cz - az) * e2z
+    edge_3 = (cx - bx) * (x2 - x1) + (cy - by) * (y2 - y1) + (cz - bz) * (e2z - e1z)
+    bulge = u * v * edge_1 + u * w * edge_2 + v * w * edge_3
+    curve[0], curve[1], curve[2] = bulge * nx, bulge * ny, bulge * nz
+    length = 1 / np.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx * length, ny * length, nz * length, u * shading[v0, 3] + v * shading[v1, 3] + w * shading[v2, 3]
+
+
+@njit()
+def see(ground, rocks, shading, origin, rays, suns, sun, far_m, depth, normal, angles, lit):
+    """Cast rays (N, 3) with z = 1 along the camera's axis from `origin` (3,), and a shadow ray from each hit.
+
+    `suns` (N, 3) are unit vectors to points of the Sun's disc, `sun` (3,) to its centre. Writes for each ray the depth
+    (inf for a miss), the unit shading normal (N, 3), `angles` (N, 4): mu0, mu, cosine of the phase angle, albedo, and
+    `lit`: the cosine of incidence of the point of the disc, 0 in shadow.
+    """
+    facet, curve = np.empty(3), np.empty(3)
+    nothing = (-1, -1, -1, -1, -1)
+    for k in range(rays.shape[0]):
+        dx, dy, dz = rays[k, 0], rays[k, 1], rays[k, 2]
+        t, rock, face, part, row, column, triangle = first_hit(
+            ground, rocks, origin[0], origin[1], origin[2], dx, dy, dz, 0.0, far_m, nothing
+        )
+        depth[k] = t
+        lit[k] = 0.0
+        if t == np.inf:
+            normal[k, 0], normal[k, 1], normal[k, 2] = 0.0, 0.0, 0.0
+            angles[k, 0], angles[k, 1], angles[k, 2], angles[k, 3] = 1.0, 1.0, 1.0, 0.0
+            continue
+        x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
+        if rock >= 0:
+            m, size = (
+                rocks.rows[rock],
+                1 / np.sqrt(rocks.rows[rock, 3] ** 2 + rocks.rows[rock, 6] ** 2 + rocks.rows[rock, 9] ** 2),
+            )
+            px, py, pz = rocks.planes[face, 0], rocks.planes[face, 1], rocks.planes[face, 2]
+            nx = size * (m[3] * px + m[6] * py + m[9] * pz)
+            ny = size * (m[4] * px + m[7] * py + m[10] * pz)
+            nz = size * (m[5] * px + m[8] * py + m[11] * pz)
+            albedo = 1.0
+            skip = (-1, -1, -1, -1, rock)
+            facet[0], facet[1], facet[2] = nx, ny, nz
+        else:
+            nx, ny, nz, albedo = ground_at(ground, shading, part, row, column, triangle, x, y, facet, curve)
+            skip = (part, row, column, triangle, -1)
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        normal[k, 0], normal[k, 1], normal[k, 2] = nx, ny, nz
+        angles[k, 0] = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 1e-4)
+        angles[k, 1] = max(-(nx * dx + ny * dy + nz * dz) / length, 1e-4)
+        angles[k, 2] = -(sun[0] * dx + sun[1] * dy + sun[2] * dz) / length
+        angles[k, 3] = albedo
+        lx, ly, lz = suns[k, 0], suns[k, 1], suns[k, 2]
+        cosine = nx * lx + ny * ly + nz * lz
+        if cosine <= 0:
+            continue
+        if rock < 0:
+            on_facet = facet[0] * lx + facet[1] * ly + facet[2] * lz
+            moved = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
+            moved = min(max(moved, 0.0), 1.0)
+            if moved > 0:
+                x, y, z = x + moved * curve[0], y + moved * curve[1], z + moved * curve[2]
+        if first_hit(ground, rocks, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0] == np.inf:
+            lit[k] = cosine

@@ -1,0 +1,177 @@
+"""The ground as arrays for casting rays: heights, vertex normals, albedo, and a pyramid of largest heights.
+
+The mesh is that of Blender (`Grid.quads`, each quad split from its first to its third vertex), in two parts:
+
+- the inner square, a regular grid;
+- four sectors between the rings, one for each side (south y = -d, then x = d, y = d, x = -d). In a sector a place has
+  two coordinates: d, its distance max(|x|, |y|), and `along`, its coordinate along the side. Rings are the lines
+  d = half_widths[r], and the lines between neighbouring vertices of a ring are along / d = t / n_half - 1.
+
+A cell is a quad. Level 0 of the pyramid has the largest height of each cell, with the boulders that touch it; level L
+that of blocks of 2^L x 2^L cells.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from perilune_render.heightfield.rocks import Rocks, rocks_of
+from perilune_render.provenance.kernels import njit
+from perilune_render.terrain.grid import vertex_of_ring
+from perilune_render.terrain.scene import Scene
+from perilune_shared.geometry.frames import Array
+
+_MOST_LEVELS = 16
+
+
+class Ground(NamedTuple):
+    """Arrays of the ground, as arguments of compiled functions: few, since each is passed in eight parts."""
+
+    half_widths_m: Array
+    """Half-widths of inner square and rings, ascending, metres (R + 1,)."""
+    height_m: np.ndarray
+    """Heights of the vertices, metres, in the grid's order (V,) float32."""
+    top_m: np.ndarray
+    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and place, metres: all levels one
+    after another, float32."""
+    level: np.ndarray
+    """Index in `top_m` at which each level of the inner square and of the sectors begins (2, L + 1) int64; the last
+    column is the index of the coarsest level."""
+    n_half: int
+    """Vertex spacings from the centre of the inner square to its border."""
+    lowest_m: float
+    """Smallest height of the ground, metres."""
+    highest_m: float
+    """Largest height of ground and boulders, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Ground and boulders of a scene."""
+
+    ground: Ground
+    """Ground."""
+    rocks: Rocks
+    """Boulders, with the cells that each touches."""
+    shading: np.ndarray
+    """Unit vertex normal, O_L, and albedo of each vertex (V, 4) float32."""
+    centre_m: tuple[float, float]
+    """x and y of the grid's centre, O_L, metres; the arrays are relative to it."""
+
+
+def surface_of(scene: Scene) -> Surface:
+    """The surface of a scene, built in a few seconds for ten million vertices."""
+    grid, n = scene.grid, scene.grid.n_half
+    half = np.ascontiguousarray(grid.half_widths_m, np.float64)
+    height = np.ascontiguousarray(scene.height_m, np.float32)
+    rocks, tops = rocks_of(scene)
+    _raise_to_ground(height, n, *tops)
+    pyramids = [_pyramid(tops[0][None]), _pyramid(tops[1])]
+    starts = np.zeros((2, _MOST_LEVELS + 1), np.int64)
+    for part, levels in enumerate(pyramids):
+        before = 0 if part == 0 else sum(map(len, pyramids[0]))
+        starts[part, : len(levels)] = before + np.concatenate([[0], np.cumsum([len(one) for one in levels])[:-1]])
+        starts[part, -1] = len(levels) - 1
+    top = np.concatenate([level for levels in pyramids for level in levels])
+    highest = max(float(part.max()) for part in tops if part.size)
+    ground = Ground(half, height, top, starts, n, float(height.min()), highest)
+    shading = np.empty((len(height), 4), np.float32)
+    shading[:, :3], shading[:, 3] = _vertex_normals(n, half, height), scene.albedo
+    return Surface(ground, rocks, shading, (grid.centre_x_m, grid.centre_y_m))
+
+
+def _pyramid(tops: np.ndarray) -> list[np.ndarray]:
+    """All levels of the largest values of `tops` (sides, rows, columns), each flat."""
+    levels, level = [], tops
+    while len(levels) < _MOST_LEVELS:
+        levels.append(level.ravel())
+        if max(level.shape[1:]) <= 1:
+            break
+        padded = np.pad(level, ((0, 0), (0, level.shape[1] % 2), (0, level.shape[2] % 2)), constant_values=-np.inf)
+        level = padded.reshape(len(tops), padded.shape[1] // 2, 2, padded.shape[2] // 2, 2).max(axis=(2, 4))
+    return levels
+
+
+@njit()
+def vertex(part, row, column, k, n):
+    """Index of vertex k (0 to 3, as in `Grid.quads`) of a cell, in the grid's order."""
+    if part == 0:
+        return (row + (1 if k >= 2 else 0)) * (2 * n + 1) + column + (1 if k == 1 or k == 2 else 0)
+    place = (part - 1) * 2 * n + column + (1 if k >= 2 else 0)
+    return vertex_of_ring(row + (1 if k == 1 or k == 2 else 0), place, n)
+
+
+@njit()
+def place_of(part, row, column, k, n, half_widths):
+    """x and y of vertex k of a cell, relative to the grid's centre."""
+    if part == 0:
+        step = half_widths[0] / n
+        return (column + (1 if k == 1 or k == 2 else 0) - n) * step, (row + (1 if k >= 2 else 0) - n) * step
+    d = half_widths[row + (1 if k == 1 or k == 2 else 0)]
+    along = d * ((column + (1 if k >= 2 else 0)) / n - 1)
+    if part == 1:
+        return along, -d
+    if part == 2:
+        return d, along
+    if part == 3:
+        return -along, d
+    return -d, -along
+
+
+@njit()
+def _raise_to_ground(height, n, inner_top, sector_top):
+    """Raise the top of each cell to the largest height of its four vertices."""
+    for j in range(2 * n):
+        for i in range(2 * n):
+            for k in range(4):
+                inner_top[j, i] = max(inner_top[j, i], height[vertex(0, j, i, k, n)])
+    for side in range(4):
+        for ring in range(sector_top.shape[1]):
+            for t in range(2 * n):
+                for k in range(4):
+                    top = height[vertex(side + 1, ring, t, k, n)]
+                    sector_top[side, ring, t] = max(sector_top[side, ring, t], top)
+
+
+@njit()
+def _add_face(part, row, column, n, half_widths, height, points, total):
+    """Add to `total` (V, 3) at each vertex of a cell the normal of its face, weighted by the angle there."""
+    for k in range(4):
+        points[k, 0], points[k, 1] = place_of(part, row, column, k, n, half_widths)
+        points[k, 2] = height[vertex(part, row, column, k, n)]
+    ax, ay, az = points[2, 0] - points[0, 0], points[2, 1] - points[0, 1], points[2, 2] - points[0, 2]
+    bx, by, bz = points[3, 0] - points[1, 0], points[3, 1] - points[1, 1], points[3, 2] - points[1, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    for k in range(4):
+        after, before = (k + 1) % 4, (k + 3) % 4
+        ux, uy, uz = points[after, 0] - points[k, 0], points[after, 1] - points[k, 1], points[after, 2] - points[k, 2]
+        vx, vy, vz = (
+            points[before, 0] - points[k, 0],
+            points[before, 1] - points[k, 1],
+            points[before, 2] - points[k, 2],
+        )
+        sides = np.sqrt((ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz))
+        angle = np.arccos(min(max((ux * vx + uy * vy + uz * vz) / sides, -1.0), 1.0)) / length
+        at = vertex(part, row, column, k, n)
+        total[at, 0] += angle * nx
+        total[at, 1] += angle * ny
+        total[at, 2] += angle * nz
+
+
+@njit()
+def _vertex_normals(n, half_widths, height):
+    """Unit vertex normals (V, 3) as Blender's: means of the faces' normals, weighted by the angles at the vertex."""
+    total, points = np.zeros((len(height), 3)), np.empty((4, 3))
+    for j in range(2 * n):
+        for i in range(2 * n):
+            _add_face(0, j, i, n, half_widths, height, points, total)
+    for side in range(4):
+        for ring in range(len(half_widths) - 1):
+            for t in range(2 * n):
+                _add_face(side + 1, ring, t, n, half_widths, height, points, total)
+    for k in range(len(height)):
+        length = np.sqrt(total[k, 0] ** 2 + total[k, 1] ** 2 + total[k, 2] ** 2)
+        total[k] /= length
+    return total
