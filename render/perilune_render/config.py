@@ -223,8 +223,10 @@ class SensorConfig(Section):
 
 
 class RenderConfig(Section):
-    """Settings of the renderer (Blender)."""
+    """Settings of the renderer."""
 
+    engine: Literal["cycles", "heightfield"] = "cycles"
+    """Cycles of Blender, or rays over the height field, which are faster but render no bounce and no earthshine."""
     samples: Annotated[int, Field(ge=1, le=4096)] = 4
     """Camera rays per pixel."""
     threads: Annotated[int, Field(ge=0, le=1024)] = 0

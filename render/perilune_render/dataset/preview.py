@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.real_ground import draw_outline, outline_m
 from perilune_render.dataset.shots import planned_shot
+from perilune_render.engines import open_engine
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.frame_source import FrameSource
@@ -35,7 +35,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
     outline = None if config.terrain.dem is None else outline_m(read_elevation(Path(config.terrain.dem)))
     plain, drawn, dark = [], [], []
-    with Renderer(scene, config, plan.exr_camera, scene_plan.sun) as engine:
+    with open_engine(scene, config, plan.exr_camera, scene_plan.sun) as engine:
         source = FrameSource.of(engine, config, plan.camera, RimCircles.of_scene(scene))
         for index in np.linspace(0, len(trajectory.splits) - 1, n_frames).astype(int):
             frame_id, frame = trajectory.frame_id(index), source.take(planned_shot(trajectory, index))

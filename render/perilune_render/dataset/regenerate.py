@@ -15,11 +15,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_render.blender.renderer import Renderer
 from perilune_render.config import CameraConfig, DatasetConfig
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.tables import ground_tables
+from perilune_render.engines import open_engine
 from perilune_render.flight.plan import camera_of
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.flight.view import view_of
@@ -141,7 +141,7 @@ def _of_scene(
     tables = ground_tables(scene["scene_id"], ground)
     same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
     outcomes, dark = [], []
-    with Renderer(ground, ground_config, exr_camera, np.array(rows[0]["sun_direction"])) as engine:
+    with open_engine(ground, ground_config, exr_camera, np.array(rows[0]["sun_direction"])) as engine:
         source = FrameSource.of(engine, config, camera, RimCircles.of_scene(ground))
         for row in rows:
             frame_id, trajectory = row["frame_id"], trajectories[row["trajectory_id"]]

@@ -77,10 +77,15 @@ def crossing(above_0, above_1, t0, t1):
 
 
 @njit()
-def _cross_inner(height, n, i, j, p0, dp, q0, dq, oz, dz, t0, t1, skipped_triangle):
+def _cross_inner(vertex, n, i, j, p0, dp, q0, dq, oz, dz, t0, t1, skipped_triangle):
     """Where a ray crosses the two triangles of a cell of the inner square: parameter and triangle; inf and -1."""
     low, high = j * (2 * n + 1) + i, (j + 1) * (2 * n + 1) + i
-    h0, h1, h2, h3 = float(height[low]), float(height[low + 1]), float(height[high + 1]), float(height[high])
+    h0, h1, h2, h3 = (
+        float(vertex[low, 2]),
+        float(vertex[low + 1, 2]),
+        float(vertex[high + 1, 2]),
+        float(vertex[high, 2]),
+    )
     ax, ay, bx, by = h1 - h0, h2 - h1, h2 - h3, h3 - h0
     # On the first triangle, right of the diagonal, p - i >= q - j.
     s0, s1 = (p0 - i) - (q0 - j) + t0 * (dp - dq), (p0 - i) - (q0 - j) + t1 * (dp - dq)
@@ -104,11 +109,14 @@ def _cross_inner(height, n, i, j, p0, dp, q0, dq, oz, dz, t0, t1, skipped_triang
 
 
 @njit()
-def _cross_sector(height, half_widths, n, side, ring, place, a0, da, d0, dd, oz, dz, t0, t1, skipped_triangle):
+def _cross_sector(vertex, half_widths, n, side, ring, place, a0, da, d0, dd, oz, dz, t0, t1, skipped_triangle):
     """Where a ray crosses the two triangles of a cell of a sector: parameter and triangle; inf and -1."""
     along = side * 2 * n + place
-    h0, h1 = float(height[vertex_of_ring(ring, along, n)]), float(height[vertex_of_ring(ring + 1, along, n)])
-    h2, h3 = float(height[vertex_of_ring(ring + 1, along + 1, n)]), float(height[vertex_of_ring(ring, along + 1, n)])
+    h0, h1 = float(vertex[vertex_of_ring(ring, along, n), 2]), float(vertex[vertex_of_ring(ring + 1, along, n), 2])
+    h2, h3 = (
+        float(vertex[vertex_of_ring(ring + 1, along + 1, n), 2]),
+        float(vertex[vertex_of_ring(ring, along + 1, n), 2]),
+    )
     near, far = half_widths[ring], half_widths[ring + 1]
     u0, u1 = place / n - 1, (place + 1) / n - 1
     a_first, a_last = near * u0, far * u1
@@ -165,19 +173,20 @@ def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
         elif dq < 0:
             tq = ((bj << level) - q0) * per_q
         end = max(min(min(tp, tq), t1), t)
-        n_blocks = (cells + (1 << level) - 1) >> level
-        top = ground.top_m[ground.level[0, level] + bj * n_blocks + bi]
-        if min(oz + t * dz, oz + end * dz) <= top:
-            if level > 0:
+        if level > 0:
+            n_blocks = (cells + (1 << level) - 1) >> level
+            top = ground.top_m[ground.level[0, level] + bj * n_blocks + bi]
+            if min(oz + t * dz, oz + end * dz) <= top:
                 level -= 1
                 continue
-            cell = j * cells + i
-            if rocks.cell_start[cell] < rocks.cell_start[cell + 1]:
+        else:
+            if ground.vertex[j * (cells + 1) + i, 3] < 0:
+                cell = j * cells + i
                 tr, rock, face = _first_rock(rocks, cell, ox, oy, oz, dx, dy, dz, t0, t1, skip[4])
                 if tr < best:
                     best, best_rock, best_face = tr, rock, face
             triangle = skip[3] if skip[0] == 0 and skip[1] == j and skip[2] == i else -1
-            tg, triangle = _cross_inner(ground.height_m, n, i, j, p0, dp, q0, dq, oz, dz, t, end, triangle)
+            tg, triangle = _cross_inner(ground.vertex, n, i, j, p0, dp, q0, dq, oz, dz, t, end, triangle)
             if tg < best:
                 return tg, -1, -1, 0, j, i, triangle
         if best <= end:
@@ -253,20 +262,21 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
                     # The line is crossed behind the ray's start, on its way towards the centre.
                     tp = np.inf
         end = max(min(min(tr, tp), t1), t)
-        n_r, n_p = (n_rings + (1 << level) - 1) >> level, (places + (1 << level) - 1) >> level
-        top = ground.top_m[ground.level[1, level] + (side * n_r + br) * n_p + bp]
-        if min(oz + t * dz, oz + end * dz) <= top:
-            if level > 0:
+        if level > 0:
+            n_r, n_p = (n_rings + (1 << level) - 1) >> level, (places + (1 << level) - 1) >> level
+            top = ground.top_m[ground.level[1, level] + (side * n_r + br) * n_p + bp]
+            if min(oz + t * dz, oz + end * dz) <= top:
                 level -= 1
                 continue
-            cell = 4 * n * n + (side * n_rings + ring) * places + place
-            if rocks.cell_start[cell] < rocks.cell_start[cell + 1]:
+        else:
+            if ground.vertex[vertex_of_ring(ring, side * places + place, n), 3] < 0:
+                cell = 4 * n * n + (side * n_rings + ring) * places + place
                 tk, rock, face = _first_rock(rocks, cell, ox, oy, oz, dx, dy, dz, t0, t1, skip[4])
                 if tk < best:
                     best, best_rock, best_face = tk, rock, face
             triangle = skip[3] if skip[0] == side + 1 and skip[1] == ring and skip[2] == place else -1
             tg, triangle = _cross_sector(
-                ground.height_m, half, n, side, ring, place, a0, da, d0, dd, oz, dz, t, end, triangle
+                ground.vertex, half, n, side, ring, place, a0, da, d0, dd, oz, dz, t, end, triangle
             )
             if tg < best:
                 return tg, -1, -1, side + 1, ring, place, triangle

@@ -104,8 +104,7 @@ class HeightfieldEngine:
         suns /= np.linalg.norm(suns, axis=1, keepdims=True)
         depth, normal = np.empty(n), np.empty((n, 3))
         angles, lit = np.empty((n, 4)), np.empty(n)
-        surface = self.surface.ground, self.surface.rocks, self.surface.shading
-        see(*surface, origin, rays, suns, self.sun, _FAR_M, depth, normal, angles, lit)
+        see(self.surface.ground, self.surface.rocks, origin, rays, suns, self.sun, _FAR_M, depth, normal, angles, lit)
         mu0, mu, cos_phase, albedo = angles.astype(np.float32).T
         seen = radiance_factor(self._law, mu0, mu, cos_phase) / mu0 * albedo * lit.astype(np.float32)
         return depth, normal, seen

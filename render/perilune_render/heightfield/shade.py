@@ -13,14 +13,21 @@ _TERMINATOR = 0.1
 surface that its vertex normals describe (its shadow terminator geometry offset, at its default)."""
 
 
+@njit(inline="always")
+def _normal(vertices, k):
+    """Unit normal of a vertex, which points upwards."""
+    x, y = float(vertices[k, 0]), float(vertices[k, 1])
+    return x, y, np.sqrt(max(1 - x * x - y * y, 0.0))
+
+
 @njit()
-def ground_at(ground, shading, part, row, column, triangle, x, y, facet, curve):
+def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
     """Shading at a place of a triangle: normal, albedo.
 
     Writes the facet's unit normal into `facet` (3,), and into `curve` (3,) the vector from the facet to the curved
     surface of the vertex normals, by a quadratic patch through the three vertices.
     """
-    n, half, height = ground.n_half, ground.half_widths_m, ground.height_m
+    n, half, vertices = ground.n_half, ground.half_widths_m, ground.vertex
     a, b = (1, 2) if triangle == 0 else (2, 3)
     v0, v1, v2 = (
         vertex(part, row, column, 0, n),
@@ -30,8 +37,8 @@ def ground_at(ground, shading, part, row, column, triangle, x, y, facet, curve):
     x0, y0 = place_of(part, row, column, 0, n, half)
     x1, y1 = place_of(part, row, column, a, n, half)
     x2, y2 = place_of(part, row, column, b, n, half)
-    e1x, e1y, e1z = x1 - x0, y1 - y0, float(height[v1] - height[v0])
-    e2x, e2y, e2z = x2 - x0, y2 - y0, float(height[v2] - height[v0])
+    e1x, e1y, e1z = x1 - x0, y1 - y0, float(vertices[v1, 2] - vertices[v0, 2])
+    e2x, e2y, e2z = x2 - x0, y2 - y0, float(vertices[v2, 2] - vertices[v0, 2])
     area = e1x * e2y - e1y * e2x
     v = ((x - x0) * e2y - (y - y0) * e2x) / area
     w = (e1x * (y - y0) - e1y * (x - x0)) / area
@@ -39,9 +46,9 @@ def ground_at(ground, shading, part, row, column, triangle, x, y, facet, curve):
     fx, fy, fz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, area
     length = 1 / np.sqrt(fx * fx + fy * fy + fz * fz)
     facet[0], facet[1], facet[2] = fx * length, fy * length, fz * length
-    ax, ay, az = float(shading[v0, 0]), float(shading[v0, 1]), float(shading[v0, 2])
-    bx, by, bz = float(shading[v1, 0]), float(shading[v1, 1]), float(shading[v1, 2])
-    cx, cy, cz = float(shading[v2, 0]), float(shading[v2, 1]), float(shading[v2, 2])
+    ax, ay, az = _normal(vertices, v0)
+    bx, by, bz = _normal(vertices, v1)
+    cx, cy, cz = _normal(vertices, v2)
     nx, ny, nz = u * ax + v * bx + w * cx, u * ay + v * by + w * cy, u * az + v * bz + w * cz
     # A patch that is normal to the vertex normals bulges over an edge by its length times the change of slope.
     edge_1 = (bx - ax) * e1x + (by - ay) * e1y + (bz - az) * e1z
@@ -49,12 +56,13 @@ def ground_at(ground, shading, part, row, column, triangle, x, y, facet, curve):
     edge_3 = (cx - bx) * (x2 - x1) + (cy - by) * (y2 - y1) + (cz - bz) * (e2z - e1z)
     bulge = u * v * edge_1 + u * w * edge_2 + v * w * edge_3
     curve[0], curve[1], curve[2] = bulge * nx, bulge * ny, bulge * nz
+    albedo = u * abs(vertices[v0, 3]) + v * abs(vertices[v1, 3]) + w * abs(vertices[v2, 3])
     length = 1 / np.sqrt(nx * nx + ny * ny + nz * nz)
-    return nx * length, ny * length, nz * length, u * shading[v0, 3] + v * shading[v1, 3] + w * shading[v2, 3]
+    return nx * length, ny * length, nz * length, albedo
 
 
 @njit()
-def see(ground, rocks, shading, origin, rays, suns, sun, far_m, depth, normal, angles, lit):
+def see(ground, rocks, origin, rays, suns, sun, far_m, depth, normal, angles, lit):
     """Cast rays (N, 3) with z = 1 along the camera's axis from `origin` (3,), and a shadow ray from each hit.
 
     `suns` (N, 3) are unit vectors to points of the Sun's disc, `sun` (3,) to its centre. Writes for each ray the depth
@@ -88,7 +96,7 @@ def see(ground, rocks, shading, origin, rays, suns, sun, far_m, depth, normal, a
             skip = (-1, -1, -1, -1, rock)
             facet[0], facet[1], facet[2] = nx, ny, nz
         else:
-            nx, ny, nz, albedo = ground_at(ground, shading, part, row, column, triangle, x, y, facet, curve)
+            nx, ny, nz, albedo = ground_at(ground, part, row, column, triangle, x, y, facet, curve)
             skip = (part, row, column, triangle, -1)
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
         normal[k, 0], normal[k, 1], normal[k, 2] = nx, ny, nz

@@ -7,8 +7,8 @@ The mesh is that of Blender (`Grid.quads`, each quad split from its first to its
   two coordinates: d, its distance max(|x|, |y|), and `along`, its coordinate along the side. Rings are the lines
   d = half_widths[r], and the lines between neighbouring vertices of a ring are along / d = t / n_half - 1.
 
-A cell is a quad. Level 0 of the pyramid has the largest height of each cell, with the boulders that touch it; level L
-that of blocks of 2^L x 2^L cells.
+A cell is a quad. Level L of the pyramid, from 1, has the largest height of blocks of 2^L x 2^L cells, with the boulders
+that touch them. The time of a ray is mostly that of reading memory, so a vertex is four numbers side by side.
 """
 
 from dataclasses import dataclass
@@ -30,11 +30,12 @@ class Ground(NamedTuple):
 
     half_widths_m: Array
     """Half-widths of inner square and rings, ascending, metres (R + 1,)."""
-    height_m: np.ndarray
-    """Heights of the vertices, metres, in the grid's order (V,) float32."""
+    vertex: np.ndarray
+    """Of each vertex, in the grid's order (V, 4) float32: x and y of its unit normal, O_L; height, metres; albedo,
+    negative if boulders touch the cell whose first vertex it is."""
     top_m: np.ndarray
-    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and place, metres: all levels one
-    after another, float32."""
+    """Pyramids of the inner square, by y and x, and of the sectors, by side, ring and place, metres: levels from 1
+    one after another, float32."""
     level: np.ndarray
     """Index in `top_m` at which each level of the inner square and of the sectors begins (2, L + 1) int64; the last
     column is the index of the coarsest level."""
@@ -54,8 +55,6 @@ class Surface:
     """Ground."""
     rocks: Rocks
     """Boulders, with the cells that each touches."""
-    shading: np.ndarray
-    """Unit vertex normal, O_L, and albedo of each vertex (V, 4) float32."""
     centre_m: tuple[float, float]
     """x and y of the grid's centre, O_L, metres; the arrays are relative to it."""
 
@@ -71,25 +70,25 @@ def surface_of(scene: Scene) -> Surface:
     starts = np.zeros((2, _MOST_LEVELS + 1), np.int64)
     for part, levels in enumerate(pyramids):
         before = 0 if part == 0 else sum(map(len, pyramids[0]))
-        starts[part, : len(levels)] = before + np.concatenate([[0], np.cumsum([len(one) for one in levels])[:-1]])
-        starts[part, -1] = len(levels) - 1
+        starts[part, 1 : len(levels) + 1] = before + np.cumsum([0, *map(len, levels)])[:-1]
+        starts[part, -1] = len(levels)
     top = np.concatenate([level for levels in pyramids for level in levels])
     highest = max(float(part.max()) for part in tops if part.size)
-    ground = Ground(half, height, top, starts, n, float(height.min()), highest)
-    shading = np.empty((len(height), 4), np.float32)
-    shading[:, :3], shading[:, 3] = _vertex_normals(n, half, height), scene.albedo
-    return Surface(ground, rocks, shading, (grid.centre_x_m, grid.centre_y_m))
+    vertices = np.empty((len(height), 4), np.float32)
+    vertices[:, :2], vertices[:, 2], vertices[:, 3] = _vertex_normals(n, half, height), height, scene.albedo
+    _mark_rocks(vertices, n, rocks.cell_start, len(half) - 1)
+    ground = Ground(half, vertices, top, starts, n, float(height.min()), highest)
+    return Surface(ground, rocks, (grid.centre_x_m, grid.centre_y_m))
 
 
 def _pyramid(tops: np.ndarray) -> list[np.ndarray]:
-    """All levels of the largest values of `tops` (sides, rows, columns), each flat."""
-    levels, level = [], tops
-    while len(levels) < _MOST_LEVELS:
-        levels.append(level.ravel())
-        if max(level.shape[1:]) <= 1:
-            break
+    """Levels from 1 of the largest values of `tops` (sides, rows, columns), each flat."""
+    levels: list[np.ndarray] = []
+    level = tops
+    while not levels or (max(level.shape[1:]) > 1 and len(levels) < _MOST_LEVELS - 1):
         padded = np.pad(level, ((0, 0), (0, level.shape[1] % 2), (0, level.shape[2] % 2)), constant_values=-np.inf)
         level = padded.reshape(len(tops), padded.shape[1] // 2, 2, padded.shape[2] // 2, 2).max(axis=(2, 4))
+        levels.append(level.ravel())
     return levels
 
 
@@ -162,7 +161,7 @@ def _add_face(part, row, column, n, half_widths, height, points, total):
 
 @njit()
 def _vertex_normals(n, half_widths, height):
-    """Unit vertex normals (V, 3) as Blender's: means of the faces' normals, weighted by the angles at the vertex."""
+    """x and y of the unit vertex normals (V, 2) as Blender's: means of the faces' normals, weighted by the angles."""
     total, points = np.zeros((len(height), 3)), np.empty((4, 3))
     for j in range(2 * n):
         for i in range(2 * n):
@@ -174,4 +173,17 @@ def _vertex_normals(n, half_widths, height):
     for k in range(len(height)):
         length = np.sqrt(total[k, 0] ** 2 + total[k, 1] ** 2 + total[k, 2] ** 2)
         total[k] /= length
-    return total
+    return total[:, :2]
+
+
+@njit()
+def _mark_rocks(vertices, n, cell_start, n_rings):
+    """Make the albedo of the first vertex of each cell with boulders negative."""
+    for cell in range(len(cell_start) - 1):
+        if cell_start[cell] < cell_start[cell + 1]:
+            if cell < 4 * n * n:
+                at = vertex(0, cell // (2 * n), cell % (2 * n), 0, n)
+            else:
+                row, place = divmod(cell - 4 * n * n, 2 * n)
+                at = vertex(row // n_rings + 1, row % n_rings, place, 0, n)
+            vertices[at, 3] = -abs(vertices[at, 3])

@@ -4,11 +4,11 @@ import contextlib
 from collections.abc import Callable
 from types import TracebackType
 
-from perilune_render.blender.renderer import Renderer
 from perilune_render.dataset import tables
 from perilune_render.dataset.begin import check_code
 from perilune_render.dataset.trajectory import render_trajectory
 from perilune_render.dataset.work import FOLDER, write_scene
+from perilune_render.engines import open_engine
 from perilune_render.flight.pose_checks import Poses, check_poses
 from perilune_render.frame_source import FrameSource
 from perilune_render.jobs.job import Job
@@ -83,7 +83,7 @@ class SceneRenderer:
             rows = tables.scene_tables(plan, scene, config, self._job.info.recipe().key)
             trajectories = tables.trajectory_table(self._job.plan.of_scene(scene_id))
             write_scene(self._out, scene_id, {**rows, "trajectories": trajectories})
-            engine = self._closing.enter_context(Renderer(scene, config, self._job.plan.exr_camera, plan.sun))
+            engine = self._closing.enter_context(open_engine(scene, config, self._job.plan.exr_camera, plan.sun))
             source = FrameSource.of(engine, config, self._job.plan.camera, RimCircles.of_scene(scene))
             self._opened = scene_id, scene, source
             note(scene_id)

@@ -13,6 +13,8 @@ from perilune_shared.errors import UserError
 
 _FILES = ("dem", "catalogue")
 _SPEED = ("threads", "cache_gib")
+DEFAULT_ENGINE = "cycles"
+"""Not recorded, so that recipes of older versions stay equal."""
 _OPTIONAL = ("scene", "survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
@@ -20,7 +22,9 @@ _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool = False) -> Recipe:
     """The recipe of a dataset. With `planned`, the recipe of a plan: it lists only the versions behind the ground."""
     with_dem = config.terrain.dem is not None
-    versions = ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem)
+    versions = (
+        ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem, engine=config.render.engine)
+    )
     return Recipe(preset=preset, kind=kind, seed=config.seed, config=recorded_settings(config, kind), versions=versions)
 
 
@@ -40,6 +44,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     for name in _OPTIONAL:
         if plain[name] is None:
             del plain[name]
+    if plain["render"]["engine"] == DEFAULT_ENGINE:
+        del plain["render"]["engine"]
     if not config.shared_terrain:
         del plain[_OTHER[kind]]
     return plain

@@ -33,7 +33,11 @@ LIBRARIES = {
     "trimesh": ("trimesh", "trimesh"),
 }
 """Recorded name and distribution of each library that affects results, by import name."""
-_NAMES = {"generator": GROUND, "renderer": RENDERING, "imaging": IMAGING}
+RAYS = (*RENDERING[:2], "perilune_render.heightfield.engine:HeightfieldEngine")
+"""Code that plans trajectories and renders radiance with the engine `heightfield`."""
+_NAMES = {"generator": GROUND, "renderer": RENDERING, "rays": RAYS, "imaging": IMAGING}
+_RECORDED = {"rays": "renderer"}
+"""Recorded name of what has another name here."""
 
 
 def ground_versions(*, with_dem: bool) -> dict[str, str]:
@@ -46,9 +50,9 @@ def imaging_versions() -> dict[str, str]:
     return _versions(("imaging",), False)
 
 
-def all_versions(*, with_dem: bool) -> dict[str, str]:
-    """Versions of everything that determines a rendered frame and its labels."""
-    return _versions(tuple(_NAMES), with_dem)
+def all_versions(*, with_dem: bool, engine: str = "cycles") -> dict[str, str]:
+    """Versions of everything that determines a frame of an engine and its labels."""
+    return _versions(("generator", "rays" if engine == "heightfield" else "renderer", "imaging"), with_dem)
 
 
 @functools.cache
@@ -58,7 +62,7 @@ def _found(names: tuple[str, ...]) -> dict[str, str]:
     return {
         "perilune_render": perilune_render.__version__,
         "perilune_shared": perilune_shared.__version__,
-        **{name: each.sha256[:16] for name, each in prints.items()},
+        **{_RECORDED.get(name, name): each.sha256[:16] for name, each in prints.items()},
         **{
             recorded: metadata.version(distribution)
             for name, (recorded, distribution) in LIBRARIES.items()

@@ -1,0 +1,30 @@
+"""Open the engine that a configuration names: `cycles` (Blender), or `heightfield` (rays over the height field)."""
+
+import os
+from contextlib import AbstractContextManager
+
+from perilune_render.config import DatasetConfig
+from perilune_render.frame_source import Engine
+from perilune_render.terrain.scene import Scene
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+
+
+def open_engine(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> AbstractContextManager[Engine]:
+    """The engine of `dataset.render.engine` for a scene lit from `sun` (3,), O_L; use it as a context manager.
+
+    Raises UserError if the engine does not render what the configuration asks for.
+    """
+    if config.render.engine == "heightfield":
+        from perilune_render.heightfield.engine import HeightfieldEngine
+
+        return HeightfieldEngine(scene, config, camera, sun, config.render.threads or n_cores())
+    # Importing Blender takes a second, and only this engine needs it.
+    from perilune_render.blender.renderer import Renderer
+
+    return Renderer(scene, config, camera, sun)
+
+
+def n_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
