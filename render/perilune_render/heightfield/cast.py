@@ -317,9 +317,9 @@ def first_hit(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
         elif abs(o) > outer:
             return np.inf, -1, -1, -1, -1, -1, -1
     if dz < 0:
-        t0, t1 = max(t0, (ground.highest_m - oz) / dz), min(t1, (ground.lowest_m - oz) / dz + 1e-6)
+        t0, t1 = max(t0, (ground.highest_m - oz) / dz), min(t1, (ground.lowest_m - oz) / dz)
     elif dz > 0:
-        t1 = min(t1, (ground.highest_m - oz) / dz + 1e-6)
+        t1 = min(t1, (ground.highest_m - oz) / dz)
     elif oz > ground.highest_m:
         t1 = -np.inf
     per_x, per_y = 1 / dx if dx != 0 else np.inf, 1 / dy if dy != 0 else np.inf

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from perilune_render.config import DatasetConfig
-from perilune_render.heightfield.shade import see
+from perilune_render.heightfield.shade import distances, see
 from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.imaging.photometry import radiance_factor
 from perilune_render.imaging.radiance import Radiance
@@ -58,6 +58,14 @@ class HeightfieldEngine:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def cast(self, origins_m: Array, directions: Array) -> Array:
+        """Distances (N,) to the first hits from places (N, 3), O_L, along directions (N, 3), in their lengths.
+
+        Infinite where a ray hits neither ground nor boulder. Start above the surface: it is solid on both sides.
+        """
+        origins = np.ascontiguousarray(origins_m - np.array([*self.surface.centre_m, 0.0]), np.float64)
+        return distances(self.surface.ground, self.surface.rocks, origins, np.ascontiguousarray(directions, np.float64))
 
     def render(
         self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0, approach_deg: int = 0

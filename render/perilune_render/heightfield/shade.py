@@ -116,3 +116,14 @@ def see(ground, rocks, origin, rays, suns, sun, far_m, depth, normal, angles, li
                 x, y, z = x + moved * curve[0], y + moved * curve[1], z + moved * curve[2]
         if first_hit(ground, rocks, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0] == np.inf:
             lit[k] = cosine
+
+
+@njit()
+def distances(ground, rocks, origins, directions):
+    """Distances (N,) of the first hits of rays from places (N, 3) along directions (N, 3), in their lengths."""
+    found = np.empty(len(origins))
+    for k in range(len(origins)):
+        ox, oy, oz = origins[k]
+        dx, dy, dz = directions[k]
+        found[k] = first_hit(ground, rocks, ox, oy, oz, dx, dy, dz, 0.0, np.inf, (-1, -1, -1, -1, -1))[0]
+    return found

@@ -23,6 +23,8 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array
 
 _MOST_LEVELS = 16
+_MARGIN_M = 0.01
+"""Between the heights where rays begin and end, and the surface: a ray must cross the ground between them."""
 
 
 class Ground(NamedTuple):
@@ -42,9 +44,9 @@ class Ground(NamedTuple):
     n_half: int
     """Vertex spacings from the centre of the inner square to its border."""
     lowest_m: float
-    """Smallest height of the ground, metres."""
+    """Height below all ground, metres."""
     highest_m: float
-    """Largest height of ground and boulders, metres."""
+    """Height above all ground and boulders, metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ def surface_of(scene: Scene) -> Surface:
     vertices = np.empty((len(height), 4), np.float32)
     vertices[:, :2], vertices[:, 2], vertices[:, 3] = _vertex_normals(n, half, height), height, scene.albedo
     _mark_rocks(vertices, n, rocks.cell_start, len(half) - 1)
-    ground = Ground(half, vertices, top, starts, n, float(height.min()), highest)
+    ground = Ground(half, vertices, top, starts, n, float(height.min()) - _MARGIN_M, highest + _MARGIN_M)
     return Surface(ground, rocks, (grid.centre_x_m, grid.centre_y_m))
 
 

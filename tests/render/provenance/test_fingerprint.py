@@ -12,7 +12,12 @@ import perilune_shared
 from perilune_render.provenance import versions
 from perilune_render.provenance.fingerprint import Fingerprint, _fingerprint, compiled_functions, fingerprint
 
-ROOTS = {"generator": versions.GROUND, "renderer": versions.RENDERING, "imaging": versions.IMAGING}
+ROOTS = {
+    "generator": versions.GROUND,
+    "renderer": versions.RENDERING,
+    "rays": versions.RAYS,
+    "imaging": versions.IMAGING,
+}
 HOLDERS = {"pandas", "pyarrow", "mathutils"}
 """Libraries that hold values and compute none, or come with Blender."""
 
@@ -163,4 +168,5 @@ def test_every_library_that_computes_is_recorded():
 
 def test_compiled_functions_are_found_in_every_module():
     known = {name.partition(":")[0].rpartition(".")[2] for name in compiled_functions()}
-    assert known == {"pixels", "grid", "albedo", "older_ground", "stamp", "noise", "interpolation", "level_ground"}
+    terrain = {"grid", "albedo", "older_ground", "stamp", "noise", "interpolation", "level_ground"}
+    assert known == terrain | {"pixels", "surface", "rocks", "cast", "shade"}
