@@ -14,6 +14,11 @@ surface that its vertex normals describe (its shadow terminator geometry offset,
 
 
 @njit(inline="always")
+def _dot(ax, ay, az, bx, by, bz):
+    return ax * bx + ay * by + az * bz
+
+
+@njit(inline="always")
 def _normal(vertices, k):
     """Unit normal of a vertex, which points upwards."""
     x, y = float(vertices[k, 0]), float(vertices[k, 1])
@@ -24,8 +29,9 @@ def _normal(vertices, k):
 def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
     """Shading at a place of a triangle: normal, albedo.
 
-    Writes the facet's unit normal into `facet` (3,), and into `curve` (3,) the vector from the facet to the curved
-    surface of the vertex normals, by a quadratic patch through the three vertices.
+    Writes the facet's unit normal into `facet` (3,), and into `curve` (3,) the vector by which Cycles lifts a grazing
+    shadow ray from the facet: to the lowest of the vertices' tangent planes, each raised over the triangle, or to half
+    the height of a quadratic patch that has the vertex normals.
     """
     n, half, vertices = ground.n_half, ground.half_widths_m, ground.vertex
     a, b = (1, 2) if triangle == 0 else (2, 3)
@@ -53,8 +59,17 @@ def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
     # A patch that is normal to the vertex normals bulges over an edge by its length times the change of slope.
     edge_1 = (bx - ax) * e1x + (by - ay) * e1y + (bz - az) * e1z
     edge_2 = (cx - ax) * e2x + (cy - ay) * e2y + (cz - az) * e2z
-    edge_3 = (cx - bx) * (x2 - x1) + (cy - by) * (y2 - y1) + (cz - bz) * (e2z - e1z)
+    edge_3 = (cx - bx) * (e2x - e1x) + (cy - by) * (e2y - e1y) + (cz - bz) * (e2z - e1z)
     bulge = u * v * edge_1 + u * w * edge_2 + v * w * edge_3
+    # The tangent plane of each vertex, raised over the other two vertices: its height above the place.
+    px, py, pz = v * e1x + w * e2x, v * e1y + w * e2y, v * e1z + w * e2z
+    over_0 = max(max(_dot(e1x, e1y, e1z, ax, ay, az), _dot(e2x, e2y, e2z, ax, ay, az)), 0.0)
+    over_1 = max(max(-_dot(e1x, e1y, e1z, bx, by, bz), _dot(e2x - e1x, e2y - e1y, e2z - e1z, bx, by, bz)), 0.0)
+    over_2 = max(max(-_dot(e2x, e2y, e2z, cx, cy, cz), _dot(e1x - e2x, e1y - e2y, e1z - e2z, cx, cy, cz)), 0.0)
+    over_0 = max(over_0 - _dot(px, py, pz, ax, ay, az), 0.0)
+    over_1 = max(over_1 - _dot(px - e1x, py - e1y, pz - e1z, bx, by, bz), 0.0)
+    over_2 = max(over_2 - _dot(px - e2x, py - e2y, pz - e2z, cx, cy, cz), 0.0)
+    bulge = max(min(min(over_0, over_1), over_2), 0.5 * bulge)
     curve[0], curve[1], curve[2] = bulge * nx, bulge * ny, bulge * nz
     albedo = u * abs(vertices[v0, 3]) + v * abs(vertices[v1, 3]) + w * abs(vertices[v2, 3])
     length = 1 / np.sqrt(nx * nx + ny * ny + nz * nz)
