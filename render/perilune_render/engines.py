@@ -2,6 +2,7 @@
 
 import os
 from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
 
 from perilune_render.config import DatasetConfig
 from perilune_render.frame_source import Engine
@@ -9,16 +10,22 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
+if TYPE_CHECKING:
+    from perilune_render.heightfield.surface import Surface
 
-def open_engine(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> AbstractContextManager[Engine]:
+
+def open_engine(
+    scene: Scene, config: DatasetConfig, camera: Camera, sun: Array, surface: "Surface | None" = None
+) -> AbstractContextManager[Engine]:
     """The engine of `dataset.render.engine` for a scene lit from `sun` (3,), O_L; use it as a context manager.
 
+    The engine `heightfield` builds the surface of the scene unless it is given.
     Raises UserError if the engine does not render what the configuration asks for.
     """
     if config.render.engine == "heightfield":
         from perilune_render.heightfield.engine import HeightfieldEngine
 
-        return HeightfieldEngine(scene, config, camera, sun, config.render.threads or n_cores())
+        return HeightfieldEngine(scene, config, camera, sun, config.render.threads or n_cores(), surface)
     # Importing Blender takes a second, and only this engine needs it.
     from perilune_render.blender.renderer import Renderer
 

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from perilune_render.config import DatasetConfig
-from perilune_render.heightfield.shade import distances, see
+from perilune_render.heightfield.shade import see
 from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.imaging.photometry import radiance_factor
 from perilune_render.imaging.radiance import Radiance
@@ -32,22 +32,26 @@ class HeightfieldEngine:
     Raises UserError if the configuration asks for light that this engine does not render.
     """
 
-    def __init__(self, scene: Scene, config: DatasetConfig, camera: Camera, sun: Array, n_threads: int = 1):
+    def __init__(
+        self,
+        scene: Scene,
+        config: DatasetConfig,
+        camera: Camera,
+        sun: Array,
+        n_threads: int = 1,
+        surface: Surface | None = None,
+    ):
         for name in ("bounce", "earthshine"):
             if getattr(config.light, name):
                 raise UserError(
                     "configuration", f"dataset.light.{name}", True, "false, or dataset.render.engine cycles"
                 )
         self.camera, self.sun = camera, np.asarray(sun, np.float64)
-        self.surface: Surface = surface_of(scene)
+        self.surface = surface if surface is not None else surface_of(scene)
         self._law, self._samples = config.light.photometry, config.render.samples
         self._disc_rad = np.radians(config.light.sun_angular_diameter_deg) / 2
         self._centres = camera.pixel_centres().reshape(-1, 2)
         self._threads = ThreadPoolExecutor(n_threads, "rays")
-
-    def turn_sun(self, sun: Array) -> None:
-        """Set the unit vector towards the Sun, O_L (3,)."""
-        self.sun = np.asarray(sun, np.float64)
 
     def close(self) -> None:
         """End the threads."""
@@ -58,14 +62,6 @@ class HeightfieldEngine:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def cast(self, origins_m: Array, directions: Array) -> Array:
-        """Distances (N,) to the first hits from places (N, 3), O_L, along directions (N, 3), in their lengths.
-
-        Infinite where a ray hits neither ground nor boulder. Start above the surface: it is solid on both sides.
-        """
-        origins = np.ascontiguousarray(origins_m - np.array([*self.surface.centre_m, 0.0]), np.float64)
-        return distances(self.surface.ground, self.surface.rocks, origins, np.ascontiguousarray(directions, np.float64))
 
     def render(
         self, position_m: Array, rotation_camera_from_site: Array, seed: int = 0, approach_deg: int = 0

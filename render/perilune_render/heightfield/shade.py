@@ -77,6 +77,19 @@ def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
 
 
 @njit()
+def rock_normal(rocks, k, face):
+    """Unit normal of a face of boulder k, O_L."""
+    m, px, py, pz = rocks.rows[k], rocks.planes[face, 0], rocks.planes[face, 1], rocks.planes[face, 2]
+    nx, ny, nz = (
+        m[3] * px + m[6] * py + m[9] * pz,
+        m[4] * px + m[7] * py + m[10] * pz,
+        m[5] * px + m[8] * py + m[11] * pz,
+    )
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx / length, ny / length, nz / length
+
+
+@njit()
 def see(ground, rocks, origin, rays, suns, sun, far_m, depth, normal, angles, lit):
     """Cast rays (N, 3) with z = 1 along the camera's axis from `origin` (3,), and a shadow ray from each hit.
 
@@ -99,14 +112,7 @@ def see(ground, rocks, origin, rays, suns, sun, far_m, depth, normal, angles, li
             continue
         x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
         if rock >= 0:
-            m, size = (
-                rocks.rows[rock],
-                1 / np.sqrt(rocks.rows[rock, 3] ** 2 + rocks.rows[rock, 6] ** 2 + rocks.rows[rock, 9] ** 2),
-            )
-            px, py, pz = rocks.planes[face, 0], rocks.planes[face, 1], rocks.planes[face, 2]
-            nx = size * (m[3] * px + m[6] * py + m[9] * pz)
-            ny = size * (m[4] * px + m[7] * py + m[10] * pz)
-            nz = size * (m[5] * px + m[8] * py + m[11] * pz)
+            nx, ny, nz = rock_normal(rocks, rock, face)
             albedo = 1.0
             skip = (-1, -1, -1, -1, rock)
             facet[0], facet[1], facet[2] = nx, ny, nz
@@ -131,14 +137,3 @@ def see(ground, rocks, origin, rays, suns, sun, far_m, depth, normal, angles, li
                 x, y, z = x + moved * curve[0], y + moved * curve[1], z + moved * curve[2]
         if first_hit(ground, rocks, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0] == np.inf:
             lit[k] = cosine
-
-
-@njit()
-def distances(ground, rocks, origins, directions):
-    """Distances (N,) of the first hits of rays from places (N, 3) along directions (N, 3), in their lengths."""
-    found = np.empty(len(origins))
-    for k in range(len(origins)):
-        ox, oy, oz = origins[k]
-        dx, dy, dz = directions[k]
-        found[k] = first_hit(ground, rocks, ox, oy, oz, dx, dy, dz, 0.0, np.inf, (-1, -1, -1, -1, -1))[0]
-    return found

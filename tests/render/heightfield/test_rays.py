@@ -10,6 +10,7 @@ from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.frame_source import FrameSource, Shot
 from perilune_render.heightfield.engine import HeightfieldEngine
+from perilune_render.heightfield.query import first_hits
 from perilune_render.imaging.photometry import radiance_factor
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.terrain.scene import grow_scene
@@ -40,6 +41,10 @@ def engine(scene):
 @pytest.fixture(scope="module")
 def caster(scene):
     return Caster(scene)
+
+
+def cast(engine, origins, directions):
+    return first_hits(engine.surface, origins, directions)[0]
 
 
 def places(scene):
@@ -73,13 +78,13 @@ def test_shadow_rays_hit_what_embree_hits(scene, engine, caster):
     x, y = rng.uniform(-0.95, 0.95, (2, 4000)) * half * rng.uniform(0, 1, 4000) ** 2
     down = np.tile([0.0, 0.0, -1.0], (len(x), 1))
     start = np.stack([x, y, np.full(len(x), 500.0)], axis=1)
-    first = engine.cast(start, down)
+    first = cast(engine, start, down)
     ground = start + down * first[:, None]
     assert np.isfinite(first).all()
     for azimuth in (10, 100, 190, 300):
         towards = np.tile(sun_direction(azimuth, 6.0), (len(x), 1))
         origin = ground + np.array([0, 0, 0.05])
-        found = np.isfinite(engine.cast(origin, towards))
+        found = np.isfinite(cast(engine, origin, towards))
         expected = caster.engine.intersects_any(origin, towards)
         assert 0.02 < expected.mean() < 0.98
         assert (found == expected).mean() > 0.999
@@ -94,12 +99,12 @@ def test_a_ray_along_the_lines_of_the_mesh_is_not_lost():
         chosen = np.linspace(0, len(x) - 1, 5000).astype(int)
         inside = chosen[np.maximum(np.abs(x), np.abs(y))[chosen] < 0.999 * flat.grid.half_widths_m[-1]]
         start = np.stack([x[inside], y[inside], np.full(len(inside), 900.0)], axis=1)
-        depth = engine.cast(start, np.tile([0.0, 0.0, -1.0], (len(inside), 1)))
+        depth = cast(engine, start, np.tile([0.0, 0.0, -1.0], (len(inside), 1)))
         above_m = 900 - depth - flat.height_m[inside]
         assert (above_m > -1e-4).all()  # also not infinite
         assert (above_m < 1e-4).mean() > 0.97  # the others are on boulders
         slanted = [(a, b, -0.5) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-        assert np.isfinite(engine.cast(np.tile([0.0, 0.0, 300.0], (9, 1)), np.array(slanted, float))).all()
+        assert np.isfinite(cast(engine, np.tile([0.0, 0.0, 300.0], (9, 1)), np.array(slanted, float))).all()
 
 
 def test_flat_ground_has_the_radiance_of_the_formula():

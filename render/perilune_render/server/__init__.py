@@ -1,0 +1,1 @@
+"""Servers that render frames on request: PANGU's wire protocol, and our own interface."""

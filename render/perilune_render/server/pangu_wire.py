@@ -1,0 +1,92 @@
+"""Numbers and texts of PANGU's wire protocol 1.20, which are not those of IEEE 754 or of C.
+
+Integers have 32 bits, most significant byte first. A float is the word of IEEE 754 rotated left by 9 bits, so that the
+fraction is on top, then the sign, then the exponent. A double is the same with 12 bits, sent with its low half first.
+"""
+
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+SIZES = {"u": 4, "i": 4, "b": 1, "f": 4, "d": 8}
+"""Bytes of each type: unsigned and signed integer, bool, float, double."""
+
+
+def float_bytes(values: Sequence[float] | np.ndarray) -> bytes:
+    """Floats (N,) as on the wire. Values beyond the range of a float become its largest; NaN is refused."""
+    array = np.asarray(values, np.float64)
+    if np.isnan(array).any():
+        raise ValueError("NaN cannot be sent")
+    largest = np.finfo(np.float32).max
+    word = np.clip(array, -largest, largest).astype(np.float32).view(np.uint32)
+    return ((word << 9) | (word >> 23)).astype(">u4").tobytes()
+
+
+def double_bytes(values: Sequence[float] | np.ndarray) -> bytes:
+    """Doubles (N,) as on the wire. Raises ValueError for values that are not finite."""
+    array = np.asarray(values, np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError("values that are not finite cannot be sent")
+    word = array.view(np.uint64)
+    turned = (word << np.uint64(12)) | (word >> np.uint64(52))
+    halves = np.stack([turned & np.uint64(0xFFFFFFFF), turned >> np.uint64(32)], axis=-1)
+    return halves.astype(">u4").tobytes()
+
+
+def floats_from(data: bytes) -> np.ndarray:
+    """Floats (N,) float64 from the wire; they may be infinite or NaN."""
+    word = np.frombuffer(data, ">u4").astype(np.uint32)
+    return ((word >> 9) | (word << 23)).view(np.float32).astype(np.float64)
+
+
+def doubles_from(data: bytes) -> np.ndarray:
+    """Doubles (N,) from the wire; they may be infinite or NaN."""
+    halves = np.frombuffer(data, ">u4").astype(np.uint64).reshape(-1, 2)
+    word = (halves[:, 1] << np.uint64(32)) | halves[:, 0]
+    return ((word >> np.uint64(12)) | (word << np.uint64(52))).view(np.float64)
+
+
+def unsigned(*values: int) -> bytes:
+    """Unsigned integers as on the wire."""
+    return struct.pack(f">{len(values)}I", *values)
+
+
+def text_bytes(text: str) -> bytes:
+    """A text as on the wire: its length, the bytes, a zero, and a second one if the length would be odd."""
+    data = text.encode("ascii", "replace") + b"\0"
+    data += b"\0" * (len(data) % 2)
+    return struct.pack(">H", len(data)) + data
+
+
+def read_fields(layout: str, data: bytes) -> list[float | int | bool]:
+    """Values of the types of a layout, such as "u3f": a number before a type repeats it."""
+    values: list[float | int | bool] = []
+    at = 0
+    for kind in expanded(layout):
+        part, at = data[at : at + SIZES[kind]], at + SIZES[kind]
+        if kind == "f":
+            values.append(float(floats_from(part)[0]))
+        elif kind == "d":
+            values.append(float(doubles_from(part)[0]))
+        elif kind == "b":
+            values.append(part != b"\0")
+        else:
+            values.append(int.from_bytes(part, "big", signed=kind == "i"))
+    return values
+
+
+def expanded(layout: str) -> str:
+    """A layout with each type written out, "u3f" as "ufff"."""
+    found, digits = "", ""
+    for letter in layout:
+        if letter.isdigit():
+            digits += letter
+        else:
+            found, digits = found + letter * int(digits or 1), ""
+    return found
+
+
+def size_of(layout: str) -> int:
+    """Number of bytes of a layout."""
+    return sum(SIZES[kind] for kind in expanded(layout))

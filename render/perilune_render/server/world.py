@@ -1,0 +1,120 @@
+"""The world of a server: one scene, rendered and measured from any pose. Only one thread may use it."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.config import DatasetConfig
+from perilune_render.engines import open_engine
+from perilune_render.frame_source import Frame, FrameSource, Shot
+from perilune_render.heightfield.query import first_hits, heights_m
+from perilune_render.heightfield.surface import Surface, surface_of
+from perilune_render.imaging.radiance import Radiance
+from perilune_render.labels.frame_labels import Labels, RimCircles
+from perilune_render.terrain.scene import Scene
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+
+LEAST_CLEARANCE_M = 0.1
+"""Smallest height of a camera above the surface below it, metres."""
+_MOST_SOURCES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Where a camera is, and what it sees by."""
+
+    position_m: Array
+    """Position, O_L, metres (3,)."""
+    rotation_camera_from_site: Array
+    """Rotation matrix (3, 3)."""
+    camera: Camera
+    """Camera."""
+    sun: Array
+    """Unit vector towards the Sun, O_L (3,)."""
+
+
+class World:
+    """Renders frames of a scene, and casts rays at it. Close it at the end.
+
+    With the engine `cycles`, a change of camera or Sun builds Blender's scene again, which takes seconds.
+    """
+
+    def __init__(self, scene: Scene, config: DatasetConfig, note: Callable[[str], object] = lambda text: None):
+        self.scene, self.config = scene, config
+        self.surface: Surface = surface_of(scene)
+        self._circles, self._note = RimCircles.of_scene(scene), note
+        self._sources: dict[tuple, tuple[FrameSource, ExitStack]] = {}
+
+    def __enter__(self) -> "World":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the engines."""
+        for _, stack in self._sources.values():
+            stack.close()
+        self._sources.clear()
+
+    def frame(self, view: View, seed: int, index: int, velocity_mps: Array | None = None) -> Frame:
+        """Render and develop a frame. Raises UserError if the camera is off the ground or below its surface."""
+        self.check(view.position_m)
+        velocity = np.zeros(3) if velocity_mps is None else velocity_mps
+        shot = Shot(view.position_m, view.rotation_camera_from_site, velocity, seed, index)
+        return self._source(view).take(shot)
+
+    def labels(self, view: View, frame: Frame) -> Labels:
+        """Labels of a frame."""
+        return self._source(view).labels(frame)
+
+    def radiance(self, view: View) -> Radiance:
+        """Depth and normals of a view; the radiance has one sample and no sensor."""
+        self.check(view.position_m)
+        return self._source(view).render(Shot(view.position_m, view.rotation_camera_from_site, np.zeros(3), 0))
+
+    def check(self, position_m: Array) -> None:
+        """Raise UserError if a camera is off the ground or not above its surface."""
+        half = self.scene.grid.extent_m / 2
+        if max(abs(position_m[0]), abs(position_m[1])) > half:
+            found = f"x {position_m[0]:.1f} m, y {position_m[1]:.1f} m"
+            raise UserError("camera", "position", found, f"|x| and |y| at most {half:.0f} m, over the ground")
+        surface = float(self.heights_m(position_m[:1], position_m[1:2])[0])
+        if position_m[2] < surface + LEAST_CLEARANCE_M:
+            found = f"{position_m[2] - surface:.2f} m above the surface"
+            raise UserError("camera", "position", found, f"at least {LEAST_CLEARANCE_M} m")
+
+    def hits(self, origins_m: Array, directions: Array, *, boulders: bool = True) -> tuple[Array, Array]:
+        """Distances (N,) and normals (N, 3) of the first hits (`perilune_render.heightfield.query.first_hits`)."""
+        return first_hits(self.surface, origins_m, directions, boulders=boulders)
+
+    def heights_m(self, x_m: Array, y_m: Array, *, boulders: bool = True) -> Array:
+        """Heights (N,) of the surface, metres; NaN off the ground."""
+        return heights_m(self.surface, x_m, y_m, boulders=boulders)
+
+    def _source(self, view: View) -> FrameSource:
+        """The frame source of a camera and a Sun, opened if it is not yet."""
+        key = (view.camera, tuple(view.sun.tolist()))
+        found = self._sources.pop(key, None)
+        if found is None:
+            found = self._opened(view)
+        self._sources[key] = found  # the last used one is the last
+        return found[0]
+
+    def _opened(self, view: View) -> tuple[FrameSource, ExitStack]:
+        cycles = self.config.render.engine == "cycles"
+        most = 1 if cycles else _MOST_SOURCES
+        while len(self._sources) >= most:
+            self._sources.pop(next(iter(self._sources)))[1].close()
+        if cycles:
+            self._note("building the scene in Blender for another camera or Sun")
+        stack = ExitStack()
+        pinhole = view.camera.covering_pinhole()
+        engine = stack.enter_context(
+            open_engine(self.scene, self.config, pinhole, view.sun, None if cycles else self.surface)
+        )
+        return FrameSource.of(engine, self.config, view.camera, self._circles), stack
