@@ -23,6 +23,7 @@ from perilune_render.cli.options import (
     resolved_config,
     warn_of_size,
 )
+from perilune_render.cli.serve import serve
 from perilune_render.cli.status import status
 from perilune_render.cli.survey import survey
 from perilune_render.config import DatasetConfig
@@ -55,6 +56,7 @@ def config(
 
 app.command()(dataset)
 app.command()(frames)
+app.command()(serve)
 app.command()(status)
 app.command()(survey)
 app.command()(counterfactual)

@@ -9,18 +9,18 @@ Ground is crossed where the ray's height over a triangle changes its sign, so no
 
 import numpy as np
 
+from perilune_render.heightfield.surface import ring_vertex
 from perilune_render.provenance.kernels import njit
-from perilune_render.terrain.grid import vertex_of_ring
 
 NO_PART = -1
 """Part of the mesh in a hit on nothing; 0 is the inner square, 1 to 4 are the sectors."""
-_FIRST_LEVEL = 3
+_FIRST_LEVEL = 4
 """Level of the pyramid at which a walk begins."""
 _BEHIND = 1e-6
 """Relative distance behind a ray's present place from which a line is taken as not ahead."""
 
 
-@njit()
+@njit(error_model="numpy")
 def enters_rock(rows, planes, k, ox, oy, oz, dx, dy, dz, t0, t1):
     """Parameter at which a ray enters boulder k between t0 and t1, and the face there; inf and -1 if it does not."""
     px, py, pz = ox - rows[k, 0], oy - rows[k, 1], oz - rows[k, 2]
@@ -54,7 +54,7 @@ def enters_rock(rows, planes, k, ox, oy, oz, dx, dy, dz, t0, t1):
     return np.inf, -1
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def _first_rock(rocks, cell, ox, oy, oz, dx, dy, dz, t0, t1, skipped):
     """First boulder of a cell that a ray enters: parameter, boulder and face; inf, -1 and -1 if there is none."""
     best, rock, face = np.inf, -1, -1
@@ -68,7 +68,7 @@ def _first_rock(rocks, cell, ox, oy, oz, dx, dy, dz, t0, t1, skipped):
     return best, rock, face
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def crossing(above_0, above_1, t0, t1):
     """Parameter at which a height above a triangle, linear from t0 to t1, changes its sign; inf if it does not."""
     if (above_0 > 0) == (above_1 > 0):
@@ -76,7 +76,7 @@ def crossing(above_0, above_1, t0, t1):
     return t0 + (t1 - t0) * above_0 / (above_0 - above_1)
 
 
-@njit()
+@njit(error_model="numpy")
 def _cross_inner(vertex, n, i, j, p0, dp, q0, dq, oz, dz, t0, t1, skipped_triangle):
     """Where a ray crosses the two triangles of a cell of the inner square: parameter and triangle; inf and -1."""
     low, high = j * (2 * n + 1) + i, (j + 1) * (2 * n + 1) + i
@@ -108,14 +108,14 @@ def _cross_inner(vertex, n, i, j, p0, dp, q0, dq, oz, dz, t0, t1, skipped_triang
     return np.inf, -1
 
 
-@njit()
+@njit(error_model="numpy")
 def _cross_sector(vertex, half_widths, n, side, ring, place, a0, da, d0, dd, oz, dz, t0, t1, skipped_triangle):
     """Where a ray crosses the two triangles of a cell of a sector: parameter and triangle; inf and -1."""
     along = side * 2 * n + place
-    h0, h1 = float(vertex[vertex_of_ring(ring, along, n), 2]), float(vertex[vertex_of_ring(ring + 1, along, n), 2])
+    h0, h1 = float(vertex[ring_vertex(ring, along, n), 2]), float(vertex[ring_vertex(ring + 1, along, n), 2])
     h2, h3 = (
-        float(vertex[vertex_of_ring(ring + 1, along + 1, n), 2]),
-        float(vertex[vertex_of_ring(ring, along + 1, n), 2]),
+        float(vertex[ring_vertex(ring + 1, along + 1, n), 2]),
+        float(vertex[ring_vertex(ring, along + 1, n), 2]),
     )
     near, far = half_widths[ring], half_widths[ring + 1]
     u0, u1 = place / n - 1, (place + 1) / n - 1
@@ -148,7 +148,7 @@ def _cross_sector(vertex, half_widths, n, side, ring, place, a0, da, d0, dd, oz,
     return np.inf, -1
 
 
-@njit()
+@njit(error_model="numpy")
 def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit in the inner square between t0 and t1; see `first_hit`."""
     n, coarsest = ground.n_half, ground.level[0, -1]
@@ -156,9 +156,9 @@ def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     step = ground.half_widths_m[0] / n
     p0, dp, q0, dq = ox / step + n, dx / step, oy / step + n, dy / step
     per_p, per_q = 1 / dp if dp != 0 else 0.0, 1 / dq if dq != 0 else 0.0
-    t = t0
-    i = min(max(int(np.floor(p0 + t * dp)), 0), cells - 1)
-    j = min(max(int(np.floor(q0 + t * dq)), 0), cells - 1)
+    t, rises = t0, dz > 0
+    i = min(max(int(p0 + t * dp), 0), cells - 1)
+    j = min(max(int(q0 + t * dq), 0), cells - 1)
     level = min(_FIRST_LEVEL, coarsest)
     best, best_rock, best_face = np.inf, -1, -1
     while t < t1:
@@ -197,21 +197,22 @@ def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
         if tp <= tq:
             i = min((bi + 1) << level, cells) if dp > 0 else (bi << level) - 1
             low = bj << level
-            j = min(max(int(np.floor(q0 + t * dq)), low), min(((bj + 1) << level), cells) - 1)
+            j = min(max(int(q0 + t * dq), low), min(((bj + 1) << level), cells) - 1)
         else:
             j = min((bj + 1) << level, cells) if dq > 0 else (bj << level) - 1
             low = bi << level
-            i = min(max(int(np.floor(p0 + t * dp)), low), min(((bi + 1) << level), cells) - 1)
+            i = min(max(int(p0 + t * dp), low), min(((bi + 1) << level), cells) - 1)
         if i < 0 or j < 0 or i >= cells or j >= cells:
             break
-        if level < coarsest:
+        # A ray that falls cannot pass the rest of a block whose beginning it could not pass.
+        if level < coarsest and (rises or i >> (level + 1) != bi >> 1 or j >> (level + 1) != bj >> 1):
             level += 1
     if best < np.inf:
         return best, best_rock, best_face, 0, j, i, -1
     return np.inf, -1, -1, -1, -1, -1, -1
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def _ring_at(half_widths, d, low, high):
     """Ring r of low..high with half_widths[r] <= d < half_widths[r + 1], the nearest of them if none."""
     while low < high:
@@ -223,7 +224,7 @@ def _ring_at(half_widths, d, low, high):
     return low
 
 
-@njit()
+@njit(error_model="numpy")
 def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit in a sector between t0 and t1; see `first_hit`."""
     n, coarsest = ground.n_half, ground.level[1, -1]
@@ -238,10 +239,10 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     else:
         a0, da, d0, dd = -oy, -dy, -ox, -dx
     turning, per_d, per_n = da * d0 - a0 * dd, 1 / dd if dd != 0 else 0.0, 1 / n
-    t = t0
+    t, rises = t0, dz > 0
     d = d0 + t * dd
     ring = _ring_at(half, d, 0, n_rings - 1)
-    place = min(max(int(np.floor(((a0 + t * da) / d + 1) * n)), 0), places - 1)
+    place = min(max(int(((a0 + t * da) / d + 1) * n), 0), places - 1)
     level = min(_FIRST_LEVEL, coarsest)
     best, best_rock, best_face = np.inf, -1, -1
     while t < t1:
@@ -269,7 +270,7 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
                 level -= 1
                 continue
         else:
-            if ground.vertex[vertex_of_ring(ring, side * places + place, n), 3] < 0:
+            if ground.vertex[ring_vertex(ring, side * places + place, n), 3] < 0:
                 cell = 4 * n * n + (side * n_rings + ring) * places + place
                 tk, rock, face = _first_rock(rocks, cell, ox, oy, oz, dx, dy, dz, t0, t1, skip[4])
                 if tk < best:
@@ -288,20 +289,21 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
         if tr <= tp:
             ring = last_ring if dd > 0 else first_ring - 1
             d = d0 + t * dd
-            place = min(max(int(np.floor(((a0 + t * da) / d + 1) * n)), first_place), last_place - 1)
+            place = min(max(int(((a0 + t * da) / d + 1) * n), first_place), last_place - 1)
         else:
             place = last_place if turning > 0 else first_place - 1
             ring = _ring_at(half, d0 + t * dd, first_ring, last_ring - 1)
         if ring < 0 or place < 0 or ring >= n_rings or place >= places:
             break
-        if level < coarsest:
+        # A ray that falls cannot pass the rest of a block whose beginning it could not pass.
+        if level < coarsest and (rises or ring >> (level + 1) != br >> 1 or place >> (level + 1) != bp >> 1):
             level += 1
     if best < np.inf:
         return best, best_rock, best_face, side + 1, ring, place, -1
     return np.inf, -1, -1, -1, -1, -1, -1
 
 
-@njit()
+@njit(error_model="numpy")
 def first_hit(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit of the ray o + t d, relative to the grid's centre, with t0 < t < t1.
 

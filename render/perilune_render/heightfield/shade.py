@@ -13,19 +13,19 @@ _TERMINATOR = 0.1
 surface that its vertex normals describe (its shadow terminator geometry offset, at its default)."""
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def _dot(ax, ay, az, bx, by, bz):
     return ax * bx + ay * by + az * bz
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def _normal(vertices, k):
     """Unit normal of a vertex, which points upwards."""
     x, y = float(vertices[k, 0]), float(vertices[k, 1])
     return x, y, np.sqrt(max(1 - x * x - y * y, 0.0))
 
 
-@njit()
+@njit(error_model="numpy")
 def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
     """Shading at a place of a triangle: normal, albedo.
 
@@ -76,7 +76,7 @@ def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
     return nx * length, ny * length, nz * length, albedo
 
 
-@njit()
+@njit(error_model="numpy")
 def rock_normal(rocks, k, face):
     """Unit normal of a face of boulder k, O_L."""
     m, px, py, pz = rocks.rows[k], rocks.planes[face, 0], rocks.planes[face, 1], rocks.planes[face, 2]
@@ -89,7 +89,7 @@ def rock_normal(rocks, k, face):
     return nx / length, ny / length, nz / length
 
 
-@njit()
+@njit(error_model="numpy")
 def see(ground, rocks, origin, rays, suns, sun, far_m, depth, normal, angles, lit):
     """Cast rays (N, 3) with z = 1 along the camera's axis from `origin` (3,), and a shadow ray from each hit.
 

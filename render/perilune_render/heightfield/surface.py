@@ -94,16 +94,24 @@ def _pyramid(tops: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-@njit()
+@njit(inline="always")
+def ring_vertex(ring, place, n):
+    """As `vertex_of_ring` for places up to 8 n, without a division."""
+    if place >= 8 * n:
+        place -= 8 * n
+    return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place if ring > 0 else vertex_of_ring(ring, place, n)
+
+
+@njit(error_model="numpy")
 def vertex(part, row, column, k, n):
     """Index of vertex k (0 to 3, as in `Grid.quads`) of a cell, in the grid's order."""
     if part == 0:
         return (row + (1 if k >= 2 else 0)) * (2 * n + 1) + column + (1 if k == 1 or k == 2 else 0)
     place = (part - 1) * 2 * n + column + (1 if k >= 2 else 0)
-    return vertex_of_ring(row + (1 if k == 1 or k == 2 else 0), place, n)
+    return ring_vertex(row + (1 if k == 1 or k == 2 else 0), place, n)
 
 
-@njit()
+@njit(error_model="numpy")
 def place_of(part, row, column, k, n, half_widths):
     """x and y of vertex k of a cell, relative to the grid's centre."""
     if part == 0:

@@ -33,6 +33,11 @@ def scene_seed(config: DatasetConfig) -> int:
     return derived_seed(config.seed, config.name, "given", "scene", 0)
 
 
+def trajectory_seed(seed: int, number: int) -> int:
+    """Random seed of a trajectory of given poses over the ground with this seed."""
+    return derived_seed(seed, "given", "trajectory", number)
+
+
 def views_of(poses: GivenPoses, camera: Camera, where: object) -> tuple[ViewConfig, ...]:
     """Views that hold all poses of a pinhole `camera`, with margins for relief, rounded to three digits.
 
@@ -116,7 +121,7 @@ def _suns(poses: GivenPoses, scene: SceneConfig) -> tuple[list[Array], np.ndarra
 def _trajectory(poses: GivenPoses, rows: np.ndarray, scene: ScenePlan, number: int) -> TrajectoryPlan:
     name = f"trajectory-{number:04d}"
     part = partial(_flight, poses, rows)
-    seed = derived_seed(scene.seed, "given", "trajectory", number)
+    seed = trajectory_seed(scene.seed, number)
     # The index goes on where the Sun changes, so that frames of one trajectory have independent noise.
     begin = int(rows[0] - np.flatnonzero(poses.trajectory == number)[0])
     index = range(begin, begin + len(rows))

@@ -30,6 +30,8 @@ REFUSED, FAULTY = 1, 2
 _CAMERAS = (0, 1)
 _MOST_HEIGHTS = 1_000_000
 _START_M = 1000.0
+_LARGEST = 1e16
+"""Largest number in a message: the Sun's distance may be 1e15 metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +95,9 @@ class Session:
     @staticmethod
     def _check(message: m.Message, values: list, items: Array | bytes) -> None:
         numbers = np.array([value for value in values if isinstance(value, float)])
-        if not np.isfinite(numbers).all() or not (isinstance(items, bytes) or np.isfinite(items).all()):
-            raise ValueError("a number that is not finite")
+        for part in (numbers, items):
+            if not isinstance(part, bytes) and not (np.abs(part) <= _LARGEST).all():
+                raise ValueError(f"a number that is not finite, or beyond {_LARGEST:g}")
 
     def view(self) -> View:
         """The current view."""

@@ -1,0 +1,108 @@
+"""The command `perilune-render serve`."""
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+import typer
+
+from perilune_render.cli.frames import CameraFile, Scene, read_camera
+from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
+from perilune_render.config import DatasetConfig
+from perilune_render.config_scene import SceneConfig
+from perilune_shared.geometry.frames import Array, sun_direction
+from perilune_shared.progress import say
+
+if TYPE_CHECKING:
+    from perilune_render.server.world import World
+
+_PORT = 10363
+_LOOPBACK = "127.0.0.1"
+_Zero = Literal["clockwise-from-y", "anticlockwise-from-x"]
+
+
+def serve(
+    scene: Scene = None,
+    camera: CameraFile = None,
+    preset: Preset = "small",
+    setting: Setting = None,
+    dem: Dem = None,
+    catalogue: Catalogue = None,
+    engine: Annotated[Literal["heightfield", "cycles"], typer.Option(help="Renderer.")] = "heightfield",
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; another than this machine's own opens it to others.")
+    ] = _LOOPBACK,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = _PORT,
+    sun_azimuth: Annotated[
+        _Zero, typer.Option(help="PANGU: where the Sun's azimuth is 0, and its sense.")
+    ] = "clockwise-from-y",
+    roll: Annotated[
+        Literal["left", "right"], typer.Option(help="PANGU: where positive roll leans the camera's top.")
+    ] = "left",
+    allow_quit: Annotated[bool, typer.Option("--allow-quit", help="PANGU: let a client end the server.")] = False,
+    max_clients: Annotated[int, typer.Option(min=1, max=1000, help="Largest number of clients at once.")] = 16,
+    idle_s: Annotated[
+        float, typer.Option(min=1, help="Disconnect a client that sends nothing for so long, seconds.")
+    ] = 600.0,
+) -> None:
+    """Render images for clients of PANGU's protocol 1.20 over TCP, at any pose over one scene."""
+    config = resolved_config(preset, scene, setting, dem, catalogue, given_scene=True)
+    if camera is not None:
+        config = config.model_copy(update={"camera": read_camera(camera)})
+    config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
+    from perilune_render.server.pangu_serve import serve_pangu
+    from perilune_render.server.pangu_session import Conventions, Session
+    from perilune_render.server.serve import Connection, Limits, Server
+
+    conventions = Conventions(sun_azimuth, roll, allow_quit)
+    limits = Limits(clients=max_clients, idle_s=idle_s)
+    with _world(config) as world:
+        start = _start(world)
+
+        async def handle(connection: Connection) -> None:
+            await serve_pangu(connection, lambda: Session(world, *start, conventions), server.stop)
+
+        server = Server(host, port, handle, limits, say)
+        server.begin()
+        stated = config.scene or SceneConfig()
+        say(
+            f"PANGU protocol 1.20 at {server.host}:{server.port}, {engine}, images of {config.camera.width_px} x "
+            f"{config.camera.height_px} px; Ctrl-C ends it"
+        )
+        say(
+            f"the world is O_L, metres; Sun at azimuth {stated.sun_azimuth_deg:g} (clockwise from north), elevation "
+            f"{stated.sun_elevation_deg:g} degrees, until a client sets it"
+        )
+        say(
+            f"not known of PANGU, so options: --sun-azimuth {sun_azimuth}, --roll {roll}; cameras 0 and 1 are the "
+            "same, each client has its own camera and Sun"
+        )
+        if host != _LOOPBACK:
+            say(f"{host}: others on the network can connect; the protocol has no password", style="yellow")
+        server.run()
+
+
+def _world(config: DatasetConfig) -> "World":
+    """The world of a configuration: its ground is made for `dataset.scene.views`, or for the flights of `nav`."""
+    from perilune_render.flight.plan import camera_of
+    from perilune_render.flight.view import scene_view, view_envelope
+    from perilune_render.poses.plan import scene_seed
+    from perilune_render.server.world import World
+    from perilune_render.terrain.cache import cached_scene
+    from perilune_render.terrain.scene import check_ground
+
+    pinhole = camera_of(config.camera).covering_pinhole()
+    stated = config.scene is not None and bool(config.scene.views)
+    view = scene_view(config.scene, pinhole) if stated and config.scene else view_envelope(pinhole, config.nav.flight)
+    check_ground(config, view)
+    say("generating the ground")
+    return World(cached_scene(config, view, scene_seed(config)), config, say)
+
+
+def _start(world: "World") -> tuple[int, int, float, Array, int]:
+    """Width and height, pixels, field of view, radians, Sun and random seed of a new client of PANGU's protocol."""
+    from perilune_render.poses.plan import trajectory_seed
+
+    camera, stated = world.config.camera, world.config.scene or SceneConfig()
+    sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)
+    field_of_view_rad = float(np.radians(camera.horizontal_fov_deg))
+    return camera.width_px, camera.height_px, field_of_view_rad, sun, trajectory_seed(world.scene.seed, 0)
