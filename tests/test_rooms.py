@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
         "errors interrupts run_record terminal progress content yaml_text config_errors config config_page storage "
-        "geometry dataset labels validation editing export cli"
+        "geometry client dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
         "processor config_values config_terrain config_survey config_counterfactual config_scene config streams "

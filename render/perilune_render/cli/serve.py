@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from perilune_render.server.world import World
 
 _PORT = 10363
+_NATIVE_PORT = 10364
 _LOOPBACK = "127.0.0.1"
 _Zero = Literal["clockwise-from-y", "anticlockwise-from-x"]
 
@@ -31,7 +32,11 @@ def serve(
     host: Annotated[
         str, typer.Option(help="Address to listen on; another than this machine's own opens it to others.")
     ] = _LOOPBACK,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes a free one.")] = _PORT,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="PANGU: port; 0 takes a free one.")] = _PORT,
+    native_port: Annotated[
+        int,
+        typer.Option(min=0, max=65535, help="Port of the interface for `perilune_shared.client`; 0 takes a free one."),
+    ] = _NATIVE_PORT,
     sun_azimuth: Annotated[
         _Zero, typer.Option(help="PANGU: where the Sun's azimuth is 0, and its sense.")
     ] = "clockwise-from-y",
@@ -44,24 +49,28 @@ def serve(
         float, typer.Option(min=1, help="Disconnect a client that sends nothing for so long, seconds.")
     ] = 600.0,
 ) -> None:
-    """Render images for clients of PANGU's protocol 1.20 over TCP, at any pose over one scene."""
+    """Render images at any pose over one scene, for clients of PANGU's protocol and of `perilune_shared.client`."""
     config = resolved_config(preset, scene, setting, dem, catalogue, given_scene=True)
     if camera is not None:
         config = config.model_copy(update={"camera": read_camera(camera)})
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
+    from perilune_render.server.native import serve_native
     from perilune_render.server.pangu_serve import serve_pangu
     from perilune_render.server.pangu_session import Conventions, Session
-    from perilune_render.server.serve import Connection, Limits, Server
+    from perilune_render.server.serve import Ask, Connection, Limits, Server
 
     conventions = Conventions(sun_azimuth, roll, allow_quit)
     limits = Limits(clients=max_clients, idle_s=idle_s)
-    with _world(config) as world:
+    with open_world(config) as world:
         start = _start(world)
 
         async def handle(connection: Connection) -> None:
             await serve_pangu(connection, lambda: Session(world, *start, conventions), server.stop)
 
-        server = Server(host, port, handle, limits, say)
+        async def native(ask: Ask, ready: Callable[[int], object]) -> None:
+            await serve_native(f"tcp://{host}:{native_port}", world, ask, ready)
+
+        server = Server(host, port, handle, limits, say, native)
         server.begin()
         stated = config.scene or SceneConfig()
         say(
@@ -76,12 +85,13 @@ def serve(
             f"not known of PANGU, so options: --sun-azimuth {sun_azimuth}, --roll {roll}; cameras 0 and 1 are the "
             "same, each client has its own camera and Sun"
         )
+        say(f"perilune_shared.client at tcp://{server.host}:{server.other_port}")
         if host != _LOOPBACK:
             say(f"{host}: others on the network can connect; the protocol has no password", style="yellow")
         server.run()
 
 
-def _world(config: DatasetConfig) -> "World":
+def open_world(config: DatasetConfig) -> "World":
     """The world of a configuration: its ground is made for `dataset.scene.views`, or for the flights of `nav`."""
     from perilune_render.flight.plan import camera_of
     from perilune_render.flight.view import scene_view, view_envelope

@@ -7,13 +7,16 @@ waits for each reply before its next request, so it has at most one request in t
 import asyncio
 import queue
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from typing import Any
 
 from perilune_shared.errors import UserError
 
 _STOP_S = 5.0
+Ask = Callable[[Callable[[], Any]], Awaitable[Any]]
+"""Runs a function in the thread of the world and returns its result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,7 @@ class Connection:
     reader: asyncio.StreamReader
     writer: asyncio.StreamWriter
     limits: Limits
-    ask: Callable[[Callable[[], bytes]], Awaitable[bytes]]
+    ask: Ask
     """Runs a function in the thread of the world."""
     name: str = ""
     """Address of the client, for messages."""
@@ -72,9 +75,14 @@ class Server:
     limits: Limits
     note: Callable[[str], object]
     """Called with a line on what happens."""
+    other: Callable[[Ask, Callable[[int], object]], Coroutine[Any, Any, None]] | None = None
+    """Coroutine function of another interface in the same loop, called with what `Connection.ask` does and with a
+    function that it calls with its port when clients can connect."""
+    other_port: int = 0
+    """Port of the other interface, once it has begun."""
     _ready: threading.Event = field(default_factory=threading.Event)
     _thread: threading.Thread | None = None
-    _work: "queue.Queue[tuple[Callable[[], bytes], Future[bytes]] | None]" = field(default_factory=queue.Queue)
+    _work: "queue.Queue[tuple[Callable[[], Any], Future[Any]] | None]" = field(default_factory=queue.Queue)
     _loop: asyncio.AbstractEventLoop | None = None
     _failure: BaseException | None = None
     _tasks: set = field(default_factory=set)
@@ -115,17 +123,31 @@ class Server:
         self._loop = loop = asyncio.new_event_loop()
         try:
             started = loop.run_until_complete(asyncio.start_server(self._connected, self.host, self.port))
+            self.port = started.sockets[0].getsockname()[1]
+            loop.run_until_complete(self._begin_other())
         except OSError as error:
-            expected = "a free port of an address of this machine"
-            self._failure = UserError("serve", "--host and --port", f"{self.host}:{self.port} ({error})", expected)
+            expected = "free ports of an address of this machine"
+            self._failure = UserError("serve", "--host and ports", f"{self.host} ({error})", expected)
             self._ready.set()
             return
-        self.port = started.sockets[0].getsockname()[1]
         self._ready.set()
         loop.run_forever()
         started.close()
         loop.run_until_complete(self._disconnect())
         loop.close()
+
+    async def _begin_other(self) -> None:
+        """Start the other interface and wait until its clients can connect. Raises OSError if they cannot."""
+        if self.other is None:
+            return
+        port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        task = asyncio.ensure_future(self.other(self._ask, port.set_result))
+        waited: list[asyncio.Future[Any]] = [task, port]
+        await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            await task
+        self.other_port = port.result()
+        self._tasks.add(task)
 
     async def _disconnect(self) -> None:
         """End all sessions."""
@@ -133,8 +155,8 @@ class Server:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    async def _ask(self, work: Callable[[], bytes]) -> bytes:
-        future: Future[bytes] = Future()
+    async def _ask(self, work: Callable[[], Any]) -> Any:
+        future: Future[Any] = Future()
         self._work.put((work, future))
         return await asyncio.wrap_future(future)
 

@@ -1,0 +1,183 @@
+"""Our own interface over ZeroMQ: requests in JSON, replies in JSON with raw arrays (`perilune_shared.client`)."""
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import zmq
+import zmq.asyncio
+from pydantic import Field, ValidationError
+
+from perilune_render.config_scene import SceneConfig
+from perilune_render.dataset.tables import label_table
+from perilune_render.flight.plan import camera_of
+from perilune_render.poses.plan import trajectory_seed
+from perilune_render.server.world import View, World
+from perilune_shared.config import Section
+from perilune_shared.errors import UserError, one_line
+from perilune_shared.geometry.frames import matrix_from_quaternion, sun_direction
+
+LARGEST_REQUEST_BYTES = 4_000_000
+MOST_WAITING = 64
+"""Largest number of requests that wait for the renderer."""
+_Number = Annotated[float, Field(ge=-1e9, le=1e9)]
+_Three = tuple[_Number, _Number, _Number]
+
+
+class SceneRequest(Section):
+    """What does the server render?"""
+
+    request: Literal["scene"]
+
+
+class FrameRequest(Section):
+    """A frame; the fields are those of `perilune_shared.client.SceneClient.frame`."""
+
+    request: Literal["frame"]
+    position_m: _Three
+    rotation_wxyz: tuple[_Number, _Number, _Number, _Number]
+    velocity_mps: _Three = (0.0, 0.0, 0.0)
+    sun_deg: tuple[_Number, Annotated[float, Field(gt=0, le=90)]] | None = None
+    index: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    depth: bool = False
+    labels: bool = False
+
+
+class HeightsRequest(Section):
+    """Heights of the surface."""
+
+    request: Literal["heights"]
+    x_m: Annotated[tuple[_Number, ...], Field(max_length=100_000)]
+    y_m: Annotated[tuple[_Number, ...], Field(max_length=100_000)]
+    boulders: bool = True
+
+
+_REQUESTS: dict[str, type[Section]] = {"scene": SceneRequest, "frame": FrameRequest, "heights": HeightsRequest}
+_LENGTH_TOLERANCE = 0.01
+
+
+def answer(world: World, content: bytes) -> list[bytes]:
+    """The parts of the reply to a request. Errors are replies too. Called in the thread of the world."""
+    try:
+        return _answer(world, _parsed(content))
+    except UserError as error:
+        return refusal(str(error))
+
+
+def refusal(text: str) -> list[bytes]:
+    """A reply that says what is wrong."""
+    return [json.dumps({"error": one_line(text)[:900]}).encode()]
+
+
+def _parsed(content: bytes) -> Section:
+    """A request. Raises UserError with the field that is wrong."""
+    try:
+        plain = json.loads(content)
+    except (ValueError, RecursionError):
+        raise UserError("request", "JSON", "none", "an object") from None
+    kind = plain.get("request") if isinstance(plain, dict) else None
+    if not isinstance(kind, str) or kind not in _REQUESTS:
+        raise UserError("request", "request", kind, f"one of {', '.join(_REQUESTS)}")
+    try:
+        return _REQUESTS[kind].model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(map(str, first["loc"])) or kind
+        raise UserError("request", field, first.get("input"), first["msg"]) from None
+
+
+def _answer(world: World, request: Section) -> list[bytes]:
+    if isinstance(request, FrameRequest):
+        return _reply({}, _frame(world, request))
+    if isinstance(request, HeightsRequest):
+        if len(request.x_m) != len(request.y_m):
+            raise UserError("request", "y_m", f"{len(request.y_m)} numbers", f"{len(request.x_m)}, as x_m")
+        heights = world.heights_m(np.array(request.x_m), np.array(request.y_m), boulders=request.boulders)
+        return _reply({}, {"height_m": heights})
+    stated, scene = world.config.scene or SceneConfig(), world.scene
+    about = {
+        "latitude_deg": scene.latitude_deg,
+        "longitude_deg": scene.longitude_deg,
+        "extent_m": scene.grid.extent_m,
+        "sun_azimuth_deg": stated.sun_azimuth_deg,
+        "sun_elevation_deg": stated.sun_elevation_deg,
+    }
+    return _reply({"scene": about, "camera": asdict(camera_of(world.config.camera))}, {})
+
+
+def _frame(world: World, request: FrameRequest) -> dict[str, np.ndarray]:
+    """The arrays of a frame: that of `perilune-render frames` for the same pose and index."""
+    quaternion = np.array(request.rotation_wxyz)
+    length = np.linalg.norm(quaternion)
+    if abs(length - 1) > _LENGTH_TOLERANCE:
+        raise UserError("request", "rotation_wxyz", f"length {length:.4g}", "a unit quaternion w, x, y, z")
+    quaternion = quaternion / length
+    stated = world.config.scene or SceneConfig()
+    sun = sun_direction(*(request.sun_deg or (stated.sun_azimuth_deg, stated.sun_elevation_deg)))
+    rotation = matrix_from_quaternion(-quaternion if quaternion[0] < 0 else quaternion)
+    view = View(np.array(request.position_m), rotation, camera_of(world.config.camera), sun)
+    seed = trajectory_seed(world.scene.seed, 0)
+    frame = world.frame(view, seed, request.index, np.array(request.velocity_mps))
+    found = {"image": frame.image}
+    if request.depth:
+        found |= {"depth_m": frame.radiance.depth_m, "normal": frame.radiance.normal}
+    if request.labels:
+        table = label_table("frame", world.labels(view, frame)).drop_columns("frame_id")
+        found |= {f"labels.{name}": table[name].to_numpy() for name in table.column_names}
+    return found
+
+
+def _reply(head: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[bytes]:
+    """The parts of a reply: the head, which lists the arrays, then each array."""
+    plain = {name: np.ascontiguousarray(value) for name, value in arrays.items()}
+    listed = [{"name": name, "dtype": value.dtype.str, "shape": value.shape} for name, value in plain.items()]
+    return [json.dumps({**head, "arrays": listed}).encode(), *(value.tobytes() for value in plain.values())]
+
+
+async def serve_native(
+    address: str, world: World, ask: Callable[[Callable[[], Any]], Awaitable[Any]], ready: Callable[[int], object]
+) -> None:
+    """Answer requests at a ZeroMQ address until cancelled; `ready` is called with the port.
+
+    A client has one request at a time: another one before the reply is refused, and so is one if too many wait.
+    """
+    context = zmq.asyncio.Context()
+    socket = context.socket(zmq.ROUTER)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_REQUEST_BYTES)
+    waiting: set[bytes] = set()
+    tasks: set[asyncio.Task] = set()
+
+    async def handle(client: bytes, envelope: list[bytes], content: bytes) -> None:
+        try:
+            reply = await ask(lambda: answer(world, content))
+        except Exception as error:
+            reply = refusal(f"{type(error).__name__}: {error}")
+        finally:
+            waiting.discard(client)
+        await socket.send_multipart([client, *envelope, *reply])
+
+    try:
+        try:
+            socket.bind(address)
+        except zmq.ZMQError as error:
+            raise OSError(f"{address}: {error}") from None
+        ready(int(socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2]))
+        while True:
+            client, *envelope, content = await socket.recv_multipart()
+            if client in waiting or len(waiting) >= MOST_WAITING:
+                text = "one request at a time" if client in waiting else "too many requests wait; try again"
+                await socket.send_multipart([client, *envelope, *refusal(text)])
+                continue
+            waiting.add(client)
+            task = asyncio.ensure_future(handle(client, envelope, content))
+            tasks.add(task)
+            task.add_done_callback(tasks.discard)
+    finally:
+        for task in tasks:
+            task.cancel()
+        socket.close()
+        context.term()

@@ -1,0 +1,180 @@
+"""A client of `perilune-render serve`: frames at any pose, as arrays. Needs the extra `client` (ZeroMQ).
+
+    from perilune_shared.client import SceneClient
+
+    with SceneClient("tcp://127.0.0.1:10364") as scene:
+        frame = scene.frame((0.0, 0.0, 800.0), (0.0, 1.0, 0.0, 0.0), labels=True)
+        print(frame.image.shape, len(frame.labels["crater_id"]))
+
+A request is one message of ZeroMQ: JSON. A reply is several: JSON, then the bytes of each array that it lists, in C
+order. Nothing else is sent, so other languages need a ZeroMQ and a JSON library alone.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+
+PORT = 10364
+"""Port of the interface, unless the server has another."""
+_TYPES = ("|u1", "<u2", "<f4", "<f8", "<i8")
+"""Types of arrays that a reply may have."""
+_MOST_BYTES = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class ServedFrame:
+    """A frame of the server."""
+
+    image: np.ndarray
+    """Grey values, DN (h, w) uint8, or uint16 above 8 bits."""
+    depth_m: np.ndarray | None
+    """Depth along the camera's axis, metres, infinite for the sky (h, w) float32; None if not asked for. With a
+    distorting lens it is in the pixels of the pinhole that covers the view."""
+    normal: np.ndarray | None
+    """Unit normals, O_L (h, w, 3) float32, in the same pixels; None if not asked for."""
+    labels: dict[str, np.ndarray] | None
+    """Columns of the table `labels` (N,); None if not asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServedScene:
+    """What a server renders."""
+
+    camera: Camera
+    """Camera of the frames."""
+    latitude_deg: float
+    """Latitude of the site, degrees."""
+    longitude_deg: float
+    """Longitude of the site, degrees."""
+    extent_m: float
+    """Side of the square of ground, centred on the site, metres."""
+    sun_azimuth_deg: float
+    """Azimuth of the Sun unless a request states another, clockwise from north, degrees."""
+    sun_elevation_deg: float
+    """Elevation of the Sun unless a request states another, degrees."""
+
+
+class SceneClient:
+    """A connection to a server. Use it as a context manager, in one thread.
+
+    Every method raises UserError if the server refuses a request or does not answer within `timeout_s`.
+    """
+
+    def __init__(self, address: str = f"tcp://127.0.0.1:{PORT}", timeout_s: float = 60.0):
+        try:
+            import zmq
+        except ModuleNotFoundError:
+            raise UserError("client", "pyzmq", "not installed", "pip install 'perilune-shared[client]'") from None
+        self._zmq, self.address, self._timeout_ms = zmq, address, int(1000 * timeout_s)
+        self._context = zmq.Context()
+        self._next_index = 0
+        self._connect()
+
+    def _connect(self) -> None:
+        self._socket = self._context.socket(self._zmq.REQ)
+        self._socket.setsockopt(self._zmq.LINGER, 0)
+        try:
+            self._socket.connect(self.address)
+        except self._zmq.ZMQError as error:
+            raise UserError("client", "address", f"{self.address} ({error})", "tcp://host:port") from None
+
+    def __enter__(self) -> "SceneClient":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the connection."""
+        self._socket.close()
+        self._context.term()
+
+    def scene(self) -> ServedScene:
+        """What the server renders."""
+        head, _ = self._ask({"request": "scene"})
+        camera = dict(head["camera"])
+        camera["distortion"] = tuple(camera["distortion"])
+        return ServedScene(**{**head["scene"], "camera": Camera(**camera)})
+
+    def frame(
+        self,
+        position_m: Sequence[float] | Array,
+        rotation_wxyz: Sequence[float] | Array,
+        *,
+        velocity_mps: Sequence[float] | Array = (0.0, 0.0, 0.0),
+        sun_deg: tuple[float, float] | None = None,
+        index: int | None = None,
+        depth: bool = False,
+        labels: bool = False,
+    ) -> ServedFrame:
+        """Render a frame.
+
+        `position_m` (3,) is in O_L, `rotation_wxyz` (4,) is rotation_camera_from_site as in a manifest, `velocity_mps`
+        (3,), O_L, blurs the frame, `sun_deg` is azimuth and elevation of the Sun. `index` sets the noise; without it
+        each frame of this client has the next one. With `depth` the frame has depth and normals.
+        """
+        if index is None:
+            index, self._next_index = self._next_index, self._next_index + 1
+        request: dict[str, Any] = {
+            "request": "frame",
+            "position_m": [float(value) for value in position_m],
+            "rotation_wxyz": [float(value) for value in rotation_wxyz],
+            "velocity_mps": [float(value) for value in velocity_mps],
+            "index": index,
+            "depth": depth,
+            "labels": labels,
+        }
+        if sun_deg is not None:
+            request["sun_deg"] = [float(value) for value in sun_deg]
+        _, arrays = self._ask(request)
+        columns = {name.partition(".")[2]: value for name, value in arrays.items() if name.startswith("labels.")}
+        return ServedFrame(arrays["image"], arrays.get("depth_m"), arrays.get("normal"), columns if labels else None)
+
+    def heights(self, x_m: Sequence[float] | Array, y_m: Sequence[float] | Array, *, boulders: bool = True) -> Array:
+        """Heights (N,) of the surface at places (N,) of O_L, metres; NaN off the ground."""
+        places = [[float(value) for value in values] for values in (x_m, y_m)]
+        request = {"request": "heights", "x_m": places[0], "y_m": places[1], "boulders": boulders}
+        return self._ask(request)[1]["height_m"]
+
+    def _ask(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Send a request; returns the head of the reply and its arrays by name."""
+        self._socket.send(json.dumps(request, allow_nan=True).encode())
+        if not self._socket.poll(self._timeout_ms):
+            self._socket.close()
+            self._connect()
+            expected = "`perilune-render serve` at this address"
+            raise UserError(self.address, "reply", f"none in {self._timeout_ms / 1000:g} s", expected)
+        head_bytes, *parts = self._socket.recv_multipart()
+        try:
+            head = json.loads(head_bytes)
+            arrays = head.get("arrays", [])
+            if len(arrays) != len(parts):
+                raise ValueError(f"{len(parts)} arrays")
+            found = {one["name"]: _array(one, part) for one, part in zip(arrays, parts, strict=True)}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UserError(self.address, "reply", error, "one of `perilune-render serve`") from None
+        if "error" in head:
+            raise UserError(self.address, str(request["request"]), head["error"], "a request that it can render")
+        return head, found
+
+
+def _array(stated: dict[str, Any], content: bytes) -> np.ndarray:
+    """An array of a reply. Raises ValueError if its size is not the stated one."""
+    if stated["dtype"] not in _TYPES:
+        raise ValueError(f"type {stated['dtype']!r}")
+    shape = tuple(int(side) for side in stated["shape"])
+    kind = np.dtype(stated["dtype"])
+    n_bytes = kind.itemsize * int(np.prod(shape, dtype=np.float64)) if min(shape, default=0) >= 0 else -1
+    if n_bytes != len(content) or n_bytes > _MOST_BYTES:
+        raise ValueError(f"{len(content)} bytes for shape {shape}")
+    return np.frombuffer(content, kind).reshape(shape)

@@ -1,0 +1,220 @@
+"""Our own interface: the client, the same bytes as `frames`, and requests that are refused."""
+
+import json
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+import zmq
+from tests.helpers import in_process
+
+from perilune_render.cli.main import main
+from perilune_render.server import native
+from perilune_render.server.serve import Limits, Server
+from perilune_render.server.world import World
+from perilune_shared.client import SceneClient
+from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.errors import UserError
+
+DOWN = (0.0, 1.0, 0.0, 0.0)
+
+
+class Running:
+    """A server of this interface alone, in a thread."""
+
+    def __init__(self, world: World):
+        async def nobody(connection):
+            connection.writer.close()
+
+        async def other(ask, ready):
+            await native.serve_native("tcp://127.0.0.1:0", world, ask, ready)
+
+        self.server = Server("127.0.0.1", 0, nobody, Limits(), lambda text: None, other)
+        self.server.begin()
+        self.thread = threading.Thread(target=self.server.run)
+        self.thread.start()
+
+    @property
+    def address(self) -> str:
+        return f"tcp://127.0.0.1:{self.server.other_port}"
+
+    def close(self) -> None:
+        self.server.stop()
+        self.thread.join(20)
+        assert not self.thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def address(world):
+    running = Running(world)
+    yield running.address
+    running.close()
+
+
+@pytest.fixture
+def scene(address):
+    with SceneClient(address) as client:
+        yield client
+
+
+def test_a_client_learns_what_is_rendered(scene, world):
+    found = scene.scene()
+    assert (found.camera.width_px, found.camera.height_px) == (64, 48)
+    assert found.sun_elevation_deg == 25
+    assert found.extent_m == world.scene.grid.extent_m
+
+
+def test_a_frame_has_the_arrays_that_were_asked_for(scene):
+    plain = scene.frame((0, 0, 500), DOWN)
+    assert plain.image.shape == (48, 64)
+    assert plain.image.dtype == np.uint8
+    assert plain.depth_m is None and plain.normal is None and plain.labels is None
+    full = scene.frame((0, 0, 500), DOWN, depth=True, labels=True)
+    assert np.median(np.abs(full.depth_m - 500)) < 20
+    assert np.allclose(np.linalg.norm(full.normal, axis=-1), 1, atol=1e-5)
+    assert len(full.labels["crater_id"]) == len(full.labels["ellipse_cx_px"]) > 5
+    assert (full.image != plain.image).any()  # other noise
+    again = scene.frame((0, 0, 500), DOWN, index=1)
+    assert (again.image == full.image).all()
+
+
+def test_sun_and_velocity_change_the_frame(scene):
+    first = scene.frame((0, 0, 500), DOWN, index=0).image.astype(int)
+    other = scene.frame((0, 0, 500), DOWN, index=0, sun_deg=(280, 25)).image.astype(int)
+    assert np.corrcoef(first.ravel(), other.ravel())[0, 1] < 0.5
+    fast = scene.frame((0, 0, 500), DOWN, index=0, velocity_mps=(8000, 0, 0)).image.astype(int)
+    along = [np.abs(np.diff(image, axis=1)).mean() for image in (first, fast)]
+    assert along[1] < 0.8 * along[0]
+
+
+def test_heights_are_those_of_the_ground(scene, world):
+    found = scene.heights([0, 10, 1e6], [0, -20, 0])
+    assert abs(found[0]) < 1
+    assert np.isnan(found[2])
+
+
+def test_frames_are_those_of_the_command_frames(tmp_path, world):
+    """Byte for byte, over the socket, for the same scene, camera and poses."""
+    views = [{"height_m": 150, "reach_m": 200}, {"height_m": 1000, "reach_m": 500}]
+    settings = {
+        "name": "given",
+        "seed": 5,
+        "camera": {"width_px": 64, "height_px": 48, "distortion": {"k1": -0.05}},
+        "terrain": {"spacing_px": 2.0},
+        "render": {"samples": 2, "engine": "heightfield"},
+        "scene": {"views": views},
+    }
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump({"dataset": settings}))
+    poses = [(3.0 * k, -20.0, 400.0 - 50 * k) for k in range(3)]
+    lines = [f"{k},{x},{y},{z},0,1,0,0,5,0,-50" for k, (x, y, z) in enumerate(poses)]
+    names = "time_s,x_m,y_m,z_m,qw,qx,qy,qz,vx_mps,vy_mps,vz_mps"
+    (tmp_path / "poses.csv").write_text("\n".join(["# frame: O_L", names, *lines, ""]))
+    command = ["--poses", tmp_path / "poses.csv", "--scene", tmp_path / "scene.yaml", "--preset", "tiny"]
+    done = in_process.call(main, "frames", *command, "--out", tmp_path / "out", "--workers", 0)
+    assert done.returncode == 0, done.stderr
+
+    from perilune_render.cli.options import resolved_config
+    from perilune_render.cli.serve import open_world
+
+    config = resolved_config("tiny", tmp_path / "scene.yaml", None, None, None, given_scene=True)
+    with open_world(config) as other:
+        running = Running(other)
+        with SceneClient(running.address) as client:
+            served = [client.frame(pose, DOWN, velocity_mps=(5, 0, -50), labels=True) for pose in poses]
+        running.close()
+    made = open_dataset(tmp_path / "out")
+    rows = made.table("frames").sort_by("frame_id").to_pylist()
+    labels = made.table("labels")
+    for row, frame in zip(rows, served, strict=True):
+        stored = cv2.imread(str(tmp_path / "out" / row["png_path"]), cv2.IMREAD_UNCHANGED)
+        assert (stored == frame.image).all()
+        own = labels.filter([name == row["frame_id"] for name in labels["frame_id"].to_pylist()]).sort_by("crater_id")
+        assert own["crater_id"].to_pylist() == sorted(frame.labels["crater_id"].tolist())
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({"request": "frames"}, "got frames, expected one of scene, frame, heights"),
+        ({"request": "scene", "path": "/etc/passwd"}, "path"),
+        ({"request": "frame", "position_m": [0, 0, 500]}, "rotation_wxyz"),
+        ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 0, 0, 0]}, "length 0"),
+        ({"request": "frame", "position_m": [0, 0, float("nan")], "rotation_wxyz": [0, 1, 0, 0]}, "position_m"),
+        ({"request": "frame", "position_m": [0, 0, -9], "rotation_wxyz": [0, 1, 0, 0]}, "above the surface"),
+        ({"request": "frame", "position_m": [9e4, 0, 500], "rotation_wxyz": [0, 1, 0, 0]}, "over the ground"),
+        ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 1, 0, 0], "index": -1}, "index"),
+        ({"request": "heights", "x_m": [1, 2], "y_m": [1]}, "y_m"),
+        ({"request": "heights", "x_m": [0] * 100_001, "y_m": [0] * 100_001}, "x_m"),
+        ([], "request"),
+        ("x" * 10, "request"),
+    ],
+)
+def test_a_faulty_request_is_refused_and_the_server_lives(scene, request_, message):
+    scene._socket.send(json.dumps(request_).encode())
+    (reply,) = scene._socket.recv_multipart()
+    assert message in json.loads(reply)["error"]
+    assert scene.frame((0, 0, 500), DOWN).image.shape == (48, 64)
+
+
+def test_the_client_says_what_the_server_refused(scene):
+    with pytest.raises(UserError, match="above the surface"):
+        scene.frame((0, 0, -50), DOWN)
+
+
+def test_bytes_that_are_no_json_and_messages_without_envelopes_are_survived(address):
+    context = zmq.Context()
+    dealer = context.socket(zmq.DEALER)
+    dealer.setsockopt(zmq.LINGER, 0)
+    dealer.connect(address)
+    for content in (b"", b"\xff" * 100, b"[" * 100_000, b'{"request": "frame"'):
+        dealer.send(content)
+        assert dealer.poll(5000)
+        assert "error" in json.loads(dealer.recv_multipart()[-1])
+    frame = json.dumps({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": DOWN}).encode()
+    for _ in range(5):
+        dealer.send(frame)
+    replies = [json.loads(dealer.recv_multipart()[0]) for _ in range(5)]
+    assert any("one request at a time" in reply.get("error", "") for reply in replies)
+    dealer.close()
+    context.term()
+
+
+def test_a_server_that_is_not_there_is_an_error_in_time():
+    start = time.monotonic()
+    with SceneClient("tcp://127.0.0.1:9", timeout_s=0.3) as client, pytest.raises(UserError, match=r"none in 0\.3 s"):
+        client.scene()
+    assert time.monotonic() - start < 5
+    with pytest.raises(UserError, match="address"):
+        SceneClient("not an address")
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        [b"no json"],
+        [b"[]"],
+        [b'{"arrays": [{"name": "image", "dtype": "|u1", "shape": [2, 2]}]}'],
+        [b'{"arrays": [{"name": "image", "dtype": "|O", "shape": [1]}]}', b"12345678"],
+        [b'{"arrays": [{"name": "image", "dtype": "|u1", "shape": [-1, -4]}]}', b"1234"],
+        [b'{"arrays": [{"name": "image", "dtype": "|u1", "shape": [3]}]}', b"1234"],
+    ],
+)
+def test_a_hostile_server_gets_an_error(reply):
+    context = zmq.Context()
+    server = context.socket(zmq.REP)
+    port = server.bind_to_random_port("tcp://127.0.0.1")
+
+    def answer():
+        server.recv()
+        server.send_multipart(reply)
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    with SceneClient(f"tcp://127.0.0.1:{port}", timeout_s=5) as client, pytest.raises(UserError, match="reply"):
+        client.frame((0, 0, 500), DOWN)
+    thread.join()
+    server.close()
+    context.term()
