@@ -11,6 +11,7 @@ from scripts.pages.column_page import column_page
 from scripts.pages.command_page import command_page
 from scripts.pages.configuration_page import configuration_page
 from scripts.pages.notebook_page import notebook_page
+from scripts.pages.pangu_page import pangu_page
 
 from perilune_render.cli.main import app as render
 from perilune_render.config import DatasetConfig
@@ -32,6 +33,7 @@ def generated_pages() -> dict[str, str]:
         "Settings of the trainer", "perilune_train", SECTIONS
     )
     pages["reference/columns.md"] = column_page()
+    pages["reference/pangu-messages.md"] = pangu_page()
     return pages
 
 

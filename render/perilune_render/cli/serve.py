@@ -1,19 +1,19 @@
 """The command `perilune-render serve`."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import typer
 
 from perilune_render.cli.frames import CameraFile, Scene, read_camera
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
 from perilune_render.config import DatasetConfig
 from perilune_render.config_scene import SceneConfig
-from perilune_shared.geometry.frames import Array, sun_direction
 from perilune_shared.progress import say
 
 if TYPE_CHECKING:
     from perilune_render.server.world import World
+    from perilune_shared.geometry.frames import Array
 
 _PORT = 10363
 _NATIVE_PORT = 10364
@@ -108,9 +108,12 @@ def open_world(config: DatasetConfig) -> "World":
     return World(cached_scene(config, view, scene_seed(config)), config, say)
 
 
-def _start(world: "World") -> tuple[int, int, float, Array, int]:
+def _start(world: "World") -> tuple[int, int, float, "Array", int]:
     """Width and height, pixels, field of view, radians, Sun and random seed of a new client of PANGU's protocol."""
+    import numpy as np
+
     from perilune_render.poses.plan import trajectory_seed
+    from perilune_shared.geometry.frames import sun_direction
 
     camera, stated = world.config.camera, world.config.scene or SceneConfig()
     sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)

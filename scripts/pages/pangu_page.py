@@ -1,0 +1,21 @@
+"""The table of PANGU's messages, from the server's own list."""
+
+from perilune_render.server.pangu_messages import FIRST_SETTING, MESSAGES
+
+_HEAD = """# PANGU's messages
+
+What `perilune-render serve` does with each message of PANGU's wire protocol 1.20. *answered*: with an effect or a value;
+*read*: acknowledged without effect; *refused*: an error, and the session goes on. How to use it:
+[Serve images](../how-to/serve.md).
+
+"""
+
+
+def pangu_page() -> str:
+    """The page as Markdown."""
+    rows = ["| Number | Message | Here | |", "|---|---|---|---|"]
+    for number, message in MESSAGES.items():
+        kind = "setting" if number >= FIRST_SETTING else "request"
+        note = message.note or ("sets the viewpoint" if "Viewpoint" in message.name else "")
+        rows.append(f"| {number} | {message.name} | {message.effect} | {note or kind} |")
+    return _HEAD + "\n".join(rows) + "\n"
