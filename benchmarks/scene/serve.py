@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-import yaml
 
 from benchmarks.figures import write_figures
 from perilune_render.server.pangu_messages import IMAGE, VERSION
 from perilune_render.server.pangu_wire import double_bytes, unsigned
 from perilune_shared.client import SceneClient
+from perilune_shared.yaml_text import to_yaml_text
 
 SCENE = {
     "name": "bench-serve",
@@ -31,6 +31,8 @@ SCENE = {
     },
 }
 """The ground of a descent of `small`, two samples."""
+CASES = (("heightfield", 256, 40), ("cycles", 256, 20), ("heightfield", 1024, 8), ("cycles", 1024, 4))
+"""Engine, width of the frames, pixels, and number of frames."""
 _SETTLED = 2000
 """Frames after which memory is compared: caches and threads are then in place."""
 
@@ -86,7 +88,7 @@ class Served:
         self.folder = tempfile.TemporaryDirectory()
         path = Path(self.folder.name) / "scene.yaml"
         camera = {"width_px": width_px, "height_px": width_px}
-        path.write_text(yaml.safe_dump({"dataset": {**SCENE, "camera": camera}}))
+        path.write_text(to_yaml_text({"dataset": {**SCENE, "camera": camera}}))
         command = [str(Path(sys.executable).parent / "perilune-render"), "serve", "--scene", str(path)]
         command += ["--engine", engine, "--port", "0", "--native-port", "0"]
         # Ground that a wider camera sees finer would be another scene: keep the vertices of 256 pixels.
@@ -123,12 +125,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=20_000)
     given = parser.parse_args()
     figures: dict[str, object] = {}
-    for engine, width, n in (
-        ("heightfield", 256, 40),
-        ("cycles", 256, 20),
-        ("heightfield", 1024, 8),
-        ("cycles", 1024, 4),
-    ):
+    for engine, width, n in CASES:
         with Served(width, engine) as server:
             client = Pangu(server.port)
             figures[f"{engine}_{width}_pangu_s"] = seconds(client.frame, n)

@@ -4,8 +4,8 @@ from perilune_render.server.pangu_messages import FIRST_SETTING, MESSAGES
 
 _HEAD = """# PANGU's messages
 
-What `perilune-render serve` does with each message of PANGU's wire protocol 1.20. *answered*: with an effect or a value;
-*read*: acknowledged without effect; *refused*: an error, and the session goes on. How to use it:
+What `perilune-render serve` does with each message of PANGU's wire protocol 1.20. *answered*: with an effect or a
+value; *read*: acknowledged without effect; *refused*: an error, and the session goes on. How to use it:
 [Serve images](../how-to/serve.md).
 
 """
