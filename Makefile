@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-gates bench-engines bench-serve bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-suppress bench-gates bench-engines bench-serve bench-infer bench-latency results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -185,6 +185,9 @@ explain-causal: detect-frames ## remove single craters from the ground of the te
 	@$(BIN)/perilune-train causal $(COMMON) --runs $(call quoted,$(RUNS)) --name $(NAME) --dataset "$(DATA)/detect" --counterfactual "$(DATA)/causal" \
 	  --turned "$(DATA)/turned" $(if $(wildcard $(STACK)/metrics.json),--nav-dataset "$(DATA)/nav" --nav-counterfactual "$(DATA)/causal-nav") $(OVER)
 
+closed-loop: setup ## fly a descent in closed loop: guidance, navigation filter and images from the server; writes runs/closed-loop
+	@$(BIN)/python examples/closed_loop.py --out "$(RUNS)/closed-loop"
+
 JOBS ?= 2
 test: setup ## run all tests, in JOBS=2 processes
 	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --max-worker-restart=0
@@ -196,7 +199,7 @@ coverage: setup ## run all tests and print their line coverage, which has no tar
 lint: setup ## ruff (rules and format) and mypy
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train benchmarks
+	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train benchmarks examples
 
 docs: docs-build ## build and serve the documentation (http://127.0.0.1:8000)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs serve

@@ -24,6 +24,11 @@ from perilune_shared.geometry.frames import Array
 
 PORT = 10364
 """Port of the interface, unless the server has another."""
+CRATER_COLUMNS = (
+    "crater_id", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "diameter_m", "depth_m", "latitude_deg",
+    "longitude_deg",
+)  # fmt: skip
+"""Columns of the craters, as in the table `craters` of a manifest."""
 _TYPES = ("|u1", "<u2", "<f4", "<f8", "<i8")
 """Types of arrays that a reply may have."""
 _MOST_BYTES = 2_000_000_000
@@ -139,6 +144,10 @@ class SceneClient:
         _, arrays = self._ask(request)
         columns = {name.partition(".")[2]: value for name, value in arrays.items() if name.startswith("labels.")}
         return ServedFrame(arrays["image"], arrays.get("depth_m"), arrays.get("normal"), columns if labels else None)
+
+    def craters(self) -> dict[str, np.ndarray]:
+        """All craters of the ground: CRATER_COLUMNS, each (N,)."""
+        return self._ask({"request": "craters"})[1]
 
     def heights(self, x_m: Sequence[float] | Array, y_m: Sequence[float] | Array, *, boulders: bool = True) -> Array:
         """Heights (N,) of the surface at places (N,) of O_L, metres; NaN off the ground."""

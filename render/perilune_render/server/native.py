@@ -12,10 +12,11 @@ import zmq.asyncio
 from pydantic import Field, ValidationError
 
 from perilune_render.config_scene import SceneConfig
-from perilune_render.dataset.tables import label_table
+from perilune_render.dataset.tables import ground_tables, label_table
 from perilune_render.flight.plan import camera_of
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.server.world import View, World
+from perilune_shared.client import CRATER_COLUMNS
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError, one_line
 from perilune_shared.geometry.frames import matrix_from_quaternion, sun_direction
@@ -46,6 +47,12 @@ class FrameRequest(Section):
     labels: bool = False
 
 
+class CratersRequest(Section):
+    """The craters of the ground."""
+
+    request: Literal["craters"]
+
+
 class HeightsRequest(Section):
     """Heights of the surface."""
 
@@ -55,7 +62,12 @@ class HeightsRequest(Section):
     boulders: bool = True
 
 
-_REQUESTS: dict[str, type[Section]] = {"scene": SceneRequest, "frame": FrameRequest, "heights": HeightsRequest}
+_REQUESTS: dict[str, type[Section]] = {
+    "scene": SceneRequest,
+    "frame": FrameRequest,
+    "craters": CratersRequest,
+    "heights": HeightsRequest,
+}
 _LENGTH_TOLERANCE = 0.01
 
 
@@ -97,6 +109,9 @@ def _answer(world: World, request: Section) -> list[bytes]:
             raise UserError("request", "y_m", f"{len(request.y_m)} numbers", f"{len(request.x_m)}, as x_m")
         heights = world.heights_m(np.array(request.x_m), np.array(request.y_m), boulders=request.boulders)
         return _reply({}, {"height_m": heights})
+    if isinstance(request, CratersRequest):
+        table = ground_tables("scene", world.scene)["craters"]
+        return _reply({}, {name: table[name].to_numpy() for name in CRATER_COLUMNS})
     stated, scene = world.config.scene or SceneConfig(), world.scene
     about = {
         "latitude_deg": scene.latitude_deg,

@@ -90,6 +90,12 @@ def test_sun_and_velocity_change_the_frame(scene):
     assert along[1] < 0.8 * along[0]
 
 
+def test_craters_are_those_of_the_ground(scene, world):
+    found = scene.craters()
+    assert found["crater_id"].tolist() == world.scene.crater_id.tolist()
+    assert (found["diameter_m"] == world.scene.craters.diameter_m).all()
+
+
 def test_heights_are_those_of_the_ground(scene, world):
     found = scene.heights([0, 10, 1e6], [0, -20, 0])
     assert abs(found[0]) < 1
@@ -138,7 +144,7 @@ def test_frames_are_those_of_the_command_frames(tmp_path, world):
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        ({"request": "frames"}, "got frames, expected one of scene, frame, heights"),
+        ({"request": "frames"}, "got frames, expected one of scene, frame, craters, heights"),
         ({"request": "scene", "path": "/etc/passwd"}, "path"),
         ({"request": "frame", "position_m": [0, 0, 500]}, "rotation_wxyz"),
         ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 0, 0, 0]}, "length 0"),

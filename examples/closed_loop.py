@@ -1,0 +1,232 @@
+"""A landing in closed loop: guidance steers by the navigation filter, which sees images from the server.
+
+    python examples/closed_loop.py [--out runs/closed-loop] [--seed 0]
+
+The lander starts 1400 m above the site with an error of 60 m on each axis in what it believes, and flies to a gate
+150 m above the site in 60 s. Each second it gets an image, finds craters with the installed detector and matches them
+to a catalogue with errors; between the images it integrates its inertial unit. Guidance is the quadratic law of Klumpp
+(1974, doi 10.1016/0005-1098(74)90019-3) on the filter's estimate. The same flight without camera is the control. Prints
+the distances by which the gate is missed, and draws both paths. The attitude is level but for a small sway.
+"""
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from perilune_shared.client import SceneClient
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, quaternion_from_matrix, rotation_vectors
+from perilune_shared.geometry.gravity import gravity_mps2
+from perilune_shared.geometry.inertial_errors import drawn_errors
+from perilune_shared.geometry.inertial_grades import GRADES
+from perilune_shared.progress import say
+from perilune_train.detect.finished_run import chosen_threshold, config_of_run
+from perilune_train.detect.images.predict import above
+from perilune_train.detect.inference.detector import open_detector
+from perilune_train.detect.inference.tiles import detect_image
+from perilune_train.detect.inference.tiling import Tiling
+from perilune_train.navigate.craters.catalogue import Catalogue, CatalogueErrors, with_errors
+from perilune_train.navigate.craters.sightings import Sightings
+from perilune_train.navigate.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
+from perilune_train.navigate.filter.propagate import Increment, InertialNoise, start_sigmas
+from perilune_train.navigate.filter.state import State
+from perilune_train.shipped.models import shipped_run
+from perilune_train.training.runs import RunFolder
+
+SCENE = Path(__file__).with_name("closed_loop.yaml")
+START_M, START_MPS = np.array([520.0, -260.0, 1400.0]), np.array([-14.0, 7.0, -24.0])
+GATE_M, GATE_MPS = np.array([0.0, 0.0, 150.0]), np.array([0.0, 0.0, -3.0])
+DURATION_S, STEP_S, FRAME_S = 60.0, 0.02, 1.0
+PRIOR_M, PRIOR_MPS, PRIOR_DEG = 60.0, 0.5, 0.5
+"""Standard deviations of the belief at the start, on each axis."""
+MOST_THRUST_MPS2, RANGE_NOISE_M = 6.0, 0.5
+LAST_S = 4.0
+"""Time to go below which guidance keeps its last command, which would otherwise grow without limit."""
+
+
+@dataclass
+class Flight:
+    """What a flight did, one entry per frame."""
+
+    true_m: list[Array] = field(default_factory=list)
+    believed_m: list[Array] = field(default_factory=list)
+    matched: list[int] = field(default_factory=list)
+
+    @property
+    def miss_m(self) -> float:
+        """Distance from the gate at the end."""
+        return float(np.linalg.norm(self.true_m[-1] - GATE_M))
+
+    @property
+    def errors_m(self) -> Array:
+        """Length of the error of the estimate at each frame (N,)."""
+        return np.linalg.norm(np.array(self.true_m) - np.array(self.believed_m), axis=1)
+
+
+@contextmanager
+def server() -> Iterator[str]:
+    """A server of the scene in another process; yields its address."""
+    program = Path(sys.executable).parent / "perilune-render"
+    command = [str(program), "serve", "--scene", str(SCENE), "--port", "0", "--native-port", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            printed = ""
+            for line in process.stderr:
+                printed = line
+                found = re.search(r"perilune_shared\.client at (tcp://\S+)", line)
+                if found:
+                    yield found[1]
+                    break
+            else:
+                raise UserError("server", "start", printed.strip(), "a server that starts")
+        finally:
+            process.terminate()
+
+
+def guidance(position_m: Array, velocity_mps: Array, left_s: float) -> Array:
+    """Thrust per mass (3,), O_L, that leads to the gate with its velocity in the time left, limited."""
+    gravity = gravity_mps2(position_m[2])
+    to_go = GATE_M - position_m - velocity_mps * left_s
+    faster = GATE_MPS - velocity_mps
+    thrust = 6 * to_go / left_s**2 - 2 * faster / left_s - gravity
+    return thrust * min(1.0, MOST_THRUST_MPS2 / float(np.linalg.norm(thrust)))
+
+
+def sway(time_s: float) -> Array:
+    """rotation_site_from_body (3, 3): level but for a sway of half a degree."""
+    angle = np.radians(0.5) * np.array([np.sin(time_s / 4), np.sin(time_s / 5 + 1), 0.3 * np.sin(time_s / 7)])
+    return matrix_from_rotation_vector(angle)
+
+
+def lander_of(scene: SceneClient, catalogue: Catalogue, rng: np.random.Generator) -> Lander:
+    """The filter, which believes a wrong start."""
+    unit = GRADES["tactical"]
+    sigmas = start_sigmas(PRIOR_M, PRIOR_MPS, PRIOR_DEG, unit)
+    tilt = matrix_from_rotation_vector(np.radians(PRIOR_DEG) * rng.normal(size=3))
+    start = START_M + PRIOR_M * rng.normal(size=3), START_MPS + PRIOR_MPS * rng.normal(size=3), sway(0.0) @ tilt
+    around = Surroundings(scene.scene().camera, ROTATION_CAMERA_FROM_BODY, catalogue, RANGE_SIGMA_M, RELIEF_M)
+    return Lander(State.starting(*start, sigmas, RELIEF_M), InertialNoise.of(unit), around)
+
+
+class Eye:
+    """The camera of the lander: images from the server, craters from the installed detector."""
+
+    def __init__(self, scene: SceneClient):
+        run = shipped_run("detect")
+        config = config_of_run(run)
+        self._scene, self._threshold = scene, chosen_threshold(run)
+        self._detector = open_detector(RunFolder(run).best, config)
+        self._tiling = Tiling(scales=tuple(config.evaluation.scales))
+        self.last = np.zeros((0, 0), np.uint8)
+
+    def sightings(self, position_m: Array, rotation_site_from_body: Array, velocity_mps: Array) -> Sightings:
+        """Craters in the image of a true pose."""
+        rotation = ROTATION_CAMERA_FROM_BODY @ rotation_site_from_body.T
+        frame = self._scene.frame(position_m, quaternion_from_matrix(rotation), velocity_mps=velocity_mps)
+        self.last = frame.image
+        found = above(detect_image(self._detector, frame.image, self._tiling), self._threshold)
+        return Sightings.of_boxes(np.asarray(found.boxes, np.float64), found.scores)
+
+
+def fly(scene: SceneClient, lander: Lander, eye: Eye | None, seed: int) -> Flight:
+    """Fly once; without an eye the filter has its inertial unit and the altimeter alone."""
+    rng = np.random.default_rng([seed, 2])
+    n_steps = round(DURATION_S / STEP_S)
+    gyro, force = drawn_errors(GRADES["tactical"], np.full(n_steps, STEP_S), rng)
+    position, velocity, flight = START_M.copy(), START_MPS.copy(), Flight()
+    thrust = np.zeros(3)
+    for step in range(n_steps + 1):
+        time_s = step * STEP_S
+        if step % round(FRAME_S / STEP_S) == 0:
+            ground = float(scene.heights(position[:1], position[1:2])[0])
+            lander.range(position[2] - ground + RANGE_NOISE_M * rng.normal())
+            located = lander.sightings(eye.sightings(position, sway(time_s), velocity)) if eye is not None else None
+            flight.true_m.append(position.copy())
+            flight.believed_m.append(lander.state.position_m.copy())
+            flight.matched.append(len(located.fix.crater) if located else 0)
+            if eye is not None:
+                say(
+                    f"{time_s:3.0f} s, height {position[2]:6.1f} m, error {flight.errors_m[-1]:6.2f} m, "
+                    f"{flight.matched[-1]} craters matched"
+                )
+        left_s = DURATION_S - time_s
+        if left_s > LAST_S:
+            thrust = guidance(lander.state.position_m, lander.state.velocity_mps, left_s)
+        if step < n_steps:
+            before, after = sway(time_s), sway(time_s + STEP_S)
+            rate = rotation_vectors(before.T @ after) / STEP_S + gyro[step]
+            sensed = sway(time_s + STEP_S / 2).T @ thrust + force[step]
+            lander.inertial(Increment(time_s + STEP_S, STEP_S, rate, sensed))
+            acceleration = thrust + gravity_mps2(position[2])
+            position = position + velocity * STEP_S + acceleration * STEP_S**2 / 2
+            velocity = velocity + acceleration * STEP_S
+    return flight
+
+
+def draw(path: Path, flown: dict[str, Flight]) -> None:
+    """Draw the paths of both flights, and the errors of their estimates."""
+    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    side, top, error = figure.subplots(1, 3)
+    for (name, flight), colour in zip(flown.items(), ("tab:blue", "tab:orange"), strict=True):
+        true = np.array(flight.true_m)
+        side.plot(np.hypot(true[:, 0], true[:, 1]), true[:, 2], color=colour, label=name)
+        top.plot(true[:, 0], true[:, 1], color=colour)
+        error.semilogy(np.arange(len(true)) * FRAME_S, flight.errors_m, color=colour)
+    side.plot(0, GATE_M[2], "k+", markersize=12, label="gate")
+    top.plot(0, 0, "k+", markersize=12)
+    side.set(xlabel="horizontal distance from the site (m)", ylabel="height (m)", title="path from the side")
+    top.set(xlabel="x, west (m)", ylabel="y, south (m)", title="path from above")
+    top.axis("equal")
+    error.set(xlabel="time (s)", ylabel="error of the estimate (m)", title="navigation")
+    side.legend()
+    for axes in (side, top, error):
+        axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Run the example."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--out", type=Path, default=Path("runs/closed-loop"))
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    say("starting the server")
+    flown = {}
+    with server() as address, SceneClient(address) as scene:
+        craters = scene.craters()
+        large = np.flatnonzero(craters["diameter_m"] >= 5)
+        large = large[np.argsort(-craters["diameter_m"][large])]
+        places, normals = (
+            np.stack([craters[name][large] for name in names], axis=1)
+            for names in (("x_m", "y_m", "z_m"), ("normal_x", "normal_y", "normal_z"))
+        )
+        exact = Catalogue(places, normals, craters["diameter_m"][large] / 2, 0.0, 0.0)
+        for name, eye in (("with camera", Eye(scene)), ("without camera", None)):
+            rng = np.random.default_rng([given.seed, 1])
+            catalogue = with_errors(exact, CatalogueErrors(), rng)
+            flown[name] = fly(scene, lander_of(scene, catalogue, rng), eye, given.seed)
+    figures = {
+        name: {"miss_m": flight.miss_m, "error_at_the_end_m": float(flight.errors_m[-1])}
+        for name, flight in flown.items()
+    }
+    (given.out / "closed_loop.json").write_text(json.dumps(figures, indent=2) + "\n")
+    draw(given.out / "closed_loop.png", flown)
+    for name, flight in flown.items():
+        say(f"{name}: the gate is missed by {flight.miss_m:.1f} m; error of the estimate {flight.errors_m[-1]:.1f} m")
+    say(f"look at {given.out / 'closed_loop.png'}")
+
+
+if __name__ == "__main__":
+    main()
