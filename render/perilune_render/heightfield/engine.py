@@ -12,7 +12,7 @@ import numpy as np
 from perilune_render.config import DatasetConfig
 from perilune_render.heightfield.shade import see
 from perilune_render.heightfield.surface import Surface, surface_of
-from perilune_render.imaging.photometry import radiance_factor
+from perilune_render.imaging.photometry import reflectance_factor
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.streams import stream
 from perilune_render.terrain.scene import Scene
@@ -110,5 +110,5 @@ class HeightfieldEngine:
         angles, lit = np.empty((n, 4)), np.empty(n)
         see(self.surface.ground, self.surface.rocks, origin, rays, suns, self.sun, _FAR_M, depth, normal, angles, lit)
         mu0, mu, cos_phase, albedo = angles.astype(np.float32).T
-        seen = radiance_factor(self._law, mu0, mu, cos_phase) / mu0 * albedo * lit.astype(np.float32)
+        seen = reflectance_factor(self._law, mu0, mu, cos_phase) * albedo * lit.astype(np.float32)
         return depth, normal, seen

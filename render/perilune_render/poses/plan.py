@@ -122,7 +122,7 @@ def _trajectory(poses: GivenPoses, rows: np.ndarray, scene: ScenePlan, number: i
     name = f"trajectory-{number:04d}"
     part = partial(_flight, poses, rows)
     seed = trajectory_seed(scene.seed, number)
-    # The index goes on where the Sun changes, so that frames of one trajectory have independent noise.
+    # Number frames across a change of the Sun: equal numbers would have equal noise.
     begin = int(rows[0] - np.flatnonzero(poses.trajectory == number)[0])
     index = range(begin, begin + len(rows))
     return TrajectoryPlan(scene.scene_id, name, seed, index, (_SPLIT,) * len(rows), part, is_drawn=False)

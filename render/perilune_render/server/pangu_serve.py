@@ -6,7 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from perilune_render.server import pangu_messages as m
-from perilune_render.server.pangu_session import FAULTY, Session, error
+from perilune_render.server.pangu_answers import FAULTY, answer, error
+from perilune_render.server.pangu_session import Session
 from perilune_render.server.pangu_wire import doubles_from, expanded, floats_from, read_fields, size_of, unsigned
 from perilune_render.server.serve import Connection
 
@@ -48,7 +49,7 @@ async def serve_pangu(connection: Connection, new_session: Callable[[], Session]
                 return
             continue
         items = items_of(message, data)
-        await connection.send(await connection.ask(lambda: session.answer(message, values, items)))  # noqa: B023
+        await connection.send(await connection.ask(lambda: answer(session, message, values, items)))  # noqa: B023
 
 
 def items_of(message: m.Message, data: bytes) -> np.ndarray | bytes:

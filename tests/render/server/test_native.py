@@ -26,13 +26,13 @@ class Running:
     """A server of this interface alone, in a thread."""
 
     def __init__(self, world: World):
-        async def nobody(connection):
+        async def refuse(connection):
             connection.writer.close()
 
         async def other(ask, ready):
             await native.serve_native("tcp://127.0.0.1:0", world, ask, ready)
 
-        self.server = Server("127.0.0.1", 0, nobody, Limits(), lambda text: None, other)
+        self.server = Server("127.0.0.1", 0, refuse, Limits(), lambda note: None, other)
         self.server.begin()
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
