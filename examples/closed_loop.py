@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from perilune_shared.client import SceneClient
 from perilune_shared.errors import UserError
@@ -50,8 +51,22 @@ DURATION_S, STEP_S, FRAME_S = 60.0, 0.02, 1.0
 PRIOR_M, PRIOR_MPS, PRIOR_DEG = 60.0, 0.5, 0.5
 """Standard deviations of the belief at the start, on each axis."""
 MOST_THRUST_MPS2, RANGE_NOISE_M = 6.0, 0.5
+SHOWN_S = (0.0, 30.0, 60.0)
+"""Times of the frames in the picture."""
 LAST_S = 4.0
 """Time to go below which guidance keeps its last command, which would otherwise grow without limit."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A frame for the picture."""
+
+    height_m: float
+    """Height of the lander above the site, metres."""
+    image: np.ndarray
+    """Grey values (h, w)."""
+    boxes: Array
+    """Detected craters (N, 4): left, top, right and bottom edge, pixels."""
 
 
 @dataclass
@@ -61,6 +76,8 @@ class Flight:
     true_m: list[Array] = field(default_factory=list)
     believed_m: list[Array] = field(default_factory=list)
     matched: list[int] = field(default_factory=list)
+    shown: list[Shown] = field(default_factory=list)
+    """Frames for the picture."""
 
     @property
     def miss_m(self) -> float:
@@ -128,15 +145,14 @@ class Eye:
         self._scene, self._threshold = scene, chosen_threshold(run)
         self._detector = open_detector(RunFolder(run).best, config)
         self._tiling = Tiling(scales=tuple(config.evaluation.scales))
-        self.last = np.zeros((0, 0), np.uint8)
 
-    def sightings(self, position_m: Array, rotation_site_from_body: Array, velocity_mps: Array) -> Sightings:
-        """Craters in the image of a true pose."""
+    def look(self, position_m: Array, rotation_site_from_body: Array, velocity_mps: Array) -> tuple[Sightings, Shown]:
+        """Craters in the image of a true pose, and the image."""
         rotation = ROTATION_CAMERA_FROM_BODY @ rotation_site_from_body.T
         frame = self._scene.frame(position_m, quaternion_from_matrix(rotation), velocity_mps=velocity_mps)
-        self.last = frame.image
         found = above(detect_image(self._detector, frame.image, self._tiling), self._threshold)
-        return Sightings.of_boxes(np.asarray(found.boxes, np.float64), found.scores)
+        boxes = np.asarray(found.boxes, np.float64)
+        return Sightings.of_boxes(boxes, found.scores), Shown(float(position_m[2]), frame.image, boxes)
 
 
 def fly(scene: SceneClient, lander: Lander, eye: Eye | None, seed: int) -> Flight:
@@ -151,7 +167,12 @@ def fly(scene: SceneClient, lander: Lander, eye: Eye | None, seed: int) -> Fligh
         if step % round(FRAME_S / STEP_S) == 0:
             ground = float(scene.heights(position[:1], position[1:2])[0])
             lander.range(position[2] - ground + RANGE_NOISE_M * rng.normal())
-            located = lander.sightings(eye.sightings(position, sway(time_s), velocity)) if eye is not None else None
+            located = None
+            if eye is not None:
+                sightings, shown = eye.look(position, sway(time_s), velocity)
+                located = lander.sightings(sightings)
+                if time_s in SHOWN_S:
+                    flight.shown.append(shown)
             flight.true_m.append(position.copy())
             flight.believed_m.append(lander.state.position_m.copy())
             flight.matched.append(len(located.fix.crater) if located else 0)
@@ -175,9 +196,9 @@ def fly(scene: SceneClient, lander: Lander, eye: Eye | None, seed: int) -> Fligh
 
 
 def draw(path: Path, flown: dict[str, Flight]) -> None:
-    """Draw the paths of both flights, and the errors of their estimates."""
-    figure = Figure(figsize=(12, 4.5), layout="constrained")
-    side, top, error = figure.subplots(1, 3)
+    """Draw the paths of both flights and the errors of their estimates; below, frames with the detected craters."""
+    figure = Figure(figsize=(12, 8.5), layout="constrained")
+    (side, top, error), below = figure.subplots(2, 3)
     for (name, flight), colour in zip(flown.items(), ("tab:blue", "tab:orange"), strict=True):
         true = np.array(flight.true_m)
         side.plot(np.hypot(true[:, 0], true[:, 1]), true[:, 2], color=colour, label=name)
@@ -192,7 +213,12 @@ def draw(path: Path, flown: dict[str, Flight]) -> None:
     side.legend()
     for axes in (side, top, error):
         axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    for axes, shown in zip(below, flown["with camera"].shown, strict=True):
+        axes.imshow(shown.image, cmap="gray")
+        for left, upper, right, lower in shown.boxes:
+            axes.add_patch(Rectangle((left, upper), right - left, lower - upper, fill=False, edgecolor="tab:cyan"))
+        axes.set(title=f"frame at {shown.height_m:.0f} m, {len(shown.boxes)} detections", xticks=[], yticks=[])
+    figure.savefig(path, dpi=90)
 
 
 def main() -> None:
