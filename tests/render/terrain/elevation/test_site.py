@@ -7,7 +7,8 @@ from tests.helpers import in_process
 from tests.helpers.elevation_models import POLAR, write
 
 from perilune_render.cli.main import main
-from perilune_render.config_terrain import ElevationConfig
+from perilune_render.config_terrain import CratersConfig, ElevationConfig
+from perilune_render.terrain.elevation.catalogue import read_catalogue
 from perilune_render.terrain.elevation.model import base_heights, raster_places, read_elevation
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
@@ -51,6 +52,14 @@ def test_the_site_is_the_origin_of_raster_places_and_of_the_ground_beyond(path):
     _, beyond = base_heights(model, Grid.even(400, 40))
     beyond = beyond.reshape(81, 81)
     assert (beyond[60, 40], beyond[40, 40]) == (0, 0) and beyond[0, 40] == pytest.approx(300, abs=3)
+
+
+def test_a_catalogue_is_placed_about_the_site(path, tmp_path):
+    model = read_elevation(path, at(*CRATER))
+    row = f"{model.longitude_deg!r},{model.latitude_deg!r},300"
+    (tmp_path / "craters.csv").write_text(f"longitude_deg,latitude_deg,diameter_m\n{row}\n")
+    found = read_catalogue(tmp_path / "craters.csv", model, Grid.even(300, 30), CratersConfig(), 40.0)
+    assert len(found) == 1 and np.hypot(found.x_m[0], found.y_m[0]) < 1e-6
 
 
 def test_pixels_and_coordinates_of_the_same_place_give_the_same_site(path):
