@@ -24,6 +24,7 @@ from perilune_render.cli.options import (
     warn_of_size,
 )
 from perilune_render.cli.serve import serve
+from perilune_render.cli.spice import spice
 from perilune_render.cli.status import status
 from perilune_render.cli.survey import survey
 from perilune_render.config import DatasetConfig
@@ -56,6 +57,7 @@ def config(
 
 app.command()(dataset)
 app.command()(frames)
+app.command()(spice)
 app.command()(serve)
 app.command()(status)
 app.command()(survey)

@@ -129,6 +129,16 @@ def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array,
     return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
 
 
+def height_of_site_m(model: ElevationModel) -> float:
+    """Height of the site above the sphere of MOON_RADIUS_M in the model, metres.
+
+    Heights of more than half this radius are taken for radii.
+    """
+    column, row = raster_places(model, np.zeros(1), np.zeros(1))
+    height = float(ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="nearest")[0])
+    return height - MOON_RADIUS_M if height > MOON_RADIUS_M / 2 else height
+
+
 def resolved_m(model: ElevationModel) -> float:
     """Diameter, metres, from which an elevation model shows a crater: four pixels. Smaller craters are generated."""
     return _RESOLVED_PIXELS * model.pixel_m
