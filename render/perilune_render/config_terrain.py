@@ -71,6 +71,8 @@ class ReliefConfig(Section):
 
 
 Outside = Literal["procedural", "refuse", "mirror"]
+SITE_FIELDS = ("site_latitude_deg", "site_longitude_deg", "site_column_px", "site_row_px")
+"""Settings of the site in an elevation model: one pair of them, or none."""
 
 
 class ElevationConfig(Section):
@@ -78,6 +80,36 @@ class ElevationConfig(Section):
 
     outside: Outside = "procedural"
     """Ground outside the model: procedural with the model's statistics, an error (refuse), or the model mirrored."""
+    site_latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    """Latitude of the landing site, degrees; null, with the other site settings, for the middle of the model."""
+    site_longitude_deg: Annotated[float, Field(ge=-180, le=360)] | None = None
+    """Longitude of the landing site, east positive, degrees."""
+    site_column_px: NotNegative | None = None
+    """Column of the landing site, in place of latitude and longitude, pixels from the left edge of the model."""
+    site_row_px: NotNegative | None = None
+    """Row of the landing site, pixels from the top edge of the model."""
+
+    @model_validator(mode="after")
+    def _one_pair(self) -> "ElevationConfig":
+        values = {name: getattr(self, name) for name in SITE_FIELDS}
+        given = tuple(name for name, value in values.items() if value is not None)
+        if given not in ((), SITE_FIELDS[:2], SITE_FIELDS[2:]):
+            raise ValueError(f"{' and '.join(SITE_FIELDS[:2])}, or {' and '.join(SITE_FIELDS[2:])}, or none of them")
+        return self
+
+    @property
+    def site_deg(self) -> tuple[float, float] | None:
+        """Latitude and longitude of the site, degrees, if they are stated."""
+        return _pair(self.site_latitude_deg, self.site_longitude_deg)
+
+    @property
+    def site_px(self) -> tuple[float, float] | None:
+        """Column and row of the site, pixels, if they are stated."""
+        return _pair(self.site_column_px, self.site_row_px)
+
+
+def _pair(first: float | None, second: float | None) -> tuple[float, float] | None:
+    return None if first is None or second is None else (first, second)
 
 
 class TerrainConfig(Section):

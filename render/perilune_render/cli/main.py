@@ -24,6 +24,7 @@ from perilune_render.cli.options import (
     warn_of_size,
 )
 from perilune_render.cli.serve import serve
+from perilune_render.cli.spice import spice
 from perilune_render.cli.status import status
 from perilune_render.cli.survey import survey
 from perilune_render.config import DatasetConfig
@@ -56,6 +57,7 @@ def config(
 
 app.command()(dataset)
 app.command()(frames)
+app.command()(spice)
 app.command()(serve)
 app.command()(status)
 app.command()(survey)
@@ -160,16 +162,19 @@ def preview(
     kind: Annotated[
         KindChoice, typer.Option(help="Dataset whose first scene and trajectory are shown (detect or nav).")
     ] = "detect",
-    out: Annotated[Path, typer.Option(help="PNG to write.")] = Path("preview.png"),
+    out: Annotated[Path, typer.Option(help="PNG to write; the map is written beside it, as NAME-map.png.")] = Path(
+        "preview.png"
+    ),
 ) -> None:
-    """Render a contact sheet of a configuration, with and without labels, in seconds."""
+    """Render a contact sheet of a configuration, with and without labels, and a map of its site, in seconds."""
     resolved = resolved_config(preset, config, setting, dem, catalogue)
     if out.suffix != ".png":
         raise UserError(out, "format", out.suffix or "none", ".png")
-    from perilune_render.dataset.preview import write_preview
+    from perilune_render.preview.contact_sheet import write_preview
 
-    write_preview(resolved, first_kind(kind), out)
-    Console().print(f"look at {out}")
+    map_path = out.with_name(f"{out.stem}-map.png")
+    write_preview(resolved, first_kind(kind), out, map_path)
+    Console().print(f"look at {out} and {map_path}", soft_wrap=True)
 
 
 @app.command()

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from perilune_render.config import DatasetConfig
+from perilune_render.config_terrain import SITE_FIELDS
 from perilune_shared.config import resolve
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
@@ -83,4 +84,8 @@ def resolved_config(
         raise UserError(
             "--catalogue", "catalogue", terrain.catalogue, "--dem as well, the elevation model of this catalogue"
         )
+    for name in SITE_FIELDS:
+        if getattr(terrain.elevation, name) is not None and terrain.dem is None:
+            found = getattr(terrain.elevation, name)
+            raise UserError("configuration", f"dataset.terrain.elevation.{name}", found, "--dem, an elevation model")
     return resolved.model_copy(update={"terrain": terrain})

@@ -35,7 +35,7 @@ def outline_m(model: ElevationModel) -> Array:
     along, zero = np.linspace(0, 1, _POINTS_PER_SIDE, endpoint=False), np.zeros(_POINTS_PER_SIDE)
     column = np.concatenate([along, zero + 1, 1 - along, zero]) * columns
     row = np.concatenate([zero, along, zero + 1, 1 - along]) * rows
-    latitude, longitude = model.selenographic(column, row)
+    latitude, longitude = model.raster.selenographic(column, row)
     x, y = site_from_selenographic(latitude, longitude, model.latitude_deg, model.longitude_deg)
     return np.stack([x, y], axis=-1)
 

@@ -9,6 +9,8 @@ columns, in Parquet by the key `frame` of the metadata, in TUM by a comment line
 
 Attitudes are quaternions rotation_camera_from_site (w, x, y, z) in the columns qw, qx, qy, qz, as `rotation_wxyz` in a
 manifest. `# rotation: site_from_camera` states the opposite direction; in a TUM file that is always so.
+
+`# site: latitude longitude`, degrees, is optional; poses of another site than that of the scene are refused.
 """
 
 import hashlib
@@ -35,12 +37,13 @@ _VELOCITY, _SUN = ("vx_mps", "vy_mps", "vz_mps"), ("sun_azimuth_deg", "sun_eleva
 _TRAJECTORY = "trajectory"
 _TUM = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _DIRECTIONS = ("camera_from_site", "site_from_camera")
-_KEYS = ("frame", "rotation", "origin_m")
+_KEYS = ("frame", "rotation", "origin_m", "site")
 _MAX_POSES = 1_000_000
 _MAX_BYTES = 500_000_000
 _LENGTH_TOLERANCE = 0.01
 """Largest deviation of a quaternion's length from 1 that rounding of its digits explains."""
 _LARGEST_M = 1e6
+_SAME_SITE_M = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,6 +180,7 @@ def _checked(source: _Source, latitude_deg: float, longitude_deg: float) -> Give
         line = "the comment line `# frame: O_L`" if path.suffix != ".parquet" else "the metadata key frame"
         found = "not stated" if frame is None else frame
         raise UserError(path, "frame", found, f"{line}, with one of {', '.join(FRAMES)}")
+    _check_site(path, stated.get("site"), latitude_deg, longitude_deg)
     names = (*_TIME, *FRAMES[frame], *_ROTATION)
     _check_columns(path, list(table.columns), names)
     if not 1 <= len(table) <= _MAX_POSES:
@@ -217,6 +221,21 @@ def _check_columns(path: Path, found: list[str], names: tuple[str, ...]) -> None
         missing = [name for name in group if name not in found]
         if missing and (group is names or len(missing) < len(group)):
             raise UserError(path, "column", f"no {missing[0]}", f"the columns {', '.join(group)}")
+
+
+def _check_site(path: Path, stated: str | None, latitude_deg: float, longitude_deg: float) -> None:
+    """Raises UserError if a file states another site than that of the scene."""
+    if stated is None:
+        return
+    try:
+        latitude, longitude = (float(word) for word in stated.replace(",", " ").split())
+        x, y = site_from_selenographic(latitude, longitude, latitude_deg, longitude_deg)
+        off_m = float(np.hypot(x, y))
+    except ValueError:
+        off_m = np.nan
+    if not off_m < _SAME_SITE_M:
+        expected = f"{latitude_deg:.6f} {longitude_deg:.6f}, latitude and longitude of the scene's site"
+        raise UserError(path, "site", stated, expected)
 
 
 def _origin(path: Path, stated: dict[str, str]) -> Array:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from perilune_render.config import DatasetConfig
+from perilune_render.config_terrain import TerrainConfig
 from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.base import base_of
 from perilune_render.terrain.boulders import Boulders, draw_boulders
@@ -80,7 +81,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     check_levels(config.terrain, view)
     terrain = config.terrain
     grid = graded_grid(terrain, view)
-    model = read_elevation(Path(terrain.dem)) if terrain.dem is not None else None
+    model = model_of(terrain)
     base = base_of(model, grid, terrain, seed)
     height = base.height_m
     base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
@@ -164,8 +165,8 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
     check_levels(config.terrain, view)
     grid = graded_grid(config.terrain, view)
     check_waves(config.terrain.relief, grid)
-    if config.terrain.dem is not None:
-        model = read_elevation(Path(config.terrain.dem))
+    model = model_of(config.terrain)
+    if model is not None:
         refuse_beyond(model, grid, config.terrain.elevation.outside)
         for line in remarks(model, grid, config.terrain.elevation.outside):
             say(line, style="yellow")
@@ -175,8 +176,12 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
 
 def site_of(config: DatasetConfig) -> tuple[float, float]:
     """Latitude and longitude of the site, degrees. Raises UserError if the elevation model cannot be read."""
-    dem = config.terrain.dem
-    return _place(config, read_elevation(Path(dem)) if dem is not None else None)
+    return _place(config, model_of(config.terrain))
+
+
+def model_of(terrain: TerrainConfig) -> ElevationModel | None:
+    """The elevation model of a configuration, or None. Raises UserError if it cannot be read."""
+    return None if terrain.dem is None else read_elevation(Path(terrain.dem), terrain.elevation)
 
 
 def _place(config: DatasetConfig, model: ElevationModel | None) -> tuple[float, float]:

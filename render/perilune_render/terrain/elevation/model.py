@@ -11,9 +11,10 @@ import numpy as np
 from scipy import ndimage
 from scipy.interpolate import RectBivariateSpline
 
-from perilune_render.config_terrain import Outside
+from perilune_render.config_terrain import ElevationConfig, Outside
 from perilune_render.terrain.elevation.continuation import continued, distance_in_holes_m, margin_m, mean_slope
 from perilune_render.terrain.elevation.quantisation import smoothed, step_of
+from perilune_render.terrain.elevation.site import RasterMap, Site, site_in
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, selenographic_from_site
@@ -22,7 +23,7 @@ from perilune_shared.storage.files import sha256_of
 if TYPE_CHECKING:
     import rasterio
 
-_MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
+_AT_THE_MIDDLE = ElevationConfig()
 _LARGEST_PIXELS = 100_000_000
 _RESOLVED_PIXELS = 4.0
 """Diameter from which a model shows a crater, pixels."""
@@ -40,16 +41,14 @@ class ElevationModel:
     """Heights (rows, columns) from the raster's top, metres, with holes filled."""
     known: np.ndarray
     """Whether a pixel has a height in the raster (rows, columns)."""
-    transform: rasterio.Affine
-    """Projected coordinates from (column, row), which are 0 at the raster's top left corner."""
-    crs: rasterio.crs.CRS
-    """Coordinate reference system of the raster."""
+    raster: RasterMap
+    """Where the raster's columns and rows are on the Moon."""
     latitude_deg: float
-    """Latitude of the raster's middle, which becomes the site, degrees."""
+    """Latitude of the site, degrees."""
     longitude_deg: float
-    """Longitude of the raster's middle, degrees."""
+    """Longitude of the site, degrees."""
     pixel_m: float
-    """Ground size of a pixel, the mean of both directions, metres."""
+    """Ground size of a pixel at the site, the mean of both directions, metres."""
     pixel_sides_m: tuple[float, float]
     """Ground size of a pixel from row to row and from column to column, metres."""
     step_m: float
@@ -59,24 +58,18 @@ class ElevationModel:
     source: str
     """File name (without folder and special characters) and SHA-256."""
 
-    def selenographic(self, column: Array, row: Array) -> tuple[Array, Array]:
-        """Latitude and longitude, degrees, of raster coordinates (N,) that are 0 at the raster's top left corner."""
-        import rasterio.warp
 
-        longitude, latitude = rasterio.warp.transform(self.crs, _MOON, *(self.transform @ (column, row)))
-        return np.array(latitude), np.array(longitude)
+def read_elevation(path: Path, config: ElevationConfig = _AT_THE_MIDDLE) -> ElevationModel:
+    """Read a GeoTIFF elevation model; its site is the one of `config`, or the raster's middle.
 
-
-def read_elevation(path: Path) -> ElevationModel:
-    """Read a GeoTIFF elevation model.
-
-    Raises UserError if it is missing, unreadable, too large, empty, or has no pixel size or no projection of the Moon.
+    Raises UserError if it is missing, unreadable, too large, empty, or has no pixel size or no projection of the Moon,
+    or if the site is outside it or in a hole.
     Holes (nodata, NaN) are filled with the nearest known height. Heights may be elevations or radii: only differences
     matter, since the site is set to height 0. Quantised heights are smoothed within half a step
     (`perilune_render.terrain.elevation.quantisation`).
     """
     # Imported where it is used, since it takes a fifth of a second.
-    import rasterio.warp
+    import rasterio
     from rasterio.errors import RasterioError
 
     if not path.is_file():
@@ -102,20 +95,17 @@ def read_elevation(path: Path) -> ElevationModel:
     if not known.all():
         nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
         height = height[tuple(nearest)]
-    middle = (height.shape[1] / 2, height.shape[0] / 2)
-    try:
-        lon, lat = rasterio.warp.transform(crs, _MOON, *([v] for v in transform @ middle))
-    except RasterioError as error:
-        raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
-    sides = _pixel_sides_m(transform, crs, middle, lat[0], lon[0])
+    raster_map = RasterMap(transform, crs, height.shape)
+    site = site_in(path, raster_map, known, config)
+    sides = _pixel_sides_m(raster_map, site)
     hole = distance_in_holes_m(known, sides)
     step = step_of(height[known], float(np.mean(sides)))
     if step:
         height = smoothed(height, step)
     plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
     source = f"{plain_name} sha256:{sha256_of(path)}"
-    place = float(lat[0]), float(lon[0])
-    return ElevationModel(height, known, transform, crs, *place, float(np.mean(sides)), sides, step, hole, source)
+    place, pixel = (site.latitude_deg, site.longitude_deg), float(np.mean(sides))
+    return ElevationModel(height, known, raster_map, *place, pixel, sides, step, hole, source)
 
 
 def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
@@ -134,16 +124,19 @@ def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
     """Column and row, 0 at the raster's top left corner, of places (...) of O_L's plane, metres."""
-    import rasterio.warp
-
     lat, lon = selenographic_from_site(x_m, y_m, model.latitude_deg, model.longitude_deg)
-    east, north = (np.array(v) for v in rasterio.warp.transform(_MOON, model.crs, np.ravel(lon), np.ravel(lat)))
-    if model.crs.is_geographic:
-        # A raster may count longitudes from 0 or from -180, and may extend across either.
-        middle = (model.transform @ (model.height_m.shape[1] / 2, model.height_m.shape[0] / 2))[0]
-        east += 360 * np.round((middle - east) / 360)
-    column, row = ~model.transform @ (east, north)
+    column, row = model.raster.places(np.ravel(lat), np.ravel(lon))
     return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
+
+
+def height_of_site_m(model: ElevationModel) -> float:
+    """Height of the site above the sphere of MOON_RADIUS_M in the model, metres.
+
+    Heights of more than half this radius are taken for radii.
+    """
+    column, row = raster_places(model, np.zeros(1), np.zeros(1))
+    height = float(ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=3, mode="nearest")[0])
+    return height - MOON_RADIUS_M if height > MOON_RADIUS_M / 2 else height
 
 
 def resolved_m(model: ElevationModel) -> float:
@@ -175,8 +168,9 @@ def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
         raise UserError(
             model.source,
             "dataset.terrain.elevation.outside",
-            f"a model of {across:.0f} m x {down:.0f} m for {grid.extent_m:.0f} m of ground",
-            "a larger model, a lower flight or a narrower view, or dataset.terrain.elevation.outside=procedural",
+            f"a model of {across:.0f} m x {down:.0f} m for {grid.extent_m:.0f} m of ground around the site",
+            "a larger model, a site farther from its edge, a lower flight or a narrower view, or "
+            "dataset.terrain.elevation.outside=procedural",
         )
 
 
@@ -256,15 +250,17 @@ def _mirrored(height_m: Array, margin: int, pixel_m: float) -> Array:
     return swell + away * mirrored + (1 - away) * (point_reflected - swell)
 
 
-def _pixel_sides_m(
-    transform: rasterio.Affine, crs: rasterio.crs.CRS, middle: tuple[float, float], lat: float, lon: float
-) -> tuple[float, float]:
-    """Ground size of the middle pixel from row to row and from column to column, from great-circle distances."""
-    import rasterio.warp
+def _pixel_sides_m(raster: RasterMap, site: Site) -> tuple[float, float]:
+    """Ground size of a pixel at the site from row to row and from column to column, from great-circle distances.
 
-    places = [transform @ (middle[0], middle[1] + 1), transform @ (middle[0] + 1, middle[1])]
-    lons, lats = rasterio.warp.transform(crs, _MOON, [p[0] for p in places], [p[1] for p in places])
-    to_east = np.cos(np.radians(lat)) * np.radians((np.array(lons) - lon + 180) % 360 - 180)
-    to_north = np.radians(np.array(lats) - lat)
-    down, across = MOON_RADIUS_M * np.hypot(to_east, to_north)
-    return float(down), float(across)
+    Approximation: small differences of latitude and longitude; wrong within two pixels of a pole.
+    """
+    # Inwards at the last row or column, since latitudes may end there.
+    down, across = (-1 if place + 1 > n else 1 for place, n in zip((site.row, site.column), raster.shape, strict=True))
+    lats, lons = raster.selenographic(
+        np.array([site.column, site.column + across]), np.array([site.row + down, site.row])
+    )
+    to_east = np.cos(np.radians(site.latitude_deg)) * np.radians((lons - site.longitude_deg + 180) % 360 - 180)
+    to_north = np.radians(lats - site.latitude_deg)
+    high, wide = MOON_RADIUS_M * np.hypot(to_east, to_north)
+    return float(high), float(wide)

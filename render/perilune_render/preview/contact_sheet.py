@@ -1,7 +1,8 @@
-"""A contact sheet of a configuration, to see the effect of a setting quickly."""
+"""A contact sheet of a configuration and a map of its site, to see the effect of a setting quickly."""
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from perilune_render.config import DatasetConfig
@@ -15,17 +16,21 @@ from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.labels.drawing import draw_labels, enlarge, write_sheet
 from perilune_render.labels.frame_labels import RimCircles
+from perilune_render.preview.horizon import horizon_of, warn_of_shadow
+from perilune_render.preview.map_picture import map_picture
+from perilune_render.preview.site_map import site_map
 from perilune_render.terrain.cache import cached_scene
-from perilune_render.terrain.elevation.model import read_elevation
-from perilune_render.terrain.scene import check_ground
+from perilune_render.terrain.scene import check_ground, model_of
 from perilune_shared.labels.selection import selected
 from perilune_shared.labels.thresholds import SELECTIONS
+from perilune_shared.storage.files import write_bytes
 
 
-def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 4) -> None:
-    """Write a contact sheet of the first scene and trajectory: frames evenly spaced in time.
+def write_preview(config: DatasetConfig, kind: str, path: Path, map_path: Path, n_frames: int = 4) -> None:
+    """Write a contact sheet of the first scene and trajectory, frames evenly spaced in time, and a map of the scene.
 
-    The lower row shows the same frames with labels and, if there is one, the outline of the elevation model.
+    The lower row of the sheet shows the same frames with labels and, if there is one, the outline of the elevation
+    model. The map shows the trajectories of the scene. Prints a warning if the site lies in shadow.
     """
     plan = make_plan(config, kind)
     scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
@@ -33,7 +38,10 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
     scene = cached_scene(config, plan.view, scene_plan.seed)
     check_poses(Poses.planned([trajectory]), plan.exr_camera, scene, f"configuration: dataset.{kind}")
     depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
-    outline = None if config.terrain.dem is None else outline_m(read_elevation(Path(config.terrain.dem)))
+    model = model_of(config.terrain)
+    outline = None if model is None else outline_m(model)
+    horizon = horizon_of(scene, scene_plan.sun_azimuth_deg)
+    warn_of_shadow(scene_plan, horizon)
     plain, drawn, dark = [], [], []
     with open_engine(scene, config, plan.exr_camera, scene_plan.sun) as engine:
         source = FrameSource.of(engine, config, plan.camera, RimCircles.of_scene(scene))
@@ -50,4 +58,8 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, n_frames: int = 
             if is_dark(frame.radiance):
                 dark.append(frame_id)
     warn_of_dark_frames(scene_plan.scene_id, dark, n_frames, scene_plan.sun_elevation_deg)
+    tracks = [each.flight.position_m for each in plan.of_scene(scene_plan.scene_id)]
+    place = scene.latitude_deg, scene.longitude_deg
+    picture = map_picture(config.name, site_map(scene, model, scene_plan.sun), scene_plan, place, tracks, horizon)
     write_sheet(path, plain + drawn, n_frames)
+    write_bytes(map_path, cv2.imencode(".png", picture)[1].tobytes())

@@ -1,0 +1,251 @@
+"""Poses and Sun from SPICE kernels, in O_L of a site (Acton et al. 2018, doi 10.1016/j.pss.2017.02.013).
+
+O_L is taken as a rigid frame fixed to the Moon: its origin is the site, its axes are west, south and up there. Place,
+velocity and attitude are converted by the same rotation. Deviation: the rendered ground is a plane, and the Moon falls
+away from the plane by d^2 / 2R at a distance d from the site (0.3 m at 1 km, 1.2 m at 2 km, 29 m at 10 km).
+
+Kernels are untrusted data: SPICE reads them and executes nothing. A meta-kernel names other files, which are read too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, quaternion_from_matrix
+
+_MOON = "MOON"
+_FIXED_FRAMES = ("MOON_ME", "IAU_MOON")
+"""Frames fixed to the Moon in order of preference: the first that the kernels define is used."""
+_MOST_FRAMES = 100_000
+_AXES = {
+    sign + name: (-1 if sign == "-" else 1) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in ("", "+", "-")
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SpiceSource:
+    """What to read from kernels."""
+
+    kernels: tuple[Path, ...]
+    """Kernels and meta-kernels, later ones override earlier ones."""
+    spacecraft: str
+    """Name or NAIF id of the spacecraft, or of its camera if the kernels have its place."""
+    camera_frame: str
+    """Name of the camera's frame."""
+    camera_axes: str
+    """Axes of this frame to the right, down and forward in the image, as `x,y,z` or `-y,x,z`."""
+    fixed_frame: str | None
+    """Frame fixed to the Moon; None for the first of MOON_ME and IAU_MOON that the kernels define."""
+    start: str
+    """UTC of the first frame."""
+    end: str
+    """UTC of the last frame, or of the end."""
+    n_frames: int | None
+    """Number of frames, evenly spaced from start to end."""
+    step_s: float | None
+    """Time between frames in place of their number, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpicePoses:
+    """Poses of N frames from kernels."""
+
+    time_s: Array
+    """Time since the first frame, seconds (N,)."""
+    position_m: Array
+    """Position in O_L, metres (N, 3)."""
+    rotation_wxyz: Array
+    """rotation_camera_from_site as unit quaternions (N, 4)."""
+    velocity_mps: Array
+    """Velocity relative to the ground, O_L, metres per second (N, 3)."""
+    sun_deg: Array
+    """Apparent azimuth and elevation of the Sun at the site, degrees (N, 2)."""
+    start: str
+    """UTC of the first frame, ISO 8601."""
+    fixed_frame: str
+    """Frame fixed to the Moon that was used."""
+
+
+def rotation_site_from_fixed(latitude_deg: float, longitude_deg: float) -> Array:
+    """The rotation (3, 3) from axes fixed to the Moon (x to 0 N 0 E, z north) to those of O_L at a site."""
+    (sin_lat, cos_lat), (sin_lon, cos_lon) = ((np.sin(a), np.cos(a)) for a in np.radians([latitude_deg, longitude_deg]))
+    west = [sin_lon, -cos_lon, 0.0]
+    south = [sin_lat * cos_lon, sin_lat * sin_lon, -cos_lat]
+    up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
+    return np.array([west, south, up])
+
+
+def read_spice(source: SpiceSource, latitude_deg: float, longitude_deg: float, site_height_m: float) -> SpicePoses:
+    """Poses, velocities and Suns of a spacecraft, for a site `site_height_m` above the sphere of 1737.4 km.
+
+    Camera poses are geometric, without light time. The Sun is apparent (light time and stellar aberration, "LT+S") and
+    seen from the site. The kernel pool of the process is cleared before and after. Raises UserError if spiceypy is not
+    installed, for an unreadable kernel, an unknown body or frame, a time without data, or a Sun below the plane.
+    """
+    spice = _library()
+    axes = camera_axes(source.camera_axes)
+    site_from_fixed = rotation_site_from_fixed(latitude_deg, longitude_deg)
+    site_km = (MOON_RADIUS_M + site_height_m) / 1000 * site_from_fixed[2]
+    with _loaded(spice, source.kernels):
+        times = _times(spice, source)
+        fixed = _fixed_frame(spice, source.fixed_frame)
+        _check_frame(spice, "--camera-frame", source.camera_frame)
+        spacecraft = _body(spice, source.spacecraft)
+        rows = []
+        for et in times:
+            with _reported(spice, f"at {_utc(spice, et)}"):
+                state = spice.spkezr(spacecraft, et, fixed, "NONE", _MOON)[0]
+                turned = axes @ spice.pxform(fixed, source.camera_frame, et) @ site_from_fixed.T
+                sun = spice.spkcpo("SUN", et, fixed, "OBSERVER", "LT+S", site_km, _MOON, fixed)[0][:3]
+            rows.append(
+                (1000 * site_from_fixed @ (state[:3] - site_km), turned, 1000 * site_from_fixed @ state[3:], sun)
+            )
+            _refuse_night(site_from_fixed @ sun, _utc(spice, et))
+        start = _utc(spice, times[0])
+    position, rotation, velocity, sun = (np.array(column) for column in zip(*rows, strict=True))
+    quaternions = np.stack([quaternion_from_matrix(each) for each in rotation])
+    towards = sun @ site_from_fixed.T
+    sun_deg = np.degrees(
+        [
+            np.arctan2(-towards[:, 0], -towards[:, 1]) % (2 * np.pi),
+            np.arcsin(towards[:, 2] / np.linalg.norm(towards, axis=1)),
+        ]
+    ).T
+    return SpicePoses(times - times[0], position, quaternions, velocity, sun_deg, start, fixed)
+
+
+def camera_axes(text: str) -> Array:
+    """The rotation (3, 3) of `right,down,forward` axes, such as `x,y,z`, from a SPICE frame. Raises UserError."""
+    names = [name.strip().lower() for name in text.split(",")]
+    rows = np.array([_AXES[name] for name in names]) if all(name in _AXES for name in names) else np.zeros((1, 1))
+    if rows.shape != (3, 3) or round(float(np.linalg.det(rows))) != 1:
+        raise UserError("--camera-axes", "axes", text, "three axes of a right-handed frame, such as x,y,z or -y,x,z")
+    return rows
+
+
+def poses_csv(
+    poses: SpicePoses, source: SpiceSource, latitude_deg: float, longitude_deg: float, height_m: float
+) -> str:
+    """The poses as a CSV that `perilune_render.poses.file.read_poses` reads, with all digits."""
+    kernels = ", ".join(path.name for path in source.kernels)
+    lines = [
+        "# frame: O_L",
+        f"# site: {latitude_deg!r} {longitude_deg!r}",
+        f"# height of the site above 1737.4 km: {height_m!r} m",
+        f"# start: {poses.start} UTC",
+        f"# {source.spacecraft}, {source.camera_frame} relative to {poses.fixed_frame}; kernels {kernels}",
+        "time_s,x_m,y_m,z_m,qw,qx,qy,qz,vx_mps,vy_mps,vz_mps,sun_azimuth_deg,sun_elevation_deg",
+    ]
+    columns = (poses.time_s[:, None], poses.position_m, poses.rotation_wxyz, poses.velocity_mps, poses.sun_deg)
+    lines += [",".join(map(repr, row)) for row in np.hstack(columns).tolist()]
+    return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines) + "\n"
+
+
+def _library() -> Any:
+    try:
+        import spiceypy
+    except ImportError:
+        raise UserError("spice", "spiceypy", "not installed", "pip install 'perilune-render[spice]'") from None
+    return spiceypy
+
+
+@contextlib.contextmanager
+def _loaded(spice: Any, kernels: Sequence[Path]) -> Iterator[None]:
+    """Load kernels into an empty pool, and clear it at the end."""
+    spice.kclear()
+    try:
+        for path in kernels:
+            if not path.is_file():
+                raise UserError(path, "kernel", "no such file", "a SPICE kernel or meta-kernel")
+            with _reported(spice, str(path)):
+                spice.furnsh(str(path))
+        yield
+    finally:
+        spice.kclear()
+
+
+@contextlib.contextmanager
+def _reported(spice: Any, where: str) -> Iterator[None]:
+    """Turn an error of SPICE into a UserError with its text."""
+    try:
+        yield
+    except spice.exceptions.SpiceyError as error:
+        short, text = (" ".join(str(part).split()) for part in (error.short, error.long))
+        raise UserError(
+            f"SPICE: {where}", short or "error", text or error, _EXPECTED.get(short, "valid kernels")
+        ) from None
+
+
+_EXPECTED = {
+    "SPICE(SPKINSUFFDATA)": "kernels (SPK) that cover this time and body, and Moon and Sun",
+    "SPICE(NOFRAMECONNECT)": "kernels (FK, CK with SCLK, PCK) that cover this time and frame",
+    "SPICE(CKINSUFFDATA)": "kernels (CK) that cover this time",
+    "SPICE(FRAMEDATANOTFOUND)": "kernels (PCK, or CK) of this frame",
+    "SPICE(KERNELVARNOTFOUND)": "kernels (PCK, SCLK) with these values",
+    "SPICE(NOLEAPSECONDS)": "a kernel of leap seconds (LSK)",
+    "SPICE(NOSUCHFILE)": "a file that exists; paths in a meta-kernel are relative to the current folder",
+}
+"""What is needed, by SPICE's short message."""
+
+
+def _times(spice: Any, source: SpiceSource) -> Array:
+    """Ephemeris times (N,), seconds past J2000 TDB, evenly spaced."""
+    if (source.n_frames is None) == (source.step_s is None):
+        raise UserError("spice", "--frames and --step-s", "both or neither", "one of them")
+    begin, end = (_time(spice, name, text) for name, text in (("--start", source.start), ("--end", source.end)))
+    if end < begin or (end == begin and source.n_frames != 1):
+        raise UserError("--end", "time", source.end, f"a time after --start, {source.start}")
+    number = source.n_frames if source.step_s is None else int((end - begin) / source.step_s + 1e-9) + 1
+    if number is None or not 1 <= number <= _MOST_FRAMES:
+        raise UserError("spice", "frames", number, f"1 to {_MOST_FRAMES}")
+    if source.step_s is not None:
+        return begin + source.step_s * np.arange(number)
+    return np.linspace(begin, end, number)
+
+
+def _time(spice: Any, option: str, text: str) -> float:
+    with _reported(spice, option):
+        return float(spice.str2et(text))
+
+
+def _utc(spice: Any, et: float) -> str:
+    with _reported(spice, "time"):
+        return str(spice.et2utc(et, "ISOC", 6))
+
+
+def _fixed_frame(spice: Any, name: str | None) -> str:
+    """The frame fixed to the Moon. Raises UserError if it is unknown or not fixed to the Moon."""
+    if name is None:
+        return next(each for each in _FIXED_FRAMES if spice.namfrm(each) != 0)
+    _check_frame(spice, "--fixed-frame", name)
+    if spice.frinfo(spice.namfrm(name))[0] != spice.bodn2c(_MOON):
+        raise UserError("--fixed-frame", "frame", name, "a frame fixed to the Moon, such as MOON_ME or IAU_MOON")
+    return name
+
+
+def _check_frame(spice: Any, option: str, name: str) -> None:
+    if spice.namfrm(name) == 0:
+        raise UserError(option, "frame", name, "a frame that the kernels (FK) define")
+
+
+def _body(spice: Any, name: str) -> str:
+    try:
+        return str(spice.bods2c(name))
+    except spice.exceptions.NotFoundError:
+        raise UserError("--spacecraft", "body", name, "a NAIF id, or a name that the kernels define") from None
+
+
+def _refuse_night(towards: Array, utc: str) -> None:
+    """Raises UserError if the Sun is at or below the site's plane."""
+    if towards[2] <= 0:
+        degrees = np.degrees(np.arcsin(towards[2] / np.linalg.norm(towards)))
+        raise UserError(
+            f"SPICE: at {utc}", "elevation of the Sun", f"{degrees:.2f} degrees", "above 0: day at the site"
+        )

@@ -1,0 +1,1 @@
+"""Pictures of a configuration: a contact sheet of frames, and a map of the site."""

@@ -1,0 +1,59 @@
+"""The horizon of the landing site in the direction of the Sun: whether the site lies in shadow."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.flight.plan import ScenePlan
+from perilune_render.terrain.grid import Grid
+from perilune_render.terrain.interpolation import value_at
+from perilune_render.terrain.scene import Scene
+from perilune_shared.geometry.frames import Array, sun_direction
+from perilune_shared.progress import say
+
+
+@dataclass(frozen=True, slots=True)
+class Horizon:
+    """The ground that stands highest above the site in one direction."""
+
+    elevation_deg: float
+    """Elevation above the site's plane, degrees."""
+    distance_m: float
+    """Horizontal distance from the site, metres."""
+    height_m: float
+    """Height above the site, metres."""
+
+
+def horizon_of(scene: Scene, azimuth_deg: float) -> Horizon:
+    """The horizon seen from the ground at the site, at an azimuth clockwise from north.
+
+    Only the ground of the scene counts, without boulders. The ground beyond its edge casts no shadow in frames either.
+    """
+    towards = sun_direction(azimuth_deg, 0.0)[:2]
+    distance = _distances(scene.grid, towards)
+    heights = scene.height_m.astype(np.float64)
+    at_site = float(value_at(heights, scene.grid, 0.0, 0.0))
+    height = value_at(heights, scene.grid, *(distance[:, None] * towards).T) - at_site
+    elevation = np.degrees(np.arctan2(height, distance))
+    highest = int(np.argmax(elevation))
+    return Horizon(float(elevation[highest]), float(distance[highest]), float(height[highest]))
+
+
+def _distances(grid: Grid, towards: Array) -> Array:
+    """Distances (N,) from the site to the edge of the ground, metres, half a vertex spacing apart."""
+    slant = np.abs(towards).max()
+    inner = np.linspace(0, grid.half_widths_m[0], 2 * grid.n_half + 1)[1:]
+    rings = np.interp(
+        np.arange(1, 2 * len(grid.half_widths_m) - 1) / 2, np.arange(len(grid.half_widths_m)), grid.half_widths_m
+    )
+    return np.concatenate([inner, rings]) / slant
+
+
+def warn_of_shadow(plan: ScenePlan, horizon: Horizon) -> None:
+    """Print a warning if the Sun of a scene is below the site's horizon."""
+    if horizon.elevation_deg > plan.sun_elevation_deg:
+        say(
+            f"warning: {plan.scene_id}: the site lies in shadow: the Sun at azimuth {plan.sun_azimuth_deg:.1f} is "
+            f"{plan.sun_elevation_deg:.1f} degrees high, and ground {horizon.distance_m:.0f} m away reaches "
+            f"{horizon.elevation_deg:.1f} degrees"
+        )

@@ -1,0 +1,152 @@
+"""The landing site in an elevation model: its middle, or a chosen place; raster coordinates of places on the Moon.
+
+Raster coordinates are column and row, 0 at the raster's top left corner; the first pixel's centre is at 0.5, 0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from perilune_render.config_terrain import ElevationConfig
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.frames import MOON_RADIUS_M, Array
+
+if TYPE_CHECKING:
+    import rasterio
+
+_MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
+_FIELD = "dataset.terrain.elevation.site"
+
+
+@dataclass(frozen=True, slots=True)
+class RasterMap:
+    """The map of a raster: what its columns and rows are on the Moon."""
+
+    transform: rasterio.Affine
+    """Projected coordinates from (column, row)."""
+    crs: rasterio.crs.CRS
+    """Coordinate reference system."""
+    shape: tuple[int, int]
+    """Numbers of rows and columns."""
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Column and row of the raster's middle."""
+        return self.shape[1] / 2, self.shape[0] / 2
+
+    def selenographic(self, column: ArrayLike, row: ArrayLike) -> tuple[Array, Array]:
+        """Latitude and longitude, degrees, of raster coordinates (N,)."""
+        import rasterio.warp
+
+        east, north = self.transform @ (np.asarray(column, np.float64), np.asarray(row, np.float64))
+        longitude, latitude = rasterio.warp.transform(self.crs, _MOON, east, north)
+        return np.array(latitude), np.array(longitude)
+
+    def places(self, latitude_deg: Array, longitude_deg: Array) -> tuple[Array, Array]:
+        """Raster coordinates (N,) of latitudes and longitudes (N,), degrees."""
+        import rasterio.warp
+
+        east, north = (np.array(v) for v in rasterio.warp.transform(_MOON, self.crs, longitude_deg, latitude_deg))
+        if self.crs.is_geographic:
+            # A raster may count longitudes from 0 or from -180, and may extend across either.
+            middle = (self.transform @ self.middle)[0]
+            east += 360 * np.round((middle - east) / 360)
+        column, row = ~self.transform @ (east, north)
+        return column, row
+
+    def covers(self, column: float, row: float) -> bool:
+        """Whether raster coordinates are in the raster; False for NaN."""
+        return 0 <= column <= self.shape[1] and 0 <= row <= self.shape[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """The landing site in a raster."""
+
+    column: float
+    """Column."""
+    row: float
+    """Row."""
+    latitude_deg: float
+    """Latitude, degrees."""
+    longitude_deg: float
+    """Longitude, degrees, -180 to 180."""
+
+
+def site_in(path: Path, raster: RasterMap, known: np.ndarray, config: ElevationConfig) -> Site:
+    """The site that a configuration states, or the raster's middle.
+
+    Raises UserError if a stated site is outside the raster or in a hole (`known` (rows, columns) is false), and if the
+    raster's map is not one of the Moon.
+    """
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    pixel, degrees = config.site_px, config.site_deg
+    try:
+        if degrees is not None:
+            latitude, longitude = degrees[0], degrees[1] - 360 if degrees[1] > 180 else degrees[1]
+            column, row = _place_of(raster, latitude, longitude)
+            _refuse_outside(path, raster, column, row, f"latitude {latitude:g}, longitude {longitude:g}", "deg")
+        else:
+            column, row = raster.middle if pixel is None else pixel
+            _refuse_outside(path, raster, column, row, f"column {column:g}, row {row:g}", "px")
+            latitude, longitude = (float(v[0]) for v in raster.selenographic([column], [row]))
+    except (RasterioError, CPLE_BaseError) as error:
+        raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
+    if pixel is not None or degrees is not None:
+        _refuse_hole(path, raster, known, column, row)
+    return Site(column, row, latitude, longitude)
+
+
+def _place_of(raster: RasterMap, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+    """Raster coordinates of a place, NaN if the raster's projection does not reach it."""
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        column, row = raster.places(np.array([latitude_deg]), np.array([longitude_deg]))
+    except (RasterioError, CPLE_BaseError):  # GDAL's own errors are not wrapped here
+        return np.nan, np.nan
+    return float(column[0]), float(row[0])
+
+
+def _refuse_outside(path: Path, raster: RasterMap, column: float, row: float, found: str, unit: str) -> None:
+    if raster.covers(column, row):
+        return
+    rows, columns = raster.shape
+    if unit == "px":
+        expected = f"column 0 to {columns}, row 0 to {rows}"
+    else:
+        # A lattice, since a raster about a pole has its extreme latitude inside.
+        lattice = np.meshgrid(np.linspace(0, columns, 65), np.linspace(0, rows, 65))
+        latitude, longitude = raster.selenographic(*(each.ravel() for each in lattice))
+        middle = raster.selenographic([raster.middle[0]], [raster.middle[1]])[1][0]
+        east = middle + (longitude - middle + 180) % 360 - 180
+        expected = (
+            f"a place in the raster: latitude {latitude.min():.6g} to {latitude.max():.6g}, "
+            f"longitude {east.min():.6g} to {east.max():.6g}"
+        )
+    raise UserError(path, f"{_FIELD}_*_{unit}", found, expected)
+
+
+def _refuse_hole(path: Path, raster: RasterMap, known: np.ndarray, column: float, row: float) -> None:
+    i, j = min(int(row), raster.shape[0] - 1), min(int(column), raster.shape[1] - 1)
+    if known[i, j]:
+        return
+    rows, columns = np.nonzero(known)
+    k = int(np.argmin((rows - i) ** 2 + (columns - j) ** 2))
+    near = columns[k] + 0.5, rows[k] + 0.5
+    latitude, longitude = raster.selenographic([near[0]], [near[1]])
+    raise UserError(
+        path,
+        _FIELD,
+        f"column {column:.1f}, row {row:.1f}, which has no height",
+        f"a pixel with a height; the nearest is column {near[0]}, row {near[1]} "
+        f"(latitude {latitude[0]:.6f}, longitude {longitude[0]:.6f})",
+    )
