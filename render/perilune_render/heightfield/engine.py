@@ -21,8 +21,6 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array
 
-_FAR_M = 100_000.0
-"""Depth beyond which nothing is rendered, metres: that of the camera in Blender."""
 _RAYS_AT_ONCE = 8192
 
 
@@ -50,6 +48,7 @@ class HeightfieldEngine:
         self.surface = surface if surface is not None else surface_of(scene)
         self._law, self._samples = config.light.photometry, config.render.samples
         self._disc_rad = np.radians(config.light.sun_angular_diameter_deg) / 2
+        self._far_m = scene.grid.farthest_m
         self._centres = camera.pixel_centres().reshape(-1, 2)
         self._threads = ThreadPoolExecutor(n_threads, "rays")
 
@@ -108,7 +107,8 @@ class HeightfieldEngine:
         suns /= np.linalg.norm(suns, axis=1, keepdims=True)
         depth, normal = np.empty(n), np.empty((n, 3))
         angles, lit = np.empty((n, 4)), np.empty(n)
-        see(self.surface.ground, self.surface.rocks, origin, rays, suns, self.sun, _FAR_M, depth, normal, angles, lit)
+        ground, rocks = self.surface.ground, self.surface.rocks
+        see(ground, rocks, origin, rays, suns, self.sun, self._far_m, depth, normal, angles, lit)
         mu0, mu, cos_phase, albedo = angles.astype(np.float32).T
         seen = reflectance_factor(self._law, mu0, mu, cos_phase) * albedo * lit.astype(np.float32)
         return depth, normal, seen

@@ -95,7 +95,7 @@ def expose(
     if config.psf_sigma_px > 0:
         kernel = psf_kernel(config.psf_sigma_px)
         light = cv2.sepFilter2D(light, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
-    exposure_s = exposure_time_s(light, config)
+    exposure_s = exposure_time_s(_on_ground(light, radiance.depth_m, camera, exr_camera), config)
     way_m = np.asarray(velocity_camera_mps) * exposure_s
     if config.motion_blur and _fastest_px(radiance.depth_m, camera, exr_camera, way_m) >= _LEAST_MOTION_PX:
         depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
@@ -154,8 +154,17 @@ def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.n
     return np.clip(mean, 0, largest), np.sqrt(np.float32(per_e**2) * variance_e2 + np.float32(1 / 12))
 
 
+def _on_ground(light: np.ndarray, depth_m: np.ndarray, camera: Camera, exr_camera: Camera) -> np.ndarray:
+    """The values of an image (h, w) without those of the sky, whose depth is infinite; all of it if all is sky."""
+    hit = np.isfinite(depth_m)
+    if hit.all() or not hit.any():
+        return light
+    ground = resample_nearest(hit, camera, exr_camera)
+    return light[ground] if ground.any() else light
+
+
 def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
-    """Exposure time, seconds, for a radiance factor (h, w).
+    """Exposure time, seconds, for the radiance factor of pixels (...).
 
     Automatic exposure brings `exposure_percentile` to the grey value `exposure_level`, but to no more than that share
     of the full well, and is limited to `longest_exposure_s`.

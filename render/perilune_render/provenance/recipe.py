@@ -46,6 +46,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
             del plain[name]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]
+    if config.scene is not None and not config.scene.horizon:
+        del plain["scene"]["horizon"]
     if not config.shared_terrain:
         del plain[_OTHER[kind]]
     return plain

@@ -127,7 +127,8 @@ def crater_masks(
         visible = None
         if depth_m is not None:
             slack_m = max(SLACK_RADII * radius, SLACK_PX * centre[2] / camera.fx_px)
-            visible = amodal & (depth_m[y0:y1, x0:x1] >= np.where(amodal, plane_m, np.inf) - slack_m)
+            depth = depth_m[y0:y1, x0:x1]
+            visible = amodal & np.isfinite(depth) & (depth >= np.where(amodal, plane_m, np.inf) - slack_m)
         masks.append(CraterMask(int(crater_id), int(y0), int(x0), amodal, visible))
     return masks
 
