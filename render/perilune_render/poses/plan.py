@@ -159,7 +159,10 @@ def _flight(poses: GivenPoses, rows: np.ndarray) -> Flight:
     duration = float(time[-1])
     speed = (position[-1] - position[0]) / duration if duration > 0 else np.zeros(3)
     nominal = NominalTrajectory(_three(position[0]), _three(speed), (0.0, 0.0, 0.0), duration or 1.0)
-    return Flight(nominal, time, position, poses.velocity_mps[rows], poses.rotation_wxyz[rows])
+    turn = None if poses.angular_velocity_radps is None else poses.angular_velocity_radps[rows]
+    return Flight(
+        nominal, time, position, poses.velocity_mps[rows], poses.rotation_wxyz[rows], angular_velocity_radps=turn
+    )
 
 
 def _three(values: Array) -> tuple[float, float, float]:
