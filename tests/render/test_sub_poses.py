@@ -190,9 +190,9 @@ def test_the_command_records_the_turn_and_the_manifest_gives_the_same_bytes(tmp_
     frame_id = labels["frame_id"].iloc[-1]
     labels = labels[labels["frame_id"] == frame_id]
     for mask, label in zip(frame_masks(made, frame_id, labels["crater_id"].tolist()), labels.itertuples(), strict=True):
-        rows, _ = np.nonzero(mask.amodal)
+        inside, _ = np.nonzero(mask.amodal)
         if mask.row > 0 and mask.row + len(mask.amodal) < 48:
-            assert abs(mask.row + rows.mean() + 0.5 - label.ellipse_cy_px) < 0.5
+            assert abs(mask.row + inside.mean() + 0.5 - label.ellipse_cy_px) < 0.5
     done = in_process.call(main, "regenerate", "--manifest", tmp_path / "out", "--verify", "--all")
     assert done.returncode == 0 and "2 frames: 2 identical" in done.stdout
     done = in_process.call(main, "dataset", "--manifest", tmp_path / "out", "--out", tmp_path / "again", "--workers", 0)
