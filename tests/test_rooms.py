@@ -16,8 +16,8 @@ ROOMS = {
     ),
     "render/perilune_render": (
         "processor config_values config_terrain config_survey config_counterfactual config_scene config streams "
-        "provenance terrain flight poses imaging labels frame_source blender heightfield engines dataset preview "
-        "server jobs cli"
+        "provenance terrain flight poses imaging labels sub_poses frame_source blender heightfield engines dataset "
+        "preview server jobs cli"
     ),
     "render/perilune_render/cli": "options dataset frames spice serve status survey counterfactual main",
     "render/perilune_render/terrain": (

@@ -214,6 +214,11 @@ class SensorConfig(Section):
     """Standard deviation of the point spread function, a discrete Gaussian, pixels; 0 for none."""
     motion_blur: bool = True
     """Whether the camera's motion during the exposure blurs the frame."""
+    blur_poses: Annotated[int, Field(ge=1, le=256)] = 1
+    """Number of poses during the exposure that are rendered and averaged: exact blur, at so many times the cost. With 1
+    one rendering is blurred by the motion of each pixel in the image."""
+    row_time_s: NotNegative = 0.0
+    """Time from the exposure of a row to that of the next (rolling shutter), seconds; 0 exposes all rows at once."""
 
     @model_validator(mode="after")
     def _above_black(self) -> "SensorConfig":

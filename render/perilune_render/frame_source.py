@@ -8,7 +8,7 @@
 The engine renders the radiance. Sensor, labels, contrast and crater index are the same for all engines.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -16,16 +16,18 @@ import numpy as np
 from perilune_render.config import DatasetConfig, LabelsConfig, SensorConfig
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.resampling import seen_by
-from perilune_render.imaging.sensor import Exposure, FixedPattern, expected, expose, read_out
+from perilune_render.imaging.sensor import Exposure, FixedPattern, expected, expose, read_out, time_of_exposure_s
 from perilune_render.labels.frame_labels import Labels, RimCircles, Shown, crater_index, label_frame, with_contrast
 from perilune_render.streams import derived_seed, stream
+from perilune_render.sub_poses import Pose, RowPoses, moved, row_times_s, sensor_rows
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.rolling_shutter import Moving
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Pose, velocity and random seed of one frame."""
+    """Pose, velocity and random seed of one frame. The pose is that of the middle of its middle row's exposure."""
 
     position_m: Array
     """Position of the camera, O_L, metres (3,)."""
@@ -39,6 +41,8 @@ class Shot:
     """Index of the frame in the sequence. Frames that differ in seed or index have independent noise."""
     approach_deg: int = 0
     """Direction from which the trajectory comes (`NominalTrajectory.approach_deg`); used only for ground in levels."""
+    angular_velocity_radps: Array = field(default_factory=lambda: np.zeros(3))
+    """Angular velocity of the camera, O_C, radians per second (3,)."""
 
     @property
     def pose(self) -> tuple[Array, Array]:
@@ -49,6 +53,17 @@ class Shot:
     def render_seed(self) -> int:
         """Random seed of the engine's samples."""
         return derived_seed(self.seed, "frame", self.index)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moves or turns."""
+        return bool(np.any(self.velocity_mps) or np.any(self.angular_velocity_radps))
+
+    def pose_at(self, time_s: float) -> Pose:
+        """Position and rotation some time after the middle of the exposure of the middle row, seconds."""
+        if time_s == 0:
+            return self.pose
+        return moved(self.pose, self.velocity_mps, self.angular_velocity_radps, time_s)
 
 
 class Engine(Protocol):
@@ -64,6 +79,9 @@ class Engine(Protocol):
 
     def render(self, position_m: Array, rotation_camera_from_site: Array, seed: int, approach_deg: int) -> Radiance:
         """The rendering, in the pixels of `camera`, at a position (3,), O_L, metres, with a rotation matrix (3, 3)."""
+
+    def render_rows(self, poses: RowPoses, seed: int, approach_deg: int) -> Radiance:
+        """The rendering with a pose for each row of the sensor (rolling shutter)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,13 +131,35 @@ class FrameSource:
         return self.develop(shot, self.render(shot))
 
     def render(self, shot: Shot) -> Radiance:
-        """The engine's rendering of a shot, in the pixels of its camera. Raises what the engine raises."""
-        return self.engine.render(*shot.pose, shot.render_seed, shot.approach_deg)
+        """The engine's rendering of a shot, in the pixels of its camera. Raises what the engine raises.
+
+        If the sensor has several poses in an exposure and the camera moves, it is also rendered at these.
+        """
+        middle = self._render_at(shot, 0.0, shot.render_seed)
+        n = self.sensor.blur_poses
+        if not (self.sensor.motion_blur and n > 1 and shot.moves):
+            return middle
+        exposure_s = time_of_exposure_s(middle, self.sensor, self.camera, self.engine.camera)
+        total = np.zeros(middle.radiance_factor.shape)
+        for k in range(n):
+            seed = derived_seed(shot.render_seed, "exposure", k)
+            total += self._render_at(shot, ((k + 0.5) / n - 0.5) * exposure_s, seed).radiance_factor
+        return replace(middle, blurred=(total / n).astype(np.float32))
+
+    def _render_at(self, shot: Shot, time_s: float, seed: int) -> Radiance:
+        """The rendering of a shot at a time of its exposure, seconds from its middle, with the shutter's row times."""
+        if not (self.sensor.row_time_s and shot.moves):
+            return self.engine.render(*shot.pose_at(time_s), seed, shot.approach_deg)
+        times_s = row_times_s(self.camera.height_px, self.sensor.row_time_s)
+        rows = sensor_rows(self.camera, self.engine.camera)
+        poses = RowPoses(rows, times_s, lambda t: shot.pose_at(time_s + t))
+        return self.engine.render_rows(poses, seed, shot.approach_deg)
 
     def develop(self, shot: Shot, radiance: Radiance) -> Frame:
         """Develop the rendering of a shot. Another thread may do this while the engine renders the next shot."""
         velocity = shot.rotation_camera_from_site @ shot.velocity_mps
-        exposure = expose(radiance, self.sensor, self.camera, self.engine.camera, velocity)
+        turn = shot.angular_velocity_radps
+        exposure = expose(radiance, self.sensor, self.camera, self.engine.camera, velocity, turn)
         noise = stream(shot.seed, "sensor", shot.index)
         return Frame(shot, radiance, exposure, read_out(exposure, self.sensor, self.pattern, noise))
 
@@ -127,13 +167,26 @@ class FrameSource:
         """Labels of a frame, in the pixels of its image."""
         seen = seen_by(frame.radiance, self.camera, self.engine.camera)
         limits = self.bounds.bounds_px(self.camera.width_px)
-        return self.with_contrast(label_frame(self.circles, self.camera, *frame.shot.pose, seen, *limits), frame)
+        circles = self._seen_circles(frame.shot)
+        return self.with_contrast(label_frame(circles, self.camera, *frame.shot.pose, seen, *limits), frame)
 
     def with_contrast(self, labels: Labels, frame: Frame) -> Labels:
         """Labels of a frame with their contrast in its exposure."""
         shown = Shown(*expected(frame.exposure, self.sensor), self.engine.sun)
-        return with_contrast(labels, self.circles, self.camera, *frame.shot.pose, shown)
+        return with_contrast(labels, self._seen_circles(frame.shot), self.camera, *frame.shot.pose, shown)
 
     def crater_index(self, frame: Frame) -> np.ndarray:
         """Id of the smallest crater in each pixel of the frame's radiance (h, w) float32, -1 for none."""
-        return crater_index(self.circles, self.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
+        circles = self._seen_circles(frame.shot)
+        return crater_index(circles, self.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
+
+    def _seen_circles(self, shot: Shot) -> RimCircles:
+        """The rims moved to where the pose of the shot sees them as the row of each one's centre does."""
+        if not (self.sensor.row_time_s and shot.moves):
+            return self.circles
+        moving = Moving(*(each[None] for each in (*shot.pose, shot.velocity_mps, shot.angular_velocity_radps)))
+        time = moving.row_times_s(self.circles.centre_m, self.camera, self.sensor.row_time_s)
+        position, rotation = shot.pose
+        centre = moving.seen_at(self.circles.centre_m, time) @ rotation + position
+        normal = np.einsum("nij,nj->ni", moving.rotations_at(time), self.circles.normal) @ rotation
+        return replace(self.circles, centre_m=centre, normal=normal)

@@ -18,6 +18,7 @@ from perilune_render.blender import stage as blender_stage
 from perilune_render.config import DatasetConfig, LightConfig, RenderConfig
 from perilune_render.imaging.exr import read_exr
 from perilune_render.imaging.radiance import Radiance
+from perilune_render.sub_poses import RowPoses
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.level_ground import on_level
 from perilune_render.terrain.levels import Level, cut_levels, level_index
@@ -28,6 +29,8 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.interrupts import interrupts_held
 
 _FAR_M = 1e9
+BAND_PX = 0.2
+"""Largest motion of the image between two bands of rows with a pose each, pixels."""
 _LEAST_FREE_BYTES = 16_000_000
 _LIT = 1e-4
 """Sunlight above which a pixel counts as sunlit: shadows have none, and earthshine gives less."""
@@ -111,20 +114,55 @@ class Renderer:
         `approach_deg` is `Shot.approach_deg`. Raises OSError if Blender wrote no readable frame, and RuntimeError if
         the Renderer is closed.
         """
+        with self._rendering(float(position_m[2]), approach_deg) as path:
+            blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
+            return self._through(path, seed)
+
+    def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
+        """Render one frame with a rolling shutter, by bands of rows that have one pose each.
+
+        There are as many bands as let the image move by at most BAND_PX between two of them, and at most one for each
+        row. Depth is along the axis at the band's pose. Raises what `render` raises.
+        """
+        middle = poses.pose_at(0.0)
+        with self._rendering(float(middle[0][2]), approach_deg) as path:
+            blender_stage.aim(self.stage, *middle)
+            with one_ray_a_pixel(self.stage):
+                whole = render_through(path, self.stage, seed)
+            motion_px = poses.motion_px(whole.depth_m, self.camera)
+            for pixels, pose in poses.bands(min(int(motion_px / BAND_PX) + 1, len(poses.time_s))):
+                rows = np.flatnonzero(pixels.any(axis=1))
+                if not len(rows):
+                    continue
+                first, last = int(rows[0]), int(rows[-1]) + 1
+                blender_stage.aim(self.stage, *pose)
+                with rows_only(self.stage, first, last, self.camera.height_px):
+                    band = self._through(path, seed)
+                own = pixels[first:last]
+                for name in ("radiance_factor", "depth_m", "normal", "sunlit"):
+                    getattr(whole, name)[first:last][own] = getattr(band, name)[own]
+            return whole
+
+    def _through(self, path: Path, seed: int) -> Radiance:
+        """Render the stage as it is."""
+        radiance = render_through(path, self.stage, seed)
+        if not self._exact:
+            return radiance
+        with one_ray_a_pixel(self.stage):
+            centre = render_through(path, self.stage, seed)
+        return replace(radiance, depth_m=centre.depth_m, normal=centre.normal)
+
+    @contextlib.contextmanager
+    def _rendering(self, z_m: float, approach_deg: int) -> Iterator[Path]:
+        """Show the level for a height, and yield the path of the EXR; a failed write becomes an OSError."""
         if self not in _open:
             raise RuntimeError("this Renderer is closed")
         if self._in_levels and self._scene.view is not None:
-            self._show_level(self._scene.view, approach_deg, float(position_m[2]))
-        blender_stage.aim(self.stage, position_m, rotation_camera_from_site)
+            self._show_level(self._scene.view, approach_deg, z_m)
         path = Path(self._folder.name) / "frame.exr"
         try:
             with interrupts_held():
-                radiance = render_through(path, self.stage, seed)
-                if not self._exact:
-                    return radiance
-                with one_ray_a_pixel(self.stage):
-                    centre = render_through(path, self.stage, seed)
-                return replace(radiance, depth_m=centre.depth_m, normal=centre.normal)
+                yield path
         except (UserError, RuntimeError) as error:
             # Blender reports a failed write only in its log; the file is then missing or truncated.
             full = shutil.disk_usage(path.parent).free < _LEAST_FREE_BYTES
@@ -139,6 +177,19 @@ def render_through(path: Path, stage: bpy.types.Scene, seed: int) -> Radiance:
     with quiet():
         bpy.ops.render.render(write_still=True)
     return _radiance(path)
+
+
+@contextlib.contextmanager
+def rows_only(stage: bpy.types.Scene, first: int, last: int, n_rows: int) -> Iterator[None]:
+    """Configure a stage to render rows `first` to `last` (excluded) of `n_rows`, counted from the top."""
+    render = stage.render
+    render.use_border = render.use_crop_to_border = True
+    render.border_min_x, render.border_max_x = 0.0, 1.0
+    render.border_min_y, render.border_max_y = 1 - last / n_rows, 1 - first / n_rows
+    try:
+        yield
+    finally:
+        render.use_border = render.use_crop_to_border = False
 
 
 @contextlib.contextmanager

@@ -31,6 +31,7 @@ def clear() -> bpy.types.Scene:
 def build(scene: Scene, config: DatasetConfig, camera: Camera, sun: Array) -> bpy.types.Scene:
     """Build a scene with its Sun in the direction `sun` (3,) of O_L; the camera is placed by `aim`."""
     stage = sunlit_stage(config.light, camera, sun)
+    stage.camera.data.clip_end = scene.grid.farthest_m
     ground = ground_object(scene)
     ground.data.materials.append(surface_material("ground", config.light.photometry, sun, albedo_attribute="albedo"))
     stage.collection.objects.link(ground)

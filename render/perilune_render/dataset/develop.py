@@ -25,6 +25,7 @@ from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.provenance.recipe import recorded_settings, settings_of
 from perilune_render.provenance.versions import imaging_versions
+from perilune_render.sub_poses import RowPoses
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
@@ -61,6 +62,10 @@ class Renderings:
         """Read the rendering of a random seed. Raises UserError if the file is damaged or of another size."""
         with local_exr(self.store, self.paths[seed]) as path:
             return read_radiance(path, (self.camera.width_px, self.camera.height_px))
+
+    def render_rows(self, poses: RowPoses, seed: int, approach_deg: int = 0) -> Radiance:
+        """Read the rendering of a random seed, whose rows have their own poses already."""
+        return self.render(*poses.pose_at(0.0), seed, approach_deg)
 
 
 def develop_dataset(
@@ -157,6 +162,13 @@ def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...
             first_difference(fixed_before, fixed_after),
             "changes to dataset.sensor and dataset.camera only; other changes need a new rendering",
         )
+    for name, rendered in (("row_time_s", before.sensor.row_time_s), ("blur_poses", 1)):
+        if getattr(after.sensor, name) != rendered:
+            expected = f"{rendered:g}, since an EXR has no other poses"
+            raise UserError("--set or --config", f"dataset.sensor.{name}", getattr(after.sensor, name), expected)
+    if before.sensor.row_time_s and before.camera != after.camera:
+        expected = "the camera of the EXRs, whose rows have their own poses"
+        raise UserError("--set or --config", "dataset.camera", "another camera", expected)
     return after
 
 

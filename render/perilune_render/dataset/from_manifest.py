@@ -21,12 +21,14 @@ from perilune_render.flight.view import view_of
 from perilune_render.provenance.recipe import config_of, recipe_of, same_source
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 from perilune_shared.storage.files import sha256_of
 
 _SAME_M = 1e-6
 """Largest difference of a recorded position from the same draw, metres: rounding on another processor."""
+_TURN = "angular_velocity_radps"
 _OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "rotation_wxyz")
 
 
@@ -99,7 +101,7 @@ class Recorded(Sequence[TrajectoryPlan]):
         keys = ["scene_id", "trajectory_id"]
         trajectories = manifest.table("trajectories").sort_by([(key, "ascending") for key in keys])
         trajectories = trajectories.filter(pc.is_in(trajectories["scene_id"], pa.array(scene_ids, pa.string())))
-        frames = manifest.table("frames", [*keys, *_OF_FRAMES])
+        frames = manifest.table("frames", [*keys, *_OF_FRAMES, *ANGULAR_VELOCITY])
         names, of_frames = (
             pc.binary_join_element_wise(*(table[key] for key in keys), "/") for table in (trajectories, frames)
         )
@@ -107,6 +109,9 @@ class Recorded(Sequence[TrajectoryPlan]):
         order = np.lexsort((frames["frame_index"].to_numpy(), place))[np.count_nonzero(place < 0) :]
         first = np.concatenate([[0], np.cumsum(np.bincount(place[order], minlength=len(names)))])
         columns = {name: _values(frames[name])[order] for name in _OF_FRAMES}
+        turn = [frames[name] for name in ANGULAR_VELOCITY]
+        if any(each.null_count < len(each) for each in turn):
+            columns[_TURN] = np.stack([pc.fill_null(each, 0.0).to_numpy() for each in turn], axis=1)[order]
         return cls(trajectories.to_pylist(), first, columns, settings)
 
     def __len__(self) -> int:
@@ -144,7 +149,7 @@ def _flight(row: dict[str, Any], columns: dict[str, np.ndarray], settings: Fligh
     if motion is not None and not _passes(motion, columns):
         motion = None
     time, path, speed, rotation = (columns[name] for name in ("time_s", "position_m", "velocity_mps", "rotation_wxyz"))
-    return Flight(nominal, time, path, speed, rotation, motion)
+    return Flight(nominal, time, path, speed, rotation, motion, columns.get(_TURN))
 
 
 def _passes(motion: Motion, columns: dict[str, np.ndarray]) -> bool:

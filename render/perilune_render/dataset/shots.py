@@ -6,12 +6,14 @@ import numpy as np
 
 from perilune_render.flight.plan import TrajectoryPlan
 from perilune_render.frame_source import Shot
+from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.geometry.frames import matrix_from_quaternion
 
 
 def planned_shot(trajectory: TrajectoryPlan, place: int) -> Shot:
     """The shot of the frame at index `place` of a planned trajectory's frames."""
     flight = trajectory.flight
+    turn = flight.angular_velocity_radps
     return Shot(
         flight.position_m[place],
         flight.rotation_camera_from_site[place],
@@ -19,6 +21,7 @@ def planned_shot(trajectory: TrajectoryPlan, place: int) -> Shot:
         trajectory.seed,
         trajectory.frame_index[place],
         flight.nominal.approach_deg,
+        np.zeros(3) if turn is None else turn[place],
     )
 
 
@@ -31,4 +34,5 @@ def recorded_shot(row: dict[str, Any], trajectory_seed: int, approach_deg: int =
         trajectory_seed,
         row["frame_index"],
         approach_deg,
+        np.array([row.get(name) or 0.0 for name in ANGULAR_VELOCITY]),
     )

@@ -12,7 +12,7 @@ from perilune_render.labels.frame_labels import Labels
 from perilune_render.terrain.craters.population import ORIGINS
 from perilune_render.terrain.scene import Scene
 from perilune_shared.content import content_sha256
-from perilune_shared.dataset.schema import TABLES, complete
+from perilune_shared.dataset.schema import ANGULAR_VELOCITY, TABLES, complete
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, selenographic_from_site
 
@@ -135,6 +135,8 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
         "sun_direction": _vectors(np.tile(sun, (n, 1))),
         "real_ground_share": [row.get("real_ground_share") for row in files],
     }
+    if flight.angular_velocity_radps is not None:
+        columns |= dict(zip(ANGULAR_VELOCITY, flight.angular_velocity_radps.T, strict=True))
     return _table("frames", columns | {name: [row.get(name) for row in files] for name in (*_FILES, *_OF_LABELS)})
 
 

@@ -1,4 +1,7 @@
-"""Check the poses of a plan against the ground: the camera is above it, and frames show nothing but ground."""
+"""Check the poses of a plan against the ground: the camera is above it, and frames show nothing but ground.
+
+Views of a ground up to the horizon may show the sky, but must show ground too.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +14,7 @@ from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.curvature import hits_sphere, horizon_m
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 LEAST_CLEARANCE_M = 1.0
@@ -43,7 +47,7 @@ class Poses:
 
 
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
-    """Make the checks that need no terrain heights: the Sun is up, poses are over the mesh, no horizon is in view.
+    """Make the checks that need no terrain heights: the Sun is up, poses are over the mesh, ground is in view.
 
     Poses are checked in the first scenes, up to about _CHECKED_FRAMES; `check_poses` checks those of each other scene
     when its ground is known. Raises UserError with `where` (the configuration or the manifest) and the first scene or
@@ -55,7 +59,7 @@ def check_plan(plan: Plan, grid: Grid, where: object) -> None:
             raise UserError(where, f"{scene.scene_id}: sun_elevation_deg", found, "above 0 (the horizon), at most 90")
     n_checked = 0
     for trajectory in plan.trajectories:
-        _check_mesh(Poses.planned([trajectory]), plan.exr_camera, grid, where)
+        _check_mesh(Poses.planned([trajectory]), plan.exr_camera, grid, where, horizon=plan.view.horizon)
         n_checked += len(trajectory.splits)
         if n_checked >= _CHECKED_FRAMES:
             break
@@ -65,10 +69,12 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
     """Check poses against the ground of a scene.
 
     The camera must be at least LEAST_CLEARANCE_M above the ground, and the ray through every tested point of the image
-    border must hit the mesh. A ray that starts above the ground hits the mesh if and only if it is below the mesh's
-    edge where it leaves the mesh's square. Raises UserError with `where` and the first frame that fails.
+    border must hit the mesh, unless the scene's views may show the sky. A ray that starts above the ground hits the
+    mesh if and only if it is below the mesh's edge where it leaves the mesh's square. Raises UserError with `where` and
+    the first frame that fails.
     """
-    rays = _check_mesh(poses, camera, scene.grid, where)
+    horizon = scene.view is not None and scene.view.horizon
+    rays = _check_mesh(poses, camera, scene.grid, where, horizon=horizon)
     x, y, z = poses.position_m.T
     ground = value_at(scene.height_m, scene.grid, x, y)
     _refuse(
@@ -78,6 +84,8 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
         lambda n: f"a camera {z[n] - ground[n]:.1f} m above the ground",
         lambda n: f"at least {LEAST_CLEARANCE_M:g} m: position_m[2] at least {ground[n] + LEAST_CLEARANCE_M:.1f}",
     )
+    if horizon:
+        return
     edge, leaves_x, leaves_y = _leaving(poses.position_m, rays, scene.grid.extent_m / 2)
     beyond = edge > value_at(scene.height_m, scene.grid, leaves_x, leaves_y)
     _refuse(
@@ -89,8 +97,11 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
     )
 
 
-def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object) -> Array:
-    """Check that poses are over the mesh and look down; returns rays (N, S, 3), O_L, through S image border points."""
+def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object, *, horizon: bool) -> Array:
+    """Check that poses are over the mesh and show ground alone, or with `horizon` some ground.
+
+    Returns rays (N, S, 3), O_L, through S image border points.
+    """
     position, rotation = poses.position_m, poses.rotation_wxyz
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= _UNIT_TOLERANCE
     _refuse(
@@ -110,6 +121,9 @@ def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object) -> Arra
     )
     matrices = matrix_from_quaternion(rotation)
     rays = np.einsum("nji,sj->nsi", matrices, camera.rays(_edge_points(camera)))
+    if horizon:
+        _check_horizon(poses, camera, matrices, half, where)
+        return rays
     off_nadir = np.degrees(np.arccos(np.clip(-matrices[:, 2, 2], -1, 1)))
     _refuse(
         (rays[..., 2] >= 0).any(axis=1),
@@ -119,6 +133,24 @@ def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object) -> Arra
         lambda n: "a view of the ground alone",
     )
     return rays
+
+
+def _check_horizon(poses: Poses, camera: Camera, matrices: Array, half_m: float, where: object) -> None:
+    """Check that the ground reaches the horizon of each pose and that some of it is in view: not only sky."""
+    position = poses.position_m
+    farthest = np.abs(position[:, :2]).max(axis=1) + horizon_m(np.maximum(position[:, 2], 0))
+    _refuse(
+        farthest > half_m,
+        poses,
+        where,
+        lambda n: f"a horizon {farthest[n]:.0f} m from the site, beyond the terrain's edge",
+        lambda n: f"at most {half_m:.0f} m: a last view of dataset.scene.views as high as the camera, and as far",
+    )
+    share = (np.arange(2 * _POINTS_PER_SIDE) + 0.5) / (2 * _POINTS_PER_SIDE)
+    u, v = share * camera.width_px, share * camera.height_px
+    points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    in_view = hits_sphere(position, np.einsum("nji,sj->nsi", matrices, camera.rays(points))).any(axis=1)
+    _refuse(~in_view, poses, where, lambda n: "a view of the sky alone", lambda n: "some ground in view")
 
 
 def _edge_points(camera: Camera) -> Array:

@@ -26,6 +26,8 @@ class Flight:
     """rotation_camera_from_site as unit quaternions (N, 4), as stored in the manifest."""
     motion: Motion | None = None
     """The motion between the frames; None if it is not known."""
+    angular_velocity_radps: Array | None = None
+    """Angular velocity of the camera, O_C, radians per second (N, 3); None for none during a frame."""
 
     @property
     def rotation_camera_from_site(self) -> Array:

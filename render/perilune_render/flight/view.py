@@ -7,11 +7,15 @@ from perilune_render.config_scene import SceneConfig
 from perilune_render.terrain.envelope import SeenGround, ViewEnvelope
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.curvature import horizon_m
 from perilune_shared.geometry.frames import Array
 
 _N_ALTITUDES = 400
 _N_HEIGHTS = 100
 _WIDEST_RAD = np.radians(80)
+_N_DISTANCES, _N_PLACES = 200, 1000
+_HILL_M = 64.0
+"""Height of the largest hills that the relief and the craters of default settings make, metres."""
 
 
 def view_of(config: DatasetConfig, camera: Camera, kind: str) -> ViewEnvelope:
@@ -29,7 +33,23 @@ def scene_view(scene: SceneConfig, camera: Camera) -> ViewEnvelope:
     if not scene.views:
         raise UserError("configuration", "dataset.scene.views", "none", "at least one height_m with its reach_m")
     height, reach = (np.array([getattr(view, name) for view in scene.views]) for name in ("height_m", "reach_m"))
-    return ViewEnvelope(height, reach, max(camera.fx_px, camera.fy_px))
+    focal_px = max(camera.fx_px, camera.fy_px)
+    if scene.horizon:
+        return ViewEnvelope(*_up_to_horizon(height, reach), focal_px, horizon=True)
+    return ViewEnvelope(height, reach, focal_px)
+
+
+def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
+    """Smallest distance from a camera to ground at each distance from the site, up to the horizon: both (M,), metres.
+
+    Cameras at the distance `reach_m[i]` from the site are at `height_m[i]` or above, with linear interpolation.
+    Beyond the horizon of the highest camera there is ground up to the place where a hill of _HILL_M is hidden.
+    """
+    edge = reach_m[-1] + float(horizon_m(height_m[-1]) + horizon_m(_HILL_M))
+    distance = np.union1d(np.geomspace(min(height_m[0], reach_m[0]), edge, _N_DISTANCES), reach_m)
+    camera = np.linspace(0, reach_m[-1], _N_PLACES)
+    away = np.hypot(np.interp(camera, reach_m, height_m), np.maximum(distance[:, None] - camera, 0))
+    return np.maximum.accumulate(away.min(axis=1)), distance
 
 
 def view_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:

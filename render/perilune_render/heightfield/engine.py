@@ -15,14 +15,13 @@ from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.imaging.photometry import reflectance_factor
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.streams import stream
+from perilune_render.sub_poses import Pose, RowPoses
 from perilune_render.terrain.scene import Scene
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array
 
-_FAR_M = 100_000.0
-"""Depth beyond which nothing is rendered, metres: that of the camera in Blender."""
 _RAYS_AT_ONCE = 8192
 
 
@@ -50,6 +49,7 @@ class HeightfieldEngine:
         self.surface = surface if surface is not None else surface_of(scene)
         self._law, self._samples = config.light.photometry, config.render.samples
         self._disc_rad = np.radians(config.light.sun_angular_diameter_deg) / 2
+        self._far_m = scene.grid.farthest_m
         self._centres = camera.pixel_centres().reshape(-1, 2)
         self._threads = ThreadPoolExecutor(n_threads, "rays")
 
@@ -70,22 +70,33 @@ class HeightfieldEngine:
 
         The first sample of a pixel is at its centre. `approach_deg` is not used: the ground is one mesh.
         """
+        everything = slice(0, len(self._centres))
+        return self._render([(everything, (position_m, rotation_camera_from_site))], seed)
+
+    def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
+        """Render one frame with a pose for each row of the sensor; a depth is along the axis at its row's pose."""
+        bands = poses.bands(len(poses.time_s))
+        return self._render([(np.flatnonzero(pixels), pose) for pixels, pose in bands if pixels.any()], seed)
+
+    def _render(self, bands: list[tuple[slice | np.ndarray, Pose]], seed: int) -> Radiance:
+        """Render one frame of which each band of pixels, by their indices, has its own pose."""
         n_pixels = len(self._centres)
         rng = stream(seed, "rays")
         moved = rng.random((self._samples, n_pixels, 2), np.float32) - np.float32(0.5)
         moved[0] = 0.0
         disc = rng.random((self._samples, n_pixels, 2), np.float32)
-        origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
         parts = [
-            (sample, slice(first, min(first + _RAYS_AT_ONCE, n_pixels)))
+            (sample, pixels[first : first + _RAYS_AT_ONCE], pose)
             for sample in range(self._samples)
-            for first in range(0, n_pixels, _RAYS_AT_ONCE)
+            for pixels, pose in ((np.arange(n_pixels)[band], pose) for band, pose in bands)
+            for first in range(0, len(pixels), _RAYS_AT_ONCE)
         ]
         radiance = np.zeros((self._samples, n_pixels), np.float32)
         depth, normal = np.empty(n_pixels, np.float32), np.empty((n_pixels, 3), np.float32)
 
-        def cast(part: tuple[int, slice]) -> None:
-            sample, pixels = part
+        def cast(part: tuple[int, np.ndarray, Pose]) -> None:
+            sample, pixels, (position_m, rotation_camera_from_site) = part
+            origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
             rays = self.camera.rays(self._centres[pixels] + moved[sample, pixels]) @ rotation_camera_from_site
             own_depth, own_normal, seen = self._see(origin, np.ascontiguousarray(rays), disc[sample, pixels])
             radiance[sample, pixels] = seen
@@ -108,7 +119,8 @@ class HeightfieldEngine:
         suns /= np.linalg.norm(suns, axis=1, keepdims=True)
         depth, normal = np.empty(n), np.empty((n, 3))
         angles, lit = np.empty((n, 4)), np.empty(n)
-        see(self.surface.ground, self.surface.rocks, origin, rays, suns, self.sun, _FAR_M, depth, normal, angles, lit)
+        ground, rocks = self.surface.ground, self.surface.rocks
+        see(ground, rocks, origin, rays, suns, self.sun, self._far_m, depth, normal, angles, lit)
         mu0, mu, cos_phase, albedo = angles.astype(np.float32).T
         seen = reflectance_factor(self._law, mu0, mu, cos_phase) * albedo * lit.astype(np.float32)
         return depth, normal, seen

@@ -19,3 +19,5 @@ class Radiance:
     ray through the pixel's centre, else the mean direction over the pixel's samples."""
     sunlit: np.ndarray
     """Whether the pixel is sunlit (h, w) bool."""
+    blurred: np.ndarray | None = None
+    """Mean radiance factor over the exposure (h, w) float32, if several poses were rendered; not in an EXR."""

@@ -40,7 +40,8 @@ def seen_by(radiance: Radiance, camera: Camera, source: Camera) -> Radiance:
     if camera == source:
         return radiance
     images = {field.name: getattr(radiance, field.name) for field in fields(radiance)}
-    return replace(radiance, **{name: resample_nearest(image, camera, source) for name, image in images.items()})
+    seen = {name: resample_nearest(each, camera, source) for name, each in images.items() if each is not None}
+    return replace(radiance, **seen)
 
 
 def refined(camera: Camera, n: int) -> Camera:

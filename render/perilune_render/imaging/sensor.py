@@ -84,23 +84,44 @@ def develop(
 
 
 def expose(
-    radiance: Radiance, config: SensorConfig, camera: Camera, exr_camera: Camera, velocity_camera_mps: Array
+    radiance: Radiance,
+    config: SensorConfig,
+    camera: Camera,
+    exr_camera: Camera,
+    velocity_camera_mps: Array,
+    angular_velocity_radps: Array | None = None,
 ) -> Exposure:
     """The light on the sensor of `camera`: resampling, point spread, exposure time, motion blur, in this order.
 
     `radiance` is the rendering by `exr_camera` at the middle of the exposure. `velocity_camera_mps` (3,) is the
-    velocity of the camera in its own axes O_C.
+    velocity of the camera in its own axes O_C, `angular_velocity_radps` (3,) its angular velocity there, None for none.
     """
-    light = np.maximum(resample(radiance.radiance_factor.astype(np.float32, copy=False), camera, exr_camera), 0)
+    light = _on_sensor(radiance.radiance_factor, config, camera, exr_camera)
+    exposure_s = exposure_time_s(_on_ground(light, radiance.depth_m, camera, exr_camera), config)
+    if radiance.blurred is not None:
+        return Exposure(_on_sensor(radiance.blurred, config, camera, exr_camera), exposure_s)
+    way_m = np.asarray(velocity_camera_mps) * exposure_s
+    turn_rad = np.zeros(3) if angular_velocity_radps is None else angular_velocity_radps * exposure_s
+    fastest_px = _fastest_px(radiance.depth_m, camera, exr_camera, way_m, turn_rad)
+    if config.motion_blur and fastest_px >= _LEAST_MOTION_PX:
+        depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
+        light = _blurred(light, motion_px(depth_m, camera, way_m, turn_rad))
+    return Exposure(light, exposure_s)
+
+
+def time_of_exposure_s(radiance: Radiance, config: SensorConfig, camera: Camera, exr_camera: Camera) -> float:
+    """Exposure time of `expose`, seconds."""
+    light = _on_sensor(radiance.radiance_factor, config, camera, exr_camera)
+    return exposure_time_s(_on_ground(light, radiance.depth_m, camera, exr_camera), config)
+
+
+def _on_sensor(factor: np.ndarray, config: SensorConfig, camera: Camera, exr_camera: Camera) -> np.ndarray:
+    """Radiance factor (h, w) in the pixels of `camera`, after the point spread."""
+    light = np.maximum(resample(factor.astype(np.float32, copy=False), camera, exr_camera), 0)
     if config.psf_sigma_px > 0:
         kernel = psf_kernel(config.psf_sigma_px)
         light = cv2.sepFilter2D(light, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
-    exposure_s = exposure_time_s(light, config)
-    way_m = np.asarray(velocity_camera_mps) * exposure_s
-    if config.motion_blur and _fastest_px(radiance.depth_m, camera, exr_camera, way_m) >= _LEAST_MOTION_PX:
-        depth_m = resample_nearest(radiance.depth_m, camera, exr_camera)
-        light = _blurred(light, motion_px(depth_m, camera, way_m))
-    return Exposure(light, exposure_s)
+    return light
 
 
 @lru_cache(maxsize=4)
@@ -154,8 +175,17 @@ def expected(exposure: Exposure, config: SensorConfig) -> tuple[np.ndarray, np.n
     return np.clip(mean, 0, largest), np.sqrt(np.float32(per_e**2) * variance_e2 + np.float32(1 / 12))
 
 
+def _on_ground(light: np.ndarray, depth_m: np.ndarray, camera: Camera, exr_camera: Camera) -> np.ndarray:
+    """The values of an image (h, w) without those of the sky, whose depth is infinite; all of it if all is sky."""
+    hit = np.isfinite(depth_m)
+    if hit.all() or not hit.any():
+        return light
+    ground = resample_nearest(hit, camera, exr_camera)
+    return light[ground] if ground.any() else light
+
+
 def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
-    """Exposure time, seconds, for a radiance factor (h, w).
+    """Exposure time, seconds, for the radiance factor of pixels (...).
 
     Automatic exposure brings `exposure_percentile` to the grey value `exposure_level`, but to no more than that share
     of the full well, and is limited to `longest_exposure_s`.
@@ -168,15 +198,19 @@ def exposure_time_s(light: np.ndarray, config: SensorConfig) -> float:
     return min(share * config.full_well_e / max(rate, 1e-30), config.longest_exposure_s)
 
 
-def motion_px(depth_m: np.ndarray, camera: Camera, way_camera_m: Array) -> np.ndarray:
+def motion_px(
+    depth_m: np.ndarray, camera: Camera, way_camera_m: Array, turn_rad: Array | tuple[float, ...] = (0.0, 0.0, 0.0)
+) -> np.ndarray:
     """Motion in the image, pixels (h, w, 2) float32, of the ground at a depth (h, w) along the axis, metres.
 
-    The camera moves by `way_camera_m` (3,) in its own axes O_C, without rotation. To first order in the ratio of motion
-    to depth; 0 where nothing is hit.
+    The camera moves by `way_camera_m` (3,) in its own axes O_C and turns by the rotation vector `turn_rad` (3,) there.
+    To first order in turn and in the ratio of motion to depth; where nothing is hit only the rotation counts.
     """
     rays = _rays(camera)
     way = np.asarray(way_camera_m, np.float32)
     move = (rays * way[2] - way[:2]) / depth_m[..., None]
+    if np.any(turn_rad):
+        move += _turned(rays, np.asarray(turn_rad, np.float32))
     if not any(camera.distortion):
         return move * np.array([camera.fx_px, camera.fy_px], np.float32)
     moved = np.concatenate([rays + move, np.ones_like(depth_m)[..., None]], axis=-1)
@@ -185,12 +219,21 @@ def motion_px(depth_m: np.ndarray, camera: Camera, way_camera_m: Array) -> np.nd
     return np.nan_to_num(camera.project(moved) - camera.project(start)).astype(np.float32)
 
 
-def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, way_camera_m: Array) -> float:
+def _turned(rays: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
+    """Motion (h, w, 2) of rays (h, w, 2), both divided by z, if the camera turns by `turn_rad` (3,): -turn x ray."""
+    x, y = rays[..., 0], rays[..., 1]
+    a, b, c = turn_rad
+    along = a * y - b * x
+    return np.stack([x * along - b + c * y, y * along + a - c * x], axis=-1)
+
+
+def _fastest_px(depth_m: np.ndarray, camera: Camera, pinhole: Camera, way_camera_m: Array, turn_rad: Array) -> float:
     """Approximate upper bound on the motion of any pixel of `camera`, pixels; `pinhole` covers its view."""
     corners = [[u, v] for u in (0, pinhole.width_px) for v in (0, pinhole.height_px)]
     widest = np.linalg.norm(pinhole.rays(corners), axis=-1).max()
     nearest_m = max(float(depth_m.min()), 1e-9)
-    return float(np.linalg.norm(way_camera_m) / nearest_m * widest * max(camera.fx_px, camera.fy_px) * _STRETCH)
+    share = np.linalg.norm(way_camera_m) / nearest_m + np.linalg.norm(turn_rad) * widest
+    return float(share * widest * max(camera.fx_px, camera.fy_px) * _STRETCH)
 
 
 @lru_cache(maxsize=4)

@@ -167,7 +167,7 @@ def _visible_fraction(
 
     The label circle is plane and the real rim is rough, so a point of the circle may be below the ground. It counts as
     hidden only if the ground in front of it is nearer by more than SLACK_RADII radii and by more than SLACK_PX pixel
-    widths.
+    widths. A point on a pixel of the sky, beyond the horizon, is hidden.
     """
     if not len(rows):
         return np.empty(0)
@@ -179,7 +179,8 @@ def _visible_fraction(
     column = np.where(inside, pixels[..., 0], 0).astype(int)
     row = np.where(inside, pixels[..., 1], 0).astype(int)
     slack = np.maximum(SLACK_RADII * radii, SLACK_PX * points[:, 0, 2] / camera.fx_px)
-    return (inside & (points[..., 2] <= depth_m[row, column] + slack[:, None])).mean(axis=1)
+    depth = depth_m[row, column]
+    return (inside & np.isfinite(depth) & (points[..., 2] <= depth + slack[:, None])).mean(axis=1)
 
 
 def crater_index(
@@ -193,7 +194,8 @@ def crater_index(
 
     The interior is the disc within the rim. It is visible where the ground, at `depth_m` (h, w) metres along the axis,
     is not nearer than the disc's plane by more than SLACK_RADII radii and SLACK_PX pixel widths; without depth all of
-    it is visible. Every crater at least a pixel wide counts, also those without a label. `camera` has no distortion.
+    it is visible. Pixels of the sky, whose depth is infinite, are -1. Every crater at least a pixel wide counts, also
+    those without a label. `camera` has no distortion.
     """
     in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
     candidate = _reaching_in(camera, in_camera, circles.radius_m)
@@ -201,7 +203,10 @@ def crater_index(
     centres, radii = in_camera[candidate], circles.radius_m[candidate]
     normals = circles.normal[candidate] @ rotation_camera_from_site.T
     boxes = project_circles(camera, centres, normals, radii).bounding_boxes()
-    return smallest_crater(circles.crater_id[candidate], centres, normals, radii, boxes, camera, depth_m)
+    image = smallest_crater(circles.crater_id[candidate], centres, normals, radii, boxes, camera, depth_m)
+    if depth_m is not None:
+        image[~np.isfinite(depth_m)] = -1
+    return image
 
 
 def _reaching_in(camera: Camera, centre_m: Array, radius_m: Array) -> np.ndarray:

@@ -34,6 +34,7 @@ FRAMES = {
 """Columns of the position in each frame."""
 _TIME, _ROTATION = ("time_s",), ("qw", "qx", "qy", "qz")
 _VELOCITY, _SUN = ("vx_mps", "vy_mps", "vz_mps"), ("sun_azimuth_deg", "sun_elevation_deg")
+_TURN = ("wx_radps", "wy_radps", "wz_radps")
 _TRAJECTORY = "trajectory"
 _TUM = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 _DIRECTIONS = ("camera_from_site", "site_from_camera")
@@ -62,6 +63,8 @@ class GivenPoses:
     """Azimuth, clockwise from north, and elevation of the Sun, degrees (N, 2); None if the file has none."""
     trajectory: np.ndarray
     """Number of the trajectory of each frame, from 0, not descending (N,)."""
+    angular_velocity_radps: Array | None = None
+    """Angular velocity of the camera, O_C, radians per second (N, 3); None if the file has none."""
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -71,7 +74,8 @@ class GivenPoses:
         """SHA-256 of all values, hexadecimal."""
         digest = hashlib.sha256()
         sun = np.empty((0, 2)) if self.sun_deg is None else self.sun_deg
-        for values in (self.time_s, self.position_m, self.rotation_wxyz, self.velocity_mps, sun, self.trajectory):
+        turn = np.empty((0, 3)) if self.angular_velocity_radps is None else self.angular_velocity_radps
+        for values in (self.time_s, self.position_m, self.rotation_wxyz, self.velocity_mps, sun, self.trajectory, turn):
             digest.update(np.ascontiguousarray(values, np.float64).tobytes())
         return digest.hexdigest()
 
@@ -206,18 +210,19 @@ def _checked(source: _Source, latitude_deg: float, longitude_deg: float) -> Give
     if sun is not None:
         low = (sun[:, 1] <= 0) | (sun[:, 1] > 90)
         source.refuse(low, _SUN[1], lambda row: f"{sun[row, 1]:g}", "above 0 (the horizon), at most 90 degrees")
-    return GivenPoses(time, place, _unit_quaternions(source), velocity, sun, trajectory)
+    turn = source.numbers(_TURN) if _TURN[0] in table else None
+    return GivenPoses(time, place, _unit_quaternions(source), velocity, sun, trajectory, turn)
 
 
 def _check_columns(path: Path, found: list[str], names: tuple[str, ...]) -> None:
     """Raises UserError for a column that is missing, unknown, given twice, or without the others of its group."""
-    known = (*names, *_VELOCITY, *_SUN, _TRAJECTORY)
+    known = (*names, *_VELOCITY, *_TURN, *_SUN, _TRAJECTORY)
     for name in found:
         if name not in known:
             raise UserError(path, "column", name, nearest(name, known))
         if found.count(name) > 1:
             raise UserError(path, "column", f"{name} twice", "each column once")
-    for group in (names, _VELOCITY, _SUN):
+    for group in (names, _VELOCITY, _TURN, _SUN):
         missing = [name for name in group if name not in found]
         if missing and (group is names or len(missing) < len(group)):
             raise UserError(path, "column", f"no {missing[0]}", f"the columns {', '.join(group)}")

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from perilune_render.config import DatasetConfig
-from perilune_render.config_scene import SceneConfig, ViewConfig
+from perilune_render.config_scene import HIGHEST_M, SceneConfig, ViewConfig
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import scene_view
@@ -44,8 +44,8 @@ def views_of(poses: GivenPoses, camera: Camera, where: object) -> tuple[ViewConf
     The ground is taken to be at most a tenth of a camera's height above or below the plane z = 0. Raises UserError for
     a pose that is not above the plane or that shows the horizon.
     """
+    _check_above(poses, where)
     height = poses.position_m[:, 2]
-    _refuse(height <= 0, poses, where, lambda n: f"z {height[n]:.1f} m", "above 0, the height of the site")
     corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
     rays = np.einsum("nji,sj->nsi", matrix_from_quaternion(poses.rotation_wxyz), corners)
     _refuse(
@@ -53,19 +53,44 @@ def views_of(poses: GivenPoses, camera: Camera, where: object) -> tuple[ViewConf
         poses,
         where,
         lambda n: "a view with the horizon",
-        "a view of the ground alone; state dataset.scene.views for others",
+        "a view of the ground alone; state dataset.scene.views for others, or dataset.scene.horizon=true for the sky",
     )
     lowest = -0.1 * height[:, None, None]
     way = (lowest - poses.position_m[:, None, 2:]) / rays[..., 2:]
     reach = _WIDER * np.abs(poses.position_m[:, None, :2] + way * rays[..., :2]).max(axis=(1, 2))
-    edges = np.geomspace(_LOWER * height.min(), _LOWER * height.max() * 1.001, _N_VIEWS + 1)
+    return tuple(_views(height, reach))
+
+
+def horizon_views_of(poses: GivenPoses, where: object) -> tuple[ViewConfig, ...]:
+    """Views with horizon that hold all poses, rounded to three digits; the last one has the height of the highest pose.
+
+    The ground is taken to be at most a tenth of a camera's height above the plane z = 0. Raises UserError for a pose
+    that is not above the plane, or higher than HIGHEST_M.
+    """
+    _check_above(poses, where)
+    height = poses.position_m[:, 2]
+    _refuse(height > HIGHEST_M, poses, where, lambda n: f"z {height[n]:.0f} m", f"at most {HIGHEST_M:g} m with horizon")
+    away = np.abs(poses.position_m[:, :2]).max(axis=1)
+    found = _views(height, np.maximum(_WIDER * away, 0.1 * height))
+    highest = min(_rounded(height.max(), np.ceil), HIGHEST_M)
+    return (*found, ViewConfig(height_m=highest, reach_m=found[-1].reach_m))
+
+
+def _views(height_m: Array, reach_m: Array) -> list[ViewConfig]:
+    """Views that hold cameras at heights (N,) with reaches (N,), both in metres."""
+    edges = np.geomspace(_LOWER * height_m.min(), _LOWER * height_m.max() * 1.001, _N_VIEWS + 1)
     found: list[ViewConfig] = []
     for low, high in pairwise(edges):
-        farthest = _rounded(reach[_LOWER * height <= high].max(), np.ceil)
+        farthest = _rounded(reach_m[_LOWER * height_m <= high].max(), np.ceil)
         lowest_m = _rounded(low, np.floor)
         if not found or (farthest > found[-1].reach_m and lowest_m > found[-1].height_m):
             found.append(ViewConfig(height_m=lowest_m, reach_m=farthest))
-    return tuple(found)
+    return found
+
+
+def _check_above(poses: GivenPoses, where: object) -> None:
+    height = poses.position_m[:, 2]
+    _refuse(height <= 0, poses, where, lambda n: f"z {height[n]:.1f} m", "above 0, the height of the site")
 
 
 def _rounded(value: float, towards) -> float:
@@ -83,7 +108,7 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     scene = config.scene or SceneConfig()
     camera = camera_of(config.camera)
     pinhole = camera.covering_pinhole()
-    views = scene.views or views_of(poses, pinhole, where)
+    views = scene.views or (horizon_views_of(poses, where) if scene.horizon else views_of(poses, pinhole, where))
     scene = scene.model_copy(update={"views": views, "poses_sha256": poses.sha256})
     suns, lit_by = _suns(poses, scene)
     if len(suns) > _MOST_SCENES:
@@ -134,7 +159,10 @@ def _flight(poses: GivenPoses, rows: np.ndarray) -> Flight:
     duration = float(time[-1])
     speed = (position[-1] - position[0]) / duration if duration > 0 else np.zeros(3)
     nominal = NominalTrajectory(_three(position[0]), _three(speed), (0.0, 0.0, 0.0), duration or 1.0)
-    return Flight(nominal, time, position, poses.velocity_mps[rows], poses.rotation_wxyz[rows])
+    turn = None if poses.angular_velocity_radps is None else poses.angular_velocity_radps[rows]
+    return Flight(
+        nominal, time, position, poses.velocity_mps[rows], poses.rotation_wxyz[rows], angular_velocity_radps=turn
+    )
 
 
 def _three(values: Array) -> tuple[float, float, float]:

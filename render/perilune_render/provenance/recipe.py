@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from perilune_render.config import DatasetConfig
+from perilune_render.config import DatasetConfig, SensorConfig
 from perilune_render.config_terrain import SITE_FIELDS
 from perilune_render.provenance.versions import all_versions, ground_versions
 from perilune_shared.config import resolve_over
@@ -16,6 +16,8 @@ _FILES = ("dem", "catalogue")
 _SPEED = ("threads", "cache_gib")
 DEFAULT_ENGINE = "cycles"
 """Not recorded, so that recipes of older versions stay equal."""
+_SINCE = ("blur_poses", "row_time_s")
+"""Settings of the sensor that are recorded only if they are not the defaults, for the same reason."""
 _OPTIONAL = ("scene", "survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
@@ -50,6 +52,11 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
             del plain["terrain"]["elevation"][name]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]
+    for name in _SINCE:
+        if plain["sensor"][name] == SensorConfig.model_fields[name].default:
+            del plain["sensor"][name]
+    if config.scene is not None and not config.scene.horizon:
+        del plain["scene"]["horizon"]
     if not config.shared_terrain:
         del plain[_OTHER[kind]]
     return plain

@@ -9,7 +9,12 @@ from perilune_render import processor
 from perilune_render.provenance.fingerprint import fingerprint
 
 _SETTINGS = "perilune_render.processor:SETTINGS"
-GROUND = (_SETTINGS, "perilune_render.flight.view:view_envelope", "perilune_render.terrain.scene:grow_scene")
+GROUND = (
+    _SETTINGS,
+    "perilune_render.flight.view:view_envelope",
+    "perilune_render.flight.view:scene_view",
+    "perilune_render.terrain.scene:grow_scene",
+)
 """Code that generates ground, craters and boulders."""
 RENDERING = (_SETTINGS, "perilune_render.flight.plan:make_plan", "perilune_render.blender.renderer:Renderer")
 """Code that plans trajectories and renders radiance."""

@@ -54,6 +54,8 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
         "seed": seed,
         "removed": list(config.removed_from(seed)),
     }
+    if view.horizon:
+        content["horizon"] = True
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

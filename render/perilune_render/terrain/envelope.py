@@ -38,19 +38,21 @@ class SeenGround:
 class ViewEnvelope:
     """The views that a scene's mesh is made for: they determine its extent and vertex spacing.
 
-    Ground at the distance `reach_m[i]` from the site is never seen from less than `height_m[i]` above it; in between,
-    the height is interpolated linearly. Ground beyond the last reach is never seen. The envelope of a flight is
+    Ground at the distance `reach_m[i]` from the site is never seen from less than `height_m[i]` away; in between, the
+    value is interpolated linearly. Ground beyond the last reach is never seen. The envelope of a flight is
     `perilune_render.flight.view.view_envelope`. Raises ValueError if a column is not finite, positive and ascending.
     """
 
     height_m: Array
-    """Lowest height of the camera above the ground in view, ascending, metres (N,)."""
+    """Smallest distance of the camera from the ground in view, mostly its height, ascending, metres (N,)."""
     reach_m: Array
     """Distance max(|x|, |y|) of that ground from the site, not descending, metres (N,)."""
     focal_px: float
     """Largest focal length of the camera, pixels: a pixel shows at least height / focal_px metres of ground."""
     seen: SeenGround | None = None
     """The ground in view by the camera's height, from which levels are cut; None allows one mesh only."""
+    horizon: bool = False
+    """Whether views may show the sky: the ground is then curved (`perilune_shared.geometry.curvature`)."""
 
     def __post_init__(self) -> None:
         columns = np.array([self.height_m, self.reach_m])

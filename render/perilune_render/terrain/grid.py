@@ -52,6 +52,11 @@ class Grid:
         return 2 * (float(self.half_widths_m[-1]) - self.off_site_m)
 
     @property
+    def farthest_m(self) -> float:
+        """Depth beyond which nothing is rendered, metres: 100 km, and more over wider ground."""
+        return max(100_000.0, 2 * float(self.half_widths_m[-1]))
+
+    @property
     def n_vertices(self) -> int:
         """Number of vertices."""
         return (2 * self.n_half + 1) ** 2 + 8 * self.n_half * (len(self.half_widths_m) - 1)
@@ -114,17 +119,26 @@ def graded_grid(terrain: TerrainConfig, view: ViewEnvelope) -> Grid:
 
     It may have more vertices than `terrain.max_vertices` (`perilune_render.terrain.levels`).
     """
-    return grid_of(view.reach_m, terrain.spacing_px * view.height_m / view.focal_px)
+    return grid_of(view.reach_m, terrain.spacing_px * view.height_m / view.focal_px, far=view.horizon)
 
 
-def grid_of(reach_m: Array, spacing_m: Array, centre_m: tuple[float, float] = (0.0, 0.0), edge_m: float = 0.0) -> Grid:
+def grid_of(
+    reach_m: Array,
+    spacing_m: Array,
+    centre_m: tuple[float, float] = (0.0, 0.0),
+    edge_m: float = 0.0,
+    *,
+    far: bool = False,
+) -> Grid:
     """The grid whose spacing, metres, is at most `spacing_m` (N,) up to the distances `reach_m` (N,) from its centre.
 
-    Both are ascending. Beyond the last reach the spacing grows by FAR_GROWTH per metre up to `edge_m`.
+    Both are ascending. Beyond the last reach the spacing grows by FAR_GROWTH per metre up to `edge_m`. `far`: the
+    reach is up to thousands of times the inner square, so distances are divided evenly in their logarithm.
     """
     n_half = int(np.ceil((reach_m / spacing_m).max()))
     inner = min(n_half * spacing_m[0], reach_m[-1])
-    distance = np.linspace(inner, max(reach_m[-1], inner + spacing_m[0]), 20_000)
+    divided = np.geomspace if far else np.linspace
+    distance = divided(inner, max(reach_m[-1], inner + spacing_m[0]), 20_000)
     allowed = np.interp(distance, reach_m, spacing_m)
     if edge_m > distance[-1]:
         n_spacings = (edge_m - distance[-1]) / allowed[-1]

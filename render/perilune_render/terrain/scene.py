@@ -21,6 +21,7 @@ from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.levels import check_levels
 from perilune_render.terrain.relief import check_waves
+from perilune_shared.geometry.curvature import drop_m
 from perilune_shared.geometry.frames import Array
 from perilune_shared.progress import say
 
@@ -43,7 +44,7 @@ class Scene:
     grid: Grid
     """Positions of the vertices."""
     height_m: np.ndarray
-    """Heights of the vertices (n_vertices,) float32, metres; the site is at 0."""
+    """Heights of the vertices above the plane of O_L (n_vertices,) float32, metres; the site is at 0."""
     albedo: np.ndarray
     """Factor on the reflectance (n_vertices,) float32, about 1."""
     craters: Craters
@@ -110,6 +111,8 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
         sag[n_real:] = np.where(near(craters.x_m, craters.y_m, places)[n_real:], again.sag_m[visible], sag[n_real:])
     base.add_waves(grid, terrain.relief, seed, 0.0, _ROUGHNESS_M)
     height -= _at_site(height, grid) - raised_m
+    if view.horizon:
+        height -= drop_m(*grid.vertices_xy())
     boulders = draw_boulders(terrain.boulders, grid, craters, seed, removed)
     kept = np.delete(np.arange(len(craters)), removed)
     craters, sag = craters.chosen(kept), sag[kept]

@@ -185,6 +185,13 @@ class DatasetInfo(_Info):
         (recipe,) = self.recipes.values()
         return recipe
 
+    def row_time_s(self, recipe: object) -> float:
+        """Return the row time of the rolling shutter in a recipe, given by its key, seconds; 0 if it has none."""
+        found = self.recipes.get(str(recipe))
+        sensor = found.config.get("sensor") if found is not None else None
+        value = sensor.get("row_time_s", 0.0) if isinstance(sensor, dict) else 0.0
+        return float(value) if isinstance(value, int | float) and 0 <= value < 1e3 else 0.0
+
     def changed(self, line: str, **fields: Any) -> "DatasetInfo":
         """Return a copy with fields replaced and a line added to the history."""
         plain = "".join(c if c.isprintable() and c not in "<>&`$" else "?" for c in line)[:500]

@@ -40,6 +40,8 @@ _SCENE = _column("scene_id", _TEXT, "", "the terrain")
 _TRAJECTORY = _column("trajectory_id", _TEXT, "", "the descent within its scene")
 _FRAME = _column("frame_id", _TEXT, "", "scene_id/trajectory_id/frame_index with 6 digits")
 _SPLIT = "train, val or test"
+ANGULAR_VELOCITY = ("wx_radps", "wy_radps", "wz_radps")
+"""Columns of the camera's angular velocity in `frames`: lists that may be null cannot be read from Parquet."""
 
 TABLES: dict[str, pa.Schema] = {
     "scenes": _table(
@@ -137,6 +139,16 @@ TABLES: dict[str, pa.Schema] = {
             "craters with their centre in the image that are too large for a label; null where not known",
             nullable=True,
         ),
+        *(
+            _column(
+                name,
+                _REAL,
+                "rad/s",
+                f"angular velocity of the camera about its {name[1]} axis, O_C; null for 0",
+                nullable=True,
+            )
+            for name in ANGULAR_VELOCITY
+        ),
     ),
     "labels": _table(
         "labels",
@@ -184,7 +196,7 @@ TABLES: dict[str, pa.Schema] = {
 }
 OPTIONAL_TABLES = ("inertial", "ranges")
 """Tables that a dataset has only if they have rows: they were added without a new schema version."""
-_ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius")
+_ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius", *ANGULAR_VELOCITY)
 MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {"frames": _ABSENT_IN_FRAMES, "shards": _ABSENT_IN_FRAMES}
 """Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
 writers always write them. To add one, append a column with `nullable=True` to its table and add its name here."""

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.names import ImageKind
+from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
+from perilune_shared.geometry.rolling_shutter import Moving
 
 SLACK_RADII, SLACK_PX = 0.1, 2.0
 """Tolerance of the depth test: in crater radii and in pixel widths at the crater; the larger of both applies."""
@@ -66,7 +68,7 @@ def frame_masks(
     a depth of another size.
     """
     scene_id, trajectory_id = [*frame_id.split("/"), ""][:2]
-    columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz"]
+    columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz", "velocity_mps", *ANGULAR_VELOCITY]
     frames = dataset.table("frames", columns, scene_id, trajectory_id).to_pandas()
     frame = frames[frames["frame_id"] == frame_id]
     if len(frame) != 1:
@@ -88,8 +90,19 @@ def frame_masks(
         if image == "png" and camera != exr_camera:
             depth_m = _resampled(depth_m, camera, exr_camera)
     rotation = matrix_from_quaternion(pose["rotation_wxyz"])
-    centres = camera_from_site(rows[["x_m", "y_m", "z_m"]].to_numpy(np.float64), pose["position_m"], rotation)
-    normals = rows[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float64) @ rotation.T
+    points = rows[["x_m", "y_m", "z_m"]].to_numpy(np.float64)
+    centres = camera_from_site(points, pose["position_m"], rotation)
+    normals = rows[["normal_x", "normal_y", "normal_z"]].to_numpy(np.float64)
+    recipe = dataset.table("scenes", ["recipe"], scene_id=pose["scene_id"])["recipe"][0].as_py()
+    row_s = dataset.info.row_time_s(recipe)
+    if row_s:
+        speeds = pose["velocity_mps"], np.nan_to_num(pose[list(ANGULAR_VELOCITY)].to_numpy(np.float64))
+        moving = Moving(*(np.asarray(each, np.float64)[None] for each in (pose["position_m"], rotation, *speeds)))
+        time = moving.row_times_s(points, camera, row_s)
+        centres, turned = moving.seen_at(points, time), moving.rotations_at(time)
+        normals = np.einsum("nij,nj->ni", turned, normals)
+    else:
+        normals = normals @ rotation.T
     radii = rows["diameter_m"].to_numpy(np.float64) / 2
     return crater_masks(camera if image == "png" else exr_camera, crater_ids, centres, normals, radii, depth_m)
 
@@ -127,7 +140,8 @@ def crater_masks(
         visible = None
         if depth_m is not None:
             slack_m = max(SLACK_RADII * radius, SLACK_PX * centre[2] / camera.fx_px)
-            visible = amodal & (depth_m[y0:y1, x0:x1] >= np.where(amodal, plane_m, np.inf) - slack_m)
+            depth = depth_m[y0:y1, x0:x1]
+            visible = amodal & np.isfinite(depth) & (depth >= np.where(amodal, plane_m, np.inf) - slack_m)
         masks.append(CraterMask(int(crater_id), int(y0), int(x0), amodal, visible))
     return masks
 

@@ -7,8 +7,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.geometry.ellipse import Ellipses, project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion, sun_direction
+from perilune_shared.geometry.rolling_shutter import Moving
 from perilune_shared.validation.faults import Fault
 
 _LABEL_TOLERANCE_PX = 1e-6
@@ -36,7 +38,7 @@ def trajectory_faults(
     """
     yield from _frames(info, scene, trajectory, frames, where["frames"])
     if len(labels):
-        yield from _labels(info, craters, frames, labels, where)
+        yield from _labels(info, info.row_time_s(scene["recipe"]), craters, frames, labels, where)
 
 
 def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, where: str) -> Iterator[Fault]:
@@ -84,7 +86,12 @@ def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, 
 
 
 def _labels(
-    info: DatasetInfo, craters: pa.Table, frames: pa.Table, labels: pa.Table, places: dict[str, str]
+    info: DatasetInfo,
+    row_s: float,
+    craters: pa.Table,
+    frames: pa.Table,
+    labels: pa.Table,
+    places: dict[str, str],
 ) -> Iterator[Fault]:
     """Check the references of labels, and their ellipses against ellipses projected from crater and pose."""
     where = places["labels"]
@@ -104,7 +111,7 @@ def _labels(
     known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
     if not len(known):
         return
-    projected = _projected(info, craters, frames, crater_of[known], frame_of[known])
+    projected = _projected(info, row_s, craters, frames, crater_of[known], frame_of[known])
     size = 1 + projected["ellipse_a_px"]
     misfit = np.zeros(len(known), bool)
     for name, values in projected.items():
@@ -135,14 +142,28 @@ def _labels(
 
 
 def _projected(
-    info: DatasetInfo, craters: pa.Table, frames: pa.Table, crater_of: np.ndarray, frame_of: np.ndarray
+    info: DatasetInfo,
+    row_s: float,
+    craters: pa.Table,
+    frames: pa.Table,
+    crater_of: np.ndarray,
+    frame_of: np.ndarray,
 ) -> dict[str, Array]:
-    """Compute the geometric columns of labels, for row numbers (M,) in the tables craters and frames."""
+    """Compute the geometric columns of labels, for row numbers (M,) in the tables craters and frames.
+
+    With a rolling shutter of `row_s` seconds from row to row, a crater is seen from the pose of its centre's row.
+    """
     rotation = matrix_from_quaternion(_vectors(frames["rotation_wxyz"]))[frame_of]
     centre = np.stack([craters[f"{axis}_m"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
     normal = np.stack([craters[f"normal_{axis}"].to_numpy() for axis in "xyz"], axis=1)[crater_of]
-    offset = centre - _vectors(frames["position_m"])[frame_of]
-    in_camera = np.einsum("nij,nj->ni", rotation, offset)
+    position = _vectors(frames["position_m"])[frame_of]
+    if row_s:
+        turn = np.stack([pc.fill_null(frames[name], 0.0).to_numpy() for name in ANGULAR_VELOCITY], axis=1)
+        moving = Moving(position, rotation, _vectors(frames["velocity_mps"])[frame_of], turn[frame_of])
+        with np.errstate(all="ignore"):
+            time = moving.row_times_s(centre, info.camera.intrinsics(), row_s)
+            rotation, position = moving.rotations_at(time), position + time[:, None] * moving.velocity_mps
+    in_camera = np.einsum("nij,nj->ni", rotation, centre - position)
     normal_in_camera = np.einsum("nij,nj->ni", rotation, normal)
     radius = craters["diameter_m"].to_numpy()[crater_of] / 2
     valid = (np.abs(in_camera) < _FARTHEST_M).all(axis=1) & (np.abs(normal_in_camera) <= 2).all(axis=1)

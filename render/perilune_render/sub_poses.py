@@ -1,0 +1,67 @@
+"""Poses of the camera during one frame: while its rows are read out, and while it is exposed.
+
+The camera keeps its velocity in O_L and its angular velocity in O_C. Times are seconds from the middle of the exposure
+of the middle row, to which the pose of a frame refers.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
+
+Pose = tuple[Array, Array]
+"""Position of the camera, O_L, metres (3,), and rotation_camera_from_site (3, 3)."""
+_SKY_M = 1e9
+
+
+def moved(pose: Pose, velocity_mps: Array, angular_velocity_radps: Array, time_s: float) -> Pose:
+    """A pose some time later: velocity (3,) in O_L, angular velocity (3,) of the camera in O_C."""
+    position, rotation = pose
+    # The camera turns by w t in its own axes, so what it sees turns by -w t.
+    return position + time_s * velocity_mps, matrix_from_rotation_vector(-time_s * angular_velocity_radps) @ rotation
+
+
+@dataclass(frozen=True, slots=True)
+class RowPoses:
+    """Poses of the rows of one frame with a rolling shutter of N rows."""
+
+    row: np.ndarray
+    """Row of the sensor, from 0, that sees each pixel of the engine's camera (h, w) int64."""
+    time_s: Array
+    """Time of the middle of each row's exposure (N,)."""
+    pose_at: Callable[[float], Pose]
+    """Returns the pose at a time, seconds."""
+
+    def bands(self, n_bands: int) -> list[tuple[np.ndarray, Pose]]:
+        """Pixels (h, w) bool of each of `n_bands` bands of neighbouring rows, with the pose in the middle of each."""
+        band = np.arange(len(self.time_s)) * n_bands // len(self.time_s)
+        own = band[self.row]
+        return [(own == k, self.pose_at(float(self.time_s[band == k].mean()))) for k in range(n_bands)]
+
+    def motion_px(self, depth_m: np.ndarray, camera: Camera) -> float:
+        """Largest motion in the image of the engine's `camera` while all rows are read out, pixels.
+
+        depth_m (h, w) is that of the middle pose.
+        """
+        position, rotation = self.pose_at(0.0)
+        depth = np.where(np.isfinite(depth_m), depth_m, _SKY_M)[..., None]
+        points = (camera.rays(camera.pixel_centres()) * depth) @ rotation + position
+        first, last = (
+            camera.project(camera_from_site(points, *self.pose_at(float(self.time_s[end])))) for end in (0, -1)
+        )
+        return float(np.nan_to_num(np.linalg.norm(last - first, axis=-1)).max())
+
+
+def row_times_s(n_rows: int, row_time_s: float) -> Array:
+    """Time of the middle of each row's exposure (n_rows,), seconds; the mean of all is 0."""
+    return (np.arange(n_rows) + 0.5 - n_rows / 2) * row_time_s
+
+
+def sensor_rows(camera: Camera, exr_camera: Camera) -> np.ndarray:
+    """Row of `camera` that sees each pixel of `exr_camera` (h, w) int64; the nearest one outside its image."""
+    row = camera.project(exr_camera.rays(exr_camera.pixel_centres()))[..., 1]
+    # Far outside the image the distortion may fold back; those pixels are not used.
+    return np.clip(np.floor(np.nan_to_num(row)), 0, camera.height_px - 1).astype(np.int64)
