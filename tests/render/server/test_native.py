@@ -13,6 +13,7 @@ from tests.helpers import in_process
 
 from perilune_render.cli.main import main
 from perilune_render.server import native
+from perilune_render.server.grounds import Grounds
 from perilune_render.server.serve import Limits, Server
 from perilune_render.server.world import World
 from perilune_shared.client import SceneClient
@@ -30,7 +31,7 @@ class Running:
             connection.writer.close()
 
         async def other(ask, ready):
-            await native.serve_native("tcp://127.0.0.1:0", world, ask, ready)
+            await native.serve_native("tcp://127.0.0.1:0", Grounds(world), ask, ready)
 
         self.server = Server("127.0.0.1", 0, refuse, Limits(), lambda note: None, other)
         self.server.begin()
@@ -144,7 +145,7 @@ def test_frames_are_those_of_the_command_frames(tmp_path, world):
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        ({"request": "frames"}, "got frames, expected one of scene, frame, craters, heights"),
+        ({"request": "frames"}, "got frames, expected one of scene, ground, frame, craters, heights"),
         ({"request": "scene", "path": "/etc/passwd"}, "path"),
         ({"request": "frame", "position_m": [0, 0, 500]}, "rotation_wxyz"),
         ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 0, 0, 0]}, "length 0"),
