@@ -7,7 +7,8 @@
         print(frame.image.shape, len(frame.labels["crater_id"]))
 
 A request is one message of ZeroMQ: JSON. A reply is several: JSON, then the bytes of each array that it lists, in C
-order. Nothing else is sent, so other languages need a ZeroMQ and a JSON library alone.
+order. Nothing else is sent, so other languages need a ZeroMQ and a JSON library alone. A head with `"ready": false` and
+no arrays says that the scene of the request is being generated: send the request again.
 """
 
 import json

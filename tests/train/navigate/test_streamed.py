@@ -11,6 +11,7 @@ from tests.train.navigate.served import Served
 from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
+from perilune_train.data.frames import normalised
 from perilune_train.data.lost import DataLost
 from perilune_train.data.shares import ALONE
 from perilune_train.evaluation.provenance import TerrainUse, check_terrain, read_provenance
@@ -131,8 +132,9 @@ def test_scenes_change_after_their_pairs_and_a_share_is_rendered(served, dataset
     keys = part.keys(0)
     assert [part.is_rendered(key) for key in keys] == [False, False, False, True] * 2
     assert [part.scene_of(key) for key in keys if part.is_rendered(key)] == [1, 1]
-    plain = part[keys[0]]
-    assert (plain.first == np.stack([value.first for value in [super(type(part), part).__getitem__(keys[0])]])[0]).all()
+    _, _, number, start = keys[0]
+    frames = part.trajectories[number].images[start : start + 4]
+    assert (part[keys[0]].first == np.stack([normalised(frame) for frame in frames])).all()
     found.close()
     part.close()
 
@@ -175,6 +177,15 @@ def test_a_lost_server_ends_with_a_saved_state_that_resumes_to_the_same_weights(
         assert rendered == {"scene-0001", "scene-0002", "scene-0003"}
         assert {use.use for use in record.uses if use.dataset == "fresh (served)"} == {"trained"}
         assert check_terrain(record, open_dataset(dataset_nav)).status == "by protocol"
+
+
+def test_a_run_is_not_resumed_over_other_terrain(served, dataset):
+    stream = Stream(settings(served.address).stream, dataset)
+    stream.load_state_dict([[1, "fresh (served)", "scene-0001", "trained", "0" * 64, "fresh (served)"]])
+    found = sequences(stream, dataset)
+    with pytest.raises(DataLost, match=r"scene 1: got terrain [0-9a-f]{12} of fresh \(served\), expected 0{12} of"):
+        found[found.keys(0)[0]]
+    found.close()
 
 
 def test_terrain_of_a_held_out_scene_is_refused(served, dataset):

@@ -30,6 +30,7 @@ class Stream:
         self._held_out = split_terrain(dataset, "val", "selected") | split_terrain(dataset, "test", "tested")
         self._velocities = _velocities(dataset)
         self._uses: dict[int, TerrainUse] = {}
+        self._known: set[int] = set()
         self._lock = threading.Lock()
         with self.client() as client:
             self.served = client.scene()
@@ -86,21 +87,26 @@ class Stream:
         return replace(part, images=pixels, camera=camera)
 
     def _record(self, client: SceneClient, scene: int) -> None:
-        """Record the terrain of a scene before its first frame. Raises UserError if it is held out."""
-        with self._lock:
-            if scene in self._uses:
-                return
-        ground = client.ground(scene)
+        """Record the terrain of a scene before its first frame in this process.
+
+        Raises UserError if it is held out, or not that which the run used before.
+        """
+        if scene in self._known:
+            return
+        ground, where = client.ground(scene), self.settings.address
         if ground is None:
-            raise UserError(self.settings.address, f"scene {scene}", "none", "a scene of the server")
-        where = self.settings.address
+            raise UserError(where, f"scene {scene}", "none", "a scene of the server")
         use = served_terrain(where, ground.dataset, scene, ground.dem_source, ground.content_sha256)
         for other in sorted(self._held_out):
             if other.sha256 == use.sha256:
                 found = f"the terrain of {other.scene_id} of the dataset ({other.use})"
                 raise UserError(where, f"scene {scene}", found, "terrain of no validation or test scene")
         with self._lock:
-            self._uses[scene] = use
+            before = self._uses.setdefault(scene, use)
+        if before != use:
+            expected = f"{before.sha256[:12]} of {before.dataset}, as before: serve the same configuration"
+            raise UserError(where, f"scene {scene}", f"terrain {use.sha256[:12]} of {use.dataset}", expected)
+        self._known.add(scene)
 
     def _checked(self, image: np.ndarray) -> np.ndarray:
         size = (self.served.camera.height_px, self.served.camera.width_px)
