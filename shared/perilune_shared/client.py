@@ -7,10 +7,12 @@
         print(frame.image.shape, len(frame.labels["crater_id"]))
 
 A request is one message of ZeroMQ: JSON. A reply is several: JSON, then the bytes of each array that it lists, in C
-order. Nothing else is sent, so other languages need a ZeroMQ and a JSON library alone.
+order. Nothing else is sent, so other languages need a ZeroMQ and a JSON library alone. A head with `"ready": false` and
+no arrays says that the scene of the request is being generated: send the request again.
 """
 
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -32,6 +34,16 @@ CRATER_COLUMNS = (
 _TYPES = ("|u1", "<u2", "<f4", "<f8", "<i8")
 """Types of arrays that a reply may have."""
 _MOST_BYTES = 2_000_000_000
+_GROUND = {
+    "dataset": str,
+    "sun_azimuth_deg": float,
+    "sun_elevation_deg": float,
+    "dem_source": str,
+    "content_sha256": str,
+}
+_POLL_S = 0.2
+_GENERATION_S = 600.0
+"""Longest time to wait for a scene to be generated, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +77,24 @@ class ServedScene:
     """Azimuth of the Sun unless a request states another, clockwise from north, degrees."""
     sun_elevation_deg: float
     """Elevation of the Sun unless a request states another, degrees."""
+    n_scenes: int = 1
+    """Number of scenes, `perilune-render serve --scenes`; the other fields are those of scene 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServedGround:
+    """One of the scenes of a server."""
+
+    dataset: str
+    """Name of the server's configuration, `dataset.name`."""
+    sun_azimuth_deg: float
+    """Azimuth of the Sun unless a request states another, clockwise from north, degrees."""
+    sun_elevation_deg: float
+    """Elevation of the Sun unless a request states another, degrees."""
+    dem_source: str
+    """Name and SHA-256 of the elevation model, or 'procedural', as in the table `scenes` of a manifest."""
+    content_sha256: str
+    """Content hash of the terrain, as in the table `scenes` of a manifest."""
 
 
 class SceneClient:
@@ -109,7 +139,17 @@ class SceneClient:
         head, _ = self._ask({"request": "scene"})
         camera = dict(head["camera"])
         camera["distortion"] = tuple(camera["distortion"])
-        return ServedScene(**{**head["scene"], "camera": Camera(**camera)})
+        return ServedScene(**{**head["scene"], "camera": Camera(**camera), "n_scenes": head.get("n_scenes", 1)})
+
+    def ground(self, scene: int, *, wait: bool = True) -> ServedGround | None:
+        """What a scene is, once it is generated; without `wait`, None if it is not yet."""
+        head, _ = self._ask({"request": "ground", "scene": scene}, wait=wait)
+        if head.get("ready") is False:
+            return None
+        try:
+            return ServedGround(**{name: kind(head["ground"][name]) for name, kind in _GROUND.items()})
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(self.address, "ground", repr(error), "a reply of `perilune-render serve`") from None
 
     def frame(
         self,
@@ -121,12 +161,14 @@ class SceneClient:
         index: int | None = None,
         depth: bool = False,
         labels: bool = False,
+        scene: int = 0,
     ) -> ServedFrame:
         """Render a frame.
 
         `position_m` (3,) is in O_L, `rotation_wxyz` (4,) is rotation_camera_from_site as in a manifest, `velocity_mps`
         (3,), O_L, blurs the frame, `sun_deg` is azimuth and elevation of the Sun. `index` sets the noise; without it
-        each frame of this client has the next one. With `depth` the frame has depth and normals.
+        each frame of this client has the next one. With `depth` the frame has depth and normals. `scene` is the number
+        of the scene; one that is not in the server's memory is waited for.
         """
         if index is None:
             index, self._next_index = self._next_index, self._next_index + 1
@@ -138,24 +180,40 @@ class SceneClient:
             "index": index,
             "depth": depth,
             "labels": labels,
-        }
+        } | _of(scene)
         if sun_deg is not None:
             request["sun_deg"] = [float(value) for value in sun_deg]
         _, arrays = self._ask(request)
         columns = {name.partition(".")[2]: value for name, value in arrays.items() if name.startswith("labels.")}
         return ServedFrame(arrays["image"], arrays.get("depth_m"), arrays.get("normal"), columns if labels else None)
 
-    def craters(self) -> dict[str, np.ndarray]:
+    def craters(self, scene: int = 0) -> dict[str, np.ndarray]:
         """All craters of the ground: CRATER_COLUMNS, each (N,)."""
-        return self._ask({"request": "craters"})[1]
+        return self._ask({"request": "craters"} | _of(scene))[1]
 
-    def heights(self, x_m: Sequence[float] | Array, y_m: Sequence[float] | Array, *, boulders: bool = True) -> Array:
+    def heights(
+        self, x_m: Sequence[float] | Array, y_m: Sequence[float] | Array, *, boulders: bool = True, scene: int = 0
+    ) -> Array:
         """Heights (N,) of the surface at places (N,) of O_L, metres; NaN off the ground."""
         places = [[float(value) for value in values] for values in (x_m, y_m)]
         request = {"request": "heights", "x_m": places[0], "y_m": places[1], "boulders": boulders}
-        return self._ask(request)[1]["height_m"]
+        return self._ask(request | _of(scene))[1]["height_m"]
 
-    def _ask(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    def _ask(self, request: dict[str, Any], wait: bool = True) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Head and arrays by name of the reply to a request; with `wait`, once its scene is generated."""
+        end = time.monotonic() + _GENERATION_S
+        while True:
+            head, arrays = self._ask_once(request)
+            if head.get("ready") is not False or not wait:
+                return head, arrays
+            if time.monotonic() > end:
+                found = f"not generated in {_GENERATION_S:g} s"
+                raise UserError(
+                    self.address, f"scene {request.get('scene', 0)}", found, "a server with less other work"
+                )
+            time.sleep(_POLL_S)
+
+    def _ask_once(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """Send a request; returns the head of the reply and its arrays by name."""
         self._socket.send(json.dumps(request, allow_nan=True).encode())
         if not self._socket.poll(self._timeout_ms):
@@ -175,6 +233,11 @@ class SceneClient:
         if "error" in head:
             raise UserError(self.address, str(request["request"]), head["error"], "a request that it can render")
         return head, found
+
+
+def _of(scene: int) -> dict[str, int]:
+    """The field `scene` of a request; none for scene 0, which every server has."""
+    return {"scene": scene} if scene else {}
 
 
 def _array(stated: dict[str, Any], content: bytes) -> np.ndarray:

@@ -48,12 +48,17 @@ def serve(
     idle_s: Annotated[
         float, typer.Option(min=1, help="Disconnect a client that sends nothing for so long, seconds.")
     ] = 600.0,
+    scenes: Annotated[
+        int,
+        typer.Option(min=1, max=2**31, help="Scenes that clients of `perilune_shared.client` may ask for by number."),
+    ] = 1,
 ) -> None:
     """Render images at any pose over one scene, for clients of PANGU's protocol and of `perilune_shared.client`."""
     config = resolved_config(preset, scene, setting, dem, catalogue, given_scene=True)
     if camera is not None:
         config = config.model_copy(update={"camera": read_camera(camera)})
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
+    from perilune_render.server.grounds import Grounds
     from perilune_render.server.native import serve_native
     from perilune_render.server.pangu_serve import serve_pangu
     from perilune_render.server.pangu_session import Conventions, Session
@@ -61,14 +66,14 @@ def serve(
 
     conventions = Conventions(sun_azimuth, roll, allow_quit)
     limits = Limits(clients=max_clients, idle_s=idle_s)
-    with open_world(config) as world:
+    with open_world(config) as world, Grounds(world, scenes, say) as grounds:
         start = _start(world)
 
         async def handle(connection: Connection) -> None:
             await serve_pangu(connection, lambda: Session(world, *start, conventions), server.stop)
 
         async def native(ask: Ask, ready: Callable[[int], object]) -> None:
-            await serve_native(f"tcp://{host}:{native_port}", world, ask, ready)
+            await serve_native(f"tcp://{host}:{native_port}", grounds, ask, ready)
 
         server = Server(host, port, handle, limits, say, native)
         server.begin()

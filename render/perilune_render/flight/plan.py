@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from perilune_render.config import CameraConfig, DatasetConfig, KindConfig
+from perilune_render.config import CameraConfig, DatasetConfig, KindConfig, SunConfig
 from perilune_render.flight.trajectories import Flight, fly
 from perilune_render.flight.view import view_envelope
 from perilune_render.streams import derived_seed, stream
@@ -164,6 +164,15 @@ def camera_of(config: CameraConfig) -> Camera:
     return camera
 
 
+def drawn_scene(config: DatasetConfig, sun: SunConfig, ground: str, number: int) -> ScenePlan:
+    """The plan of a scene: its seed is derived from the configuration's seed and name, `ground` and the number."""
+    seed = derived_seed(config.seed, config.name, ground, "scene", number)
+    drawn = stream(seed, "sun")
+    azimuth = drawn.uniform(sun.azimuth_deg.low, sun.azimuth_deg.high)
+    elevation = drawn.uniform(sun.elevation_deg.low, sun.elevation_deg.high)
+    return ScenePlan(f"scene-{number:04d}", seed, float(azimuth), float(elevation))
+
+
 def make_plan(config: DatasetConfig, kind: str) -> Plan:
     """The plan of the dataset `detect` or `nav`. Raises UserError if the distortion is too strong.
 
@@ -174,13 +183,7 @@ def make_plan(config: DatasetConfig, kind: str) -> Plan:
     camera = camera_of(config.camera)
     splits = _splits(settings, stream(config.seed, config.name, kind, "splits"))
     ground = "shared" if config.shared_terrain else kind
-    scenes = []
-    for s in range(settings.n_scenes):
-        seed = derived_seed(config.seed, config.name, ground, "scene", s)
-        sun = stream(seed, "sun")
-        azimuth = sun.uniform(settings.sun.azimuth_deg.low, settings.sun.azimuth_deg.high)
-        elevation = sun.uniform(settings.sun.elevation_deg.low, settings.sun.elevation_deg.high)
-        scenes.append(ScenePlan(f"scene-{s:04d}", seed, float(azimuth), float(elevation)))
+    scenes = [drawn_scene(config, settings.sun, ground, s) for s in range(settings.n_scenes)]
     n = settings.trajectories_per_scene
     places = {scene.scene_id: range(s * n, (s + 1) * n) for s, scene in enumerate(scenes)}
     exr_camera = camera.covering_pinhole()

@@ -15,6 +15,7 @@ from perilune_render.config_scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables, label_table
 from perilune_render.flight.plan import camera_of
 from perilune_render.poses.plan import trajectory_seed
+from perilune_render.server.grounds import Grounds
 from perilune_render.server.world import View, World
 from perilune_shared.client import CRATER_COLUMNS
 from perilune_shared.config import Section
@@ -28,13 +29,26 @@ _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Three = tuple[_Number, _Number, _Number]
 
 
+class _OfScene(Section):
+    """A request about one scene."""
+
+    scene: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Number of the scene."""
+
+
 class SceneRequest(Section):
     """What does the server render?"""
 
     request: Literal["scene"]
 
 
-class FrameRequest(Section):
+class GroundRequest(_OfScene):
+    """Is a scene in memory, and what is it? If it is not, it is generated."""
+
+    request: Literal["ground"]
+
+
+class FrameRequest(_OfScene):
     """A frame; the fields are those of `perilune_shared.client.SceneClient.frame`."""
 
     request: Literal["frame"]
@@ -47,13 +61,13 @@ class FrameRequest(Section):
     labels: bool = False
 
 
-class CratersRequest(Section):
+class CratersRequest(_OfScene):
     """The craters of the ground."""
 
     request: Literal["craters"]
 
 
-class HeightsRequest(Section):
+class HeightsRequest(_OfScene):
     """Heights of the surface."""
 
     request: Literal["heights"]
@@ -64,6 +78,7 @@ class HeightsRequest(Section):
 
 _REQUESTS: dict[str, type[Section]] = {
     "scene": SceneRequest,
+    "ground": GroundRequest,
     "frame": FrameRequest,
     "craters": CratersRequest,
     "heights": HeightsRequest,
@@ -71,10 +86,19 @@ _REQUESTS: dict[str, type[Section]] = {
 _LENGTH_TOLERANCE = 0.01
 
 
-def answer(world: World, content: bytes) -> list[bytes]:
-    """The parts of the reply to a request. Errors are replies too. Called in the thread of the world."""
+def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
+    """The parts of the reply to a request. Errors are replies too. Called in the thread of the worlds.
+
+    If the scene of the request is not in memory, the reply is `"ready": false` without arrays.
+    """
     try:
-        return _answer(world, _parsed(content))
+        request = _parsed(content)
+        world = grounds.world(request.scene, client) if isinstance(request, _OfScene) else grounds.first
+        if world is None:
+            return _reply({"ready": False}, {})
+        if isinstance(request, SceneRequest):
+            return _reply(_about(grounds), {})
+        return _answer(world, request)
     except UserError as error:
         return refusal(str(error))
 
@@ -112,7 +136,21 @@ def _answer(world: World, request: Section) -> list[bytes]:
     if isinstance(request, CratersRequest):
         table = ground_tables("scene", world.scene)["craters"]
         return _reply({}, {name: table[name].to_numpy() for name in CRATER_COLUMNS})
-    stated, scene = world.config.scene or SceneConfig(), world.scene
+    stated = world.config.scene or SceneConfig()
+    about = {
+        "dataset": world.config.name,
+        "sun_azimuth_deg": stated.sun_azimuth_deg,
+        "sun_elevation_deg": stated.sun_elevation_deg,
+        "dem_source": world.scene.dem_source,
+        "content_sha256": world.content_sha256,
+    }
+    return _reply({"ready": True, "ground": about}, {})
+
+
+def _about(grounds: Grounds) -> dict[str, Any]:
+    """What the server renders."""
+    config, scene = grounds.first.config, grounds.first.scene
+    stated = config.scene or SceneConfig()
     about = {
         "latitude_deg": scene.latitude_deg,
         "longitude_deg": scene.longitude_deg,
@@ -120,7 +158,7 @@ def _answer(world: World, request: Section) -> list[bytes]:
         "sun_azimuth_deg": stated.sun_azimuth_deg,
         "sun_elevation_deg": stated.sun_elevation_deg,
     }
-    return _reply({"scene": about, "camera": asdict(camera_of(world.config.camera))}, {})
+    return {"scene": about, "camera": asdict(camera_of(config.camera)), "n_scenes": grounds.n_scenes}
 
 
 def _frame(world: World, request: FrameRequest) -> dict[str, np.ndarray]:
@@ -153,7 +191,7 @@ def _reply(head: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[bytes]:
 
 
 async def serve_native(
-    address: str, world: World, ask: Callable[[Callable[[], Any]], Awaitable[Any]], ready: Callable[[int], object]
+    address: str, grounds: Grounds, ask: Callable[[Callable[[], Any]], Awaitable[Any]], ready: Callable[[int], object]
 ) -> None:
     """Answer requests at a ZeroMQ address until cancelled; `ready` is called with the port.
 
@@ -168,7 +206,7 @@ async def serve_native(
 
     async def handle(client: bytes, envelope: list[bytes], content: bytes) -> None:
         try:
-            reply = await ask(lambda: answer(world, content))
+            reply = await ask(lambda: answer(grounds, content, client))
         except Exception as error:
             reply = refusal(f"{type(error).__name__}: {error}")
         finally:

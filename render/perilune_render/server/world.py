@@ -3,10 +3,12 @@
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from perilune_render.config import DatasetConfig
+from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines import open_engine
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.heightfield.query import first_hits, heights_m
@@ -14,6 +16,7 @@ from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.labels.frame_labels import Labels, RimCircles
 from perilune_render.terrain.scene import Scene
+from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
@@ -60,6 +63,12 @@ class World:
         for _, stack in self._sources.values():
             stack.close()
         self._sources.clear()
+
+    @cached_property
+    def content_sha256(self) -> str:
+        """Content hash of the terrain, as in the table `scenes` of a manifest."""
+        tables = ground_tables("scene", self.scene)
+        return content_sha256(tables["craters"], tables["boulders"])
 
     def frame(self, view: View, seed: int, index: int, velocity_mps: Array | None = None) -> Frame:
         """Render and develop a frame. Raises UserError if the camera is off the ground or below its surface."""

@@ -10,11 +10,10 @@ import pytest
 import yaml
 import zmq
 from tests.helpers import in_process
+from tests.render.server.native_running import NativeRunning
 
 from perilune_render.cli.main import main
-from perilune_render.server import native
-from perilune_render.server.serve import Limits, Server
-from perilune_render.server.world import World
+from perilune_render.server.grounds import Grounds
 from perilune_shared.client import SceneClient
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
@@ -22,34 +21,9 @@ from perilune_shared.errors import UserError
 DOWN = (0.0, 1.0, 0.0, 0.0)
 
 
-class Running:
-    """A server of this interface alone, in a thread."""
-
-    def __init__(self, world: World):
-        async def refuse(connection):
-            connection.writer.close()
-
-        async def other(ask, ready):
-            await native.serve_native("tcp://127.0.0.1:0", world, ask, ready)
-
-        self.server = Server("127.0.0.1", 0, refuse, Limits(), lambda note: None, other)
-        self.server.begin()
-        self.thread = threading.Thread(target=self.server.run)
-        self.thread.start()
-
-    @property
-    def address(self) -> str:
-        return f"tcp://127.0.0.1:{self.server.other_port}"
-
-    def close(self) -> None:
-        self.server.stop()
-        self.thread.join(20)
-        assert not self.thread.is_alive()
-
-
 @pytest.fixture(scope="module")
 def address(world):
-    running = Running(world)
+    running = NativeRunning(Grounds(world))
     yield running.address
     running.close()
 
@@ -127,7 +101,7 @@ def test_frames_are_those_of_the_command_frames(tmp_path, world):
 
     config = resolved_config("tiny", tmp_path / "scene.yaml", None, None, None, given_scene=True)
     with open_world(config) as other:
-        running = Running(other)
+        running = NativeRunning(Grounds(other))
         with SceneClient(running.address) as client:
             served = [client.frame(pose, DOWN, velocity_mps=(5, 0, -50), labels=True) for pose in poses]
         running.close()
@@ -144,7 +118,7 @@ def test_frames_are_those_of_the_command_frames(tmp_path, world):
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        ({"request": "frames"}, "got frames, expected one of scene, frame, craters, heights"),
+        ({"request": "frames"}, "got frames, expected one of scene, ground, frame, craters, heights"),
         ({"request": "scene", "path": "/etc/passwd"}, "path"),
         ({"request": "frame", "position_m": [0, 0, 500]}, "rotation_wxyz"),
         ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 0, 0, 0]}, "length 0"),

@@ -110,6 +110,19 @@ def split_terrain(dataset: Dataset, split: str, use: Use) -> frozenset[TerrainUs
     )
 
 
+def served_terrain(where: object, dataset: str, scene: int, dem_source: str, content_sha256: str) -> TerrainUse:
+    """The terrain of a scene that an image server rendered for training, as the server states it.
+
+    Raises UserError if a record cannot hold it.
+    """
+    name, sha256 = f"{dataset} (served)", terrain_of(dem_source, content_sha256)
+    if not _NAME.fullmatch(name):
+        raise UserError(where, "dataset", repr(dataset), _NAME_EXPECTED)
+    if not _SHA256.fullmatch(sha256):
+        raise UserError(where, f"content_sha256 of scene {scene}", repr(sha256), "64 hexadecimal digits")
+    return TerrainUse(name, f"scene-{scene:04d}", "trained", sha256, name)
+
+
 def training_provenance(dataset: Dataset) -> Provenance:
     """The record of a network that is trained, selected and tested on a dataset's splits."""
     return Provenance(frozenset().union(*(split_terrain(dataset, *part) for part in _USE_OF_SPLIT.items())))

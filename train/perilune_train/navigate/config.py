@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from perilune_shared.config import Section
 from perilune_train.config import Attention, Count, Device, Positive, Precision
@@ -41,6 +41,23 @@ class FusionConfig(Section):
     in the training set."""
 
 
+class StreamConfig(Section):
+    """Training sequences over new ground, rendered by `perilune-render serve` while the network trains."""
+
+    address: Annotated[str, Field(min_length=1, max_length=300)]
+    """Address of the server's interface for `perilune_shared.client`, such as tcp://127.0.0.1:10364."""
+    n_scenes: Annotated[int, Field(ge=1, lt=2**31)]
+    """Number of scenes: 1 to this number of the server, in turn. Start it with `--scenes` one larger."""
+    pairs_per_scene: Count = 64
+    """Consecutive rendered pairs over one scene, before the next one."""
+    share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the sequences of an epoch that are rendered; the others are those of the dataset."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Random seed of the poses and the noise of rendered sequences."""
+    timeout_s: Positive = 60.0
+    """Longest time to wait for a reply of the server, seconds."""
+
+
 class NavigateConfig(Section):
     """The section `navigate`."""
 
@@ -67,7 +84,16 @@ class NavigateConfig(Section):
     epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0
     """Worker processes that prepare sequences; 0 prepares them in the training process, which is best on few cores."""
+    stream: StreamConfig | None = None
+    """Training sequences rendered while training, for `fusion=warp` and `workers=0`; null for those of the dataset
+    alone. Unlike `detect.stream`, which reads a dataset."""
     warp: FusionConfig
     """Network with the second frame warped by the nominal motion and stacked in channels; the default navigator."""
     stack: FusionConfig
     """The paper's network, with the pair stacked in height; the explanations use it."""
+
+    @model_validator(mode="after")
+    def _can_stream(self) -> "NavigateConfig":
+        if self.stream is not None and (self.fusion != "warp" or self.workers > 0):
+            raise ValueError("fusion=warp and workers=0, since stream is given")
+        return self

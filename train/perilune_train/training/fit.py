@@ -16,6 +16,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import progress_bar
 from perilune_train.config import Precision
+from perilune_train.data.lost import DataLost
 from perilune_train.data.shares import Share
 from perilune_train.training.runs import (
     RunFolder,
@@ -101,6 +102,14 @@ class KeepLast(Callback):
 
     def on_train_epoch_end(self, trainer, pl_module) -> None:
         self.save(trainer)
+
+    def on_exception(self, trainer, pl_module, exception) -> None:
+        # Loaders raise it between two batches, when the state is whole. Several processes cannot save, since the
+        # others may still train, and before the first batch of an epoch the state of the last epoch is saved already.
+        done = trainer.fit_loop.epoch_loop.batch_progress.current
+        between = done.ready == done.completed > 0 and done.completed % trainer.accumulate_grad_batches == 0
+        if isinstance(exception, DataLost) and self.minutes is not None and trainer.world_size == 1 and between:
+            self.save(trainer)
 
     def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
         checkpoint[_PROCESSES] = trainer.world_size

@@ -56,9 +56,12 @@ class TrainingSequences(torch_data.Dataset):
         return [(epoch, place, *sequence) for place, sequence in enumerate(places) if sequence[0] in own]
 
     def __getitem__(self, key: Key) -> Sequence:
-        epoch, place, number, start = key
+        _, _, number, start = key
+        return self.augmented_sequence(key, self.trajectories[number], start)
+
+    def augmented_sequence(self, key: Key, trajectory: Trajectory, start: int) -> Sequence:
+        """The pairs of a trajectory from `start` on, with the augmentation of a key."""
+        epoch, place, number, first = key
         rng = np.random.default_rng([self.seed, epoch, place]) if self.augmented else None
-        sequence = pair_sequence(
-            self.trajectories[number], start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter
-        )
-        return replace(sequence, place=(number, start))
+        sequence = pair_sequence(trajectory, start, self.n_pairs, warp=self.warp, rng=rng, jitter=self.jitter)
+        return replace(sequence, place=(number, first))

@@ -1,6 +1,7 @@
 """One navigation run: train and evaluate the selected networks, evaluate the baselines, write tables and pictures."""
 
 import time
+from contextlib import closing
 from pathlib import Path
 
 import lightning
@@ -19,6 +20,7 @@ from perilune_train.evaluation.provenance import (
 )
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.covariance import calibrate, stated_covariances
+from perilune_train.navigate.data.stream import Stream
 from perilune_train.navigate.data.trajectories import Trajectory, load_trajectories
 from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.report import write_evaluation
@@ -74,6 +76,7 @@ def navigate_run(
     # One check for both, because the table of the warp run includes the metrics of stack.
     terrain_check = check_terrain(terrain["stack"], opened, "test", allow_overlap)
     share = own_share(1, 1)
+    stream = Stream(settings.stream, opened) if settings.stream is not None else None
     trajectories = load_trajectories(opened, share)
     seconds: dict[Fusion, float] = {}
     # Train all before any is evaluated, so that the other processes do not wait for the first.
@@ -81,7 +84,8 @@ def navigate_run(
         if states[fusion] != "finished":
             start_run(run, "navigate", settings, inputs[fusion], states[fusion])
             start, resume = backbone if fusion == "stack" else None, states[fusion] == "resume"
-            seconds[fusion] = _train(run, settings, fusion, trajectories, start, resume, terrain[fusion], share)
+            given = start, resume, terrain[fusion], share, stream
+            seconds[fusion] = _train(run, settings, fusion, trajectories, *given)
     if not is_first_process():
         return list(folders.values())
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
@@ -125,27 +129,29 @@ def _train(
     resume: bool,
     terrain: Provenance,
     share: Share,
+    stream: Stream | None,
 ) -> float:
     """Train one network; returns the training time in seconds."""
     lightning.seed_everything(settings.seed, verbose=False)
-    task = NavigationTask(settings, fusion, trajectories, backbone, share)
-    task.terrain = terrain.plain()
+    task = NavigationTask(settings, fusion, trajectories, backbone, share, stream)
+    task.provenance = terrain
     own = task.own
-    return fit(
-        run,
-        task,
-        label=f"train {fusion}",
-        epochs=own.coarse_epochs + own.fine_epochs,
-        monitor="val/position_rmse_vector_m",
-        mode="min",
-        resume=resume,
-        precision=settings.precision,
-        device=choose_device(settings.device),
-        # In coarse epochs some weights have no gradient.
-        strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
-        checkpoint_minutes=settings.checkpoint_minutes,
-        accumulate=own.accumulate,
-    )
+    with closing(task):
+        return fit(
+            run,
+            task,
+            label=f"train {fusion}",
+            epochs=own.coarse_epochs + own.fine_epochs,
+            monitor="val/position_rmse_vector_m",
+            mode="min",
+            resume=resume,
+            precision=settings.precision,
+            device=choose_device(settings.device),
+            # In coarse epochs some weights have no gradient.
+            strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
+            checkpoint_minutes=settings.checkpoint_minutes,
+            accumulate=own.accumulate,
+        )
 
 
 def _detector_backbone(

@@ -11,10 +11,13 @@ from torch.utils.data import DataLoader
 
 from perilune_train.data.epochs import EpochBatches, batch_loader
 from perilune_train.data.shares import ALONE, Share
+from perilune_train.evaluation.provenance import Provenance
 from perilune_train.models.navigator import WarpNavigator
 from perilune_train.navigate.config import FusionConfig, NavigateConfig
 from perilune_train.navigate.data.epochs import TrainingSequences
 from perilune_train.navigate.data.sequences import Jitter
+from perilune_train.navigate.data.stream import Stream
+from perilune_train.navigate.data.streamed import StreamedSequences
 from perilune_train.navigate.data.trajectories import Motion, Trajectory, own_trajectories
 from perilune_train.navigate.evaluate.metrics import motion_errors, summary
 from perilune_train.navigate.geometry import euler_from_rotation
@@ -61,9 +64,10 @@ class NavigationTask(lightning.LightningModule):
         trajectories: list[Trajectory],
         pretrained: dict[str, Tensor] | None = None,
         share: Share = ALONE,
+        stream: Stream | None = None,
     ):
         super().__init__()
-        self.settings, self.fusion = settings, fusion
+        self.settings, self.fusion, self.stream = settings, fusion, stream
         self.own: FusionConfig = getattr(settings, fusion)
         self.scales = Scales.measured([one for one in trajectories if one.split == "train"], fusion)
         self.architecture = {
@@ -85,7 +89,7 @@ class NavigationTask(lightning.LightningModule):
         self.pretrained = frozenset(pretrained or ())
         if pretrained:
             self.network.backbone.load_state_dict(pretrained, strict=False)
-        self.terrain: dict[str, Any] | None = None
+        self.provenance: Provenance | None = None
         self.log_weights = nn.Parameter(torch.zeros(2))
         self.share = share
         self.training_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "train"]
@@ -97,6 +101,20 @@ class NavigationTask(lightning.LightningModule):
         self.validated = own_trajectories("val", len(self.validation_trajectories), share)
         jitter, scales = self.own.jitter, self.scales
         self.jitter = Jitter(jitter * np.array(scales.spread_m), jitter * scales.rotation_rad) if jitter else None
+        self.sequences = self._sequences()
+
+    def close(self) -> None:
+        """End what runs beside the training."""
+        if isinstance(self.sequences, StreamedSequences):
+            self.sequences.close()
+
+    @property
+    def terrain(self) -> dict[str, Any] | None:
+        """The record of the terrain of the training, as plain data, with all that was rendered so far."""
+        if self.provenance is None:
+            return None
+        rendered = self.stream.uses if self.stream is not None else frozenset()
+        return self.provenance.joined([Provenance(rendered)]).plain()
 
     @property
     def evaluated(self) -> nn.Module:
@@ -108,23 +126,27 @@ class NavigationTask(lightning.LightningModule):
         """Whether this epoch belongs to the coarse stage."""
         return self.current_epoch < self.own.coarse_epochs
 
+    def _sequences(self) -> TrainingSequences:
+        own: dict[str, Any] = {
+            "warp": self.fusion == "warp",
+            "augmented": self.fusion == "warp",
+            "jitter": self.jitter,
+            "seed": self.settings.seed,
+            "share": self.share,
+        }
+        place = self.training_trajectories, self.own.sequence_pairs
+        if self.stream is None:
+            return TrainingSequences(*place, **own)
+        return StreamedSequences(self.stream, self.own.size_px, *place, **own)
+
     def train_dataloader(self) -> DataLoader:
-        sequences = TrainingSequences(
-            self.training_trajectories,
-            self.own.sequence_pairs,
-            warp=self.fusion == "warp",
-            augmented=self.fusion == "warp",
-            jitter=self.jitter,
-            seed=self.settings.seed,
-            share=self.share,
-        )
         # The current epoch is one too low here if the run is resumed.
         epoch = self._trainer.fit_loop.epoch_progress.current.processed if self._trainer else 0
         resumed_epoch, done = self.resumed
         start = done if epoch == resumed_epoch else 0
-        batches = EpochBatches(sequences.keys, sequences.fewest, self.own.batch_sequences, epoch, start)
+        batches = EpochBatches(self.sequences.keys, self.sequences.fewest, self.own.batch_sequences, epoch, start)
         pinned = choose_device(self.settings.device) == "cuda"
-        return batch_loader(sequences, batches, Collate(self.scales, self.fusion), self.settings.workers, pinned)
+        return batch_loader(self.sequences, batches, Collate(self.scales, self.fusion), self.settings.workers, pinned)
 
     def val_dataloader(self) -> DataLoader:
         own = [self.validation_trajectories[number] for number in self.validated]
@@ -137,10 +159,14 @@ class NavigationTask(lightning.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         done = self.trainer.fit_loop.epoch_loop.batch_progress.current.processed
         checkpoint["epoch_and_batches"] = [self.current_epoch, done]
+        if self.stream is not None:
+            checkpoint["streamed"] = self.stream.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         epoch, done = checkpoint.get("epoch_and_batches", (0, 0))
         self.resumed = (epoch, done)
+        if self.stream is not None:
+            self.stream.load_state_dict(checkpoint.get("streamed", []))
 
     def on_train_epoch_start(self) -> None:
         for name, parameter in self.network.backbone.named_parameters():

@@ -1,0 +1,120 @@
+"""The grounds of a server: scene 0, that of the configuration, and further ones that clients ask for by number.
+
+Further scenes are generated in a thread of their own, one after another, while frames are rendered. A client has at
+most one scene in that queue. The last used scenes stay in memory.
+"""
+
+import queue
+import threading
+from collections.abc import Callable
+
+from perilune_render.config import DatasetConfig
+from perilune_render.config_scene import SceneConfig
+from perilune_render.flight.plan import ScenePlan, drawn_scene
+from perilune_render.server.world import World
+from perilune_render.terrain.cache import cached_scene
+from perilune_shared.errors import UserError
+
+MOST_KEPT = 3
+"""Largest number of scenes in memory beside scene 0 and the one that is being generated."""
+MOST_WAITING = 16
+"""Largest number of scenes that wait to be generated."""
+_STREAM = "served"
+
+
+def served_scene(config: DatasetConfig, number: int) -> ScenePlan:
+    """Random seed and Sun of a further scene, from 1; the Sun is drawn from `dataset.nav.sun`.
+
+    The seed is derived as for the scenes of a dataset, from another name: no dataset of any configuration has this
+    terrain.
+    """
+    return drawn_scene(config, config.nav.sun, _STREAM, number)
+
+
+class Grounds:
+    """The worlds of `n_scenes` scenes by number. Only the thread of the worlds may use it. Close it at the end."""
+
+    def __init__(self, first: World, n_scenes: int = 1, note: Callable[[str], object] = lambda text: None):
+        self.first, self.n_scenes, self._note = first, n_scenes, note
+        self._kept: dict[int, World] = {}
+        self._waiting: dict[int, object] = {}
+        self._failed: dict[int, Exception] = {}
+        self._asked: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._made: queue.SimpleQueue[tuple[int, World | Exception]] = queue.SimpleQueue()
+        self._last = first
+        if n_scenes > 1:
+            # A daemon: the server ends while a scene is being generated.
+            threading.Thread(target=self._generate, name="grounds", daemon=True).start()
+
+    def __enter__(self) -> "Grounds":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the engines of all worlds."""
+        for world in (self.first, *self._kept.values()):
+            world.close()
+        self._kept.clear()
+
+    def world(self, number: int, client: object) -> World | None:
+        """The world of a scene; None if it is not in memory, and then it is being generated or waits for that.
+
+        Raises UserError for a number that the server does not have, if too many scenes wait, or if the scene could not
+        be generated.
+        """
+        if number >= self.n_scenes:
+            raise UserError("request", "scene", number, f"below {self.n_scenes}, the server's --scenes")
+        self._collect()
+        if number in self._failed:
+            raise self._failed.pop(number)
+        if number == 0 or number in self._kept:
+            return self._used(number)
+        if number not in self._waiting and client not in self._waiting.values():
+            if len(self._waiting) >= MOST_WAITING:
+                raise UserError("request", "scene", f"{MOST_WAITING} scenes wait to be generated", "fewer; try again")
+            self._waiting[number] = client
+            self._asked.put(number)
+        return None
+
+    def _used(self, number: int) -> World:
+        if number > 0:
+            self._kept[number] = self._kept.pop(number)  # the last used one is the last
+        world = self._kept.get(number, self.first)
+        if world is not self._last and world.config.render.engine == "cycles":
+            self._last.close()  # Blender has one scene
+        self._last = world
+        return world
+
+    def _collect(self) -> None:
+        """Take over what was generated, and forget the scenes that were not used for longest."""
+        while not self._made.empty():
+            number, found = self._made.get()
+            del self._waiting[number]
+            if isinstance(found, Exception):
+                self._failed[number] = found
+                continue
+            while len(self._kept) >= MOST_KEPT:
+                self._kept.pop(next(iter(self._kept))).close()
+            self._kept[number] = found
+
+    def _generate(self) -> None:
+        """The thread that generates scenes."""
+        while True:
+            number = self._asked.get()
+            try:
+                self._made.put((number, self._grown(number)))
+            except Exception as error:
+                self._made.put((number, error))
+
+    def _grown(self, number: int) -> World:
+        config, view = self.first.config, self.first.scene.view
+        if view is None:
+            raise UserError("request", "scene", number, "0: the ground was made for no views")
+        planned = served_scene(config, number)
+        sun = {"sun_azimuth_deg": planned.sun_azimuth_deg, "sun_elevation_deg": planned.sun_elevation_deg}
+        lit = config.model_copy(update={"scene": (config.scene or SceneConfig()).model_copy(update=sun)})
+        world = World(cached_scene(config, view, planned.seed), lit, self._note)
+        _ = world.content_sha256  # computed here, while frames of other scenes are rendered
+        return world

@@ -1,0 +1,32 @@
+"""A server of our own interface alone, in a thread."""
+
+import threading
+
+from perilune_render.server import native
+from perilune_render.server.grounds import Grounds
+from perilune_render.server.serve import Limits, Server
+
+
+class NativeRunning:
+    """Answers clients at `address` until `close`."""
+
+    def __init__(self, grounds: Grounds):
+        async def refuse(connection):
+            connection.writer.close()
+
+        async def other(ask, ready):
+            await native.serve_native("tcp://127.0.0.1:0", grounds, ask, ready)
+
+        self.server = Server("127.0.0.1", 0, refuse, Limits(), lambda note: None, other)
+        self.server.begin()
+        self.thread = threading.Thread(target=self.server.run)
+        self.thread.start()
+
+    @property
+    def address(self) -> str:
+        return f"tcp://127.0.0.1:{self.server.other_port}"
+
+    def close(self) -> None:
+        self.server.stop()
+        self.thread.join(20)
+        assert not self.thread.is_alive()

@@ -1,0 +1,113 @@
+"""Further scenes of a server: seeds, Suns, several clients, memory, requests that are refused."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.helpers.scenes import config_with
+from tests.render.server.native_running import NativeRunning
+
+from perilune_render.flight.plan import make_plan
+from perilune_render.poses.plan import scene_seed
+from perilune_render.server.grounds import MOST_KEPT, Grounds, served_scene
+from perilune_render.terrain.scene import grow_scene
+from perilune_shared.client import SceneClient
+from perilune_shared.errors import UserError
+
+DOWN = (0.0, 1.0, 0.0, 0.0)
+N_SCENES = MOST_KEPT + 3
+
+
+@pytest.fixture(scope="module")
+def grounds(world):
+    return Grounds(world, N_SCENES)
+
+
+@pytest.fixture(scope="module")
+def address(grounds):
+    running = NativeRunning(grounds)
+    yield running.address
+    running.close()
+
+
+def image(client, scene, index=0):
+    return client.frame((0, 0, 500), DOWN, index=index, scene=scene).image
+
+
+def test_no_dataset_has_the_terrain_of_a_further_scene():
+    for shared in (False, True):
+        config = config_with(name="some", seed=3, shared_terrain=shared)
+        config = config.model_copy(update={"nav": config.nav.model_copy(update={"n_scenes": 50})})
+        planned = {scene.seed for kind in ("detect", "nav") for scene in make_plan(config, kind).scenes}
+        served = {served_scene(config, number).seed for number in range(1, 1000)}
+        assert len(served) == 999
+        assert not served & (planned | {scene_seed(config)})
+
+
+def test_a_further_scene_is_that_of_its_seed_under_a_drawn_sun(address, world):
+    planned = served_scene(world.config, 1)
+    with SceneClient(address) as client:
+        assert client.scene().n_scenes == N_SCENES
+        ground = client.ground(1)
+        assert (ground.sun_azimuth_deg, ground.sun_elevation_deg) == (
+            planned.sun_azimuth_deg,
+            planned.sun_elevation_deg,
+        )
+        span = world.config.nav.sun.elevation_deg
+        assert span.low <= ground.sun_elevation_deg <= span.high
+        own, craters = grow_scene(world.config, world.scene.view, planned.seed), client.craters(1)
+        assert (craters["diameter_m"] == own.craters.diameter_m).all()
+        assert len(craters["x_m"]) != len(client.craters()["x_m"])
+        assert ground.content_sha256 != client.ground(0).content_sha256 == world.content_sha256
+        assert client.heights([30.0], [40.0], scene=1) != client.heights([30.0], [40.0])
+        stated = (ground.sun_azimuth_deg, ground.sun_elevation_deg)
+        lit = client.frame((0, 0, 500), DOWN, index=0, scene=1, sun_deg=stated).image
+        assert (lit == image(client, 1)).all()
+
+
+def test_clients_on_other_scenes_do_not_change_a_clients_frames(address, grounds):
+    with SceneClient(address) as first, SceneClient(address) as second:
+        plain, own = image(first, 0), image(first, 1)
+        assert (plain != own).any()
+        for scene in range(2, N_SCENES):
+            image(second, scene)
+            assert (image(first, 0) == plain).all()
+        # By now scene 1 was forgotten, and is generated again.
+        assert len(grounds._kept) == MOST_KEPT and 1 not in grounds._kept
+        assert (image(first, 1) == own).all()
+        assert len(grounds._kept) == MOST_KEPT
+
+
+def test_a_client_has_one_scene_in_the_queue(world):
+    grounds = Grounds(world, 100)
+    assert [grounds.world(number, "first") for number in (1, 2, 3)] == [None] * 3
+    assert list(grounds._waiting) == [1]
+    assert grounds.world(4, "second") is None
+    assert list(grounds._waiting) == [1, 4]
+    for number in range(50, 64):
+        grounds.world(number, number)
+    with pytest.raises(UserError, match="16 scenes wait"):
+        grounds.world(99, "another")
+    assert grounds.world(0, "another") is world
+
+
+def test_a_scene_that_cannot_be_generated_is_an_error_for_those_who_ask_for_it(world, monkeypatch):
+    grounds = Grounds(world, 3)
+    monkeypatch.setattr(Grounds, "_grown", lambda self, number: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        while grounds.world(1, "client") is None:
+            pass
+    assert grounds.world(0, "client") is world
+    assert grounds._waiting == {}
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [(N_SCENES, f"below {N_SCENES}"), (-1, "scene"), (2**31, "scene"), (1.5, "scene"), ("1", "scene"), (None, "scene")],
+)
+def test_a_number_of_no_scene_is_refused(address, scene, message):
+    with SceneClient(address) as client:
+        client._socket.send(json.dumps({"request": "ground", "scene": scene}).encode())
+        (reply,) = client._socket.recv_multipart()
+        assert message in json.loads(reply)["error"]
+        assert image(client, 0).dtype == np.uint8

@@ -1,0 +1,77 @@
+"""Items made ahead in a background thread, in a known order."""
+
+import queue
+import threading
+from collections.abc import Callable, Hashable, Iterator
+from typing import Generic, TypeVar
+
+Key = TypeVar("Key", bound=Hashable)
+Item = TypeVar("Item")
+_STOP_S = 5.0
+_POLL_S = 0.1
+
+
+class Ahead(Generic[Key, Item]):
+    """Makes items while others are used, at most `most` ahead.
+
+    `make(keys)` is called in the thread and yields the items of these keys. `following(key)` yields a key and those
+    that are needed after it. If another key than the expected one is taken, the thread starts again with that one.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[Iterator[Key]], Iterator[tuple[Key, Item]]],
+        following: Callable[[Key], Iterator[Key]],
+        most: int,
+    ):
+        self._make, self._following, self._most = make, following, most
+        self._expected: Iterator[Key] = iter(())
+        self._made: queue.Queue[tuple[Key, Item] | BaseException] = queue.Queue()
+        self._stop, self._thread = threading.Event(), threading.Thread()
+
+    def take(self, key: Key) -> Item:
+        """The item of a key, once it is made. Raises what making it raised."""
+        if next(self._expected, None) != key:
+            self._begin(key)
+        found = self._made.get()
+        if isinstance(found, BaseException):
+            self._expected = iter(())
+            raise found
+        return found[1]
+
+    def close(self) -> None:
+        """End the thread; one that waits for a reply ends after it."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(_STOP_S)
+
+    def _begin(self, key: Key) -> None:
+        self.close()
+        self._expected = self._following(key)
+        next(self._expected)
+        self._made, self._stop = queue.Queue(self._most), threading.Event()
+        arguments = (self._following(key), self._made, self._stop)
+        # A daemon: it must not keep a process alive that ends with an error.
+        self._thread = threading.Thread(target=self._run, args=arguments, name="ahead", daemon=True)
+        self._thread.start()
+
+    def _run(self, keys: Iterator[Key], made: queue.Queue, stop: threading.Event) -> None:
+        def put(found: tuple[Key, Item] | BaseException) -> None:
+            while not stop.is_set():
+                try:
+                    made.put(found, timeout=_POLL_S)
+                    return
+                except queue.Full:
+                    continue
+
+        def wanted() -> Iterator[Key]:
+            for key in keys:
+                if stop.is_set():
+                    return
+                yield key
+
+        try:
+            for found in self._make(wanted()):
+                put(found)
+        except BaseException as error:
+            put(error)
