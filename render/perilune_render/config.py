@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from perilune_render.config_counterfactual import CounterfactualConfig
+from perilune_render.config_outputs import FlashLidarConfig, HazardConfig
 from perilune_render.config_scene import SceneConfig
 from perilune_render.config_survey import SurveyConfig
 from perilune_render.config_terrain import TerrainConfig
@@ -107,7 +108,7 @@ class InstrumentsConfig(Section):
     inertial_rate_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
     """Inertial measurements per second."""
     range_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Measurements of the laser altimeter per second; 0 for none."""
+    """Measurements of the laser altimeter per second; 0 for none. Given poses have one at the time of each frame."""
     range_sigma_m: NotNegative = 0.2
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0005
@@ -293,6 +294,10 @@ class DatasetConfig(Section):
     """Dataset for crater detection."""
     nav: KindConfig
     """Dataset for navigation."""
+    hazard: HazardConfig | None = None
+    """Hazard map of each scene; null for none."""
+    flash_lidar: FlashLidarConfig | None = None
+    """Flash lidar beside the camera; null for none."""
     scene: SceneConfig | None = None
     """One scene whose poses are given, in place of drawn scenes and descents; `perilune-render frames` reads it."""
     survey: SurveyConfig | None = None
@@ -307,6 +312,12 @@ class DatasetConfig(Section):
         for field in _GROUND_FIELDS if self.shared_terrain else ():
             if getattr(self.detect.flight, field) != getattr(self.nav.flight, field):
                 raise ValueError(f"detect.flight.{field} equal to nav.flight.{field}, since shared_terrain is true")
+        return self
+
+    @model_validator(mode="after")
+    def _channels_have_a_file(self) -> "DatasetConfig":
+        if self.hazard is not None and self.hazard.frame_channels and not self.render.exr:
+            raise ValueError("render.exr true, since hazard.frame_channels is true")
         return self
 
     def kind(self, name: str) -> KindConfig:

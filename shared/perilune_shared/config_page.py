@@ -33,7 +33,10 @@ class Key:
 
 
 def keys(section: str, config: Section) -> Iterator[Key]:
-    """Yield every key of a resolved section, in the order of the configuration file."""
+    """Yield every key of a resolved section, in the order of the configuration file.
+
+    After a section that is null come its keys, with their defaults as values.
+    """
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
         value, full = getattr(config, name), f"{section}.{name}"
@@ -42,6 +45,16 @@ def keys(section: str, config: Section) -> Iterator[Key]:
         else:
             default = None if field.is_required() else _default(field)
             yield Key(full, field, _meaning(field), _choices(field), default, _flow(plain[name]))
+            for kind in _optional_sections(field) if value is None else ():
+                yield from keys(full, kind())
+
+
+def _optional_sections(field: FieldInfo) -> Iterator[type[Section]]:
+    """Yield the sections without required keys that a field may have in place of null."""
+    for kind in typing.get_args(field.annotation):
+        is_section = isinstance(kind, type) and issubclass(kind, Section)
+        if is_section and not any(each.is_required() for each in kind.model_fields.values()):
+            yield kind
 
 
 def annotated_yaml(section: str, config: Section) -> str:

@@ -116,10 +116,12 @@ def open_finished(store: Store) -> Dataset:
 
 def check_code(recipe: Recipe, *, with_dem: bool) -> None:
     """Raises UserError if code or libraries of this process are not those of a recipe."""
-    engine = recipe.config.get("render", {}).get("engine", "cycles")
-    recorded, found = (
-        _without_releases(versions) for versions in (recipe.versions, all_versions(with_dem=with_dem, engine=engine))
+    found = all_versions(
+        with_dem=with_dem,
+        engine=recipe.config.get("render", {}).get("engine", "cycles"),
+        outputs="hazard" in recipe.config or "flash_lidar" in recipe.config,
     )
+    recorded, found = (_without_releases(versions) for versions in (recipe.versions, found))
     if recorded != found:
         expected = "the code that the rendering began with: render with one version from start to end"
         raise UserError("perilune_render", "versions", first_difference(recorded, found), expected)

@@ -29,6 +29,7 @@ from perilune_render.sub_poses import RowPoses
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import Counts, DatasetInfo, Origin, Recipe, recipes_of
+from perilune_shared.dataset.names import SCENE_FILE_KINDS
 from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
@@ -215,7 +216,9 @@ def _develop_trajectory(source: Dataset, out: Store, frame_source: FrameSource, 
 
 
 def _copy_scene(source: Dataset, out: Store, scene_id: str, recipe: Recipe) -> None:
-    """Copy the rows of a scene; the scene's row gets the new recipe."""
+    """Copy the rows of a scene; the scene's row gets the new recipe, and names no files."""
     rows = {name: source.table(name, scene_id=scene_id) for name in OF_SCENE}
     rows["scenes"] = with_column(rows["scenes"], "recipe", [recipe.key] * len(rows["scenes"]))
+    for name in (f"{kind}_{column}" for kind in SCENE_FILE_KINDS for column in ("path", "sha256", "bytes")):
+        rows["scenes"] = with_column(rows["scenes"], name, [None] * len(rows["scenes"]))
     write_scene(out, scene_id, rows)

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from perilune_render.dataset import work
 from perilune_render.dataset.overview import overview_png
-from perilune_shared.dataset.index import index_rows, seal
+from perilune_shared.dataset.index import index_rows, scene_file_rows, seal
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.parts import Written
@@ -37,6 +37,7 @@ def finish(store: Store, info: DatasetInfo, scenes: Iterable[tuple[str, list[str
     for (scene_id, trajectory_ids), rows in _read_ahead(lambda scene: work.scene_rows(store, scene[0]), scenes):
         for table, part in rows.items():
             whole.add(table, part)
+        files.append(scene_file_rows(rows["scenes"]))
         names = (f"{scene_id}.{trajectory_id}" for trajectory_id in trajectory_ids)
         found = [each for _, each in _read_ahead(lambda name: work.trajectory_rows(store, name), names)]
         for table in work.OF_TRAJECTORY:

@@ -1,4 +1,4 @@
-"""Write a frame's files: PNG, and EXR on request."""
+"""Write a frame's files: PNG; EXR and image of the flash lidar on request."""
 
 import hashlib
 
@@ -7,26 +7,37 @@ import numpy as np
 
 from perilune_render.frame_source import Frame, FrameSource
 from perilune_render.imaging.exr import exr_bytes
-from perilune_shared.dataset.names import ImageKind, frame_path
-from perilune_shared.storage.store import Address, Store, open_store
+from perilune_render.outputs.of_scene import Beside
+from perilune_shared.dataset.names import ImageKind, SceneFileKind, frame_path
+from perilune_shared.storage.store import Address, open_store
+
+NOTHING_BESIDE = Beside()
 
 
-def write_frame(out: Address, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool) -> dict[str, str | int]:
-    """Write a frame's PNG, and with `exr` its EXR; returns its columns png_* and exr_* of the manifest.
+def write_frame(
+    out: Address, frame_id: str, source: FrameSource, frame: Frame, *, exr: bool, beside: Beside = NOTHING_BESIDE
+) -> dict[str, str | int]:
+    """Write a frame's PNG, with `exr` its EXR, and the file of its flash lidar if there is one.
 
-    Does not wait until the files are on the disk.
+    Returns the columns png_*, exr_* and lidar_* of the manifest. Does not wait until the files are on the disk.
     """
     store, columns = open_store(out), dict[str, str | int]()
-    for kind, content in frame_contents(source, frame, exr=exr).items():
-        columns |= _write(store, frame_id, kind, content)
+    for kind, content in frame_contents(source, frame, exr=exr, beside=beside).items():
+        path = frame_path(frame_id, kind)
+        store.replace(path, content, durable=False)
+        columns |= file_columns(kind, path, content)
     return columns
 
 
-def frame_contents(source: FrameSource, frame: Frame, *, exr: bool) -> dict[ImageKind, bytes]:
-    """The content of a frame's PNG, and with `exr` of its EXR."""
+def frame_contents(
+    source: FrameSource, frame: Frame, *, exr: bool, beside: Beside = NOTHING_BESIDE
+) -> dict[ImageKind, bytes]:
+    """The content of a frame's PNG, with `exr` of its EXR, and of its flash lidar if there is one."""
     contents: dict[ImageKind, bytes] = {"png": png_bytes(frame.image, source.sensor.bits)}
     if exr:
-        contents["exr"] = exr_bytes(frame.radiance, source.crater_index(frame))
+        contents["exr"] = exr_bytes(frame.radiance, source.crater_index(frame), beside.channels)
+    if beside.lidar is not None:
+        contents["lidar"] = beside.lidar
     return contents
 
 
@@ -36,10 +47,8 @@ def png_bytes(image: np.ndarray, bits: int) -> bytes:
     return cv2.imencode(".png", stored)[1].tobytes()
 
 
-def _write(store: Store, frame_id: str, kind: ImageKind, content: bytes) -> dict[str, str | int]:
-    """Write a file of a frame; returns its columns png_* or exr_* (by `kind`)."""
-    path = frame_path(frame_id, kind)
-    store.replace(path, content, durable=False)
+def file_columns(kind: ImageKind | SceneFileKind, path: str, content: bytes) -> dict[str, str | int]:
+    """The columns of a file in the manifest: its path, size and hash, with names that begin with `kind`."""
     return {
         f"{kind}_path": path,
         f"{kind}_bytes": len(content),

@@ -7,10 +7,11 @@ from perilune_render.dataset import tables
 from perilune_render.dataset.begin import new_info
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
+from perilune_render.outputs.hazard import check_hazard
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground, grow_scene
-from perilune_shared.dataset.names import ImageKind, Kind, frame_path
+from perilune_shared.dataset.names import IMAGE_KINDS, Kind, frame_path, scene_file_path
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.editing.writer import new_dataset
 from perilune_shared.interrupts import interrupts_held
@@ -26,7 +27,10 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
     """
     plan, where = make_plan(config, kind), f"configuration: dataset.{kind}"
     check_ground(config, plan.view)
-    check_plan(plan, graded_grid(config.terrain, plan.view), where)
+    grid = graded_grid(config.terrain, plan.view)
+    check_plan(plan, grid, where)
+    if config.hazard is not None:
+        check_hazard(config.hazard, grid)
     recipe = recipe_of(config, kind, preset, planned=True)
     info = new_info(config, plan, recipe).model_copy(update={"complete": True, "images": "planned"})
     task = progress.add_task(f"plan {kind}", total=len(plan.scenes), unit="scenes")
@@ -36,7 +40,9 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
                 scene = grow_scene(config, plan.view, scene_plan.seed)
             trajectories = plan.of_scene(scene_plan.scene_id)
             check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)
-            kinds: tuple[ImageKind, ...] = ("png", "exr") if config.render.exr else ("png",)
+            wanted = {"png": True, "exr": config.render.exr, "lidar": config.flash_lidar is not None}
+            kinds = [kind for kind in IMAGE_KINDS if wanted[kind]]
+            hazard = {"hazard_path": scene_file_path(scene_plan.scene_id, "hazard")} if config.hazard else None
             frames = []
             for trajectory in trajectories:
                 ids = [trajectory.frame_id(place) for place in range(len(trajectory.splits))]
@@ -44,7 +50,7 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
                 frames.append(tables.frame_table(trajectory, plan.camera, scene_plan.sun, paths))
             writer.add_scene(
                 {
-                    "scenes": tables.scene_tables(scene_plan, scene, config, recipe.key)["scenes"],
+                    "scenes": tables.scene_tables(scene_plan, scene, config, recipe.key, hazard)["scenes"],
                     "trajectories": tables.trajectory_table(trajectories),
                     "frames": pa.concat_tables(frames),
                     **{name: TABLES[name].empty_table() for name in ("craters", "boulders", "labels")},

@@ -27,6 +27,7 @@ from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.imaging.exr import local_exr, read_exr
 from perilune_render.labels.frame_labels import RimCircles
+from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.provenance.recipe import config_of, same_source
 from perilune_render.terrain.cache import cached_scene
 from perilune_shared.config import resolve_over
@@ -62,6 +63,8 @@ class Outcome:
     """The PNG compared with the manifest's hash, then with the dataset's file; new if the manifest has no hash."""
     exr: State | None
     """The same comparison for the EXR; None if the frame has none."""
+    lidar: State | None
+    """The same comparison for the flash lidar; None if the frame has none."""
     same_ground: bool
     """Whether the content hash of craters and boulders equals that of the scene's row."""
     png_path: str
@@ -69,8 +72,8 @@ class Outcome:
 
     @property
     def state(self) -> State:
-        """The worse of the states of PNG and EXR."""
-        return max((state for state in (self.png, self.exr) if state is not None), key=_ORDER.index)
+        """The worst of the states of its files."""
+        return max((state for state in (self.png, self.exr, self.lidar) if state is not None), key=_ORDER.index)
 
 
 def regenerate(
@@ -81,7 +84,7 @@ def regenerate(
     dem: Path | None = None,
     catalogue: Path | None = None,
 ) -> list[Outcome]:
-    """Regenerate frames as `out`/frames/<frame_id>.png and .exr, and compare them with the manifest.
+    """Regenerate frames as `out`/frames/<frame_id>.png, .exr and .lidar.exr, and compare them with the manifest.
 
     `dem` and `catalogue` are the user's copies of the files that the recipes name; a path in a recipe is never opened.
     Raises UserError on frames that are not in the manifest, on recipes that this version does not support, and if `out`
@@ -141,7 +144,9 @@ def _of_scene(
     tables = ground_tables(scene["scene_id"], ground)
     same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
     outcomes, dark = [], []
-    with open_engine(ground, ground_config, exr_camera, np.array(rows[0]["sun_direction"])) as engine:
+    sun = np.array(rows[0]["sun_direction"])
+    outputs = SceneOutputs.of(ground, _wanted(config, rows), sun)
+    with open_engine(ground, ground_config, exr_camera, sun, outputs.surface) as engine:
         source = FrameSource.of(engine, config, camera, RimCircles.of_scene(ground))
         for row in rows:
             frame_id, trajectory = row["frame_id"], trajectories[row["trajectory_id"]]
@@ -149,15 +154,25 @@ def _of_scene(
             frame = source.take(recorded_shot(row, trajectory["seed"], approach))
             # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
             has_exr = row["exr_path"] is not None
-            new = write_frame(out, frame_id, source, frame, exr=has_exr)
+            beside = outputs.beside(frame, engine.camera)
+            new = write_frame(out, frame_id, source, frame, exr=has_exr, beside=beside)
             png = _compared(dataset, row, "png", out, new)
             exr = _compared(dataset, row, "exr", out, new) if has_exr else None
-            outcomes.append(Outcome(frame_id, png, exr, same_ground, out.at(str(new["png_path"]))))
+            lidar = _compared(dataset, row, "lidar", out, new) if row["lidar_path"] is not None else None
+            outcomes.append(Outcome(frame_id, png, exr, lidar, same_ground, out.at(str(new["png_path"]))))
             if is_dark(frame.radiance):
                 dark.append(frame_id)
             advance()
     warn_of_dark_frames(scene["scene_id"], dark, len(rows), scene["sun_elevation_deg"])
     return outcomes
+
+
+def _wanted(config: DatasetConfig, rows: list[dict]) -> DatasetConfig:
+    """The settings without outputs that the rows of a scene's frames do not have."""
+    has_exrs, has_lidar = (any(row[f"{kind}_path"] is not None for row in rows) for kind in ("exr", "lidar"))
+    channels = config.hazard is not None and config.hazard.frame_channels and has_exrs
+    hazard, lidar = config.hazard if channels else None, config.flash_lidar if has_lidar else None
+    return config.model_copy(update={"hazard": hazard, "flash_lidar": lidar})
 
 
 def _ground_config(recipe: Recipe, config: DatasetConfig, where: object) -> DatasetConfig:
@@ -182,8 +197,9 @@ def _compared(dataset: Dataset, row: dict, kind: ImageKind, out: Store, new: dic
             frames = dataset.table("frames", scene_id=row["scene_id"], trajectory_id=row["trajectory_id"])
             old = dict(dataset.pngs(frames.filter(pc.equal(frames["frame_id"], row["frame_id"]))))[row["frame_id"]]
             return _state(png_outlier_share(old, out.read(new["png_path"])))
-        if kind == "exr" and dataset.info.images == "files":
-            with local_exr(dataset.store, row["exr_path"]) as before, local_exr(out, new["exr_path"]) as after:
+        if kind != "png" and dataset.info.images == "files":
+            path = f"{kind}_path"
+            with local_exr(dataset.store, row[path]) as before, local_exr(out, new[path]) as after:
                 return _state(exr_outlier_share(read_exr(before), read_exr(after)))
     except UserError:
         pass  # the old file is missing or damaged, and the hash differs

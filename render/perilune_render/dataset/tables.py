@@ -5,19 +5,21 @@ import pyarrow as pa
 from numpy.typing import ArrayLike
 
 from perilune_render.config import DatasetConfig, InstrumentsConfig
-from perilune_render.flight.altimeter import measure_ranges
+from perilune_render.flight.altimeter import measure_ranges, measure_ranges_of_frames
 from perilune_render.flight.inertial import measured, true_increments
 from perilune_render.flight.plan import ScenePlan, TrajectoryPlan
 from perilune_render.labels.frame_labels import Labels
 from perilune_render.terrain.craters.population import ORIGINS
 from perilune_render.terrain.scene import Scene
 from perilune_shared.content import content_sha256
+from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS
 from perilune_shared.dataset.schema import ANGULAR_VELOCITY, TABLES, complete
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, selenographic_from_site
 
 _CAMERA = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
-_FILES = ("png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
+_FILES = tuple(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256", "bytes"))
+_OF_SCENE = tuple(f"{kind}_{name}" for kind in SCENE_FILE_KINDS for name in ("path", "sha256", "bytes"))
 _OF_LABELS = ("n_craters_above_max_radius",)
 
 
@@ -75,8 +77,13 @@ def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
     }
 
 
-def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str) -> dict[str, pa.Table]:
-    """Parts of the tables `scenes`, `craters` and `boulders` for one scene; `recipe` is the key of its recipe."""
+def scene_tables(
+    plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: str, files: dict | None = None
+) -> dict[str, pa.Table]:
+    """Parts of the tables `scenes`, `craters` and `boulders` for one scene.
+
+    `recipe` is the key of its recipe, `files` holds the columns of its files, such as hazard_*.
+    """
     ground = ground_tables(plan.scene_id, scene)
     return {
         "scenes": _table(
@@ -93,6 +100,7 @@ def scene_tables(plan: ScenePlan, scene: Scene, config: DatasetConfig, recipe: s
                 "extent_m": [scene.grid.extent_m],
                 "recipe": [recipe],
                 "content_sha256": [content_sha256(ground["craters"], ground["boulders"])],
+                **{name: [(files or {}).get(name)] for name in _OF_SCENE},
             },
         ),
         **ground,
@@ -119,7 +127,7 @@ def trajectory_table(trajectories: list[TrajectoryPlan]) -> pa.Table:
 
 
 def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: list[dict]) -> pa.Table:
-    """Part of the table `frames` for one trajectory; `files`: columns png_*, exr_* and measurements of each frame."""
+    """Part of the table `frames` for one trajectory; `files`: columns of files and measurements of each frame."""
     flight, n = trajectory.flight, len(trajectory.splits)
     columns: dict = {
         "frame_id": [trajectory.frame_id(i) for i in range(n)],
@@ -140,21 +148,21 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
     return _table("frames", columns | {name: [row.get(name) for row in files] for name in (*_FILES, *_OF_LABELS)})
 
 
-def measurement_tables(trajectory: TrajectoryPlan, scene: Scene, config: InstrumentsConfig) -> dict[str, pa.Table]:
+def measurement_tables(
+    trajectory: TrajectoryPlan, scene: Scene, config: InstrumentsConfig, *, at_frames: bool
+) -> dict[str, pa.Table]:
     """Parts of the tables `inertial` and `ranges` for one trajectory: those that have rows.
 
-    There are none if the motion between the frames is not known.
+    If the motion between the frames is not known, there are none, or with `at_frames` a range for each frame.
     """
     motion = trajectory.flight.motion
-    if motion is None:
-        return {}
 
     def table(name: str, n_rows: int, columns: dict) -> pa.Table:
         keys = {"scene_id": [trajectory.scene_id] * n_rows, "trajectory_id": [trajectory.trajectory_id] * n_rows}
         return _table(name, keys | columns)
 
-    found, duration_s, seed = {}, motion.nominal.duration_s, trajectory.seed
-    if config.inertial_grades:
+    found, seed = {}, trajectory.seed
+    if config.inertial_grades and motion is not None:
         true = true_increments(motion, config.inertial_rate_hz)
         units = [measured(true, grade, seed) for grade in config.inertial_grades]
         columns = {name: np.concatenate([getattr(unit, name) for unit in units]) for name in ("time_s", "interval_s")}
@@ -162,8 +170,11 @@ def measurement_tables(trajectory: TrajectoryPlan, scene: Scene, config: Instrum
             columns[name] = _vectors(np.concatenate([getattr(unit, name) for unit in units]))
         grades = [grade for grade in config.inertial_grades for _ in true.time_s]
         found["inertial"] = table("inertial", len(grades), {"grade": grades, **columns})
-    if config.range_rate_hz:
-        ranges = measure_ranges(motion, scene, config, duration_s, seed)
+    if config.range_rate_hz and (motion is not None or at_frames):
+        if motion is not None:
+            ranges = measure_ranges(motion, scene, config, motion.nominal.duration_s, seed)
+        else:
+            ranges = measure_ranges_of_frames(trajectory.flight, trajectory.frame_index, scene, config, seed)
         columns = {"time_s": ranges.time_s, "range_m": pa.array(ranges.range_m, from_pandas=True)}
         found["ranges"] = table("ranges", len(ranges.time_s), columns)
     return found

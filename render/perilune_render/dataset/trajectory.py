@@ -16,8 +16,11 @@ from perilune_render.flight.plan import TrajectoryPlan
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.imaging.darkness import is_dark
 from perilune_render.imaging.radiance import Radiance
+from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.terrain.scene import Scene
 from perilune_shared.storage.store import Store
+
+NO_OUTPUTS = SceneOutputs()
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,31 +43,40 @@ def render_trajectory(
     config: DatasetConfig,
     instruments: InstrumentsConfig,
     advance: Callable[[], object] = lambda: None,
+    outputs: SceneOutputs = NO_OUTPUTS,
 ) -> list[str]:
     """Render and write one trajectory of `scene` into the dataset at `out`; returns the ids of its dark frames.
 
-    `source` renders the scene. A second thread develops, labels and writes each frame while the next one is rendered.
-    `advance` is called after each frame, in order. The same arguments give the same bytes; a trajectory whose rendering
-    was interrupted is rendered from its start.
+    `source` renders the scene, `outputs` makes what there is beside the frames. A second thread develops, labels and
+    writes each frame while the next one is rendered. `advance` is called after each frame, in order. The same arguments
+    give the same bytes; a trajectory whose rendering was interrupted is rendered from its start.
     """
     frames: list[_Written] = []
-    for frame in _frames(out, source, trajectory, scene, config):
+    for frame in _frames(out, source, trajectory, scene, config, outputs):
         frames.append(frame)
         advance()
     rows = tables.frame_table(trajectory, source.camera, source.engine.sun, [frame.row for frame in frames])
     labels = [frame.labels for frame in frames]
-    commit(out, labels, rows, tables.measurement_tables(trajectory, scene, instruments))
+    measured = tables.measurement_tables(trajectory, scene, instruments, at_frames=config.scene is not None)
+    commit(out, labels, rows, measured)
     return [trajectory.frame_id(place) for place, frame in enumerate(frames) if frame.is_dark]
 
 
 def _frames(
-    out: Store, source: FrameSource, trajectory: TrajectoryPlan, scene: Scene, config: DatasetConfig
+    out: Store,
+    source: FrameSource,
+    trajectory: TrajectoryPlan,
+    scene: Scene,
+    config: DatasetConfig,
+    outputs: SceneOutputs,
 ) -> Iterator[_Written]:
     """Render and write the frames of a trajectory, in order; rendering is one frame ahead of writing."""
 
     def written(place: int, shot: Shot, radiance: Radiance) -> _Written:
         frame = source.develop(shot, radiance)
-        return _write(out, trajectory.frame_id(place), source, frame, scene, exr=config.render.exr)
+        beside = outputs.beside(frame, source.engine.camera)
+        files = write_frame(out, trajectory.frame_id(place), source, frame, exr=config.render.exr, beside=beside)
+        return _labelled(trajectory.frame_id(place), files, source, frame, scene)
 
     with ThreadPoolExecutor(1, "develop") as developer:
         last: Future[_Written] | None = None
@@ -78,9 +90,8 @@ def _frames(
             yield last.result()
 
 
-def _write(out: Store, frame_id: str, source: FrameSource, frame: Frame, scene: Scene, *, exr: bool) -> _Written:
-    """Write the files of a frame and label it."""
-    files = write_frame(out, frame_id, source, frame, exr=exr)
+def _labelled(frame_id: str, files: dict[str, str | int], source: FrameSource, frame: Frame, scene: Scene) -> _Written:
+    """Label a frame whose files are written; `files` are their columns."""
     share = real_ground_share(scene, source.engine.camera, *frame.shot.pose, frame.radiance.depth_m)
     found = source.labels(frame)
     row = {**files, "real_ground_share": share, "n_craters_above_max_radius": found.n_above}

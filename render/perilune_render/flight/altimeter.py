@@ -1,11 +1,13 @@
 """Simulated ranges of a laser altimeter that looks along the camera's axis."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from perilune_render.config import InstrumentsConfig
 from perilune_render.flight.motion import Motion
+from perilune_render.flight.trajectories import Flight
 from perilune_render.streams import stream
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene
@@ -32,6 +34,17 @@ def measure_ranges(motion: Motion, scene: Scene, config: InstrumentsConfig, dura
     true_m = range_to_ground_m(scene, motion.path_at(time)[0], beam)
     sigma_m = config.range_sigma_m + config.range_sigma_share * true_m
     return Ranges(time, true_m + sigma_m * stream(seed, "ranges").normal(size=len(time)))
+
+
+def measure_ranges_of_frames(
+    flight: Flight, frame_index: Sequence[int], scene: Scene, config: InstrumentsConfig, seed: int
+) -> Ranges:
+    """Simulate one range at each frame of a flight, given its random seed; the beam is the axis of the camera."""
+    true_m = range_to_ground_m(scene, flight.position_m, flight.rotation_camera_from_site[:, 2])
+    sigma_m = config.range_sigma_m + config.range_sigma_share * true_m
+    # Of each frame's own stream: parts of one trajectory in several scenes have different noise.
+    noise = np.array([stream(seed, "range", index).normal() for index in frame_index])
+    return Ranges(flight.time_s, true_m + sigma_m * noise)
 
 
 def range_to_ground_m(scene: Scene, position_m: Array, direction: Array) -> Array:

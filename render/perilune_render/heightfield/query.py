@@ -16,6 +16,13 @@ def first_hits(surface: Surface, origins_m: Array, directions: Array, *, boulder
     the facets (N, 3), 0 there. Start above the surface, whose underside is hit too. Without `boulders` rays hit only
     the ground.
     """
+    return first_returns(surface, origins_m, directions, boulders=boulders)[:2]
+
+
+def first_returns(
+    surface: Surface, origins_m: Array, directions: Array, *, boulders: bool = True
+) -> tuple[Array, Array, Array]:
+    """Distances and normals as `first_hits`, and the albedo factors (N,) there: 1 on boulders, 0 where nothing is."""
     origins = np.ascontiguousarray(origins_m - np.array([*surface.centre_m, 0.0]), np.float64)
     rocks = surface.rocks if boulders else surface.rocks._replace(cell_start=np.zeros_like(surface.rocks.cell_start))
     return _hits(surface.ground, rocks, origins, np.ascontiguousarray(directions, np.float64))
@@ -31,8 +38,8 @@ def heights_m(surface: Surface, x_m: Array, y_m: Array, *, boulders: bool = True
 
 @njit()
 def _hits(ground, rocks, origins, directions):
-    """See `first_hits`; places are relative to the grid's centre."""
-    distance, normal = np.empty(len(origins)), np.zeros((len(origins), 3))
+    """See `first_returns`; places are relative to the grid's centre."""
+    distance, normal, albedo = np.empty(len(origins)), np.zeros((len(origins), 3)), np.zeros(len(origins))
     facet, curve = np.empty(3), np.empty(3)
     for k in range(len(origins)):
         ox, oy, oz = origins[k]
@@ -43,7 +50,8 @@ def _hits(ground, rocks, origins, directions):
         distance[k] = t
         if rock >= 0:
             normal[k, 0], normal[k, 1], normal[k, 2] = rock_normal(rocks, rock, face)
+            albedo[k] = 1.0
         elif t < np.inf:
-            ground_at(ground, part, row, column, triangle, ox + t * dx, oy + t * dy, facet, curve)
+            albedo[k] = ground_at(ground, part, row, column, triangle, ox + t * dx, oy + t * dy, facet, curve)[3]
             normal[k] = facet
-    return distance, normal
+    return distance, normal, albedo

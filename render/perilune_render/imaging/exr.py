@@ -3,7 +3,7 @@
 import contextlib
 import io
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +20,18 @@ _MOST_CHANNELS = 64
 CHANNELS = ("R", "Z", "N.X", "N.Y", "N.Z", "sunlit", "crater")
 
 
-def exr_bytes(radiance: Radiance, crater: np.ndarray) -> bytes:
-    """An EXR file of a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), without loss."""
+def exr_bytes(radiance: Radiance, crater: np.ndarray, more: Mapping[str, np.ndarray] | None = None) -> bytes:
+    """An EXR file of a frame: float32 channels CHANNELS (h, w; sunlit 0 or 1, crater -1 for none), then `more`."""
     values = (radiance.radiance_factor, radiance.depth_m, *np.moveaxis(radiance.normal, -1, 0), radiance.sunlit, crater)
-    channels = {name: np.ascontiguousarray(value, np.float32) for name, value in zip(CHANNELS, values, strict=True)}
+    return channel_bytes(dict(zip(CHANNELS, values, strict=True)) | dict(more or {}))
+
+
+def channel_bytes(channels: Mapping[str, np.ndarray]) -> bytes:
+    """An EXR file of named channels (h, w), stored as float32 without loss."""
+    stored = {name: np.ascontiguousarray(value, np.float32) for name, value in channels.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     stream = io.BytesIO()
-    OpenEXR.File(header, channels).write(stream)
+    OpenEXR.File(header, stored).write(stream)
     return stream.getvalue()
 
 

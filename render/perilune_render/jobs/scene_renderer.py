@@ -6,6 +6,7 @@ from types import TracebackType
 
 from perilune_render.dataset import tables
 from perilune_render.dataset.begin import check_code
+from perilune_render.dataset.frame_files import file_columns
 from perilune_render.dataset.trajectory import render_trajectory
 from perilune_render.dataset.work import FOLDER, write_scene
 from perilune_render.engines import open_engine
@@ -14,8 +15,11 @@ from perilune_render.frame_source import FrameSource
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.records import RunningRecord
 from perilune_render.labels.frame_labels import RimCircles
+from perilune_render.outputs.hazard_raster import hazard_tiff
+from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene
+from perilune_shared.dataset.names import scene_file_path
 from perilune_shared.interrupts import interrupts_held
 from perilune_shared.storage.store import Store
 
@@ -33,7 +37,7 @@ class SceneRenderer:
         self._record = RunningRecord(out)
         self._shared = None if out.is_local else out.sub(f"{FOLDER}/scenes")
         self._grown: tuple[str, Scene] | None = None
-        self._opened: tuple[str, Scene, FrameSource] | None = None
+        self._opened: tuple[str, Scene, FrameSource, SceneOutputs] | None = None
         self._closing = contextlib.ExitStack()
 
     @property
@@ -68,26 +72,41 @@ class SceneRenderer:
 
         try:
             self._record.begin(self._job.name(place))
-            scene, source = self._open(trajectory.scene_id, note)
+            scene, source, outputs = self._open(trajectory.scene_id, note)
             config = self._job.config
             instruments = config.kind(self._job.info.kind).instruments
-            return render_trajectory(self._out, source, trajectory, scene, config, instruments, counted)
+            return render_trajectory(self._out, source, trajectory, scene, config, instruments, counted, outputs)
         except BaseException:
             self.close()  # Blender's scene may be half changed
             raise
 
-    def _open(self, scene_id: str, note: Callable[[str], object]) -> tuple[Scene, FrameSource]:
+    def _open(self, scene_id: str, note: Callable[[str], object]) -> tuple[Scene, FrameSource, SceneOutputs]:
         if self._opened is None or self._opened[0] != scene_id:
             note(f"{scene_id}: generating ground")
             scene, plan, config = self.grow(scene_id), self._job.scene(scene_id), self._job.config
-            rows = tables.scene_tables(plan, scene, config, self._job.info.recipe().key)
+            if config.hazard is not None:
+                note(f"{scene_id}: making the hazard map")
+            outputs = SceneOutputs.of(scene, config, plan.sun)
+            files = self._write_hazard(scene_id, scene, outputs)
+            rows = tables.scene_tables(plan, scene, config, self._job.info.recipe().key, files)
             trajectories = tables.trajectory_table(self._job.plan.of_scene(scene_id))
             write_scene(self._out, scene_id, {**rows, "trajectories": trajectories})
-            engine = self._closing.enter_context(open_engine(scene, config, self._job.plan.exr_camera, plan.sun))
+            engine = self._closing.enter_context(
+                open_engine(scene, config, self._job.plan.exr_camera, plan.sun, outputs.surface)
+            )
             source = FrameSource.of(engine, config, self._job.plan.camera, RimCircles.of_scene(scene))
-            self._opened = scene_id, scene, source
+            self._opened = scene_id, scene, source, outputs
             note(scene_id)
         return self._opened[1:]
+
+    def _write_hazard(self, scene_id: str, scene: Scene, outputs: SceneOutputs) -> dict[str, str | int]:
+        """Write the hazard map of a scene if there is one; returns its columns of the table `scenes`."""
+        if outputs.hazard is None:
+            return {}
+        path = scene_file_path(scene_id, "hazard")
+        content = hazard_tiff(outputs.hazard, scene.latitude_deg, scene.longitude_deg)
+        self._out.replace(path, content)
+        return file_columns("hazard", path, content)
 
     def __enter__(self) -> "SceneRenderer":
         return self

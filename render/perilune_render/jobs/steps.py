@@ -11,6 +11,7 @@ from perilune_render.dataset.work import committed
 from perilune_render.flight.pose_checks import check_plan
 from perilune_render.jobs.identity import begin_plan, check_finished
 from perilune_render.jobs.job import Job
+from perilune_render.outputs.hazard import check_hazard
 from perilune_render.terrain.grid import graded_grid
 from perilune_render.terrain.scene import check_ground
 from perilune_shared.dataset.manifest import Dataset
@@ -22,7 +23,10 @@ from perilune_shared.storage.store import Store
 def check(job: Job) -> None:
     """Make the checks of a job that need no terrain heights and write nothing. Raises UserError."""
     check_ground(job.config, job.plan.view)
-    check_plan(job.plan, graded_grid(job.config.terrain, job.plan.view), job.where)
+    grid = graded_grid(job.config.terrain, job.plan.view)
+    check_plan(job.plan, grid, job.where)
+    if job.config.hazard is not None:
+        check_hazard(job.config.hazard, grid)
 
 
 def prepare(job: Job, out: Store, check_scene: Callable[[str], object]) -> DatasetInfo:

@@ -18,7 +18,7 @@ DEFAULT_ENGINE = "cycles"
 """Not recorded, so that recipes of older versions stay equal."""
 _SINCE = ("blur_poses", "row_time_s")
 """Settings of the sensor that are recorded only if they are not the defaults, for the same reason."""
-_OPTIONAL = ("scene", "survey", "counterfactual")
+_OPTIONAL = ("hazard", "flash_lidar", "scene", "survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
@@ -26,7 +26,13 @@ def recipe_of(config: DatasetConfig, kind: Kind, preset: str, *, planned: bool =
     """The recipe of a dataset. With `planned`, the recipe of a plan: it lists only the versions behind the ground."""
     with_dem = config.terrain.dem is not None
     versions = (
-        ground_versions(with_dem=with_dem) if planned else all_versions(with_dem=with_dem, engine=config.render.engine)
+        ground_versions(with_dem=with_dem)
+        if planned
+        else all_versions(
+            with_dem=with_dem,
+            engine=config.render.engine,
+            outputs=config.hazard is not None or config.flash_lidar is not None,
+        )
     )
     return Recipe(preset=preset, kind=kind, seed=config.seed, config=recorded_settings(config, kind), versions=versions)
 
@@ -35,8 +41,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, those of the other kind unless the kinds share terrain, and those of a given scene, a survey, a
-    counterfactual or a site in an elevation model if there is none.
+    speed, those of the other kind unless the kinds share terrain, optional sections that are not set, and a site in an
+    elevation model if there is none.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:

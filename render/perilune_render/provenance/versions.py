@@ -40,13 +40,15 @@ LIBRARIES = {
 """Recorded name and distribution of each library that affects results, by import name."""
 RAYS = (*RENDERING[:2], "perilune_render.heightfield.engine:HeightfieldEngine")
 """Code that plans trajectories and renders radiance with the engine `heightfield`."""
-_NAMES = {"generator": GROUND, "renderer": RENDERING, "rays": RAYS, "imaging": IMAGING}
+OUTPUTS = (_SETTINGS, "perilune_render.outputs.of_scene:SceneOutputs", "perilune_render.outputs.hazard_raster:")
+"""Code that makes hazard maps and images of the flash lidar."""
+_NAMES = {"generator": GROUND, "renderer": RENDERING, "rays": RAYS, "imaging": IMAGING, "outputs": OUTPUTS}
 _RECORDED = {"rays": "renderer"}
 """Recorded name of what has another name here."""
 
 
 def ground_versions(*, with_dem: bool) -> dict[str, str]:
-    """Versions of what generates the ground. rasterio only reads elevation models: it is listed if there is one."""
+    """Versions of what generates the ground. rasterio is listed if there is an elevation model."""
     return _versions(("generator",), with_dem)
 
 
@@ -55,9 +57,10 @@ def imaging_versions() -> dict[str, str]:
     return _versions(("imaging",), False)
 
 
-def all_versions(*, with_dem: bool, engine: str = "cycles") -> dict[str, str]:
-    """Versions of everything that determines a frame of an engine and its labels."""
-    return _versions(("generator", "rays" if engine == "heightfield" else "renderer", "imaging"), with_dem)
+def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = False) -> dict[str, str]:
+    """Versions of everything that determines a frame of an engine, its labels and the `outputs` beside it."""
+    names = ("generator", "rays" if engine == "heightfield" else "renderer", "imaging")
+    return _versions((*names, "outputs") if outputs else names, with_dem or outputs)
 
 
 @functools.cache

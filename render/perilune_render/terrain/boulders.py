@@ -149,6 +149,18 @@ def rock(shape_id: int, seed: int, n_points: int = N_POINTS) -> trimesh.Trimesh:
     return mesh
 
 
+def highest_points(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> Array:
+    """The highest vertex of each boulder (N, 3), O_L, metres; arguments as `boulder_mesh`."""
+    full = boulders.diameter_m >= FULL_SPACINGS * grid.spacing_under(boulders.x_m, boulders.y_m)
+    kinds = list(zip(boulders.shape_id.tolist(), np.where(full, N_POINTS, N_FEW_POINTS).tolist(), strict=True))
+    solids = {kind: rock(kind[0], seed, kind[1]).vertices for kind in set(kinds)}
+    points = np.stack([boulders.x_m, boulders.y_m, z_m], axis=-1)
+    for k, rotation in enumerate(matrix_from_quaternion(boulders.rotation_wxyz.reshape(-1, 4))):
+        placed = solids[kinds[k]] @ rotation.T * boulders.diameter_m[k]
+        points[k] += placed[np.argmax(placed[:, 2])]
+    return points
+
+
 def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """All boulders as one mesh: vertices (V, 3) float32 in O_L, metres, and triangles (F, 3) int32.
 

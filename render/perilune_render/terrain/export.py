@@ -1,6 +1,7 @@
 """Export of a scene for other tools: meshes (GLB, PLY, OBJ, STL) and a height raster (GeoTIFF)."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,6 +50,24 @@ def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = Tru
         trimesh.util.concatenate(parts).export(aside)
 
 
+def site_profile(latitude_deg: float, longitude_deg: float, n: int, pixel_m: float, n_bands: int) -> dict[str, Any]:
+    """Options of rasterio for a float32 GeoTIFF of n x n pixels about a site: north up, azimuthal equidistant."""
+    import rasterio
+
+    place = f"+lat_0={latitude_deg!r} +lon_0={longitude_deg!r}"
+    return {
+        "driver": "GTiff",
+        "width": n,
+        "height": n,
+        "count": n_bands,
+        "dtype": "float32",
+        "crs": f"+proj=aeqd {place} +R={MOON_RADIUS_M:.0f} +units=m +no_defs",
+        "transform": rasterio.Affine(pixel_m, 0, -n / 2 * pixel_m, 0, -pixel_m, n / 2 * pixel_m),
+        "compress": "deflate",
+        "predictor": 3,
+    }
+
+
 def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
     """Write heights, metres, as a float32 GeoTIFF: square pixels, north up, azimuthal equidistant about the site.
 
@@ -61,18 +80,7 @@ def export_raster(scene: Scene, path: Path, pixel_m: float) -> None:
         raise UserError(path, "pixel size", f"{pixel_m} m, which makes {n} pixels per side", f"1 to {_LARGEST_SIDE}")
     centre = (np.arange(n) + 0.5 - n / 2) * pixel_m
     # O_L's x points west and y south; a raster's columns go east and its rows south.
-    place = f"+lat_0={scene.latitude_deg!r} +lon_0={scene.longitude_deg!r}"
-    profile = {
-        "driver": "GTiff",
-        "width": n,
-        "height": n,
-        "count": 1,
-        "dtype": "float32",
-        "crs": f"+proj=aeqd {place} +R={MOON_RADIUS_M:.0f} +units=m +no_defs",
-        "transform": rasterio.Affine(pixel_m, 0, -n / 2 * pixel_m, 0, -pixel_m, n / 2 * pixel_m),
-        "compress": "deflate",
-        "predictor": 3,
-    }
+    profile = site_profile(scene.latitude_deg, scene.longitude_deg, n, pixel_m, 1)
     with written_aside(path) as aside, rasterio.open(aside, "w", **profile) as raster:
         for top in range(0, n, _ROWS_AT_ONCE):
             rows = centre[top : top + _ROWS_AT_ONCE]

@@ -5,7 +5,7 @@ never overwrites the old one: writing dataset.json switches between them.
 """
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from perilune_shared.dataset.info_file import INFO_NAME, write_info
 from perilune_shared.dataset.metadata import DatasetInfo, IndexPart
-from perilune_shared.dataset.names import IMAGE_KINDS
+from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS
 from perilune_shared.dataset.parts import Part, Written
 from perilune_shared.dataset.schema import SCHEMA_VERSION
 from perilune_shared.errors import UserError
@@ -47,16 +47,25 @@ def index_rows(written: Iterable[Written]) -> pa.Table:
 
 
 def frame_rows(frames: pa.Table) -> pa.Table:
-    """Return the rows of the PNG and EXR files that rows of the table frames name, in the order of the frames.
+    """Return the rows of the files that rows of the table frames name, by kind, in the order of the frames.
 
     Raises UserError if a frame has a path without size or hash.
     """
+    return _named_files(frames, "frames", IMAGE_KINDS)
+
+
+def scene_file_rows(scenes: pa.Table) -> pa.Table:
+    """Return the rows of the files that rows of the table scenes name. Raises UserError as `frame_rows`."""
+    return _named_files(scenes, "scenes", SCENE_FILE_KINDS)
+
+
+def _named_files(table: pa.Table, name: str, kinds: Sequence[str]) -> pa.Table:
     pieces = [INDEX.empty_table()]
-    for kind in IMAGE_KINDS:
-        own = frames.filter(pc.is_valid(frames[f"{kind}_path"]))
-        columns = [own[f"{kind}_{name}"] for name in ("path", "bytes", "sha256")]
+    for kind in kinds:
+        own = table.filter(pc.is_valid(table[f"{kind}_path"]))
+        columns = [own[f"{kind}_{column}"] for column in ("path", "bytes", "sha256")]
         if any(column.null_count for column in columns):
-            raise UserError("frames", f"{kind}_sha256", "null", "size and SHA-256 of every frame")
+            raise UserError(name, f"{kind}_sha256", "null", f"size and SHA-256 of every {name.removesuffix('s')}")
         pieces.append(
             pa.table([column.cast(field.type) for column, field in zip(columns, INDEX, strict=True)], schema=INDEX)
         )

@@ -13,8 +13,10 @@ SplitUnit = Literal["scene", "trajectory", "frame"]
 """Rows that belong to one split as a whole."""
 ImageState = Literal["files", "packed", "absent", "planned"]
 """Where the frames are: under frames/, in shards/*.parquet, left out, or not rendered yet (then without labels)."""
-ImageKind = Literal["png", "exr"]
-"""The two files of a frame: the image of the sensor, and radiance with depth and crater index."""
+ImageKind = Literal["png", "exr", "lidar"]
+"""The files of a frame: image of the sensor; radiance with depth and crater index; ranges of the flash lidar."""
+SceneFileKind = Literal["hazard"]
+"""The files of a scene: its hazard map."""
 ImageChoice = Literal["copy", "none", "plan"]
 """How frames are written: `copy`, `none` (left out), or `plan` (frames, craters, boulders and labels left out: scenes
 and poses determine them)."""
@@ -30,14 +32,27 @@ PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
 KINDS: tuple[Kind, ...] = get_args(Kind)
 SPLITS: tuple[Split, ...] = get_args(Split)
 IMAGE_KINDS: tuple[ImageKind, ...] = get_args(ImageKind)
+SUFFIXES: dict[ImageKind | SceneFileKind, str] = {
+    "png": ".png",
+    "exr": ".exr",
+    "lidar": ".lidar.exr",
+    "hazard": ".tif",
+}
+"""How the name of each file ends."""
+SCENE_FILE_KINDS: tuple[SceneFileKind, ...] = get_args(SceneFileKind)
 
 
 def frame_path(frame_id: str, kind: ImageKind) -> str:
     """Return the path of a frame's file relative to the dataset, as written by this version; readers use the manifest.
 
-    The columns png_path and exr_path of other datasets may contain other paths.
+    The columns png_path, exr_path and lidar_path of other datasets may contain other paths.
     """
-    return f"frames/{frame_id}.{kind}"
+    return f"frames/{frame_id}{SUFFIXES[kind]}"
+
+
+def scene_file_path(scene_id: str, kind: SceneFileKind) -> str:
+    """Return the path of a scene's file relative to the dataset, as written by this version."""
+    return f"{kind}/{scene_id}{SUFFIXES[kind]}"
 
 
 def stem_of(path: str) -> str:

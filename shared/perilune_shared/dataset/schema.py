@@ -57,6 +57,9 @@ TABLES: dict[str, pa.Schema] = {
         _column("extent_m", _REAL, "m", "side of the square terrain, centred on the site"),
         _column("recipe", _TEXT, "", "what it was made by: a key of `recipes` in dataset.json"),
         _column("content_sha256", _TEXT, "", "of its craters and boulders to a millimetre (perilune_shared.content)"),
+        _column("hazard_path", _TEXT, "", "hazard map, relative to the dataset; null if none", nullable=True),
+        _column("hazard_sha256", _TEXT, "", "of the whole file; null where not written", nullable=True),
+        _column("hazard_bytes", _INTEGER, "B", "file size; null where not written", nullable=True),
     ),
     "craters": _table(
         "craters",
@@ -149,6 +152,15 @@ TABLES: dict[str, pa.Schema] = {
             )
             for name in ANGULAR_VELOCITY
         ),
+        _column(
+            "lidar_path",
+            _TEXT,
+            "",
+            "image of the flash lidar, relative to the dataset; null where not written",
+            nullable=True,
+        ),
+        _column("lidar_sha256", _TEXT, "", "of the whole file; null where not written", nullable=True),
+        _column("lidar_bytes", _INTEGER, "B", "file size; null where not written", nullable=True),
     ),
     "labels": _table(
         "labels",
@@ -196,8 +208,19 @@ TABLES: dict[str, pa.Schema] = {
 }
 OPTIONAL_TABLES = ("inertial", "ranges")
 """Tables that a dataset has only if they have rows: they were added without a new schema version."""
-_ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius", *ANGULAR_VELOCITY)
-MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {"frames": _ABSENT_IN_FRAMES, "shards": _ABSENT_IN_FRAMES}
+_ABSENT_IN_FRAMES = (
+    "real_ground_share",
+    "n_craters_above_max_radius",
+    *ANGULAR_VELOCITY,
+    "lidar_path",
+    "lidar_sha256",
+    "lidar_bytes",
+)
+MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {
+    "scenes": ("hazard_path", "hazard_sha256", "hazard_bytes"),
+    "frames": _ABSENT_IN_FRAMES,
+    "shards": _ABSENT_IN_FRAMES,
+}
 """Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
 writers always write them. To add one, append a column with `nullable=True` to its table and add its name here."""
 KEYS: dict[str, list[str]] = {

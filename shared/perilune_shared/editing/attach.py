@@ -3,7 +3,7 @@
 import pyarrow as pa
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.names import IMAGE_KINDS
+from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS
 from perilune_shared.editing.rewrite import check_source
 from perilune_shared.editing.writer import new_dataset, with_column
 from perilune_shared.errors import UserError
@@ -25,8 +25,8 @@ def attach(
 
     Frames are copied, or hard-linked with `link`. Every PNG must match the hash in the manifest. With `rehash` the
     hashes of the given frames replace those of the manifest, e.g. for frames rendered on another kind of machine. EXRs
-    of a scene are included if all of them exist. Raises UserError if a frame is missing or different, and if the
-    manifest is a plan, which has no labels.
+    of a scene are included if all of them exist, and so are its flash lidar images and its hazard map. Raises UserError
+    if a frame is missing or different, and if the manifest is a plan, which has no labels.
     """
     check_source(manifest, out, progress)
     if manifest.info.images != "absent":
@@ -40,30 +40,28 @@ def attach(
     with new_dataset(out, info) as writer:
         for scene_id in scene_ids:
             tables = manifest.scene(scene_id)
-            frames = _checked(source, tables["frames"], rehash)
-            writer.add_scene({**tables, "frames": frames})
+            frames, scenes = (
+                _checked(source, tables["frames"], rehash),
+                _checked_scene(source, tables["scenes"], rehash),
+            )
+            writer.add_scene({**tables, "frames": frames, "scenes": scenes})
             writer.add_images(source, frames, {name: name for name in frames["frame_id"].to_pylist()}, link=link)
+            writer.add_scene_files(source, scenes, scene_id, link=link)
             progress.advance(task, len(frames))
 
 
 def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
     """Return a scene's rows of `frames` with the hashes of the existing files."""
     camera = source.info.camera
-    rows = frames.select(["frame_id", "png_path", "png_sha256", "exr_path", "exr_sha256"]).to_pylist()
+    rows = frames.select([f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256")]).to_pylist()
     found: dict[str, list] = {f"{kind}_{name}": [] for kind in IMAGE_KINDS for name in ("sha256", "bytes", "path")}
     for row in rows:
         for kind in IMAGE_KINDS:
-            path = row[f"{kind}_path"]
-            size = source.store.size(path) if path is not None else None
-            if kind == "png" and size is None:
+            file = _file(source, row, kind, rehash)
+            if kind == "png" and file["path"] is None:
                 raise UserError(source.store, "frame", f"no {row['png_path']}", "every frame of the manifest")
-            sha256 = source.store.sha256(path) if size is not None else None
-            if size is not None and not rehash and sha256 != row[f"{kind}_sha256"]:
-                expected = f"the file with SHA-256 {row[f'{kind}_sha256']}, or --rehash"
-                raise UserError(source.store.at(path), f"{kind}_sha256", sha256, expected)
-            found[f"{kind}_sha256"].append(sha256)
-            found[f"{kind}_bytes"].append(size)
-            found[f"{kind}_path"].append(path if size is not None else None)
+            for name, value in file.items():
+                found[f"{kind}_{name}"].append(value)
         head = source.store.read(row["png_path"], 0, 64)
         try:
             header = png_header(head)
@@ -72,8 +70,31 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
         if (header.width_px, header.height_px) != (camera.width_px, camera.height_px):
             found_px = f"{header.width_px} x {header.height_px}"
             raise UserError(row["png_path"], "size", found_px, f"{camera.width_px} x {camera.height_px} pixels")
-    if None in found["exr_path"]:
-        found |= {name: [None] * len(rows) for name in found if name.startswith("exr")}
+    for kind in IMAGE_KINDS:
+        if None in found[f"{kind}_path"]:
+            found |= {name: [None] * len(rows) for name in found if name.startswith(kind)}
     for name, values in found.items():
         frames = with_column(frames, name, values)
     return frames
+
+
+def _checked_scene(source: Dataset, scenes: pa.Table, rehash: bool) -> pa.Table:
+    """Return a scene's row with the hashes of its existing files."""
+    row = scenes.to_pylist()[0]
+    for kind in SCENE_FILE_KINDS:
+        for name, value in _file(source, row, kind, rehash).items():
+            scenes = with_column(scenes, f"{kind}_{name}", [value])
+    return scenes
+
+
+def _file(source: Dataset, row: dict, kind: str, rehash: bool) -> dict[str, str | int | None]:
+    """Return path, bytes and sha256 of the file of a row; None if it does not exist. Raises UserError on another."""
+    path = row[f"{kind}_path"]
+    size = source.store.size(path) if path is not None else None
+    if size is None:
+        return {"sha256": None, "bytes": None, "path": None}
+    sha256 = source.store.sha256(path)
+    if not rehash and sha256 != row[f"{kind}_sha256"]:
+        expected = f"the file with SHA-256 {row[f'{kind}_sha256']}, or --rehash"
+        raise UserError(source.store.at(path), f"{kind}_sha256", sha256, expected)
+    return {"sha256": sha256, "bytes": size, "path": path}

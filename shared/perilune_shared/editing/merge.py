@@ -7,7 +7,7 @@ import pyarrow.compute as pc
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
-from perilune_shared.dataset.names import ImageMode, frame_id_of
+from perilune_shared.dataset.names import SCENE_FILE_KINDS, ImageMode, frame_id_of
 from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.editing.licence import joined_licence
 from perilune_shared.editing.rewrite import check_source, state_of, without_derived_rows
@@ -33,9 +33,10 @@ def merge(
     """Write the frames of all sources, each once, as one dataset.
 
     Equal scenes (recipe, seed, Sun, craters) are merged; different scenes with the same name are renamed. Trajectories
-    are treated in the same way. A frame in several sources is taken from the first, with its split and labels. Counts,
-    splits and the split unit are recomputed from the rows. Raises UserError if kinds, cameras or EXR cameras differ, a
-    licence is not an SPDX expression, or two copies of a frame were rendered differently.
+    are treated in the same way. A frame in several sources is taken from the first, with its split and labels, and so
+    is the hazard map of a scene. Counts, splits and the split unit are recomputed from the rows. Raises UserError if
+    kinds, cameras or EXR cameras differ, a licence is not an SPDX expression, or two copies of a frame were rendered
+    differently.
     """
     if len(sources) < 2:
         raise UserError("merge", "datasets", len(sources), "at least two")
@@ -48,6 +49,10 @@ def merge(
         for scene_id, members in groups.items():
             tables, used_frames = _join(scene_id, [(sources[i], own) for i, own in members])
             writer.add_scene(without_derived_rows(tables) if info.images == "planned" else tables)
+            if info.images == "files":
+                (i, own), *_ = members
+                link = images == "link"
+                writer.add_scene_files(sources[i], sources[i].table("scenes", scene_id=own), scene_id, link=link)
             for source, frames, names in used_frames:
                 if info.images == "files" and len(frames):
                     writer.add_images(source, frames, names, link=images == "link")
@@ -102,6 +107,8 @@ def _same_scenes(sources: Sequence[Dataset], *, planned: bool) -> dict[str, list
     for i, source in enumerate(sources):
         for row in sorted(source.table("scenes").to_pylist(), key=lambda row: row["scene_id"]):
             own = row.pop("scene_id")
+            # A packed copy of a scene has no files.
+            row = {name: value for name, value in row.items() if not name.startswith(SCENE_FILE_KINDS)}
             # Labels refer to craters by id, so the ids must be equal too.
             craters = [] if planned else source.table("craters", ["crater_id"], scene_id=own)["crater_id"].to_pylist()
             key = (*row.values(), tuple(craters))

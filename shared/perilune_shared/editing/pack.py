@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.names import SCENE_FILE_KINDS, SPLITS
 from perilune_shared.dataset.packed import LABEL, SHARDS, packed_rows, shard_name
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN
 from perilune_shared.dataset.schema import TABLES
@@ -23,7 +23,8 @@ MOST_FRAMES_WRITTEN = 100_000
 _MAX_SHARD_MB = 2000
 _FRAMES_PER_GROUP, _BYTES_PER_GROUP = 64, 2**23
 """Maximum of a row group, the unit that a stream reads and shuffles."""
-_EXR_COLUMNS = ("exr_path", "exr_sha256", "exr_bytes")
+_NOT_PACKED = [f"{kind}_{name}" for kind in ("exr", "lidar") for name in ("path", "sha256", "bytes")]
+_NOT_PACKED_OF_SCENES = [f"{kind}_{name}" for kind in SCENE_FILE_KINDS for name in ("path", "sha256", "bytes")]
 _ORDER = [("scene_id", "ascending"), ("trajectory_id", "ascending"), ("frame_index", "ascending")]
 
 
@@ -40,8 +41,8 @@ def pack(
 
     Shards contain the frames of one split, in the order scene, trajectory, frame index. A table of more than
     `most_rows` rows becomes several parts, and a shard contains at most `most_frames` frames, to stay within the limits
-    of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are packed. EXRs are not
-    packed: their columns become null.
+    of readers (perilune_shared.dataset.parts). If the dataset has no frames, only its tables are packed. EXRs, images
+    of the flash lidar and hazard maps are not packed: their columns become null.
     """
     check_source(source, out, progress)
     if not 0 < shard_mb <= _MAX_SHARD_MB:
@@ -53,7 +54,10 @@ def pack(
     with new_dataset(out, info, most_rows=most_rows) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)
-            writer.add_scene({**tables, "frames": _without_exr(tables["frames"]) if packed else tables["frames"]})
+            if packed:
+                tables["frames"] = _without(_NOT_PACKED, tables["frames"])
+                tables["scenes"] = _without(_NOT_PACKED_OF_SCENES, tables["scenes"])
+            writer.add_scene(tables)
         if packed:
             task = progress.add_task("packing", total=source.info.counts.frames, unit="frames")
             for split in SPLITS:
@@ -111,14 +115,14 @@ def _groups(source: Dataset, split: str, sizes: Sequence[int]) -> Iterator[pa.Ta
 
 
 def _trajectories(source: Dataset, split: str) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield the frames, in order and without EXRs, and the labels of each trajectory of a split."""
+    """Yield the frames, in order and with their PNGs only, and the labels of each trajectory of a split."""
     columns = ["scene_id", "trajectory_id", "split"]
     for row in source.table("trajectories", columns).sort_by(_ORDER[:2]).to_pylist():
         if row["split"] in (split, None):
             keys = row["scene_id"], row["trajectory_id"], split
             frames = source.table("frames", None, *keys).replace_schema_metadata(TABLES["frames"].metadata)
             labels = source.table("labels", None, *keys).replace_schema_metadata(TABLES["labels"].metadata)
-            yield _without_exr(frames.sort_by(_ORDER)), labels
+            yield _without(_NOT_PACKED, frames.sort_by(_ORDER)), labels
 
 
 def unpack(source: Dataset, out: Address, progress: Progress = NO_PROGRESS, *, link: bool = False) -> None:
@@ -131,7 +135,7 @@ def unpack(source: Dataset, out: Address, progress: Progress = NO_PROGRESS, *, l
     rewrite(source, out, info, lambda tables: tables, "link" if link else "copy", progress)
 
 
-def _without_exr(frames: pa.Table) -> pa.Table:
-    for name in _EXR_COLUMNS:
-        frames = with_column(frames, name, [None] * len(frames))
-    return frames
+def _without(columns: Sequence[str], rows: pa.Table) -> pa.Table:
+    for name in columns:
+        rows = with_column(rows, name, [None] * len(rows))
+    return rows

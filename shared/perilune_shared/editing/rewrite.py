@@ -45,6 +45,7 @@ def rewrite(
                 if info.images == "files":
                     names = {name: name for name in frames["frame_id"].to_pylist()}
                     writer.add_images(source, frames, names, link=images == "link")
+                    writer.add_scene_files(source, tables["scenes"], scene_id, link=images == "link")
             progress.advance(task)
 
 

@@ -13,12 +13,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.content import terrain_of
-from perilune_shared.dataset.index import frame_rows, index_rows, seal
+from perilune_shared.dataset.index import frame_rows, index_rows, scene_file_rows, seal
 from perilune_shared.dataset.info_file import INFO_NAME, checked_info, info_bytes
 from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.manifest import LARGEST_FRAME_BYTES, Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.dataset.names import IMAGE_KINDS, SplitUnit, frame_path
+from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS, SplitUnit, frame_path, scene_file_path
 from perilune_shared.dataset.parts import MOST_ROWS_WRITTEN, Written
 from perilune_shared.dataset.schema import OPTIONAL_TABLES
 from perilune_shared.dataset.whole_tables import WholeTables
@@ -64,12 +64,13 @@ class DatasetWriter:
         self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
         trajectories = _with_counts_and_splits(tables["trajectories"], frames)
         labels = with_frame_columns(tables["labels"], frames)
-        tables = {**tables, "frames": frames, "trajectories": trajectories, "labels": labels}
+        scenes = _with_new_scene_paths(tables["scenes"])
+        tables = {**tables, "scenes": scenes, "frames": frames, "trajectories": trajectories, "labels": labels}
         for name in OPTIONAL_TABLES:
             if name in tables:
                 tables[name] = of_trajectories(tables[name], trajectories)
         if self.info.images == "files":
-            self._index.append(frame_rows(frames))
+            self._index += [frame_rows(frames), scene_file_rows(scenes)]
         for name, rows in tables.items():
             self._tables.add(name, _sorted_by(rows, "frame_id") if name in _PER_TRAJECTORY else rows)
 
@@ -78,7 +79,7 @@ class DatasetWriter:
 
         With `link`, make hard links where the file system allows it.
         """
-        by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path"]).to_pylist()}
+        by_id = {row["frame_id"]: row for row in frames.select(["frame_id", "exr_path", "lidar_path"]).to_pylist()}
         if source.info.images == "packed":
             for frame_id, png in source.pngs(frames):
                 self.store.write(frame_path(names[frame_id], "png"), png, durable=False)
@@ -88,13 +89,20 @@ class DatasetWriter:
         for frame_id, row in by_id.items():
             for kind in IMAGE_KINDS:
                 if row.get(f"{kind}_path") is not None:
-                    to = frame_path(names[frame_id], kind)
-                    if source.store.is_local and self.store.folder is not None:
-                        to_path = files.inside(self.store.folder, to)
-                        files.copy_or_link(source.file(row[f"{kind}_path"]), to_path, link=link)
-                    else:
-                        content = source.store.read(row[f"{kind}_path"], most_bytes=LARGEST_FRAME_BYTES)
-                        self.store.write(to, content, durable=False)
+                    self._copy(source, row[f"{kind}_path"], frame_path(names[frame_id], kind), link=link)
+
+    def add_scene_files(self, source: Dataset, scenes: pa.Table, scene_id: str, *, link: bool) -> None:
+        """Copy the files of a scene, such as its hazard map: `scenes` is its row in `source`, `scene_id` its new id."""
+        for kind in SCENE_FILE_KINDS:
+            path = scenes[f"{kind}_path"][0].as_py()
+            if path is not None:
+                self._copy(source, path, scene_file_path(scene_id, kind), link=link)
+
+    def _copy(self, source: Dataset, path: str, to: str, *, link: bool) -> None:
+        if source.store.is_local and self.store.folder is not None:
+            files.copy_or_link(source.file(path), files.inside(self.store.folder, to), link=link)
+        else:
+            self.store.write(to, source.store.read(path, most_bytes=LARGEST_FRAME_BYTES), durable=False)
 
     def add_file(self, path: str, content: bytes) -> None:
         """Write another file of the dataset."""
@@ -169,6 +177,15 @@ def with_new_paths(frames: pa.Table) -> pa.Table:
         paths = [None if path is None else frame_path(key, kind) for key, path in zip(ids, known, strict=True)]
         frames = with_column(frames, name, paths)
     return frames
+
+
+def _with_new_scene_paths(scenes: pa.Table) -> pa.Table:
+    ids = scenes["scene_id"].to_pylist()
+    for kind in SCENE_FILE_KINDS:
+        known = scenes[f"{kind}_path"].to_pylist()
+        paths = [None if path is None else scene_file_path(key, kind) for key, path in zip(ids, known, strict=True)]
+        scenes = with_column(scenes, f"{kind}_path", paths)
+    return scenes
 
 
 def of_trajectories(rows: pa.Table, trajectories: pa.Table) -> pa.Table:

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.names import SPLITS
+from perilune_shared.dataset.names import IMAGE_KINDS, SPLITS
 from perilune_shared.dataset.packed import IMAGE, LABEL, features_of
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.export.card_head import head_of
@@ -24,7 +24,7 @@ from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_files
 from perilune_shared.storage.store import Address
 
-_OMITTED = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
+_OMITTED = ("split", *(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256", "bytes")))
 _LABEL = pa.struct([*(pa.field(field.name, field.type) for field in LABEL), pa.field("chosen", pa.bool_())])
 _FRAMES_PER_GROUP = 128
 

@@ -13,12 +13,12 @@ hides a pixel only if it is nearer by more than a tenth of the radius and by mor
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.names import ImageKind
 from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera, camera_from_site
@@ -58,7 +58,7 @@ def frame_masks(
     frame_id: str,
     crater_ids: Sequence[int] | None = None,
     depth_m: NDArray[np.floating] | None = None,
-    image: ImageKind = "png",
+    image: Literal["png", "exr"] = "png",
 ) -> list[CraterMask]:
     """Compute the masks of all labelled craters of a frame, in the order of the labels, or of `crater_ids`.
 

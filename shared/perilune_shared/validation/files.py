@@ -4,7 +4,7 @@ Other tools may read files that this package ignores: any file below manifest/, 
 So every unknown file is a fault, and so is every file that is not of the dataset format, even if the index names it.
 """
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
 from pathlib import PurePosixPath
 
 import pyarrow as pa
@@ -15,7 +15,7 @@ from perilune_shared.dataset.index import INDEX, read_index
 from perilune_shared.dataset.info_file import INFO_NAME, has_own_hash, read_info
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.dataset.metadata import DatasetInfo
-from perilune_shared.dataset.names import IMAGE_KINDS
+from perilune_shared.dataset.names import IMAGE_KINDS, SCENE_FILE_KINDS, SUFFIXES, ImageKind, SceneFileKind
 from perilune_shared.dataset.schema import TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.progress import NO_PROGRESS, Progress
@@ -65,13 +65,19 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
     and the records of its rendering.
     """
     try:
-        frames = _frame_files(dataset)
+        frames = _named_files(dataset, "frames", IMAGE_KINDS)
     except UserError as error:
         yield Fault.from_error("manifest/frames", None, error)
         frames = None
+    try:
+        of_scenes = _named_files(dataset, "scenes", SCENE_FILE_KINDS)
+    except UserError as error:
+        yield Fault.from_error("manifest/scenes", None, error)
+        of_scenes = INDEX.empty_table()
     sizes = {item.path: item.size_bytes for item in dataset.store.list()}
     if not dataset.info.complete:
-        known = [*_named_by_format(dataset), *(frames["path"].to_pylist() if frames is not None else ())]
+        known = [*_named_by_format(dataset), *of_scenes["path"].to_pylist()]
+        known += frames["path"].to_pylist() if frames is not None else ()
         yield from _strays(dataset.info, sizes, known)
         return
     if not has_own_hash(dataset.store):
@@ -85,26 +91,27 @@ def file_faults(dataset: Dataset, progress: Progress = NO_PROGRESS) -> Iterator[
         yield Fault.from_error(error.where.removeprefix(f"{dataset.store.address}/"), None, error)
         return
     yield from _strays(info, sizes, rows["path"].to_pylist())
+    yield from _differences(rows, of_scenes, "scenes")
     if frames is not None:
-        yield from _frame_faults(rows, frames)
+        yield from _differences(rows, frames, "frames")
         rows = rows.filter(pc.invert(pc.is_in(rows["path"], frames["path"].combine_chunks())))
-        by_format = _named_by_format(dataset)
+        by_format = {*_named_by_format(dataset), *of_scenes["path"].to_pylist()}
         for path in [path for path in rows["path"].to_pylist() if path not in by_format][:_MAX_REPORTED]:
             yield Fault.of(path, None, "file", "an unexpected file", "only files of the dataset format")
     yield from _hash_faults(dataset, rows, sizes, progress)
 
 
-def _frame_files(dataset: Dataset) -> pa.Table:
-    """Return path, bytes and sha256 of the frames that are files, as in the table frames."""
+def _named_files(dataset: Dataset, table: str, kinds: Sequence[ImageKind | SceneFileKind]) -> pa.Table:
+    """Return path, bytes and sha256 of the files that frames or scenes have, as in that table."""
     pieces = [pa.schema([field.with_nullable(True) for field in INDEX]).empty_table()]
     if dataset.info.images == "files":
-        columns = [f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "bytes", "sha256")]
-        frames = dataset.table("frames", columns)
-        for kind in IMAGE_KINDS:
-            own = frames.select([name for name in columns if name.startswith(kind)]).rename_columns(INDEX.names)
-            # Files of other types stay unexpected, even if a row of `frames` names them.
+        columns = [f"{kind}_{name}" for kind in kinds for name in ("path", "bytes", "sha256")]
+        rows = dataset.table(table, columns)
+        for kind in kinds:
+            own = rows.select([name for name in columns if name.startswith(kind)]).rename_columns(INDEX.names)
+            # Files of other types stay unexpected, even if a row names them.
             fits = pc.and_(
-                pc.ends_with(own["path"], f".{kind}"),
+                pc.ends_with(own["path"], SUFFIXES[kind]),
                 pc.invert(pc.match_substring_regex(own["path"], "^(manifest|shards|index)/")),
             )
             pieces.append(own.filter(pc.fill_null(fits, False)))
@@ -112,7 +119,7 @@ def _frame_files(dataset: Dataset) -> pa.Table:
 
 
 def _named_by_format(dataset: Dataset) -> set[str]:
-    """Return the paths of all files that a dataset may have, except frames."""
+    """Return the paths of all files that a dataset may have, except those of frames and scenes."""
     parts = {path for table in TABLES for path in dataset.parts(table)}
     shards = set(dataset.shards()) if dataset.info.images == "packed" else set()
     return parts | shards | EXTRA_NAMES
@@ -147,23 +154,24 @@ def _cure(path: str) -> str:
     return "only files of the dataset format (docs/reference/validation.md)"
 
 
-def _frame_faults(rows: pa.Table, frames: pa.Table) -> Iterator[Fault]:
-    """Compare the index with path, size and hash in the table frames; yield the first difference of each kind.
+def _differences(rows: pa.Table, named: pa.Table, table: str) -> Iterator[Fault]:
+    """Compare the index with path, size and hash in the table frames or scenes; yield the first difference of each.
 
     The file of these faults is the folder of the index.
     """
-    place = pc.index_in(frames["path"], rows["path"].combine_chunks())
+    place = pc.index_in(named["path"], rows["path"].combine_chunks())
     if place.null_count:
-        missing = frames["path"].filter(pc.is_null(place))[0].as_py()
-        yield Fault.of(index.FOLDER, None, "path", f"no {missing}", "every frame of the table frames")
-    frames, place = frames.filter(pc.is_valid(place)), place.drop_null()
+        missing = named["path"].filter(pc.is_null(place))[0].as_py()
+        expected = f"every {table.removesuffix('s')} of the table {table}"
+        yield Fault.of(index.FOLDER, None, "path", f"no {missing}", expected)
+    named, place = named.filter(pc.is_valid(place)), place.drop_null()
     for name in ("bytes", "sha256"):
         found = rows[name].take(place)
-        equal = pc.fill_null(pc.equal(found, frames[name]), False)
+        equal = pc.fill_null(pc.equal(found, named[name]), False)
         row = pc.index(equal, False).as_py()
         if row >= 0:
-            path, expected = frames["path"][row].as_py(), frames[name][row].as_py()
-            yield Fault.of(index.FOLDER, None, name, f"{found[row].as_py()} for {path}", f"{expected}, as in frames")
+            path, expected = named["path"][row].as_py(), named[name][row].as_py()
+            yield Fault.of(index.FOLDER, None, name, f"{found[row].as_py()} for {path}", f"{expected}, as in {table}")
 
 
 def _hash_faults(dataset: Dataset, rows: pa.Table, sizes: dict[str, int], progress: Progress) -> Iterator[Fault]:

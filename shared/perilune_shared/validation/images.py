@@ -51,9 +51,9 @@ def _file_faults(dataset: Dataset, frame: dict, kind: str, row: int, where: str)
     sha256 = hashlib.sha256(content).hexdigest()
     if len(content) != frame[f"{kind}_bytes"]:
         yield Fault.of(relative, row, f"{kind}_bytes", len(content), frame[f"{kind}_bytes"])
-    elif kind == "exr":
-        if sha256 != frame["exr_sha256"]:
-            yield Fault.of(relative, row, "exr_sha256", "a different SHA-256", frame["exr_sha256"])
+    elif kind != "png":
+        if sha256 != frame[f"{kind}_sha256"]:
+            yield Fault.of(relative, row, f"{kind}_sha256", "a different SHA-256", frame[f"{kind}_sha256"])
     else:
         yield from png_faults(dataset, content, len(content), sha256, frame, row, relative)
 

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.names import IMAGE_KINDS
 from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.geometry.ellipse import Ellipses, project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion, sun_direction
@@ -73,14 +74,14 @@ def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, 
     if len(wrong):
         found = frames["sun_direction"][int(wrong[0])].as_py()
         yield Fault.of(where, int(wrong[0]), "sun_direction", found, f"{sun.tolist()}, the scene's Sun")
-    for kind in ("png", "exr"):
+    for kind in IMAGE_KINDS:
         hashed = np.asarray(frames[f"{kind}_sha256"].is_valid())
         sized = np.asarray(frames[f"{kind}_bytes"].is_valid())
         wrong = np.flatnonzero(hashed != sized)
         if info.images in ("files", "packed") and kind == "png":
             wrong = np.flatnonzero(~hashed | ~sized)
-        if kind == "exr":
-            wrong = np.flatnonzero((hashed != sized) | (hashed & ~np.asarray(frames["exr_path"].is_valid())))
+        if kind != "png":
+            wrong = np.flatnonzero((hashed != sized) | (hashed & ~np.asarray(frames[f"{kind}_path"].is_valid())))
         if len(wrong):
             yield Fault.of(where, int(wrong[0]), f"{kind}_sha256", "null", "path, hash and size together")
 

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 
 from perilune_shared.content import content_sha256, terrain_of
 from perilune_shared.dataset.manifest import Dataset, count_rows
-from perilune_shared.dataset.names import is_whole
+from perilune_shared.dataset.names import SCENE_FILE_KINDS, is_whole
 from perilune_shared.dataset.schema import KEYS, OPTIONAL_TABLES, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
@@ -140,6 +140,11 @@ def _scene_faults(
         seen[name] += len(rows)
         yield from _repeated_keys(dataset, name, rows.select(KEYS[name]), where[name])
     row = scene.to_pylist()[0]
+    for kind in SCENE_FILE_KINDS:
+        if len({row[f"{kind}_{name}"] is None for name in ("sha256", "bytes")}) > 1 or (
+            row[f"{kind}_sha256"] is not None and row[f"{kind}_path"] is None
+        ):
+            yield Fault.of(where["scenes"], 0, f"{kind}_sha256", "null", "path, hash and size together")
     if dataset.info.images != "planned":
         content = content_sha256(craters, boulders)
         if row["content_sha256"] != content:

@@ -1,8 +1,9 @@
 import numpy as np
 
 from perilune_render.config import FlightConfig, InstrumentsConfig
-from perilune_render.flight.altimeter import measure_ranges, range_to_ground_m
+from perilune_render.flight.altimeter import measure_ranges, measure_ranges_of_frames, range_to_ground_m
 from perilune_render.flight.motion import draw_motion
+from perilune_render.flight.trajectories import fly
 from perilune_render.terrain.interpolation import value_at
 
 CONFIG = InstrumentsConfig(range_rate_hz=10.0)
@@ -29,3 +30,17 @@ def test_noise_grows_with_the_range(scene):
     error = np.stack([measure_ranges(motion, scene, CONFIG, 65.0, s).range_m - true_m for s in range(200)])
     assert np.allclose(error.std(axis=0)[:100].mean(), 0.2 + 0.0005 * true_m[:100].mean(), rtol=0.05)
     assert np.allclose(error.std(axis=0)[-100:].mean(), 0.2 + 0.0005 * true_m[-100:].mean(), rtol=0.05)
+
+
+def test_ranges_of_frames_are_along_the_cameras_axis_with_noise_of_their_own(scene):
+    flight = fly(FlightConfig(attitude_sigma_deg=2.0), 20, 7)
+    exact = InstrumentsConfig(range_rate_hz=1.0, range_sigma_m=0.0, range_sigma_share=0.0)
+    found = measure_ranges_of_frames(flight, range(20), scene, exact, 5)
+    end = flight.position_m + found.range_m[:, None] * flight.rotation_camera_from_site[:, 2]
+    assert np.array_equal(found.time_s, flight.time_s)
+    assert np.allclose(end[:, 2], value_at(scene.height_m, scene.grid, end[:, 0], end[:, 1]), atol=0.01)
+    draws = [measure_ranges_of_frames(flight, range(20), scene, CONFIG, seed).range_m for seed in range(200)]
+    error = np.stack(draws) - found.range_m
+    assert np.allclose(error.std(axis=0).mean(), 0.2 + 0.0005 * found.range_m.mean(), rtol=0.05)
+    later = measure_ranges_of_frames(flight, range(5, 25), scene, CONFIG, 0).range_m
+    assert not np.allclose(later - found.range_m, error[0], atol=0.01)

@@ -17,6 +17,7 @@ ROOTS = {
     "renderer": versions.RENDERING,
     "rays": versions.RAYS,
     "imaging": versions.IMAGING,
+    "outputs": versions.OUTPUTS,
 }
 HOLDERS = {"pandas", "pyarrow", "mathutils"}
 """Libraries that hold values and compute none, or come with Blender."""
@@ -72,7 +73,7 @@ def changed(copy, module, pattern, replacement):
         ("perilune_shared.labels.masks", "SLACK_RADII, SLACK_PX", {"imaging"}),
         ("perilune_shared.geometry.ellipse", "_N_FITTED", {"imaging"}),
         ("perilune_shared.geometry.camera", "_MAX_UNDISTORTION_ERROR", set(ROOTS)),
-        ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "imaging"}),
+        ("perilune_shared.geometry.frames", "MOON_RADIUS_M", {"generator", "imaging", "outputs"}),
     ],
 )
 def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, expected):
@@ -83,7 +84,7 @@ def test_a_constant_changes_the_hashes_of_what_uses_it(copy, module, name, expec
     ("module", "pattern", "replacement", "expected"),
     [
         ("perilune_render.imaging.resampling", "INTER_LANCZOS4", "INTER_CUBIC", {"imaging"}),
-        ("perilune_render.imaging.exr", "ZIP_COMPRESSION", "NO_COMPRESSION", {"imaging"}),
+        ("perilune_render.imaging.exr", "ZIP_COMPRESSION", "NO_COMPRESSION", {"imaging", "outputs"}),
         ("perilune_render.dataset.frame_files", '".png", stored', '".png", stored + 1', {"imaging"}),
         ("perilune_render.dataset.real_ground", "> 0\\.5", "> 0.6", {"imaging"}),
         ("perilune_render.blender.nodes", "MULTIPLY", "ADD", {"renderer"}),
@@ -170,4 +171,4 @@ def test_every_library_that_computes_is_recorded():
 def test_compiled_functions_are_found_in_every_module():
     known = {name.partition(":")[0].rpartition(".")[2] for name in compiled_functions()}
     terrain = {"grid", "albedo", "older_ground", "stamp", "noise", "interpolation", "level_ground"}
-    assert known == terrain | {"pixels", "surface", "rocks", "cast", "shade", "query"}
+    assert known == terrain | {"pixels", "surface", "rocks", "cast", "shade", "query", "hazard"}

@@ -1,0 +1,63 @@
+"""The outputs beside the frames of one lit scene, as a configuration asks for them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perilune_render.config import DatasetConfig
+from perilune_render.config_outputs import FlashLidarConfig
+from perilune_render.frame_source import Frame
+from perilune_render.heightfield.surface import Surface, surface_of
+from perilune_render.outputs.flash_lidar import flash
+from perilune_render.outputs.hazard import HazardMap, hazard_map
+from perilune_render.terrain.scene import Scene
+from perilune_shared.geometry.camera import Camera
+from perilune_shared.geometry.frames import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """What there is of a frame beside its rendering."""
+
+    channels: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """More channels of the EXR (h, w), in the pixels of the engine's camera."""
+    lidar: bytes | None = None
+    """File of the flash lidar; None for none."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneOutputs:
+    """The outputs beside the frames of one lit scene. Create it with `SceneOutputs.of`."""
+
+    surface: Surface | None = None
+    """Surface of the scene; None if no output needs it."""
+    hazard: HazardMap | None = None
+    """Hazard map of the scene; None for none."""
+    has_channels: bool = False
+    """Whether the EXRs have channels of the hazard map."""
+    flash_lidar: FlashLidarConfig | None = None
+    """Settings of the flash lidar; None for none."""
+
+    @classmethod
+    def of(cls, scene: Scene, config: DatasetConfig, sun: Array) -> "SceneOutputs":
+        """The outputs of a scene lit from `sun` (3,), a unit vector in O_L."""
+        if config.hazard is None and config.flash_lidar is None:
+            return cls()
+        surface = surface_of(scene)
+        if config.hazard is None:
+            return cls(surface, flash_lidar=config.flash_lidar)
+        hazard = hazard_map(surface, scene, sun, config.hazard)
+        return cls(surface, hazard, config.hazard.frame_channels, config.flash_lidar)
+
+    def beside(self, frame: Frame, camera: Camera) -> Beside:
+        """The outputs beside a frame whose radiance is in the pixels of `camera`."""
+        channels: Mapping[str, np.ndarray] = {}
+        if self.hazard is not None and self.has_channels:
+            depth = frame.radiance.depth_m.astype(np.float64)
+            rays = camera.rays(camera.pixel_centres()) @ frame.shot.rotation_camera_from_site
+            seen = np.where(np.isfinite(depth), depth, np.nan)[..., None] * rays + frame.shot.position_m
+            channels = self.hazard.at(seen[..., 0], seen[..., 1])
+        if self.surface is None or self.flash_lidar is None:
+            return Beside(channels)
+        return Beside(channels, flash(self.surface, frame.shot, self.flash_lidar).exr())
