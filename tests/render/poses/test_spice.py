@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from tests.helpers import in_process
-from tests.helpers.spice_kernels import (
+from tests.render.poses.spice_kernels import (
     CAMERA_FROM_FIXED_WXYZ,
     HEIGHT_M,
     LATITUDE,
