@@ -11,7 +11,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -86,9 +89,21 @@ def read_spice(source: SpiceSource, latitude_deg: float, longitude_deg: float, s
     """Poses, velocities and Suns of a spacecraft, for a site `site_height_m` above the sphere of 1737.4 km.
 
     Camera poses are geometric, without light time. The Sun is apparent (light time and stellar aberration, "LT+S") and
-    seen from the site. The kernel pool of the process is cleared before and after. Raises UserError if spiceypy is not
-    installed, for an unreadable kernel, an unknown body or frame, a time without data, or a Sun below the plane.
+    seen from the site. SPICE runs in a process of its own, since damaged kernels can crash it. Raises UserError if
+    spiceypy is not installed, for an unreadable kernel, an unknown body or frame, a time without data, or a Sun below
+    the plane.
     """
+    _library()
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
+        try:
+            return process.submit(_read, source, latitude_deg, longitude_deg, site_height_m).result()
+        except BrokenProcessPool:
+            names = ", ".join(path.name for path in source.kernels)
+            raise UserError("SPICE", "kernels", f"a crash while reading {names}", "undamaged kernels") from None
+
+
+def _read(source: SpiceSource, latitude_deg: float, longitude_deg: float, site_height_m: float) -> SpicePoses:
+    """See `read_spice`; in this process."""
     spice = _library()
     axes = camera_axes(source.camera_axes)
     site_from_fixed = rotation_site_from_fixed(latitude_deg, longitude_deg)

@@ -168,13 +168,27 @@ def test_damaged_kernels_are_one_line(folder, tmp_path):
     rng = np.random.default_rng(1)
     whole = (folder / "a.bsp").read_bytes()
     others = [text for name in ("a.tls", "a.tpc", "a.tf", "a.tsc", "a.bc") for text in ("--kernels", folder / name)]
-    for k in range(12):
+    for k in range(4):
         damaged = bytearray(whole[: len(whole) // 2] if k == 0 else whole)
         for place in rng.integers(0, len(damaged), 40):
             damaged[place] = rng.integers(256)
         (tmp_path / "damaged.bsp").write_bytes(bytes(damaged))
         done = spice(folder, tmp_path / "poses.csv", *others, kernels=tmp_path / "damaged.bsp")
         assert done.returncode in (0, 2) and len(done.stderr.strip().splitlines()) <= 1
+
+
+def test_a_crash_of_the_library_is_one_line(folder, tmp_path):
+    """SPICE reads past an array if the number of doubles of a summary, byte 8 of the file record, is too large."""
+    damaged = bytearray((folder / "a.bc").read_bytes())
+    damaged[8] = 86
+    (tmp_path / "a.bc").write_bytes(bytes(damaged))
+    names = [folder / name for name in ("a.tpc", "a.tf", "a.tsc", "a.bsp")] + [tmp_path / "a.bc"]
+    done = spice(
+        folder, tmp_path / "poses.csv", *[t for n in names for t in ("--kernels", n)], kernels=folder / "a.tls"
+    )
+    (line,) = done.stderr.strip().splitlines()
+    assert done.returncode == 2 and line.startswith("error: SPICE: ")
+    assert not (tmp_path / "poses.csv").exists()
 
 
 def test_without_the_library_the_extra_is_named(folder, tmp_path, monkeypatch):
