@@ -15,9 +15,9 @@ ROOMS = {
         "geometry client dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
-        "processor config_values config_terrain config_survey config_counterfactual config_scene config streams "
-        "provenance terrain flight poses imaging labels frame_source blender heightfield engines dataset server jobs "
-        "cli"
+        "processor config_values config_cameras config_terrain config_survey config_counterfactual config_scene config "
+        "streams provenance terrain flight poses imaging labels frame_source blender heightfield engines dataset "
+        "server jobs cli"
     ),
     "render/perilune_render/cli": "options dataset frames serve status survey counterfactual main",
     "render/perilune_render/terrain": (

@@ -134,6 +134,7 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
         "velocity_mps": _vectors(flight.velocity_mps),
         "sun_direction": _vectors(np.tile(sun, (n, 1))),
         "real_ground_share": [row.get("real_ground_share") for row in files],
+        "camera": pa.array([trajectory.camera] * n, pa.string()),
     }
     return _table("frames", columns | {name: [row.get(name) for row in files] for name in (*_FILES, *_OF_LABELS)})
 

@@ -15,7 +15,7 @@ _FILES = ("dem", "catalogue")
 _SPEED = ("threads", "cache_gib")
 DEFAULT_ENGINE = "cycles"
 """Not recorded, so that recipes of older versions stay equal."""
-_OPTIONAL = ("scene", "survey", "counterfactual")
+_OPTIONAL = ("cameras", "scene", "survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
@@ -32,8 +32,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, those of the other kind unless the kinds share terrain, and those of a given scene, a survey or a
-    counterfactual if there is none.
+    speed, those of the other kind unless the kinds share terrain, and those of several cameras, a given scene, a
+    survey or a counterfactual if there is none.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -42,7 +42,7 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     for name in _SPEED:
         del plain["render"][name]
     for name in _OPTIONAL:
-        if plain[name] is None:
+        if not plain[name]:
             del plain[name]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]

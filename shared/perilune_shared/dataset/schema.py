@@ -24,6 +24,13 @@ def complete(table: str, rows: pa.Table) -> pa.Table:
     return rows.select(TABLES[table].names).cast(TABLES[table])
 
 
+def stored(table: str, rows: pa.Table) -> pa.Table:
+    """Return `rows` as a file has them: `complete`, without columns of `ONLY_IF_USED` that are null in all rows."""
+    rows = complete(table, rows)
+    unused = [name for name in ONLY_IF_USED.get(table, ()) if rows[name].null_count == len(rows)]
+    return rows.drop_columns(unused) if unused else rows
+
+
 def _vector(length: int) -> pa.DataType:
     return pa.list_(_REAL, length)
 
@@ -137,6 +144,13 @@ TABLES: dict[str, pa.Schema] = {
             "craters with their centre in the image that are too large for a label; null where not known",
             nullable=True,
         ),
+        _column(
+            "camera",
+            _TEXT,
+            "",
+            "name of the camera: a key of `cameras` in dataset.json; null if the lander has one camera without a name",
+            nullable=True,
+        ),
     ),
     "labels": _table(
         "labels",
@@ -185,9 +199,11 @@ TABLES: dict[str, pa.Schema] = {
 OPTIONAL_TABLES = ("inertial", "ranges")
 """Tables that a dataset has only if they have rows: they were added without a new schema version."""
 _ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius")
-MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {"frames": _ABSENT_IN_FRAMES, "shards": _ABSENT_IN_FRAMES}
+MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {"frames": (*_ABSENT_IN_FRAMES, "camera"), "shards": _ABSENT_IN_FRAMES}
 """Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
 writers always write them. To add one, append a column with `nullable=True` to its table and add its name here."""
+ONLY_IF_USED: dict[str, tuple[str, ...]] = {"frames": ("camera",)}
+"""Columns of MAY_BE_ABSENT that are written only if a row has a value, so that other datasets keep their bytes."""
 KEYS: dict[str, list[str]] = {
     "scenes": ["scene_id"],
     "craters": ["scene_id", "crater_id"],

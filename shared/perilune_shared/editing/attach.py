@@ -48,8 +48,7 @@ def attach(
 
 def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
     """Return a scene's rows of `frames` with the hashes of the existing files."""
-    camera = source.info.camera
-    rows = frames.select(["frame_id", "png_path", "png_sha256", "exr_path", "exr_sha256"]).to_pylist()
+    rows = frames.select(["frame_id", "camera", "png_path", "png_sha256", "exr_path", "exr_sha256"]).to_pylist()
     found: dict[str, list] = {f"{kind}_{name}": [] for kind in IMAGE_KINDS for name in ("sha256", "bytes", "path")}
     for row in rows:
         for kind in IMAGE_KINDS:
@@ -69,6 +68,7 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
             header = png_header(head)
         except ValueError as error:
             raise UserError(source.store.at(row["png_path"]), "frame", error, "a grey PNG") from None
+        camera = source.camera_of(row)
         if (header.width_px, header.height_px) != (camera.width_px, camera.height_px):
             found_px = f"{header.width_px} x {header.height_px}"
             raise UserError(row["png_path"], "size", found_px, f"{camera.width_px} x {camera.height_px} pixels")

@@ -24,7 +24,7 @@ from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_files
 from perilune_shared.storage.store import Address
 
-_OMITTED = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes")
+_OMITTED = ("split", "png_path", "png_sha256", "png_bytes", "exr_path", "exr_sha256", "exr_bytes", "camera")
 _LABEL = pa.struct([*(pa.field(field.name, field.type) for field in LABEL), pa.field("chosen", pa.bool_())])
 _FRAMES_PER_GROUP = 128
 

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
 from perilune_shared.geometry.ellipse import Ellipses, project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion, sun_direction
 from perilune_shared.validation.faults import Fault
@@ -34,12 +34,21 @@ def trajectory_faults(
     `scene` and `trajectory` are rows of these tables; the other tables have the trajectory's rows, and the craters of
     the scene. `where` gives the file of each table.
     """
-    yield from _frames(info, scene, trajectory, frames, where["frames"])
+    names = frames["camera"].unique().to_pylist()
+    if info.cameras is not None and (len(names) != 1 or names[0] not in info.cameras):
+        if names:
+            expected = f"one camera in a trajectory, of {', '.join(info.cameras)}"
+            yield Fault.of(where["frames"], None, "camera", names, expected)
+        return
+    camera = info.camera_of(names[0] if names else None)
+    yield from _frames(info, camera, scene, trajectory, frames, where["frames"])
     if len(labels):
-        yield from _labels(info, craters, frames, labels, where)
+        yield from _labels(camera, craters, frames, labels, where)
 
 
-def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, where: str) -> Iterator[Fault]:
+def _frames(
+    info: DatasetInfo, camera: CameraRecord, scene: dict, trajectory: dict, frames: pa.Table, where: str
+) -> Iterator[Fault]:
     key = f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"
     if len(frames) != trajectory["n_frames"]:
         expected = f"{len(frames)}, the number of frames of {key}"
@@ -62,10 +71,10 @@ def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, 
     if (np.diff(time[order]) <= 0).any():
         yield Fault.of(where, None, "time_s", "not increasing with frame_index", "increasing times")
     for name in _CAMERA:
-        wrong = np.flatnonzero(frames[name].to_numpy() != getattr(info.camera, name))
+        wrong = np.flatnonzero(frames[name].to_numpy() != getattr(camera, name))
         if len(wrong):
             found = frames[name][int(wrong[0])].as_py()
-            yield Fault.of(where, int(wrong[0]), name, found, f"{getattr(info.camera, name)}, the dataset's camera")
+            yield Fault.of(where, int(wrong[0]), name, found, f"{getattr(camera, name)}, the dataset's camera")
     sun = sun_direction(scene["sun_azimuth_deg"], scene["sun_elevation_deg"])
     wrong = np.flatnonzero(np.abs(_vectors(frames["sun_direction"]) - sun).max(axis=1) > _SUN_TOLERANCE)
     if len(wrong):
@@ -84,7 +93,7 @@ def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, 
 
 
 def _labels(
-    info: DatasetInfo, craters: pa.Table, frames: pa.Table, labels: pa.Table, places: dict[str, str]
+    camera: CameraRecord, craters: pa.Table, frames: pa.Table, labels: pa.Table, places: dict[str, str]
 ) -> Iterator[Fault]:
     """Check the references of labels, and their ellipses against ellipses projected from crater and pose."""
     where = places["labels"]
@@ -104,7 +113,7 @@ def _labels(
     known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
     if not len(known):
         return
-    projected = _projected(info, craters, frames, crater_of[known], frame_of[known])
+    projected = _projected(camera, craters, frames, crater_of[known], frame_of[known])
     size = 1 + projected["ellipse_a_px"]
     misfit = np.zeros(len(known), bool)
     for name, values in projected.items():
@@ -135,7 +144,7 @@ def _labels(
 
 
 def _projected(
-    info: DatasetInfo, craters: pa.Table, frames: pa.Table, crater_of: np.ndarray, frame_of: np.ndarray
+    camera: CameraRecord, craters: pa.Table, frames: pa.Table, crater_of: np.ndarray, frame_of: np.ndarray
 ) -> dict[str, Array]:
     """Compute the geometric columns of labels, for row numbers (M,) in the tables craters and frames."""
     rotation = matrix_from_quaternion(_vectors(frames["rotation_wxyz"]))[frame_of]
@@ -151,7 +160,7 @@ def _projected(
     in_camera[~valid], normal_in_camera[~valid], radius[~valid] = (0, 0, -10), (0, 0, 1), 1
     with np.errstate(all="ignore"):
         try:
-            ellipses = project_circles(info.camera.intrinsics(), in_camera, normal_in_camera, radius)
+            ellipses = project_circles(camera.intrinsics(), in_camera, normal_in_camera, radius)
         except np.linalg.LinAlgError:
             ellipses = Ellipses(*np.full((5, len(radius)), np.nan))
     names = ("cx_px", "cy_px", "a_px", "b_px", "theta_rad")
