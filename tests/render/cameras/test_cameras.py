@@ -57,7 +57,7 @@ def instants(dataset):
     """The rows of both cameras for each instant."""
     frames = dataset.frames
     for index in sorted(set(frames["frame_index"])):
-        own = frames[frames["frame_index"] == index].set_index("camera")
+        own = frames[frames["frame_index"] == index].set_index("camera", drop=False)
         yield own.loc["nav"], own.loc["wide"]
 
 
