@@ -16,7 +16,7 @@ import numpy as np
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig
-from perilune_render.flight.plan import camera_of
+from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import view_envelope
 from perilune_render.imaging.sensor import FixedPattern, develop
 from perilune_render.terrain.cache import cached_scene

@@ -15,9 +15,9 @@ ROOMS = {
         "geometry client dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
-        "processor config_values config_terrain config_survey config_counterfactual config_scene config_outputs "
-        "config streams provenance terrain flight poses imaging labels sub_poses frame_source blender heightfield "
-        "engines outputs dataset preview server jobs cli"
+        "processor config_values config_cameras config_terrain config_survey config_counterfactual config_scene "
+        "config_outputs config streams provenance terrain flight poses imaging labels sub_poses frame_source blender "
+        "heightfield engines outputs dataset preview server jobs cli"
     ),
     "render/perilune_render/cli": "options dataset frames spice serve status survey counterfactual main",
     "render/perilune_render/terrain": (

@@ -17,7 +17,8 @@ from perilune_render.blender.renderer import Renderer
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_terrain import CratersConfig
 from perilune_render.config_values import Span
-from perilune_render.flight.plan import camera_of, make_plan
+from perilune_render.flight.lens import camera_of
+from perilune_render.flight.plan import make_plan
 from perilune_render.flight.view import view_envelope
 from perilune_render.terrain.boulders import boulder_mesh
 from perilune_render.terrain.cache import cached_scene

@@ -2,8 +2,9 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from perilune_render.config_cameras import CameraConfig, CameraName, MountedCameraConfig
 from perilune_render.config_counterfactual import CounterfactualConfig
 from perilune_render.config_outputs import FlashLidarConfig, HazardConfig
 from perilune_render.config_scene import SceneConfig
@@ -14,41 +15,6 @@ from perilune_shared.config import Section
 from perilune_shared.dataset.names import SplitUnit
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.labels.thresholds import default_label_bound_px
-
-
-class DistortionConfig(Section):
-    """Brown-Conrady lens distortion in OpenCV's form, on image coordinates divided by the focal length."""
-
-    k1: float = 0.0
-    """Radial coefficient of r^2."""
-    k2: float = 0.0
-    """Radial coefficient of r^4."""
-    p1: float = 0.0
-    """First tangential coefficient."""
-    p2: float = 0.0
-    """Second tangential coefficient."""
-    k3: float = 0.0
-    """Radial coefficient of r^6."""
-
-
-class CameraConfig(Section):
-    """The lander's camera, looking along -Z of the body."""
-
-    width_px: Annotated[int, Field(ge=16, le=4096)] = 256
-    """Image width, pixels."""
-    height_px: Annotated[int, Field(ge=16, le=4096)] = 256
-    """Image height, pixels."""
-    horizontal_fov_deg: Annotated[float, Field(ge=1, le=120)] = 50.0
-    """Horizontal field of view over the image width, without distortion, degrees."""
-    focal_length_px: Positive | None = None
-    """Focal length, pixels; null computes it from horizontal_fov_deg."""
-    principal_x_px: float | None = None
-    """Principal point, from the left edge, pixels; null is the image centre."""
-    principal_y_px: float | None = None
-    """Principal point, from the top edge, pixels; null is the image centre."""
-    distortion: DistortionConfig = DistortionConfig()
-    """Lens distortion."""
-
 
 _LEAST_LIMIT = 3.0
 """Smallest limit of that acceleration, in standard deviations on an axis: about half of all draws keep it."""
@@ -280,6 +246,8 @@ class DatasetConfig(Section):
     """Whether both kinds use the same scenes, as in the paper; otherwise each kind has its own."""
     camera: CameraConfig = CameraConfig()
     """Camera."""
+    cameras: dict[CameraName, MountedCameraConfig] = Field(default_factory=dict)
+    """Several cameras on the body, by name, in place of `camera`; each has its settings and a `mounting`."""
     terrain: TerrainConfig = TerrainConfig()
     """Terrain."""
     light: LightConfig = LightConfig()
@@ -304,6 +272,11 @@ class DatasetConfig(Section):
     """Images from orbit in place of the descents, over the same ground; `perilune-render survey` sets it."""
     counterfactual: CounterfactualConfig | None = None
     """Craters removed from the ground, or another Sun; `perilune-render counterfactual` sets it."""
+
+    @field_validator("cameras")
+    @classmethod
+    def _sorted_by_name(cls, cameras: dict[str, MountedCameraConfig]) -> dict[str, MountedCameraConfig]:
+        return dict(sorted(cameras.items()))
 
     @model_validator(mode="after")
     def _same_ground(self) -> "DatasetConfig":

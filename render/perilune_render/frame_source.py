@@ -18,7 +18,7 @@ from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.resampling import seen_by
 from perilune_render.imaging.sensor import Exposure, FixedPattern, expected, expose, read_out, time_of_exposure_s
 from perilune_render.labels.frame_labels import Labels, RimCircles, Shown, crater_index, label_frame, with_contrast
-from perilune_render.streams import derived_seed, stream
+from perilune_render.streams import camera_seed, derived_seed, stream
 from perilune_render.sub_poses import Pose, RowPoses, moved, row_times_s, sensor_rows
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
@@ -116,14 +116,17 @@ class FrameSource:
     """Limits on the radius of labels."""
 
     @classmethod
-    def of(cls, engine: Engine, config: DatasetConfig, camera: Camera, circles: RimCircles) -> "FrameSource":
+    def of(
+        cls, engine: Engine, config: DatasetConfig, camera: Camera, circles: RimCircles, name: str | None = None
+    ) -> "FrameSource":
         """The source with a configuration's sensor and label limits; the configuration's seed draws the fixed pattern.
 
-        Raises ValueError if the engine's camera does not cover the view of `camera`.
+        `name` is that of the camera, one of several on a body: each has a fixed pattern of its own. Raises ValueError
+        if the engine's camera does not cover the view of `camera`.
         """
         if not engine.camera.covers(camera):
             raise ValueError(f"camera of the engine: got {engine.camera}, expected one that covers {camera}")
-        pattern = FixedPattern.draw(config.sensor, camera, config.seed)
+        pattern = FixedPattern.draw(config.sensor, camera, camera_seed(config.seed, name))
         return cls(engine, camera, circles, config.sensor, pattern, config.labels)
 
     def take(self, shot: Shot) -> Frame:

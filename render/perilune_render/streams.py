@@ -14,3 +14,8 @@ def derived_seed(seed: int, *names: object) -> int:
 def stream(seed: int, *names: object) -> np.random.Generator:
     """The random generator of a named stream, for example `stream(scene.seed, "craters")`."""
     return np.random.default_rng(derived_seed(seed, *names))
+
+
+def camera_seed(seed: int, camera: str | None) -> int:
+    """Random seed of a camera's frames or sensor: independent for each of several cameras, `seed` for a single one."""
+    return seed if camera is None else derived_seed(seed, "camera", camera)

@@ -7,8 +7,9 @@ import pytest
 from tests.helpers.flat_engine import FlatEngine
 from tests.helpers.scenes import config_with
 
-from perilune_render.config import CameraConfig, DistortionConfig, LightConfig
-from perilune_render.flight.plan import camera_of
+from perilune_render.config import LightConfig
+from perilune_render.config_cameras import CameraConfig, DistortionConfig
+from perilune_render.flight.lens import camera_of
 from perilune_render.frame_source import FrameSource, Shot
 from perilune_render.imaging.sensor import expected
 from perilune_render.labels.frame_labels import RimCircles

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from perilune_render.cli.dataset import How, made_or_exit
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
-from perilune_render.config import CameraConfig
+from perilune_render.config_cameras import CameraConfig
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
@@ -48,6 +48,10 @@ def frames(
     """
     how = How.of("local", None, workers, threads, None, finish=False, dry_run=False)
     config = resolved_config(preset, scene, setting, dem, catalogue, given_scene=True)
+    if camera is not None and config.cameras:
+        raise UserError(
+            "--camera", "dataset.cameras", ", ".join(config.cameras), "--camera or dataset.cameras, not both"
+        )
     if camera is not None:
         config = config.model_copy(update={"camera": read_camera(camera)})
     store = open_store(out)

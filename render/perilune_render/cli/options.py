@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from perilune_render.config import DatasetConfig
+from perilune_render.config_cameras import CameraConfig
 from perilune_render.config_terrain import SITE_FIELDS
 from perilune_shared.config import resolve
 from perilune_shared.dataset.names import Kind
@@ -48,12 +49,16 @@ def one_kind(kind: KindChoice) -> Kind:
 
 def warn_of_size(config: DatasetConfig) -> None:
     """Warn before rendering if the detector cannot be trained on frames of this size."""
-    sides = {"width_px": config.camera.width_px, "height_px": config.camera.height_px}
+    cameras: dict[str, CameraConfig] = {f"cameras.{name}": each for name, each in config.cameras.items()}
+    cameras = cameras or {"camera": config.camera}
+    sides = {
+        f"{camera}.{name}": getattr(each, name)
+        for camera, each in cameras.items()
+        for name in ("width_px", "height_px")
+    }
     for name, side in sides.items():
         if side % 32:
-            line = (
-                f"dataset.camera.{name}: {side} is not a multiple of 32: the detector cannot be trained on such frames"
-            )
+            line = f"dataset.{name}: {side} is not a multiple of 32: the detector cannot be trained on such frames"
             console.print(line, soft_wrap=True)
 
 

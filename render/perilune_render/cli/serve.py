@@ -9,6 +9,7 @@ from perilune_render.cli.frames import CameraFile, Scene, read_camera
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
 from perilune_render.config import DatasetConfig
 from perilune_render.config_scene import SceneConfig
+from perilune_shared.errors import UserError
 from perilune_shared.progress import say
 
 if TYPE_CHECKING:
@@ -55,6 +56,9 @@ def serve(
 ) -> None:
     """Render images at any pose over one scene, for clients of PANGU's protocol and of `perilune_shared.client`."""
     config = resolved_config(preset, scene, setting, dem, catalogue, given_scene=True)
+    if config.cameras:
+        expected = "none: the server has one dataset.camera"
+        raise UserError("configuration", "dataset.cameras", ", ".join(config.cameras), expected)
     if camera is not None:
         config = config.model_copy(update={"camera": read_camera(camera)})
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
@@ -98,7 +102,7 @@ def serve(
 
 def open_world(config: DatasetConfig) -> "World":
     """The world of a configuration: its ground is made for `dataset.scene.views`, or for the flights of `nav`."""
-    from perilune_render.flight.plan import camera_of
+    from perilune_render.flight.lens import camera_of
     from perilune_render.flight.view import scene_view, view_envelope
     from perilune_render.poses.plan import scene_seed
     from perilune_render.server.world import World

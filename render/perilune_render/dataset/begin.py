@@ -26,6 +26,11 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
     split_by = settings.split_by
     if split_by == "scene" and config.terrain.dem is not None and settings.n_scenes > 1:
         split_by = "trajectory"  # all scenes show the same elevation model
+    camera, exr_camera = plan.first.records()
+
+    def named(which: int) -> dict[str, CameraRecord]:
+        return {str(name): each.records()[which] for name, each in plan.rig.items()}
+
     return DatasetInfo(
         name=f"perilune-{config.name}-{recipe.kind}",
         kind=recipe.kind,
@@ -33,8 +38,10 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
         complete=False,
         images="files",
         split_by=split_by,
-        camera=CameraRecord.of(plan.camera),
-        exr_camera=CameraRecord.of(plan.exr_camera) if config.render.exr else None,
+        camera=camera,
+        exr_camera=exr_camera if config.render.exr else None,
+        cameras=named(0) if len(plan.rig) > 1 else None,
+        exr_cameras=named(1) if len(plan.rig) > 1 and config.render.exr else None,
         recipes=recipes_of(recipe),
         counts=Counts(),
         licence=LICENCE,

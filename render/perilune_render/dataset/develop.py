@@ -6,6 +6,7 @@ once its commit is written, which comes last.
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +19,7 @@ from perilune_render.dataset.finish import finish
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.work import OF_SCENE, commit, committed, write_scene
-from perilune_render.flight.plan import camera_of
+from perilune_render.flight.rig import Rig, rig_of
 from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.exr import local_exr, read_radiance
 from perilune_render.imaging.radiance import Radiance
@@ -74,20 +75,21 @@ def develop_dataset(
 ) -> Dataset:
     """Make a dataset at `out` from the EXRs of `source`, with changes to its settings.
 
-    `config_file` and `settings` may change `dataset.sensor` and `dataset.camera` only. Scenes, craters, boulders and
-    trajectories are copied. With the same camera the labels are copied and only their contrast is measured again; with
-    another camera all labels are computed again. Raises UserError if another setting is changed, if the source is
-    incomplete or lacks EXRs, or if the EXRs do not cover the camera's view.
+    `config_file` and `settings` may change `dataset.sensor` and `dataset.camera` only, or the intrinsics in
+    `dataset.cameras`. Scenes, craters, boulders and trajectories are copied. With the same camera the labels are copied
+    and only their contrast is measured again; with another camera all labels are computed again. Raises UserError if
+    another setting is changed, if the source is incomplete or lacks EXRs, or if the EXRs do not cover the camera's
+    view.
     """
     if len(source.info.recipes) != 1:
         raise UserError(source.store, "recipes", len(source.info.recipes), "one recipe (a dataset that was not merged)")
     old = source.info.recipe()
     config = _changed(source, config_file, settings)
-    camera, exr_camera = _cameras(source, config)
+    rig = _rig(source, config)
     made_of = Origin(
         name=source.info.name,
         sha256=source.store.sha256("dataset.json"),
-        camera_config=old.config.get("camera", {}),
+        camera_config=old.config.get("cameras") or old.config.get("camera", {}),
     )
     recipe = old.model_copy(
         update={
@@ -101,8 +103,9 @@ def develop_dataset(
             "name": f"{source.info.name}-developed",
             "complete": False,
             "images": "files",
-            "camera": source.info.camera.model_copy(update=asdict(camera)),
+            **_records(source, rig),
             "exr_camera": None,
+            "exr_cameras": None,
             "recipes": recipes_of(recipe),
             "history": (),
             "counts": Counts(),
@@ -115,19 +118,18 @@ def develop_dataset(
         raise UserError(source.store, "images", source.info.images, "a dataset with its EXRs")
     store = open_store(out)
     with writing(store):
-        return _develop(source, config, info, (camera, exr_camera), store, progress)
+        return _develop(source, config, info, rig, store, progress)
 
 
 def _develop(
     source: Dataset,
     config: DatasetConfig,
     info: DatasetInfo,
-    cameras: tuple[Camera, Camera],
+    rig: Rig,
     out: Store,
     progress: Progress,
 ) -> Dataset:
-    """Begin or resume the dataset at `out`; `cameras`: the camera of its PNGs, then that of the source's EXRs."""
-    camera, exr_camera = cameras
+    """Begin or resume the dataset at `out`; `rig` has the cameras of its PNGs."""
     info = begin_or_resume(out, info)
     if info.complete:
         return open_finished(out)
@@ -141,8 +143,10 @@ def _develop(
         for trajectory in trajectories:
             frames = source.table("frames", scene_id=scene_id, trajectory_id=trajectory["trajectory_id"])
             if f"{scene_id}.{trajectory['trajectory_id']}" not in done:
+                name = frames["camera"][0].as_py()
+                exr_camera = source.info.exr_camera_of(name).intrinsics()
                 renderings = Renderings.of(source, frames, trajectory["seed"], exr_camera)
-                frame_source = FrameSource.of(renderings, config, camera, circles)
+                frame_source = FrameSource.of(renderings, config, rig[name].camera, circles, name)
                 _develop_trajectory(source, out, frame_source, frames, trajectory["seed"])
             progress.advance(task, len(frames))
     return finish(out, info, scenes)
@@ -154,8 +158,10 @@ def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...
     given = settings_of(source.info.recipe())
     before = resolve_over(DatasetConfig, "dataset", where, given)
     after = resolve_over(DatasetConfig, "dataset", where, given, config_file, settings)
-    kept = set(DatasetConfig.model_fields) - {"sensor", "camera"}
+    kept = set(DatasetConfig.model_fields) - {"sensor", "camera", "cameras"}
     fixed_before, fixed_after = before.model_dump(include=kept), after.model_dump(include=kept)
+    for fixed, config in ((fixed_before, before), (fixed_after, after)):
+        fixed["cameras"] = {name: camera.mounting.model_dump() for name, camera in config.cameras.items()}
     if fixed_before != fixed_after:
         raise UserError(
             "--set or --config",
@@ -173,28 +179,41 @@ def _changed(source: Dataset, config_file: Path | None, settings: tuple[str, ...
     return after
 
 
-def _cameras(source: Dataset, config: DatasetConfig) -> tuple[Camera, Camera]:
-    """The camera of the new frames and that of the EXRs. Raises UserError if the EXRs do not cover the new view."""
+def _rig(source: Dataset, config: DatasetConfig) -> Rig:
+    """The cameras of the new frames. Raises UserError if the EXRs do not cover the view of one of them."""
     if not source.info.complete:
         raise UserError(source.store.at("dataset.json"), "complete", "false", "a finished dataset")
-    camera = camera_of(config.camera)
-    exr_camera = source.exr_camera
-    if not exr_camera.covers(camera):
-        raise UserError(
-            "--set or --config",
-            "dataset.camera",
-            f"a view that the EXRs ({exr_camera.width_px} x {exr_camera.height_px} px, focal length"
-            f" {exr_camera.fx_px:.6g} px) do not cover",
-            "a view within that of the EXRs",
-        )
-    return camera, exr_camera
+    rig = rig_of(config)
+    for name in source.table("frames", ["camera"])["camera"].unique().to_pylist():
+        if name not in rig:
+            raise UserError(source.store.at("dataset.json"), "cameras", name, "a camera of its recipe")
+        exr_camera = source.info.exr_camera_of(name).intrinsics()
+        if not exr_camera.covers(rig[name].camera):
+            raise UserError(
+                "--set or --config",
+                "dataset.camera" if name is None else f"dataset.cameras.{name}",
+                f"a view that the EXRs ({exr_camera.width_px} x {exr_camera.height_px} px, focal length"
+                f" {exr_camera.fx_px:.6g} px) do not cover",
+                "a view within that of the EXRs",
+            )
+    return rig
+
+
+def _records(source: Dataset, rig: Rig) -> dict[str, Any]:
+    """The fields `camera` and `cameras` of dataset.json with the intrinsics of a rig."""
+    info = source.info
+    if info.cameras is None:
+        (name,) = source.table("frames", ["camera"])["camera"].unique().to_pylist()
+        return {"camera": info.camera.model_copy(update=asdict(rig[name].camera))}
+    cameras = {n: each.model_copy(update=asdict(rig[n].camera)) for n, each in info.cameras.items()}
+    return {"camera": next(iter(cameras.values())), "cameras": cameras}
 
 
 def _develop_trajectory(source: Dataset, out: Store, frame_source: FrameSource, frames: pa.Table, seed: int) -> None:
     """Develop one trajectory, given its rows of the source's table `frames` and its random seed."""
     scene_id, trajectory_id = (frames[name][0].as_py() for name in ("scene_id", "trajectory_id"))
     known = None
-    if frame_source.camera == source.camera:
+    if frame_source.camera == source.info.camera_of(frames["camera"][0].as_py()).intrinsics():
         known = source.table("labels", scene_id=scene_id, trajectory_id=trajectory_id)
     written: list[dict] = []
     labels = []

@@ -14,7 +14,8 @@ import pyarrow.compute as pc
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.dataset.begin import new_info
 from perilune_render.flight.motion import Motion, draw_motion
-from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
+from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan
+from perilune_render.flight.rig import MountedCamera, Rig, mounted, rig_of
 from perilune_render.flight.survey import survey_camera
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import view_of
@@ -29,7 +30,7 @@ from perilune_shared.storage.files import sha256_of
 _SAME_M = 1e-6
 """Largest difference of a recorded position from the same draw, metres: rounding on another processor."""
 _TURN = "angular_velocity_radps"
-_OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "rotation_wxyz")
+_OF_FRAMES = ("frame_index", "split", "time_s", "position_m", "velocity_mps", "rotation_wxyz", "camera")
 
 
 def plan_from_manifest(
@@ -51,25 +52,38 @@ def plan_from_manifest(
         raise UserError(where, "developed_from", recipe.developed_from.name, expected)
     config = config_of(recipe, where, dem, catalogue)
     _check_dem(manifest, config)
-    lander = camera_of(config.camera)
-    view = view_of(config, lander.covering_pinhole(), recipe.kind)
-    camera = lander if config.survey is None else survey_camera(config.survey, float(view.reach_m[-1]))
-    if camera != info.camera.intrinsics():
-        raise UserError(where, "camera", info.camera.intrinsics(), f"that of its recipe, {camera}")
+    rig: Rig = rig_of(config)
+    view = view_of(config, rig, recipe.kind)
+    if config.survey is not None:
+        rig = {None: mounted(survey_camera(config.survey, float(view.reach_m[-1])))}
     scenes = [
         ScenePlan(row["scene_id"], row["seed"], row["sun_azimuth_deg"], row["sun_elevation_deg"])
         for row in manifest.table("scenes").sort_by("scene_id").to_pylist()
     ]
-    recorded = Recorded.of(manifest, [scene.scene_id for scene in scenes], config.kind(recipe.kind).flight)
+    recorded = Recorded.of(manifest, [scene.scene_id for scene in scenes], config.kind(recipe.kind).flight, rig)
+    rig = _rig_of_frames(manifest, rig)
     of_scene = [row["scene_id"] for row in recorded.rows]
     places = {
         scene.scene_id: range(bisect_left(of_scene, scene.scene_id), bisect_right(of_scene, scene.scene_id))
         for scene in scenes
     }
-    plan = Plan(camera, camera.covering_pinhole(), view, tuple(scenes), recorded, places)
+    plan = Plan(rig, view, tuple(scenes), recorded, places)
     begun = new_info(config, plan, recipe_of(config, recipe.kind, recipe.preset))
     kept = {"name": info.name, "split_by": info.split_by, "history": info.history, "licence": info.licence}
     return plan, config, begun.model_copy(update=kept)
+
+
+def _rig_of_frames(manifest: Dataset, rig: Rig) -> Rig:
+    """The cameras of a rig that a manifest has frames of. Raises UserError if it records others."""
+    info, where = manifest.info, manifest.store.at("dataset.json")
+    names = set(manifest.table("frames", ["camera"])["camera"].unique().to_pylist())
+    if not names <= rig.keys():
+        raise UserError(where, "cameras", sorted(map(str, names)), f"those of its recipe, {sorted(map(str, rig))}")
+    own = {name: each for name, each in rig.items() if name in names}
+    for name, each in own.items():
+        if (recorded := info.camera_of(name)) != each.records()[0]:
+            raise UserError(where, "camera", recorded, f"that of its recipe, {each.records()[0]}")
+    return own or rig
 
 
 def _check_dem(manifest: Dataset, config: DatasetConfig) -> None:
@@ -94,9 +108,17 @@ class Recorded(Sequence[TrajectoryPlan]):
     """Columns of the table `frames`, in the order of trajectories and of `frame_index`, each (n_frames, ...)."""
     settings: FlightConfig | None
     """Settings of the flights, to know the motion between the frames; None if that is not needed."""
+    rig: Rig
+    """Cameras; needed only with `settings`."""
 
     @classmethod
-    def of(cls, manifest: Dataset, scene_ids: list[str], settings: FlightConfig | None = None) -> "Recorded":
+    def of(
+        cls,
+        manifest: Dataset,
+        scene_ids: list[str],
+        settings: FlightConfig | None = None,
+        rig: Rig | None = None,
+    ) -> "Recorded":
         """Read the trajectories and poses of some scenes of a manifest."""
         keys = ["scene_id", "trajectory_id"]
         trajectories = manifest.table("trajectories").sort_by([(key, "ascending") for key in keys])
@@ -112,7 +134,7 @@ class Recorded(Sequence[TrajectoryPlan]):
         turn = [frames[name] for name in ANGULAR_VELOCITY]
         if any(each.null_count < len(each) for each in turn):
             columns[_TURN] = np.stack([pc.fill_null(each, 0.0).to_numpy() for each in turn], axis=1)[order]
-        return cls(trajectories.to_pylist(), first, columns, settings)
+        return cls(trajectories.to_pylist(), first, columns, settings, rig or {})
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -124,9 +146,12 @@ class Recorded(Sequence[TrajectoryPlan]):
         place = range(len(self))[place]
         row, own = self.rows[place], slice(self.first[place], self.first[place + 1])
         columns = {name: values[own] for name, values in self.columns.items()}
-        flight = partial(_flight, row, columns, self.settings)
+        cameras = columns.pop("camera")
+        camera = cameras[0] if len(cameras) and isinstance(cameras[0], str) else None
+        flight = partial(_flight, row, columns, self.settings, self.rig.get(camera))
         index, splits = tuple(columns["frame_index"].tolist()), tuple(columns["split"].tolist())
-        return TrajectoryPlan(row["scene_id"], row["trajectory_id"], row["seed"], index, splits, flight, is_drawn=False)
+        ids = row["scene_id"], row["trajectory_id"]
+        return TrajectoryPlan(*ids, row["seed"], index, splits, flight, is_drawn=False, camera=camera)
 
 
 def _values(column: pa.ChunkedArray) -> np.ndarray:
@@ -136,7 +161,9 @@ def _values(column: pa.ChunkedArray) -> np.ndarray:
     return column.to_numpy()
 
 
-def _flight(row: dict[str, Any], columns: dict[str, np.ndarray], settings: FlightConfig | None) -> Flight:
+def _flight(
+    row: dict[str, Any], columns: dict[str, np.ndarray], settings: FlightConfig | None, camera: MountedCamera | None
+) -> Flight:
     """The flight of a row of the table `trajectories` and the columns of its frames.
 
     Its motion is that of the recorded seed, unless a position differs: then it was not drawn, or with other settings.
@@ -146,15 +173,18 @@ def _flight(row: dict[str, Any], columns: dict[str, np.ndarray], settings: Fligh
     )
     nominal = NominalTrajectory(position, velocity, acceleration, row["duration_s"])
     motion = draw_motion(settings, row["seed"]) if settings is not None else None
-    if motion is not None and not _passes(motion, columns):
+    if motion is not None and not _passes(motion, columns, camera):
         motion = None
     time, path, speed, rotation = (columns[name] for name in ("time_s", "position_m", "velocity_mps", "rotation_wxyz"))
     return Flight(nominal, time, path, speed, rotation, motion, columns.get(_TURN))
 
 
-def _passes(motion: Motion, columns: dict[str, np.ndarray]) -> bool:
-    """Whether a motion passes through the recorded positions of all frames."""
-    return np.allclose(motion.path_at(columns["time_s"])[0], columns["position_m"], rtol=0, atol=_SAME_M)
+def _passes(motion: Motion, columns: dict[str, np.ndarray], camera: MountedCamera | None) -> bool:
+    """Whether a motion of the body passes through the recorded positions of all frames of a camera on it."""
+    position = columns["position_m"]
+    if camera is not None and camera.position_in_body_m.any():
+        position = camera.body_position(position, columns["rotation_wxyz"])
+    return np.allclose(motion.path_at(columns["time_s"])[0], position, rtol=0, atol=_SAME_M)
 
 
 def compare_hashes(manifest: Dataset, made: Dataset) -> tuple[int, int, int]:

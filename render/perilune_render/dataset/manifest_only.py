@@ -6,7 +6,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.dataset import tables
 from perilune_render.dataset.begin import new_info
 from perilune_render.flight.plan import make_plan
-from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
+from perilune_render.flight.pose_checks import check_plan, check_trajectories
 from perilune_render.outputs.hazard import check_hazard
 from perilune_render.provenance.recipe import recipe_of
 from perilune_render.terrain.grid import graded_grid
@@ -39,7 +39,7 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
             with interrupts_held():
                 scene = grow_scene(config, plan.view, scene_plan.seed)
             trajectories = plan.of_scene(scene_plan.scene_id)
-            check_poses(Poses.planned(trajectories), plan.exr_camera, scene, where)
+            check_trajectories(plan, trajectories, scene, where)
             wanted = {"png": True, "exr": config.render.exr, "lidar": config.flash_lidar is not None}
             kinds = [kind for kind in IMAGE_KINDS if wanted[kind]]
             hazard = {"hazard_path": scene_file_path(scene_plan.scene_id, "hazard")} if config.hazard else None
@@ -47,7 +47,7 @@ def write_manifest_only(config: DatasetConfig, kind: Kind, preset: str, out: Add
             for trajectory in trajectories:
                 ids = [trajectory.frame_id(place) for place in range(len(trajectory.splits))]
                 paths = [{f"{kind}_path": frame_path(frame_id, kind) for kind in kinds} for frame_id in ids]
-                frames.append(tables.frame_table(trajectory, plan.camera, scene_plan.sun, paths))
+                frames.append(tables.frame_table(trajectory, plan.rig[trajectory.camera].camera, scene_plan.sun, paths))
             writer.add_scene(
                 {
                     "scenes": tables.scene_tables(scene_plan, scene, config, recipe.key, hazard)["scenes"],

@@ -15,20 +15,21 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_render.config import CameraConfig, DatasetConfig
+from perilune_render.config import DatasetConfig
+from perilune_render.config_cameras import CameraConfig
 from perilune_render.dataset.frame_files import write_frame
 from perilune_render.dataset.shots import recorded_shot
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines import open_engine
-from perilune_render.flight.plan import camera_of
 from perilune_render.flight.pose_checks import Poses, check_poses
+from perilune_render.flight.rig import rig_of
 from perilune_render.flight.view import view_of
 from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.imaging.exr import local_exr, read_exr
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.outputs.of_scene import SceneOutputs
-from perilune_render.provenance.recipe import config_of, same_source
+from perilune_render.provenance.recipe import config_of, same_source, settings_of
 from perilune_render.terrain.cache import cached_scene
 from perilune_shared.config import resolve_over
 from perilune_shared.content import content_sha256
@@ -131,38 +132,46 @@ def _of_scene(
             raise UserError(dataset.store, "trajectories", f"no {row['trajectory_id']}", f"that of {row['frame_id']}")
     config = config_of(recipe, where, dem, catalogue)
     ground_config = _ground_config(recipe, config, where)
-    camera, exr_camera = camera_of(config.camera), camera_of(ground_config.camera).covering_pinhole()
-    view = view_of(ground_config, exr_camera, recipe.kind)
-    if camera != dataset.camera:
-        raise UserError(where, "camera", dataset.camera, f"that of its recipe, {camera}")
+    rig, exr_rig = rig_of(config), rig_of(ground_config)
+    view = view_of(ground_config, exr_rig, recipe.kind)
+    for row in rows:
+        if row["camera"] not in rig:
+            raise UserError(where, "cameras", row["camera"], f"one of its recipe, {', '.join(map(str, rig))}")
+        if rig[row["camera"]].camera != dataset.camera_of(row):
+            found = dataset.camera_of(row)
+            raise UserError(where, "camera", found, f"that of its recipe, {rig[row['camera']].camera}")
     with interrupts_held():
         ground = cached_scene(ground_config, view, scene["seed"])
     if not same_source(ground.dem_source, scene["dem_source"]):
         raise UserError("--dem", "elevation model", ground.dem_source, scene["dem_source"])
-    poses = (np.array([row[name] for row in rows]) for name in ("position_m", "rotation_wxyz"))
-    check_poses(Poses([row["frame_id"] for row in rows], *poses), exr_camera, ground, dataset.store)
+    of_camera = {name: own for name in rig if (own := [row for row in rows if row["camera"] == name])}
+    for name, own in of_camera.items():
+        poses = (np.array([row[column] for row in own]) for column in ("position_m", "rotation_wxyz"))
+        ids = [row["frame_id"] for row in own]
+        check_poses(Poses(ids, *poses), exr_rig[name].exr_camera, ground, dataset.store)
     tables = ground_tables(scene["scene_id"], ground)
     same_ground = content_sha256(tables["craters"], tables["boulders"]) == scene["content_sha256"]
     outcomes, dark = [], []
-    sun = np.array(rows[0]["sun_direction"])
+    circles, sun = RimCircles.of_scene(ground), np.array(rows[0]["sun_direction"])
     outputs = SceneOutputs.of(ground, _wanted(config, rows), sun)
-    with open_engine(ground, ground_config, exr_camera, sun, outputs.surface) as engine:
-        source = FrameSource.of(engine, config, camera, RimCircles.of_scene(ground))
-        for row in rows:
-            frame_id, trajectory = row["frame_id"], trajectories[row["trajectory_id"]]
-            approach = approach_deg(trajectory["nominal_position_m"])
-            frame = source.take(recorded_shot(row, trajectory["seed"], approach))
-            # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
-            has_exr = row["exr_path"] is not None
-            beside = outputs.beside(frame, engine.camera)
-            new = write_frame(out, frame_id, source, frame, exr=has_exr, beside=beside)
-            png = _compared(dataset, row, "png", out, new)
-            exr = _compared(dataset, row, "exr", out, new) if has_exr else None
-            lidar = _compared(dataset, row, "lidar", out, new) if row["lidar_path"] is not None else None
-            outcomes.append(Outcome(frame_id, png, exr, lidar, same_ground, out.at(str(new["png_path"]))))
-            if is_dark(frame.radiance):
-                dark.append(frame_id)
-            advance()
+    for name, own in of_camera.items():
+        with open_engine(ground, ground_config, exr_rig[name].exr_camera, sun, outputs.surface) as engine:
+            source = FrameSource.of(engine, config, rig[name].camera, circles, name)
+            for row in own:
+                frame_id, trajectory = row["frame_id"], trajectories[row["trajectory_id"]]
+                approach = approach_deg(trajectory["nominal_position_m"])
+                frame = source.take(recorded_shot(row, trajectory["seed"], approach))
+                # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
+                has_exr = row["exr_path"] is not None
+                beside = outputs.beside(frame, engine.camera)
+                new = write_frame(out, frame_id, source, frame, exr=has_exr, beside=beside)
+                png = _compared(dataset, row, "png", out, new)
+                exr = _compared(dataset, row, "exr", out, new) if has_exr else None
+                lidar = _compared(dataset, row, "lidar", out, new) if row["lidar_path"] is not None else None
+                outcomes.append(Outcome(frame_id, png, exr, lidar, same_ground, out.at(str(new["png_path"]))))
+                if is_dark(frame.radiance):
+                    dark.append(frame_id)
+                advance()
     warn_of_dark_frames(scene["scene_id"], dark, len(rows), scene["sun_elevation_deg"])
     return outcomes
 
@@ -182,6 +191,9 @@ def _ground_config(recipe: Recipe, config: DatasetConfig, where: object) -> Data
         return config
     if origin.camera_config is None:
         raise UserError(where, "developed_from", "no camera", "a dataset that records the camera of its source")
+    if config.cameras:
+        plain = {**settings_of(recipe), "cameras": origin.camera_config}
+        return config.model_copy(update={"cameras": resolve_over(DatasetConfig, "dataset", str(where), plain).cameras})
     camera = resolve_over(CameraConfig, "dataset.camera", str(where), origin.camera_config)
     return config.model_copy(update={"camera": camera})
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from perilune_render.flight.plan import TrajectoryPlan
 from perilune_render.frame_source import Shot
+from perilune_render.streams import camera_seed
 from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.geometry.frames import matrix_from_quaternion
 
@@ -18,7 +19,7 @@ def planned_shot(trajectory: TrajectoryPlan, place: int) -> Shot:
         flight.position_m[place],
         flight.rotation_camera_from_site[place],
         flight.velocity_mps[place],
-        trajectory.seed,
+        camera_seed(trajectory.seed, trajectory.camera),
         trajectory.frame_index[place],
         flight.nominal.approach_deg,
         np.zeros(3) if turn is None else turn[place],
@@ -31,7 +32,7 @@ def recorded_shot(row: dict[str, Any], trajectory_seed: int, approach_deg: int =
         np.array(row["position_m"]),
         matrix_from_quaternion(row["rotation_wxyz"]),
         np.array(row["velocity_mps"]),
-        trajectory_seed,
+        camera_seed(trajectory_seed, row["camera"]),
         row["frame_index"],
         approach_deg,
         np.array([row.get(name) or 0.0 for name in ANGULAR_VELOCITY]),

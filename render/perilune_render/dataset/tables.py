@@ -142,6 +142,7 @@ def frame_table(trajectory: TrajectoryPlan, camera: Camera, sun: Array, files: l
         "velocity_mps": _vectors(flight.velocity_mps),
         "sun_direction": _vectors(np.tile(sun, (n, 1))),
         "real_ground_share": [row.get("real_ground_share") for row in files],
+        "camera": pa.array([trajectory.camera] * n, pa.string()),
     }
     if flight.angular_velocity_radps is not None:
         columns |= dict(zip(ANGULAR_VELOCITY, flight.angular_velocity_radps.T, strict=True))

@@ -18,7 +18,7 @@ from perilune_shared.dataset.index import INDEX, frame_rows, index_rows
 from perilune_shared.dataset.label_rows import with_frame_columns
 from perilune_shared.dataset.names import stem_of
 from perilune_shared.dataset.parts import Part, Written
-from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES, complete
+from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES, stored
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Store
 
@@ -102,7 +102,7 @@ def _path(table: str, name: str) -> str:
 
 def _write(store: Store, table: str, name: str, rows: pa.Table) -> Written:
     """Write rows of a table; does not wait until they are on the disk."""
-    content = _parquet(complete(table, rows))
+    content = _parquet(stored(table, rows))
     store.replace(_path(table, name), content, durable=False)
     return Written.of(_path(table, name), content)
 

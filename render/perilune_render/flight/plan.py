@@ -6,24 +6,21 @@ for, and a flight is drawn when it is first used, so that the plan of many milli
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
-from perilune_render.config import CameraConfig, DatasetConfig, KindConfig, SunConfig
+from perilune_render.config import DatasetConfig, KindConfig, SunConfig
+from perilune_render.flight.rig import MountedCamera, Rig, rig_of
 from perilune_render.flight.trajectories import Flight, fly
-from perilune_render.flight.view import view_envelope
+from perilune_render.flight.view import rig_envelope
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.envelope import ViewEnvelope
-from perilune_shared.dataset.names import SPLITS, frame_id_of
-from perilune_shared.errors import UserError
+from perilune_shared.dataset.names import SPLITS, frame_id_of, trajectory_of_camera
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, sun_direction
-
-_LARGEST_COVER = 9
-"""Largest ratio of rendered pixels to the camera's pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +60,8 @@ class TrajectoryPlan:
     """Returns the flight."""
     is_drawn: bool = True
     """Whether the flight follows from the seed; otherwise it is recorded in a manifest."""
+    camera: str | None = None
+    """Name of its camera, one of several on the body; None if the body has one without a name."""
 
     @cached_property
     def flight(self) -> Flight:
@@ -83,10 +82,8 @@ class TrajectoryPlan:
 class Plan:
     """A dataset before rendering."""
 
-    camera: Camera
-    """Camera of all frames."""
-    exr_camera: Camera
-    """Camera of the rendering and the EXRs: a pinhole that covers the view of `camera`."""
+    rig: Rig
+    """Cameras by name. Each trajectory is of one of them: a descent seen by two is two trajectories."""
     view: ViewEnvelope
     """The views that the mesh of every scene is made for."""
     scenes: tuple[ScenePlan, ...]
@@ -95,6 +92,21 @@ class Plan:
     """All trajectories, in the order of their scenes. A drawn plan makes a trajectory anew at each access."""
     places: Mapping[str, range]
     """Indices in `trajectories` of the trajectories of each scene, by its id."""
+
+    @property
+    def first(self) -> MountedCamera:
+        """The only camera, or the first of several."""
+        return next(iter(self.rig.values()))
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the frames; the first of several."""
+        return self.first.camera
+
+    @property
+    def exr_camera(self) -> Camera:
+        """Camera of the rendering and the EXRs: a pinhole that covers the view of `camera`."""
+        return self.first.exr_camera
 
     def of_scene(self, scene_id: str) -> list[TrajectoryPlan]:
         """The trajectories of one scene; none if the plan has no such scene."""
@@ -111,57 +123,39 @@ class _Drawn(Sequence[TrajectoryPlan]):
     """`detect` or `nav`."""
     scenes: tuple[ScenePlan, ...]
     """All scenes."""
+    rig: Rig
+    """Cameras; each sees every descent."""
     splits: np.ndarray
     """Index in SPLITS of each frame's split (n_scenes, trajectories_per_scene, n_frames) int8."""
 
     def __len__(self) -> int:
-        return len(self.scenes) * self.settings.trajectories_per_scene
+        return len(self.scenes) * len(self.rig) * self.settings.trajectories_per_scene
 
     def __getitem__(self, place: Any) -> Any:
         """The trajectory at an index, or a tuple of those in a slice."""
         if isinstance(place, slice):
             return tuple(self[k] for k in range(*place.indices(len(self))))
-        s, t = divmod(range(len(self))[place], self.settings.trajectories_per_scene)
+        # All descents of one camera come first: an engine is opened once for each camera of a scene.
+        nth, t = divmod(range(len(self))[place], self.settings.trajectories_per_scene)
+        s, c = divmod(nth, len(self.rig))
         scene, n_frames = self.scenes[s], self.settings.n_frames
         seed = derived_seed(scene.seed, self.kind, "trajectory", t)
         splits = tuple(SPLITS[code] for code in self.splits[s, t])
         draw_flight = partial(fly, self.settings.flight, n_frames, seed)
-        return TrajectoryPlan(scene.scene_id, f"trajectory-{t:04d}", seed, range(n_frames), splits, draw_flight)
+        trajectory = TrajectoryPlan(scene.scene_id, f"trajectory-{t:04d}", seed, range(n_frames), splits, draw_flight)
+        return seen_by(trajectory, list(self.rig)[c], self.rig)
 
 
-def camera_of(config: CameraConfig) -> Camera:
-    """The camera of a configuration. Raises UserError if its distortion is too strong.
+def seen_by(body: TrajectoryPlan, name: str | None, rig: Rig) -> TrajectoryPlan:
+    """The trajectory of a camera on a body; the same one for a camera without a name."""
+    if name is None:
+        return body
+    trajectory_id = trajectory_of_camera(name, body.trajectory_id)
+    return replace(body, trajectory_id=trajectory_id, camera=name, draw_flight=partial(_seen, body, rig[name]))
 
-    Too strong means that it folds back within the image, or that the pinhole that covers the view has more than
-    _LARGEST_COVER times the camera's pixels.
-    """
-    width, height, lens = config.width_px, config.height_px, config.distortion
-    focal = config.focal_length_px or width / 2 / np.tan(np.radians(config.horizontal_fov_deg) / 2)
-    camera = Camera(
-        width,
-        height,
-        float(focal),
-        float(focal),
-        width / 2 if config.principal_x_px is None else config.principal_x_px,
-        height / 2 if config.principal_y_px is None else config.principal_y_px,
-        (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3),
-    )
-    if camera.folds_back():
-        raise UserError(
-            "configuration",
-            "dataset.camera.distortion",
-            camera.distortion,
-            "a distortion that does not fold back within the image: weaker, or a narrower view",
-        )
-    covering = camera.covering_pinhole()
-    if covering.width_px * covering.height_px > _LARGEST_COVER * width * height:
-        raise UserError(
-            "configuration",
-            "dataset.camera.distortion",
-            camera.distortion,
-            f"a weaker one (this one needs a rendering of {covering.width_px} x {covering.height_px} pixels)",
-        )
-    return camera
+
+def _seen(body: TrajectoryPlan, camera: MountedCamera) -> Flight:
+    return camera.flight_of(body.flight)
 
 
 def drawn_scene(config: DatasetConfig, sun: SunConfig, ground: str, number: int) -> ScenePlan:
@@ -174,21 +168,20 @@ def drawn_scene(config: DatasetConfig, sun: SunConfig, ground: str, number: int)
 
 
 def make_plan(config: DatasetConfig, kind: str) -> Plan:
-    """The plan of the dataset `detect` or `nav`. Raises UserError if the distortion is too strong.
+    """The plan of the dataset `detect` or `nav`. Raises UserError if a distortion is too strong.
 
     Seeds are derived from the configuration's seed, its name and the kind. Presets therefore share no terrain. The
     two kinds of one preset share it only with `shared_terrain`.
     """
     settings = config.kind(kind)
-    camera = camera_of(config.camera)
+    rig = rig_of(config)
     splits = _splits(settings, stream(config.seed, config.name, kind, "splits"))
     ground = "shared" if config.shared_terrain else kind
     scenes = [drawn_scene(config, settings.sun, ground, s) for s in range(settings.n_scenes)]
-    n = settings.trajectories_per_scene
+    n = settings.trajectories_per_scene * len(rig)
     places = {scene.scene_id: range(s * n, (s + 1) * n) for s, scene in enumerate(scenes)}
-    exr_camera = camera.covering_pinhole()
-    view = view_envelope(exr_camera, config.ground_flight(kind))
-    return Plan(camera, exr_camera, view, tuple(scenes), _Drawn(settings, kind, tuple(scenes), splits), places)
+    view = rig_envelope(rig, config.ground_flight(kind))
+    return Plan(rig, view, tuple(scenes), _Drawn(settings, kind, tuple(scenes), rig, splits), places)
 
 
 def _splits(settings: KindConfig, rng: np.random.Generator) -> np.ndarray:

@@ -59,10 +59,19 @@ def check_plan(plan: Plan, grid: Grid, where: object) -> None:
             raise UserError(where, f"{scene.scene_id}: sun_elevation_deg", found, "above 0 (the horizon), at most 90")
     n_checked = 0
     for trajectory in plan.trajectories:
-        _check_mesh(Poses.planned([trajectory]), plan.exr_camera, grid, where, horizon=plan.view.horizon)
+        camera = plan.rig[trajectory.camera].exr_camera
+        _check_mesh(Poses.planned([trajectory]), camera, grid, where, horizon=plan.view.horizon)
         n_checked += len(trajectory.splits)
         if n_checked >= _CHECKED_FRAMES:
             break
+
+
+def check_trajectories(plan: Plan, trajectories: Sequence[TrajectoryPlan], scene: Scene, where: object) -> None:
+    """Check the poses of all frames of planned trajectories of one scene, as `check_poses`."""
+    for name, mounted in plan.rig.items():
+        own = [trajectory for trajectory in trajectories if trajectory.camera == name]
+        if own:
+            check_poses(Poses.planned(own), mounted.exr_camera, scene, where)
 
 
 def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from perilune_render.config import DatasetConfig
 from perilune_render.config_survey import SurveyConfig
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan
+from perilune_render.flight.rig import mounted
 from perilune_render.flight.trajectories import Flight
 from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
@@ -34,6 +35,8 @@ def survey_plan(descents: Plan, config: DatasetConfig) -> Plan:
     survey = config.survey
     if survey is None:
         raise ValueError("no survey in the configuration")
+    if config.cameras:
+        raise UserError("survey", "dataset.cameras", ", ".join(config.cameras), "descents with a single dataset.camera")
     if graded_grid(config.terrain, descents.view).n_vertices > config.terrain.max_vertices:
         found = "ground in several meshes"
         raise UserError("survey", "dataset.terrain.max_vertices", found, "a scene that fits one mesh")
@@ -41,7 +44,7 @@ def survey_plan(descents: Plan, config: DatasetConfig) -> Plan:
     scenes = tuple(_lit(scene, survey) for scene in descents.scenes)
     trajectories = tuple(_pair(descents, scene.scene_id, survey) for scene in scenes)
     places = {scene.scene_id: range(place, place + 1) for place, scene in enumerate(scenes)}
-    return replace(descents, camera=camera, exr_camera=camera, scenes=scenes, trajectories=trajectories, places=places)
+    return replace(descents, rig={None: mounted(camera)}, scenes=scenes, trajectories=trajectories, places=places)
 
 
 def survey_camera(survey: SurveyConfig, reach_m: float) -> Camera:

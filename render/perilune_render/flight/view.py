@@ -4,6 +4,7 @@ import numpy as np
 
 from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_scene import SceneConfig
+from perilune_render.flight.rig import Rig
 from perilune_render.terrain.envelope import SeenGround, ViewEnvelope
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
@@ -18,22 +19,22 @@ _HILL_M = 64.0
 """Height of the largest hills that the relief and the craters of default settings make, metres."""
 
 
-def view_of(config: DatasetConfig, camera: Camera, kind: str) -> ViewEnvelope:
-    """The views that the ground of a configuration is made for, for a pinhole `camera`.
+def view_of(config: DatasetConfig, rig: Rig, kind: str) -> ViewEnvelope:
+    """The views that the ground of a configuration is made for, for the cameras on the body.
 
     Raises UserError if frames of the flights of `kind` could show the horizon, or if a given scene has no views.
     """
     if config.scene is not None:
-        return scene_view(config.scene, camera)
-    return view_envelope(camera, config.ground_flight(kind))
+        return scene_view(config.scene, *(each.exr_camera for each in rig.values()))
+    return rig_envelope(rig, config.ground_flight(kind))
 
 
-def scene_view(scene: SceneConfig, camera: Camera) -> ViewEnvelope:
-    """The views of a given scene, for a pinhole `camera`. Raises UserError if it has none."""
+def scene_view(scene: SceneConfig, *cameras: Camera) -> ViewEnvelope:
+    """The views of a given scene, for pinhole cameras. Raises UserError if it has none."""
     if not scene.views:
         raise UserError("configuration", "dataset.scene.views", "none", "at least one height_m with its reach_m")
     height, reach = (np.array([getattr(view, name) for view in scene.views]) for name in ("height_m", "reach_m"))
-    focal_px = max(camera.fx_px, camera.fy_px)
+    focal_px = max(max(camera.fx_px, camera.fy_px) for camera in cameras)
     if scene.horizon:
         return ViewEnvelope(*_up_to_horizon(height, reach), focal_px, horizon=True)
     return ViewEnvelope(height, reach, focal_px)
@@ -50,6 +51,33 @@ def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
     camera = np.linspace(0, reach_m[-1], _N_PLACES)
     away = np.hypot(np.interp(camera, reach_m, height_m), np.maximum(distance[:, None] - camera, 0))
     return np.maximum.accumulate(away.min(axis=1)), distance
+
+
+def rig_envelope(rig: Rig, flight: FlightConfig) -> ViewEnvelope:
+    """The views of all cameras on a body: at each distance the finest spacing that one of them needs.
+
+    Raises UserError as `view_envelope`.
+    """
+    views = [view_envelope(each.levelled(), each.flight_settings(flight)) for each in rig.values()]
+    return views[0] if len(views) == 1 else _joined(views)
+
+
+def _joined(views: list[ViewEnvelope]) -> ViewEnvelope:
+    """The envelope of several, with the largest focal length; heights of the others are scaled to it."""
+    focal = max(view.focal_px for view in views)
+    reach = np.unique(np.concatenate([view.reach_m for view in views]))
+    heights = []
+    for view in views:
+        distance, first = np.unique(view.reach_m, return_index=True)
+        height = np.interp(reach, distance, view.height_m[first]) * focal / view.focal_px
+        heights.append(np.where(reach <= distance[-1], height, np.inf))
+    seen = [view.seen for view in views if view.seen is not None]
+    # Levels are cut by the height of the camera alone, so all have the spacing of the largest focal length.
+    z = np.geomspace(min(each.z_m[0] for each in seen), max(each.z_m[-1] for each in seen), _N_HEIGHTS)
+    nearest = np.min([np.interp(z, each.z_m, each.nearest_m) for each in seen], axis=0)
+    farthest = np.max([np.interp(z, each.z_m, each.farthest_m) for each in seen], axis=0)
+    margin = np.max([np.interp(z, each.z_m, each.margin_m) for each in seen], axis=0)
+    return ViewEnvelope(np.min(heights, axis=0), reach, focal, SeenGround(z, 0.95 * z, nearest, farthest, margin))
 
 
 def view_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:

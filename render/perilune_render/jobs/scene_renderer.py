@@ -10,7 +10,7 @@ from perilune_render.dataset.frame_files import file_columns
 from perilune_render.dataset.trajectory import render_trajectory
 from perilune_render.dataset.work import FOLDER, write_scene
 from perilune_render.engines import open_engine
-from perilune_render.flight.pose_checks import Poses, check_poses
+from perilune_render.flight.pose_checks import check_trajectories
 from perilune_render.frame_source import FrameSource
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.records import RunningRecord
@@ -37,14 +37,16 @@ class SceneRenderer:
         self._record = RunningRecord(out)
         self._shared = None if out.is_local else out.sub(f"{FOLDER}/scenes")
         self._grown: tuple[str, Scene] | None = None
-        self._opened: tuple[str, Scene, FrameSource, SceneOutputs] | None = None
+        self._outputs: tuple[str, SceneOutputs] | None = None
+        self._opened: tuple[tuple[str, str | None], Scene, FrameSource, SceneOutputs] | None = None
         self._closing = contextlib.ExitStack()
 
     @property
     def scene_id(self) -> str | None:
         """The scene that is kept, if any."""
-        kept = self._opened or self._grown
-        return kept[0] if kept is not None else None
+        if self._opened is not None:
+            return self._opened[0][0]
+        return self._grown[0] if self._grown is not None else None
 
     def grow(self, scene_id: str) -> Scene:
         """Generate the ground of a scene and check that all its poses fit it. Raises UserError if one does not."""
@@ -54,8 +56,7 @@ class SceneRenderer:
             with interrupts_held():
                 scene = cached_scene(job.config, job.plan.view, job.scene(scene_id).seed, self._shared)
             trajectories = job.plan.of_scene(scene_id)
-            if trajectories:
-                check_poses(Poses.planned(trajectories), job.plan.exr_camera, scene, job.where)
+            check_trajectories(job.plan, trajectories, scene, job.where)
             self._grown = scene_id, scene
         return self._grown[1]
 
@@ -72,7 +73,7 @@ class SceneRenderer:
 
         try:
             self._record.begin(self._job.name(place))
-            scene, source, outputs = self._open(trajectory.scene_id, note)
+            scene, source, outputs = self._open(trajectory.scene_id, trajectory.camera, note)
             config = self._job.config
             instruments = config.kind(self._job.info.kind).instruments
             return render_trajectory(self._out, source, trajectory, scene, config, instruments, counted, outputs)
@@ -80,24 +81,35 @@ class SceneRenderer:
             self.close()  # Blender's scene may be half changed
             raise
 
-    def _open(self, scene_id: str, note: Callable[[str], object]) -> tuple[Scene, FrameSource, SceneOutputs]:
-        if self._opened is None or self._opened[0] != scene_id:
+    def _open(
+        self, scene_id: str, camera: str | None, note: Callable[[str], object]
+    ) -> tuple[Scene, FrameSource, SceneOutputs]:
+        if self._opened is None or self._opened[0] != (scene_id, camera):
             note(f"{scene_id}: generating ground")
+            self._opened = None
+            self._closing.close()  # the engine of another camera of the scene
             scene, plan, config = self.grow(scene_id), self._job.scene(scene_id), self._job.config
-            if config.hazard is not None:
-                note(f"{scene_id}: making the hazard map")
-            outputs = SceneOutputs.of(scene, config, plan.sun)
+            outputs = self._outputs_of(scene_id, scene, note)
             files = self._write_hazard(scene_id, scene, outputs)
             rows = tables.scene_tables(plan, scene, config, self._job.info.recipe().key, files)
             trajectories = tables.trajectory_table(self._job.plan.of_scene(scene_id))
             write_scene(self._out, scene_id, {**rows, "trajectories": trajectories})
+            mounted = self._job.plan.rig[camera]
             engine = self._closing.enter_context(
-                open_engine(scene, config, self._job.plan.exr_camera, plan.sun, outputs.surface)
+                open_engine(scene, config, mounted.exr_camera, plan.sun, outputs.surface)
             )
-            source = FrameSource.of(engine, config, self._job.plan.camera, RimCircles.of_scene(scene))
-            self._opened = scene_id, scene, source, outputs
-            note(scene_id)
+            source = FrameSource.of(engine, config, mounted.camera, RimCircles.of_scene(scene), camera)
+            self._opened = (scene_id, camera), scene, source, outputs
+            note(scene_id if camera is None else f"{scene_id} {camera}")
         return self._opened[1:]
+
+    def _outputs_of(self, scene_id: str, scene: Scene, note: Callable[[str], object]) -> SceneOutputs:
+        """Outputs beside the frames of a scene, which all its cameras share."""
+        if self._outputs is None or self._outputs[0] != scene_id:
+            if self._job.config.hazard is not None:
+                note(f"{scene_id}: making the hazard map")
+            self._outputs = scene_id, SceneOutputs.of(scene, self._job.config, self._job.scene(scene_id).sun)
+        return self._outputs[1]
 
     def _write_hazard(self, scene_id: str, scene: Scene, outputs: SceneOutputs) -> dict[str, str | int]:
         """Write the hazard map of a scene if there is one; returns its columns of the table `scenes`."""
@@ -119,5 +131,5 @@ class SceneRenderer:
 
     def close(self) -> None:
         """Release Blender and the memory of the scene."""
-        self._opened = self._grown = None
+        self._opened = self._grown = self._outputs = None
         self._closing.close()

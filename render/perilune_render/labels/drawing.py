@@ -10,6 +10,7 @@ from perilune_shared.storage.files import write_bytes
 
 _CHOSEN, _OTHER = (80, 220, 80), (60, 140, 255)
 """Colours of the ellipses, BGR."""
+_DARK = 40
 
 
 def draw_labels(image: np.ndarray, labels: Labels, chosen: np.ndarray, scale: int = 2) -> np.ndarray:
@@ -29,6 +30,21 @@ def draw_labels(image: np.ndarray, labels: Labels, chosen: np.ndarray, scale: in
 def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
     """Enlarge an image: each pixel becomes a square with a side of `scale` pixels."""
     return np.repeat(np.repeat(image, scale, axis=0), scale, axis=1)
+
+
+def padded(pictures: list[np.ndarray], in_row: list[int], columns: int) -> list[np.ndarray]:
+    """Pictures of any size for a sheet, in rows of `columns`; the row k starts with the next `in_row[k]` pictures.
+
+    Smaller pictures and missing ones are filled with dark grey.
+    """
+    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
+    sheet, rest = [], iter(pictures)
+    for n in in_row:
+        own = [next(rest) for _ in range(n)] + [np.full((1, 1), _DARK, np.uint8)] * (-n % columns)
+        for picture in own:
+            more = (0, height - picture.shape[0], 0, width - picture.shape[1])
+            sheet.append(cv2.copyMakeBorder(picture, *more, cv2.BORDER_CONSTANT, value=(_DARK,) * 3))
+    return sheet
 
 
 def write_sheet(path: Path, pictures: list[np.ndarray], columns: int) -> None:

@@ -7,14 +7,14 @@ import numpy as np
 
 from perilune_render.config import DatasetConfig
 from perilune_render.config_scene import HIGHEST_M, SceneConfig, ViewConfig
-from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, camera_of
+from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, seen_by
+from perilune_render.flight.rig import MountedCamera, Rig, rig_of
 from perilune_render.flight.trajectories import Flight
 from perilune_render.flight.view import scene_view
 from perilune_render.poses.file import GivenPoses
 from perilune_render.streams import derived_seed
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
-from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
@@ -38,39 +38,32 @@ def trajectory_seed(seed: int, number: int) -> int:
     return derived_seed(seed, "given", "trajectory", number)
 
 
-def views_of(poses: GivenPoses, camera: Camera, where: object) -> tuple[ViewConfig, ...]:
-    """Views that hold all poses of a pinhole `camera`, with margins for relief, rounded to three digits.
+def views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ...]:
+    """Views that hold what all cameras see from all poses, with margins for relief, rounded to three digits.
 
     The ground is taken to be at most a tenth of a camera's height above or below the plane z = 0. Raises UserError for
     a pose that is not above the plane or that shows the horizon.
     """
-    _check_above(poses, where)
-    height = poses.position_m[:, 2]
-    corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
-    rays = np.einsum("nji,sj->nsi", matrix_from_quaternion(poses.rotation_wxyz), corners)
-    _refuse(
-        (rays[..., 2] > -0.01 * np.linalg.norm(rays, axis=-1)).any(axis=1),
-        poses,
-        where,
-        lambda n: "a view with the horizon",
-        "a view of the ground alone; state dataset.scene.views for others, or dataset.scene.horizon=true for the sky",
-    )
-    lowest = -0.1 * height[:, None, None]
-    way = (lowest - poses.position_m[:, None, 2:]) / rays[..., 2:]
-    reach = _WIDER * np.abs(poses.position_m[:, None, :2] + way * rays[..., :2]).max(axis=(1, 2))
+    seen = [_reach(poses, mounted, name, where) for name, mounted in rig.items()]
+    height, reach = (np.concatenate(each) for each in zip(*seen, strict=True))
     return tuple(_views(height, reach))
 
 
-def horizon_views_of(poses: GivenPoses, where: object) -> tuple[ViewConfig, ...]:
+def horizon_views_of(poses: GivenPoses, rig: Rig, where: object) -> tuple[ViewConfig, ...]:
     """Views with horizon that hold all poses, rounded to three digits; the last one has the height of the highest pose.
 
     The ground is taken to be at most a tenth of a camera's height above the plane z = 0. Raises UserError for a pose
     that is not above the plane, or higher than HIGHEST_M.
     """
-    _check_above(poses, where)
-    height = poses.position_m[:, 2]
-    _refuse(height > HIGHEST_M, poses, where, lambda n: f"z {height[n]:.0f} m", f"at most {HIGHEST_M:g} m with horizon")
-    away = np.abs(poses.position_m[:, :2]).max(axis=1)
+    places = []
+    for name, mounted in rig.items():
+        position = _poses_of(poses, mounted, name)[0]
+        z = position[:, 2]
+        _check_above(z, poses, where)
+        _refuse(z > HIGHEST_M, poses, where, lambda n, z=z: f"z {z[n]:.0f} m", f"at most {HIGHEST_M:g} m with horizon")
+        places.append(position)
+    position = np.concatenate(places)
+    height, away = position[:, 2], np.abs(position[:, :2]).max(axis=1)
     found = _views(height, np.maximum(_WIDER * away, 0.1 * height))
     highest = min(_rounded(height.max(), np.ceil), HIGHEST_M)
     return (*found, ViewConfig(height_m=highest, reach_m=found[-1].reach_m))
@@ -88,9 +81,39 @@ def _views(height_m: Array, reach_m: Array) -> list[ViewConfig]:
     return found
 
 
-def _check_above(poses: GivenPoses, where: object) -> None:
-    height = poses.position_m[:, 2]
-    _refuse(height <= 0, poses, where, lambda n: f"z {height[n]:.1f} m", "above 0, the height of the site")
+def _check_above(height_m: Array, poses: GivenPoses, where: object) -> None:
+    """Refuse cameras at heights (N,) above O_L's plane that are not above it."""
+    _refuse(height_m <= 0, poses, where, lambda n: f"z {height_m[n]:.1f} m", "above 0, the height of the site")
+
+
+def _poses_of(poses: GivenPoses, mounted: MountedCamera, name: str | None) -> tuple[Array, Array]:
+    """Positions (N, 3) and rotations (N, 4) of a camera, for given poses of the body."""
+    if name is None:
+        return poses.position_m, poses.rotation_wxyz
+    return mounted.poses(poses.position_m, poses.rotation_wxyz)
+
+
+def _reach(poses: GivenPoses, mounted: MountedCamera, name: str | None, where: object) -> tuple[Array, Array]:
+    """Height of a camera and largest |x| or |y| of the ground that it sees, metres, (N,) each, for poses of the body.
+
+    Raises UserError as `views_of`.
+    """
+    camera, (position, rotation) = mounted.exr_camera, _poses_of(poses, mounted, name)
+    height = position[:, 2]
+    _check_above(height, poses, where)
+    corners = camera.rays(np.array([[u, v] for u in (0, camera.width_px) for v in (0, camera.height_px)]))
+    rays = np.einsum("nji,sj->nsi", matrix_from_quaternion(rotation), corners)
+    _refuse(
+        (rays[..., 2] > -0.01 * np.linalg.norm(rays, axis=-1)).any(axis=1),
+        poses,
+        where,
+        lambda n: "a view with the horizon",
+        "a view of the ground alone; state dataset.scene.views for others, or dataset.scene.horizon=true for the sky",
+    )
+    lowest = -0.1 * height[:, None, None]
+    way = (lowest - position[:, None, 2:]) / rays[..., 2:]
+    reach = _WIDER * np.abs(position[:, None, :2] + way * rays[..., :2]).max(axis=(1, 2))
+    return height, reach
 
 
 def _rounded(value: float, towards) -> float:
@@ -106,9 +129,8 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     the poses fit no ground, or for more than _MOST_SCENES Suns.
     """
     scene = config.scene or SceneConfig()
-    camera = camera_of(config.camera)
-    pinhole = camera.covering_pinhole()
-    views = scene.views or (horizon_views_of(poses, where) if scene.horizon else views_of(poses, pinhole, where))
+    rig = rig_of(config)
+    views = scene.views or (horizon_views_of(poses, rig, where) if scene.horizon else views_of(poses, rig, where))
     scene = scene.model_copy(update={"views": views, "poses_sha256": poses.sha256})
     suns, lit_by = _suns(poses, scene)
     if len(suns) > _MOST_SCENES:
@@ -120,12 +142,13 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     places: dict[str, range] = {}
     for k, one in enumerate(scenes):
         first = len(trajectories)
-        for number in np.unique(poses.trajectory[lit_by == k]).tolist():
-            rows = np.flatnonzero((poses.trajectory == number) & (lit_by == k))
-            trajectories.append(_trajectory(poses, rows, one, number))
+        numbers = np.unique(poses.trajectory[lit_by == k]).tolist()
+        rows = [np.flatnonzero((poses.trajectory == number) & (lit_by == k)) for number in numbers]
+        bodies = [_trajectory(poses, own, one, number) for own, number in zip(rows, numbers, strict=True)]
+        trajectories += [seen_by(body, name, rig) for name in rig for body in bodies]
         places[one.scene_id] = range(first, len(trajectories))
-    view = scene_view(scene, pinhole)
-    plan = Plan(camera, pinhole, view, scenes, tuple(trajectories), places)
+    view = scene_view(scene, *(each.exr_camera for each in rig.values()))
+    plan = Plan(rig, view, scenes, tuple(trajectories), places)
     return plan, config.model_copy(update={"scene": scene})
 
 

@@ -10,17 +10,18 @@ from perilune_render.dataset import tables
 from perilune_render.dataset.real_ground import draw_outline, outline_m
 from perilune_render.dataset.shots import planned_shot
 from perilune_render.engines import open_engine
-from perilune_render.flight.plan import make_plan
-from perilune_render.flight.pose_checks import Poses, check_poses
+from perilune_render.flight.plan import TrajectoryPlan, make_plan
+from perilune_render.flight.pose_checks import check_trajectories
 from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
-from perilune_render.labels.drawing import draw_labels, enlarge, write_sheet
+from perilune_render.labels.drawing import draw_labels, enlarge, padded, write_sheet
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.preview.horizon import horizon_of, warn_of_shadow
 from perilune_render.preview.map_picture import map_picture
 from perilune_render.preview.site_map import site_map
 from perilune_render.terrain.cache import cached_scene
-from perilune_render.terrain.scene import check_ground, model_of
+from perilune_render.terrain.elevation.model import ElevationModel
+from perilune_render.terrain.scene import Scene, check_ground, model_of
 from perilune_shared.labels.selection import selected
 from perilune_shared.labels.thresholds import SELECTIONS
 from perilune_shared.storage.files import write_bytes
@@ -29,37 +30,58 @@ from perilune_shared.storage.files import write_bytes
 def write_preview(config: DatasetConfig, kind: str, path: Path, map_path: Path, n_frames: int = 4) -> None:
     """Write a contact sheet of the first scene and trajectory, frames evenly spaced in time, and a map of the scene.
 
-    The lower row of the sheet shows the same frames with labels and, if there is one, the outline of the elevation
+    Beneath each camera's frames are the same frames with labels and, if there is one, the outline of the elevation
     model. The map shows the trajectories of the scene. Prints a warning if the site lies in shadow.
     """
     plan = make_plan(config, kind)
-    scene_plan, trajectory = plan.scenes[0], plan.trajectories[0]
+    scene_plan = plan.scenes[0]
+    trajectories = [next(t for t in plan.of_scene(scene_plan.scene_id) if t.camera == name) for name in plan.rig]
     check_ground(config, plan.view)
     scene = cached_scene(config, plan.view, scene_plan.seed)
-    check_poses(Poses.planned([trajectory]), plan.exr_camera, scene, f"configuration: dataset.{kind}")
-    depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
+    check_trajectories(plan, trajectories, scene, f"configuration: dataset.{kind}")
     model = model_of(config.terrain)
-    outline = None if model is None else outline_m(model)
     horizon = horizon_of(scene, scene_plan.sun_azimuth_deg)
     warn_of_shadow(scene_plan, horizon)
-    plain, drawn, dark = [], [], []
-    with open_engine(scene, config, plan.exr_camera, scene_plan.sun) as engine:
-        source = FrameSource.of(engine, config, plan.camera, RimCircles.of_scene(scene))
-        for index in np.linspace(0, len(trajectory.splits) - 1, n_frames).astype(int):
-            frame_id, frame = trajectory.frame_id(index), source.take(planned_shot(trajectory, index))
-            labels = source.labels(frame)
-            rows = tables.label_table(frame_id, labels).to_pandas()
-            rows = rows.assign(depth_m=depth_m[labels.crater_id], diameter_m=diameter_m[labels.crater_id])
-            grey = (frame.image >> (config.sensor.bits - 8)).astype(np.uint8)
-            plain.append(enlarge(grey, 2))
-            drawn.append(draw_labels(grey, labels, selected(rows, SELECTIONS["visible"])))
-            if outline is not None:
-                draw_outline(drawn[-1], outline, scene, plan.camera, *frame.shot.pose)
-            if is_dark(frame.radiance):
-                dark.append(frame_id)
-    warn_of_dark_frames(scene_plan.scene_id, dark, n_frames, scene_plan.sun_elevation_deg)
+    pictures, dark = [], []
+    for trajectory in trajectories:
+        mounted = plan.rig[trajectory.camera]
+        with open_engine(scene, config, mounted.exr_camera, scene_plan.sun) as engine:
+            source = FrameSource.of(engine, config, mounted.camera, RimCircles.of_scene(scene), trajectory.camera)
+            own, own_dark = _rows(source, trajectory, scene, model, config, n_frames)
+        pictures += own
+        dark += own_dark
+    warn_of_dark_frames(scene_plan.scene_id, dark, n_frames * len(trajectories), scene_plan.sun_elevation_deg)
+    if len(trajectories) > 1:
+        pictures = padded(pictures, [n_frames] * 2 * len(trajectories), n_frames)
     tracks = [each.flight.position_m for each in plan.of_scene(scene_plan.scene_id)]
     place = scene.latitude_deg, scene.longitude_deg
     picture = map_picture(config.name, site_map(scene, model, scene_plan.sun), scene_plan, place, tracks, horizon)
-    write_sheet(path, plain + drawn, n_frames)
+    write_sheet(path, pictures, n_frames)
     write_bytes(map_path, cv2.imencode(".png", picture)[1].tobytes())
+
+
+def _rows(
+    source: FrameSource,
+    trajectory: TrajectoryPlan,
+    scene: Scene,
+    model: ElevationModel | None,
+    config: DatasetConfig,
+    n_frames: int,
+) -> tuple[list[np.ndarray], list[str]]:
+    """Frames of a trajectory, then the same frames with labels, and the ids of the dark ones."""
+    depth_m, diameter_m = scene.rims.depth_m, scene.craters.diameter_m
+    outline = None if model is None else outline_m(model)
+    plain, drawn, dark = [], [], []
+    for index in np.linspace(0, len(trajectory.splits) - 1, n_frames).astype(int):
+        frame_id, frame = trajectory.frame_id(index), source.take(planned_shot(trajectory, index))
+        labels = source.labels(frame)
+        rows = tables.label_table(frame_id, labels).to_pandas()
+        rows = rows.assign(depth_m=depth_m[labels.crater_id], diameter_m=diameter_m[labels.crater_id])
+        grey = (frame.image >> (config.sensor.bits - 8)).astype(np.uint8)
+        plain.append(enlarge(grey, 2))
+        drawn.append(draw_labels(grey, labels, selected(rows, SELECTIONS["visible"])))
+        if outline is not None:
+            draw_outline(drawn[-1], outline, scene, source.camera, *frame.shot.pose)
+        if is_dark(frame.radiance):
+            dark.append(frame_id)
+    return plain + drawn, dark

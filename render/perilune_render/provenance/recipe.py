@@ -18,7 +18,7 @@ DEFAULT_ENGINE = "cycles"
 """Not recorded, so that recipes of older versions stay equal."""
 _SINCE = ("blur_poses", "row_time_s")
 """Settings of the sensor that are recorded only if they are not the defaults, for the same reason."""
-_OPTIONAL = ("hazard", "flash_lidar", "scene", "survey", "counterfactual")
+_OPTIONAL = ("cameras", "hazard", "flash_lidar", "scene", "survey", "counterfactual")
 _OTHER: dict[Kind, Kind] = {"detect": "nav", "nav": "detect"}
 
 
@@ -51,7 +51,7 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     for name in _SPEED:
         del plain["render"][name]
     for name in _OPTIONAL:
-        if plain[name] is None:
+        if not plain[name]:
             del plain[name]
     for name in SITE_FIELDS:
         if plain["terrain"]["elevation"][name] is None:

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 
 from perilune_render.config_scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables, label_table
-from perilune_render.flight.plan import camera_of
+from perilune_render.flight.lens import camera_of
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.world import View, World

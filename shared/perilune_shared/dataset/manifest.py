@@ -9,9 +9,10 @@ Parts are written atomically and never rewritten. Use:
 
 import contextlib
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pyarrow as pa
@@ -73,12 +74,20 @@ class Dataset:
 
     @property
     def camera(self) -> Camera:
-        """Camera of the frames' PNGs."""
+        """Camera of the frames' PNGs; the first one if there are several (`camera_of`)."""
         return self.info.camera.intrinsics()
+
+    def camera_of(self, row: Mapping[str, Any]) -> Camera:
+        """Camera of a frame, given its row of the table frames with the column `camera`."""
+        return self.info.camera_of(_name_of(row, self.info, self.store)).intrinsics()
+
+    def exr_camera_of(self, row: Mapping[str, Any]) -> Camera:
+        """Camera of a frame's EXR, as `camera_of`."""
+        return self.info.exr_camera_of(_name_of(row, self.info, self.store)).intrinsics()
 
     @property
     def exr_camera(self) -> Camera:
-        """Camera of the frames' EXRs; that of the PNGs if there are no EXRs."""
+        """Camera of the frames' EXRs; that of the PNGs if there are no EXRs. The first one if there are several."""
         return (self.info.exr_camera or self.info.camera).intrinsics()
 
     @functools.cached_property
@@ -221,6 +230,29 @@ def open_dataset(address: Address) -> Dataset:
     """
     store = open_store(address)
     return Dataset(store, read_info(store))
+
+
+def open_single(address: Address) -> Dataset:
+    """Open a dataset of one camera. Raises UserError as `open_dataset`, and if its frames are of several cameras."""
+    dataset = open_dataset(address)
+    check_single(dataset)
+    return dataset
+
+
+def check_single(dataset: Dataset) -> None:
+    """Raise UserError if the frames of a dataset are of several cameras."""
+    names = list(dataset.info.cameras or ())
+    if names:
+        select = f"perilune-manifest subset {dataset.store} --where \"camera == '{names[0]}'\" --out ..."
+        expected = f"one camera; select it with `{select}`"
+        raise UserError(dataset.store.at("dataset.json"), "cameras", ", ".join(names), expected)
+
+
+def _name_of(row: Mapping[str, Any], info: DatasetInfo, where: object) -> str | None:
+    name = row["camera"] if isinstance(row["camera"], str) else None
+    if info.cameras is not None and name not in info.cameras:
+        raise UserError(where, "frames: camera", name, "one of " + ", ".join(info.cameras))
+    return name
 
 
 def count_rows(dataset: Dataset) -> Counts:

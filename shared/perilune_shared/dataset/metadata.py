@@ -2,14 +2,24 @@
 
 import hashlib
 import json
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
-from perilune_shared.dataset.names import ImageState, Kind, SplitUnit
+from perilune_shared.dataset.names import CAMERA_PATTERN, ImageState, Kind, SplitUnit
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
+from perilune_shared.geometry.frames import Array
 
 LARGEST_IMAGE_PX = 2**27
 """Largest image that is decompressed, pixels."""
@@ -19,6 +29,7 @@ _ROTATION_TOLERANCE = 1e-6
 # Names appear in tables, pages and quoted shell commands: only letters, digits and punctuation that is safe there.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+,:()/-]{0,199}$")]
 _Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_CameraName = Annotated[str, Field(pattern=CAMERA_PATTERN)]
 _Row = tuple[float, float, float]
 
 
@@ -68,11 +79,16 @@ class CameraRecord(_Info):
         return self
 
     @classmethod
-    def of(cls, camera: Camera) -> "CameraRecord":
-        """Record a camera at the body's origin that looks straight down while the body is level."""
-        x, y, z = ROTATION_CAMERA_FROM_BODY.tolist()
+    def of(
+        cls,
+        camera: Camera,
+        rotation_camera_from_body: Array = ROTATION_CAMERA_FROM_BODY,
+        position_in_body_m: _Row = (0.0, 0.0, 0.0),
+    ) -> "CameraRecord":
+        """Record a camera; by default at the body's origin, looking straight down while the body is level."""
+        x, y, z = rotation_camera_from_body.tolist()
         rows = tuple(x), tuple(y), tuple(z)
-        return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=(0.0, 0.0, 0.0))
+        return cls(**asdict(camera), rotation_camera_from_body=rows, position_in_body_m=position_in_body_m)
 
     def intrinsics(self) -> Camera:
         """Return the camera model, without the mounting."""
@@ -108,7 +124,8 @@ class Origin(_Info):
     sha256: _Sha256
     """SHA-256 of its dataset.json."""
     camera_config: dict[str, Any] | None
-    """Section `dataset.camera` of its configuration, to which terrain and EXRs are adapted; null if not known."""
+    """Section `dataset.camera` of its configuration, or `dataset.cameras` if there are several, to which terrain and
+    EXRs are adapted; null if not known."""
 
 
 class Recipe(_Info):
@@ -145,6 +162,9 @@ class IndexPart(_Info):
     """SHA-256 of the file."""
 
 
+_OF_SEVERAL = ("cameras", "exr_cameras")
+
+
 class DatasetInfo(_Info):
     """Content of dataset.json."""
 
@@ -164,6 +184,11 @@ class DatasetInfo(_Info):
     """Camera of all frames (PNG)."""
     exr_camera: CameraRecord | None = None
     """Camera of the EXRs: without distortion, covering the whole view of `camera`; null if there are no EXRs."""
+    cameras: dict[_CameraName, CameraRecord] | None = None
+    """Cameras by name, if frames are of several: the column `camera` of frames has the name. `camera` is then the first
+    of them."""
+    exr_cameras: dict[_CameraName, CameraRecord] | None = None
+    """Cameras of the EXRs by name, if frames are of several cameras and there are EXRs."""
     recipes: dict[str, Recipe]
     """Recipes by key; each scene refers to one."""
     history: tuple[_Line, ...] = ()
@@ -175,10 +200,49 @@ class DatasetInfo(_Info):
     index: tuple[IndexPart, ...] = ()
     """Parts of the index, which names all other files; none while the dataset is not complete."""
 
+    @model_validator(mode="after")
+    def _names_agree(self) -> "DatasetInfo":
+        names = list(self.cameras or {})
+        if self.cameras is not None and (len(names) < 2 or self.cameras[names[0]] != self.camera):
+            raise ValueError("cameras should be two or more, the first of them equal to camera")
+        if self.exr_cameras is not None and list(self.exr_cameras) != names:
+            raise ValueError("exr_cameras should have the names of cameras")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what only datasets of several cameras have, so that others keep their bytes."""
+        found: dict[str, Any] = handler(self)
+        return {key: value for key, value in found.items() if value is not None or key not in _OF_SEVERAL}
+
     @property
     def leak(self) -> str:
         """Warning to append to the split unit if splits share terrain; otherwise empty."""
         return "" if self.split_by == "scene" else ": splits share terrain, so test metrics are optimistic"
+
+    def camera_of(self, name: str | None) -> CameraRecord:
+        """Return the camera of frames whose column `camera` is `name`. Raises KeyError if there is none."""
+        return self.camera if self.cameras is None or name is None else self.cameras[name]
+
+    def exr_camera_of(self, name: str | None) -> CameraRecord:
+        """Return the camera of the EXRs of such frames; that of the PNGs if there are no EXRs."""
+        if self.cameras is None or name is None:
+            return self.exr_camera or self.camera
+        return (self.exr_cameras or self.cameras)[name]
+
+    def with_cameras(self, names: Iterable[str]) -> "DatasetInfo":
+        """Return a copy for frames of some of the cameras; of one, it is an ordinary dataset of a single camera."""
+        used = set(names)
+        if self.cameras is None or not used & self.cameras.keys() or used >= self.cameras.keys():
+            return self
+        kept = [name for name in self.cameras if name in used]
+        fields: dict[str, Any] = {}
+        for one, several in (("camera", "cameras"), ("exr_camera", "exr_cameras")):
+            found = getattr(self, several)
+            if found is not None:
+                chosen = {name: found[name] for name in kept}
+                fields |= {one: chosen[kept[0]], several: chosen if len(kept) > 1 else None}
+        return self.model_copy(update=fields)
 
     def recipe(self) -> Recipe:
         """Return the recipe of a dataset with exactly one. Raises ValueError if there are more."""

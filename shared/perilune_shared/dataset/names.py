@@ -28,6 +28,8 @@ _ID = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 ID_PATTERN = f"^{_ID}$"
 """Pattern of scene_id and trajectory_id, which become file names."""
 FRAME_ID_PATTERN = f"^{_ID}/{_ID}/[0-9]{{6}}$"
+CAMERA_PATTERN = "^[a-z][a-z0-9_]{0,30}$"
+"""Pattern of the names of several cameras on one body."""
 PART_PATTERN = rf"^{_ID}(\.{_ID})?$"
 KINDS: tuple[Kind, ...] = get_args(Kind)
 SPLITS: tuple[Split, ...] = get_args(Split)
@@ -68,3 +70,16 @@ def is_whole(stem: str) -> bool:
 def frame_id_of(scene_id: str, trajectory_id: str, frame_index: int) -> str:
     """Return the key of a frame."""
     return f"{scene_id}/{trajectory_id}/{frame_index:06d}"
+
+
+def trajectory_of_camera(camera: str, trajectory_id: str) -> str:
+    """Return the trajectory_id of the frames of one of several cameras along a trajectory of the body."""
+    return f"{camera}-{trajectory_id}"
+
+
+def trajectory_of_body(camera: str, trajectory_id: str) -> str:
+    """Return the name of the body's trajectory, given the camera and the trajectory_id of its frames.
+
+    Frames of one instant share scene_id, this name and frame_index.
+    """
+    return trajectory_id.removeprefix(f"{camera}-")

@@ -51,13 +51,14 @@ def _feature(kind: pa.DataType) -> dict[str, Any]:
 def _shard_schema() -> pa.Schema:
     labels = pa.list_(pa.field("element", LABEL, nullable=False))
     meaning = {"unit": "", "meaning": "the frame's labels: the columns of the table labels"}
-    columns = [*TABLES["frames"], IMAGE, pa.field("labels", labels, nullable=False, metadata=meaning)]
+    of_frames = [field for field in TABLES["frames"] if field.name != "camera"]
+    columns = [*of_frames, IMAGE, pa.field("labels", labels, nullable=False, metadata=meaning)]
     about = {"perilune.table": FOLDER, "perilune.schema_version": SCHEMA_VERSION, "huggingface": features_of(columns)}
     return pa.schema(columns, metadata=about)
 
 
 SHARDS = _shard_schema()
-"""Schema of a shard: the columns of `frames`, the image and the labels."""
+"""Schema of a shard: the columns of `frames` but `camera`, the image and the labels."""
 
 
 def shard_name(split: str, number: int, count: int) -> str:

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from pyarrow.fs import LocalFileSystem
 
 from perilune_shared.dataset.names import FRAME_ID_PATTERN, ID_PATTERN, PART_PATTERN, stem_of
-from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, complete
+from perilune_shared.dataset.schema import MAY_BE_ABSENT, SCHEMA_VERSION, TABLES, stored
 from perilune_shared.errors import UserError
 from perilune_shared.storage.footers import check_footer
 from perilune_shared.storage.pages import pages_of, range_of
@@ -295,7 +295,7 @@ def write_part(
     if not replace and store.exists(path):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), store.at(path))
     sink = pa.BufferOutputStream()
-    pq.write_table(complete(table, rows), sink, compression="zstd", row_group_size=rows_per_group)
+    pq.write_table(stored(table, rows), sink, compression="zstd", row_group_size=rows_per_group)
     content = sink.getvalue().to_pybytes()
     if replace:
         store.replace(path, content)

@@ -24,6 +24,13 @@ def complete(table: str, rows: pa.Table) -> pa.Table:
     return rows.select(TABLES[table].names).cast(TABLES[table])
 
 
+def stored(table: str, rows: pa.Table) -> pa.Table:
+    """Return `rows` as a file has them: `complete`, without columns of `ONLY_IF_USED` that are null in all rows."""
+    rows = complete(table, rows)
+    unused = [name for name in ONLY_IF_USED.get(table, ()) if rows[name].null_count == len(rows)]
+    return rows.drop_columns(unused) if unused else rows
+
+
 def _vector(length: int) -> pa.DataType:
     return pa.list_(_REAL, length)
 
@@ -161,6 +168,13 @@ TABLES: dict[str, pa.Schema] = {
         ),
         _column("lidar_sha256", _TEXT, "", "of the whole file; null where not written", nullable=True),
         _column("lidar_bytes", _INTEGER, "B", "file size; null where not written", nullable=True),
+        _column(
+            "camera",
+            _TEXT,
+            "",
+            "name of the camera: a key of `cameras` in dataset.json; null if the lander has one camera without a name",
+            nullable=True,
+        ),
     ),
     "labels": _table(
         "labels",
@@ -208,21 +222,18 @@ TABLES: dict[str, pa.Schema] = {
 }
 OPTIONAL_TABLES = ("inertial", "ranges")
 """Tables that a dataset has only if they have rows: they were added without a new schema version."""
-_ABSENT_IN_FRAMES = (
-    "real_ground_share",
-    "n_craters_above_max_radius",
-    *ANGULAR_VELOCITY,
-    "lidar_path",
-    "lidar_sha256",
-    "lidar_bytes",
-)
+_HAZARD = ("hazard_path", "hazard_sha256", "hazard_bytes")
+_LIDAR = ("lidar_path", "lidar_sha256", "lidar_bytes")
+_ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius", *ANGULAR_VELOCITY, *_LIDAR)
 MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {
-    "scenes": ("hazard_path", "hazard_sha256", "hazard_bytes"),
-    "frames": _ABSENT_IN_FRAMES,
+    "scenes": _HAZARD,
+    "frames": (*_ABSENT_IN_FRAMES, "camera"),
     "shards": _ABSENT_IN_FRAMES,
 }
 """Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
 writers always write them. To add one, append a column with `nullable=True` to its table and add its name here."""
+ONLY_IF_USED: dict[str, tuple[str, ...]] = {"scenes": _HAZARD, "frames": (*ANGULAR_VELOCITY, *_LIDAR, "camera")}
+"""Columns of MAY_BE_ABSENT that are written only if a row has a value, so that other datasets keep their bytes."""
 KEYS: dict[str, list[str]] = {
     "scenes": ["scene_id"],
     "craters": ["scene_id", "crater_id"],

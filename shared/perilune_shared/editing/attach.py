@@ -52,8 +52,8 @@ def attach(
 
 def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
     """Return a scene's rows of `frames` with the hashes of the existing files."""
-    camera = source.info.camera
-    rows = frames.select([f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256")]).to_pylist()
+    names = [f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256")]
+    rows = frames.select(["frame_id", "camera", *names]).to_pylist()
     found: dict[str, list] = {f"{kind}_{name}": [] for kind in IMAGE_KINDS for name in ("sha256", "bytes", "path")}
     for row in rows:
         for kind in IMAGE_KINDS:
@@ -67,6 +67,7 @@ def _checked(source: Dataset, frames: pa.Table, rehash: bool) -> pa.Table:
             header = png_header(head)
         except ValueError as error:
             raise UserError(source.store.at(row["png_path"]), "frame", error, "a grey PNG") from None
+        camera = source.camera_of(row)
         if (header.width_px, header.height_px) != (camera.width_px, camera.height_px):
             found_px = f"{header.width_px} x {header.height_px}"
             raise UserError(row["png_path"], "size", found_px, f"{camera.width_px} x {camera.height_px} pixels")

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.content import terrain_of
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.names import trajectory_of_body
 
 
 def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
@@ -16,7 +17,7 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
     or rendered with another Sun is the same flight. A split by one of these units puts each unit in one split.
     """
     columns = ["frame_id", "scene_id", "trajectory_id", "position_m", "rotation_wxyz"]
-    rows = dataset.table("frames", columns).sort_by("frame_id")
+    rows = dataset.table("frames", [*columns, "camera", "frame_index"]).sort_by("frame_id")
     frames = rows.select(columns[:3]).to_pandas()
     scenes = dataset.table("scenes", ["scene_id", "dem_source", "content_sha256"]).to_pandas()
     terrain = {row.scene_id: terrain_of(row.dem_source, row.content_sha256) for row in scenes.itertuples()}
@@ -25,11 +26,16 @@ def terrains_and_flights(dataset: Dataset) -> pd.DataFrame:
     frames["seed"] = frames.merge(seeds, on=["scene_id", "trajectory_id"], how="left")["seed"].to_numpy()
     numbers = [
         rows[name].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(len(rows), -1)
-        for name in columns[3:]
+        for name in columns[3:5]
     ]
     # Adding 0.0 turns negative zero into zero.
     poses = pd.DataFrame(np.hstack(numbers) + 0.0).assign(terrain=frames["terrain"].to_numpy())
     frames["pose"] = poses.groupby(list(poses.columns), dropna=False).ngroup().to_numpy()
+    if dataset.info.cameras is not None:  # the poses of all cameras of one instant are one unit
+        rig = rows.select(["scene_id", "trajectory_id", "camera", "frame_index"]).to_pylist()
+        names = [trajectory_of_body(str(row["camera"]), row["trajectory_id"]) for row in rig]
+        instant = frames.assign(body=names, index=rows["frame_index"].to_numpy()).groupby(["scene_id", "body", "index"])
+        frames["pose"] = _connected_groups(frames["pose"].to_numpy(), [instant.ngroup().to_numpy()])
     trajectory = frames.groupby(["scene_id", "trajectory_id"], sort=False).ngroup().to_numpy()
     by_seed = frames.groupby(["terrain", "seed"], dropna=False).ngroup().to_numpy()
     frames["flight"] = _connected_groups(trajectory, [by_seed, frames["pose"].to_numpy()])

@@ -5,7 +5,7 @@ from collections.abc import Container, Sequence
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.dataset.manifest import Dataset, check_single
 from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
 from perilune_shared.dataset.names import SCENE_FILE_KINDS, ImageMode, frame_id_of
 from perilune_shared.dataset.schema import OPTIONAL_TABLES
@@ -41,6 +41,7 @@ def merge(
     if len(sources) < 2:
         raise UserError("merge", "datasets", len(sources), "at least two")
     for source in {_place(source): source for source in sources}.values():
+        check_single(source)
         check_source(source, out, progress)
     info = _joined_info(sources, name, state_of(list(sources), images))
     groups = _same_scenes(sources, planned=info.images == "planned")

@@ -50,7 +50,7 @@ def pack(
     packed = source.info.images in ("files", "packed")
     info = source.info
     if packed:
-        info = info.changed("packed", images="packed", exr_camera=None)
+        info = info.changed("packed", images="packed", exr_camera=None, exr_cameras=None)
     with new_dataset(out, info, most_rows=most_rows) as writer:
         for scene_id in source.scene_ids():
             tables = source.scene(scene_id)

@@ -42,6 +42,7 @@ class DatasetWriter:
         self._splits_of_terrain: dict[str, set[str]] = defaultdict(set)
         self._splits_of_trajectory: dict[tuple[str, int], set[str]] = defaultdict(set)
         self._has_exr = False
+        self._cameras: set[str] = set()
         self._recipes: set[str] = set()
 
     def add_scene(self, tables: SceneTables) -> None:
@@ -61,6 +62,7 @@ class DatasetWriter:
             own = np.asarray(pc.equal(frames["trajectory_id"], trajectory["trajectory_id"]), bool)
             self._splits_of_trajectory[terrain, trajectory["seed"]] |= set(splits[own])
         self._has_exr |= frames["exr_path"].null_count < len(frames)
+        self._cameras |= set(frames["camera"].drop_null().unique().to_pylist())
         self._recipes |= set(tables["scenes"]["recipe"].to_pylist())
         trajectories = _with_counts_and_splits(tables["trajectories"], frames)
         labels = with_frame_columns(tables["labels"], frames)
@@ -119,11 +121,10 @@ class DatasetWriter:
         trajectory_in_two_splits = any(len(splits) > 1 for splits in self._splits_of_trajectory.values())
         terrain_in_two_splits = any(len(splits) > 1 for splits in self._splits_of_terrain.values())
         unit: SplitUnit = "frame" if trajectory_in_two_splits else "trajectory" if terrain_in_two_splits else "scene"
-        exr_camera = self.info.exr_camera if self._has_exr else None
+        exr = {} if self._has_exr else {"exr_camera": None, "exr_cameras": None}
         recipes = {key: recipe for key, recipe in self.info.recipes.items() if key in self._recipes}
-        info = self.info.model_copy(
-            update={"split_by": unit, "recipes": recipes, "exr_camera": exr_camera, "counts": counts}
-        )
+        info = self.info.with_cameras(self._cameras)
+        info = info.model_copy(update={"split_by": unit, "recipes": recipes, "counts": counts, **exr})
         seal(self.store, info, pa.concat_tables(self._index))
 
 

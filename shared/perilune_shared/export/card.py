@@ -16,7 +16,7 @@ import pandas as pd
 from perilune_shared.content import terrain_of
 from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.dataset.manifest import Dataset
-from perilune_shared.dataset.metadata import DatasetInfo, Recipe
+from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo, Recipe
 from perilune_shared.errors import UserError, one_line, shortened
 from perilune_shared.export.added_files import Target, add_files, check_index
 from perilune_shared.export.card_head import head_of, table_configs
@@ -160,18 +160,25 @@ def _splits(dataset: Dataset) -> str:
 
 
 def _files(dataset: Dataset) -> str:
-    info, camera = dataset.info, dataset.info.camera
-    lens = "no distortion" if not any(camera.distortion) else f"distortion {', '.join(map(str, camera.distortion))}"
+    info = dataset.info
+    named = info.cameras or {"": info.camera}
     return "\n".join(
         [
             f"- Images: {_IMAGES[info.images]}.",
-            f"- Camera: {camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px, principal point "
-            f"({camera.cx_px:.6g}, {camera.cy_px:.6g}) px from the outer corner of the top-left pixel, {lens}.",
+            *(f"- Camera{f' {name}' if name else ''}: {_camera(camera)}" for name, camera in named.items()),
             "- Tables: manifest/*/*.parquet; the metadata of the files has the unit and meaning of each column.",
             f"- {INFO_NAME}: settings, random seeds and versions; it contains the SHA-256 of index/*.parquet.",
             "- index/*.parquet: path, size and SHA-256 of every other file.",
             f"- Schema version {code(info.schema_version)}.",
         ]
+    )
+
+
+def _camera(camera: CameraRecord) -> str:
+    lens = "no distortion" if not any(camera.distortion) else f"distortion {', '.join(map(str, camera.distortion))}"
+    return (
+        f"{camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.6g} px, principal point "
+        f"({camera.cx_px:.6g}, {camera.cy_px:.6g}) px from the outer corner of the top-left pixel, {lens}."
     )
 
 

@@ -24,7 +24,7 @@ from perilune_shared.storage import files
 from perilune_shared.storage.new_store import new_files
 from perilune_shared.storage.store import Address
 
-_OMITTED = ("split", *(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256", "bytes")))
+_OMITTED = ("split", "camera", *(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "sha256", "bytes")))
 _LABEL = pa.struct([*(pa.field(field.name, field.type) for field in LABEL), pa.field("chosen", pa.bool_())])
 _FRAMES_PER_GROUP = 128
 

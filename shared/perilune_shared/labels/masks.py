@@ -68,7 +68,7 @@ def frame_masks(
     a depth of another size.
     """
     scene_id, trajectory_id = [*frame_id.split("/"), ""][:2]
-    columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz", "velocity_mps", *ANGULAR_VELOCITY]
+    columns = ["frame_id", "scene_id", "position_m", "rotation_wxyz", "velocity_mps", "camera", *ANGULAR_VELOCITY]
     frames = dataset.table("frames", columns, scene_id, trajectory_id).to_pandas()
     frame = frames[frames["frame_id"] == frame_id]
     if len(frame) != 1:
@@ -82,7 +82,7 @@ def frame_masks(
     if unknown:
         raise UserError(dataset.store, "crater_id", unknown[0], f"a crater of {pose['scene_id']}")
     rows = craters.loc[list(crater_ids)]
-    camera, exr_camera = dataset.camera, dataset.exr_camera
+    camera, exr_camera = dataset.camera_of(pose), dataset.exr_camera_of(pose)
     if depth_m is not None:
         if depth_m.shape != (exr_camera.height_px, exr_camera.width_px):
             expected = f"{exr_camera.width_px} x {exr_camera.height_px} pixels, the size of the EXRs"

@@ -59,7 +59,8 @@ def label_bound_px(info: DatasetInfo) -> float:
     stated = [recipe.config.get("labels") for recipe in info.recipes.values()]
     bounds = [labels.get("max_radius_px") for labels in stated if isinstance(labels, dict)]
     numbers = [float(bound) for bound in bounds if isinstance(bound, int | float) and bound > 0]
-    return max(numbers, default=default_label_bound_px(info.camera.width_px))
+    widths = [camera.width_px for camera in (info.cameras or {"": info.camera}).values()]
+    return max(numbers, default=default_label_bound_px(max(widths)))
 
 
 def read_labels(dataset: Dataset, columns: Sequence[str] = (), split: str | None = None) -> pd.DataFrame:

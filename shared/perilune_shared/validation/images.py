@@ -17,7 +17,11 @@ from perilune_shared.validation.faults import Fault
 def image_faults(dataset: Dataset, progress: Progress) -> Iterator[Fault]:
     """Yield missing frames and faults in size, header and hash of the files of every frame."""
     task = progress.add_task("hashing", total=dataset.info.counts.frames, unit="frames")
-    columns = ["frame_id", *(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "bytes", "sha256"))]
+    columns = [
+        "frame_id",
+        "camera",
+        *(f"{kind}_{name}" for kind in IMAGE_KINDS for name in ("path", "bytes", "sha256")),
+    ]
     for where in dataset.parts("frames"):
         first_row = 0
         for rows in _readable_groups(dataset, where, columns):
@@ -62,7 +66,6 @@ def png_faults(
     dataset: Dataset, head: bytes, n_bytes: int, sha256: str, frame: dict, row: int, where: str
 ) -> Iterator[Fault]:
     """Check a PNG's size, hash and header, given its first bytes; `where` is the file to report."""
-    camera = dataset.info.camera
     if n_bytes != frame["png_bytes"]:
         yield Fault.of(where, row, "png_bytes", n_bytes, frame["png_bytes"])
     if sha256 != frame["png_sha256"]:
@@ -72,6 +75,7 @@ def png_faults(
     except ValueError as error:
         yield Fault.of(where, row, "png_path", error, "a grey PNG")
         return
+    camera = dataset.camera_of(frame)
     if (header.width_px, header.height_px) != (camera.width_px, camera.height_px):
         size = f"{header.width_px} x {header.height_px}"
         yield Fault.of(where, row, "width_px", size, f"{camera.width_px} x {camera.height_px}")

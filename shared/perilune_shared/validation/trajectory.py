@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from perilune_shared.dataset.metadata import DatasetInfo
+from perilune_shared.dataset.metadata import CameraRecord, DatasetInfo
 from perilune_shared.dataset.names import IMAGE_KINDS
 from perilune_shared.dataset.schema import ANGULAR_VELOCITY
 from perilune_shared.geometry.ellipse import Ellipses, project_circles
@@ -37,12 +37,21 @@ def trajectory_faults(
     `scene` and `trajectory` are rows of these tables; the other tables have the trajectory's rows, and the craters of
     the scene. `where` gives the file of each table.
     """
-    yield from _frames(info, scene, trajectory, frames, where["frames"])
+    names = frames["camera"].unique().to_pylist()
+    if info.cameras is not None and (len(names) != 1 or names[0] not in info.cameras):
+        if names:
+            expected = f"one camera in a trajectory, of {', '.join(info.cameras)}"
+            yield Fault.of(where["frames"], None, "camera", names, expected)
+        return
+    camera = info.camera_of(names[0] if names else None)
+    yield from _frames(info, camera, scene, trajectory, frames, where["frames"])
     if len(labels):
-        yield from _labels(info, info.row_time_s(scene["recipe"]), craters, frames, labels, where)
+        yield from _labels(camera, info.row_time_s(scene["recipe"]), craters, frames, labels, where)
 
 
-def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, where: str) -> Iterator[Fault]:
+def _frames(
+    info: DatasetInfo, camera: CameraRecord, scene: dict, trajectory: dict, frames: pa.Table, where: str
+) -> Iterator[Fault]:
     key = f"{trajectory['scene_id']}/{trajectory['trajectory_id']}"
     if len(frames) != trajectory["n_frames"]:
         expected = f"{len(frames)}, the number of frames of {key}"
@@ -65,10 +74,10 @@ def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, 
     if (np.diff(time[order]) <= 0).any():
         yield Fault.of(where, None, "time_s", "not increasing with frame_index", "increasing times")
     for name in _CAMERA:
-        wrong = np.flatnonzero(frames[name].to_numpy() != getattr(info.camera, name))
+        wrong = np.flatnonzero(frames[name].to_numpy() != getattr(camera, name))
         if len(wrong):
             found = frames[name][int(wrong[0])].as_py()
-            yield Fault.of(where, int(wrong[0]), name, found, f"{getattr(info.camera, name)}, the dataset's camera")
+            yield Fault.of(where, int(wrong[0]), name, found, f"{getattr(camera, name)}, the dataset's camera")
     sun = sun_direction(scene["sun_azimuth_deg"], scene["sun_elevation_deg"])
     wrong = np.flatnonzero(np.abs(_vectors(frames["sun_direction"]) - sun).max(axis=1) > _SUN_TOLERANCE)
     if len(wrong):
@@ -87,7 +96,7 @@ def _frames(info: DatasetInfo, scene: dict, trajectory: dict, frames: pa.Table, 
 
 
 def _labels(
-    info: DatasetInfo,
+    camera: CameraRecord,
     row_s: float,
     craters: pa.Table,
     frames: pa.Table,
@@ -112,7 +121,7 @@ def _labels(
     known = np.flatnonzero((frame_of >= 0) & (crater_of >= 0))
     if not len(known):
         return
-    projected = _projected(info, row_s, craters, frames, crater_of[known], frame_of[known])
+    projected = _projected(camera, row_s, craters, frames, crater_of[known], frame_of[known])
     size = 1 + projected["ellipse_a_px"]
     misfit = np.zeros(len(known), bool)
     for name, values in projected.items():
@@ -143,7 +152,7 @@ def _labels(
 
 
 def _projected(
-    info: DatasetInfo,
+    camera: CameraRecord,
     row_s: float,
     craters: pa.Table,
     frames: pa.Table,
@@ -162,7 +171,7 @@ def _projected(
         turn = np.stack([pc.fill_null(frames[name], 0.0).to_numpy() for name in ANGULAR_VELOCITY], axis=1)
         moving = Moving(position, rotation, _vectors(frames["velocity_mps"])[frame_of], turn[frame_of])
         with np.errstate(all="ignore"):
-            time = moving.row_times_s(centre, info.camera.intrinsics(), row_s)
+            time = moving.row_times_s(centre, camera.intrinsics(), row_s)
             rotation, position = moving.rotations_at(time), position + time[:, None] * moving.velocity_mps
     in_camera = np.einsum("nij,nj->ni", rotation, centre - position)
     normal_in_camera = np.einsum("nij,nj->ni", rotation, normal)
@@ -173,7 +182,7 @@ def _projected(
     in_camera[~valid], normal_in_camera[~valid], radius[~valid] = (0, 0, -10), (0, 0, 1), 1
     with np.errstate(all="ignore"):
         try:
-            ellipses = project_circles(info.camera.intrinsics(), in_camera, normal_in_camera, radius)
+            ellipses = project_circles(camera.intrinsics(), in_camera, normal_in_camera, radius)
         except np.linalg.LinAlgError:
             ellipses = Ellipses(*np.full((5, len(radius)), np.nan))
     names = ("cx_px", "cy_px", "a_px", "b_px", "theta_rad")

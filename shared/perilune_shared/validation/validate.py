@@ -19,6 +19,7 @@ from perilune_shared.dataset.schema import KEYS, OPTIONAL_TABLES, TABLES
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import selenographic_from_site
 from perilune_shared.progress import NO_PROGRESS, Progress
+from perilune_shared.validation.cameras import camera_faults
 from perilune_shared.validation.faults import Fault, part_faults
 from perilune_shared.validation.files import file_faults
 from perilune_shared.validation.images import image_faults
@@ -157,6 +158,8 @@ def _scene_faults(
             )
     if len(craters):
         yield from _in_file(dataset, _crater_faults(craters, row, where["craters"]), scene_id, reported)
+    if dataset.info.cameras is not None:
+        yield from camera_faults(dataset, scene_id, where["frames"])
     for trajectory in trajectories.to_pylist():
         trajectory_id = trajectory["trajectory_id"]
         frames = dataset.table("frames", scene_id=scene_id, trajectory_id=trajectory_id)

@@ -17,7 +17,7 @@ import pytest
 from llvmlite.binding import get_host_cpu_features
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.schema import OPTIONAL_TABLES
+from perilune_shared.dataset.schema import OPTIONAL_TABLES, stored
 
 PINNED = Path(__file__).with_name("tiny_pinned.json")
 KINDS = ("detect", "nav")
@@ -51,7 +51,7 @@ def plan_of(folder):
         scenes = dataset.table("scenes").sort_by("scene_id")
         found[kind] = dict(zip(scenes["scene_id"].to_pylist(), scenes["content_sha256"].to_pylist(), strict=True))
         for name in ("scenes", "trajectories", "frames"):
-            table = dataset.table(name)
+            table = stored(name, dataset.table(name))
             left_out = ("recipe", *OF_IMAGES)
             fields = [f.name for f in table.schema if f.name not in left_out and not holds_floats(f.type)]
             found[kind][name] = hash_of(table.select(fields).to_pylist())
@@ -72,7 +72,7 @@ def bytes_of(folder):
         root = folder / kind
         dataset = open_dataset(root)
         tables = {
-            name: dataset.table(name)
+            name: stored(name, dataset.table(name))
             for name in ("scenes", "craters", "boulders", "trajectories", "frames", *OPTIONAL_TABLES)
         }
         tables = {**tables, "scenes": tables["scenes"].drop_columns(["recipe"]), "labels": dataset.table("labels")}

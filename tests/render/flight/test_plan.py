@@ -6,8 +6,10 @@ from tests.helpers import in_process
 from tests.helpers.scenes import config_with
 
 from perilune_render.cli.main import main
-from perilune_render.config import CameraConfig, DistortionConfig, KindConfig
-from perilune_render.flight.plan import camera_of, make_plan
+from perilune_render.config import KindConfig
+from perilune_render.config_cameras import CameraConfig, DistortionConfig
+from perilune_render.flight.lens import camera_of
+from perilune_render.flight.plan import make_plan
 from perilune_render.streams import derived_seed, stream
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera

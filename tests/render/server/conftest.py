@@ -10,7 +10,7 @@ from tests.helpers.scenes import config_with
 from perilune_render.config import CameraConfig, RenderConfig
 from perilune_render.config_scene import SceneConfig, ViewConfig
 from perilune_render.config_terrain import TerrainConfig
-from perilune_render.flight.plan import camera_of
+from perilune_render.flight.lens import camera_of
 from perilune_render.flight.view import scene_view
 from perilune_render.poses.plan import scene_seed, trajectory_seed
 from perilune_render.server.pangu_serve import serve_pangu

@@ -2,7 +2,7 @@
 
 Use:
 
-    stream = FrameStream(open_dataset("packed"), "train", batch_size=8, seed=0)
+    stream = FrameStream(open_single("packed"), "train", batch_size=8, seed=0)
     for epoch in range(10):
         stream.set_epoch(epoch)
         for batch in stream_loader(stream, workers=2):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.store import Address
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.split import load_split
@@ -48,7 +48,7 @@ def evaluate_again(
         "of the run, chosen on its validation split" if threshold is None else "given on the command line"
     )
     known = read_metrics(run).get("dataset/name")
-    dataset = open_dataset(dataset_address)
+    dataset = open_single(dataset_address)
     best = runs.RunFolder(run).best
     terrain = read_provenance(runs.load_weights(best), best)
     if choose_threshold:

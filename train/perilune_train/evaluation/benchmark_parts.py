@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address, open_store
 
@@ -51,7 +51,7 @@ def open_parts(kind: str, data: Address, manifests: Address) -> list[Part]:
     found = []
     for name in part_names(kind):
         if store.exists(f"{name}/dataset.json"):
-            dataset, manifest = open_dataset(store.sub(name)), open_dataset(locked.sub(name))
+            dataset, manifest = open_single(store.sub(name)), open_single(locked.sub(name))
             if not dataset.info.complete:
                 raise UserError(dataset.store, "complete", "false", "a finished dataset; resume its rendering")
             _check_scenes(dataset, manifest)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.store import Address
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.inference.detector import Detector, open_detector
@@ -34,7 +34,7 @@ def terrain_marks(
     marks: dict[str, str] = {}
     metrics: Metrics = {}
     for part, (checkpoint, address) in networks.items():
-        dataset = open_dataset(address)
+        dataset = open_single(address)
         check = check_terrain(read_provenance(load_weights(checkpoint), checkpoint), dataset, split, allow_overlap)
         marks[part] = check.mark
         figures = {"dataset/protocol": protocol_of(dataset.info), **check.metrics()}

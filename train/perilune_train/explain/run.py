@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
@@ -67,7 +67,7 @@ def explain_run(
     )
     own = config_of_run(folder_of(detector), ())
     opened = open_single_scale(detector, own, settings)
-    labelled, flown = open_dataset(detect_data), open_dataset(nav_data)
+    labelled, flown = open_single(detect_data), open_single(nav_data)
     frames, split = labelled_frames(labelled, "test", own, settings.n_frames, settings.ring_factors)
     known_frames, _ = labelled_frames(labelled, "val", own, settings.n_validation, settings.ring_factors)
     pairs = consecutive_pairs(flown, "test", settings.n_pairs)

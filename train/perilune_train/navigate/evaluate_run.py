@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import progress_bar
@@ -29,7 +29,7 @@ def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Pat
     best = RunFolder(run).best
     content = load_weights(best)
     fusion = fusion_of(best, content["architecture"])
-    dataset = open_dataset(dataset_address)
+    dataset = open_single(dataset_address)
     terrain_check = check_terrain(read_provenance(content, best), dataset, split, allow_overlap)
     trajectories = load_split(dataset, split)
     network, architecture = load_navigator(best, fusion)

@@ -9,7 +9,7 @@ import pyarrow as pa
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
 from perilune_train.detect.data.split import DetectSplit, load_split
@@ -34,7 +34,7 @@ class Detected:
 
 def read_detections(run: Path, dataset: Address) -> Detected:
     """Read a run's detections. Raises UserError if they are missing, damaged or of other frames."""
-    split = load_split(open_dataset(dataset), "test", config_of_run(run).labels)
+    split = load_split(open_single(dataset), "test", config_of_run(run).labels)
     path = run / "detections.parquet"
     if not path.is_file():
         raise UserError(path, "detections", "no such file", "the detections of a finished run")

@@ -13,7 +13,7 @@ import jinja2
 from markupsafe import Markup
 
 from perilune_shared.dataset.info_file import INFO_NAME
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.detect.config import LabelSettings
@@ -110,7 +110,7 @@ def _open(folders: Folders, root: Path) -> _Opened:
         if not (folder / INFO_NAME).is_file():
             missing.append(f"dataset {folder.name}")
             continue
-        dataset = open_dataset(str(folder))
+        dataset = open_single(str(folder))
         if dataset.info.complete and dataset.info.images in ("files", "packed") and len(dataset):
             datasets[folder] = dataset
         else:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import new_folder, sha256_of, write_text
 from perilune_shared.storage.store import Address
@@ -124,7 +124,7 @@ def export_run(
         package(name)
     trained = load_trained(root)
     channels = trained.config.in_channels
-    opened = None if dataset is None else open_dataset(dataset)
+    opened = None if dataset is None else open_single(dataset)
     if opened is not None:
         camera = opened.info.camera
         if (camera.width_px, camera.height_px) != (size_px, size_px):

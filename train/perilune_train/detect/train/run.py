@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
 from perilune_train.data.shares import ALONE
@@ -70,7 +70,7 @@ def run_detect(
     if state == "finished":
         return run
     resume = state == "resume"
-    dataset = open_dataset(dataset_address)
+    dataset = open_single(dataset_address)
     terrain = training_provenance(dataset).joined(inherited_terrain(config, run.last if resume else None))
     terrain_check = check_terrain(terrain, dataset, "test", allow_overlap)
     device = runs.choose_device(config.device)

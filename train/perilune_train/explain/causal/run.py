@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
@@ -82,13 +82,13 @@ def causal_run(
         return run
     folder = folder_of(checkpoint)
     config, threshold = config_of_run(folder, ()), chosen_threshold(folder)
-    removed, opened = read_removed(counterfactual), open_dataset(dataset)
+    removed, opened = read_removed(counterfactual), open_single(dataset)
     fitted = {"detector": (checkpoint, dataset)} | ({} if pose is None else {"navigator": (pose[2], pose[0])})
     marks, terrain = terrain_marks(fitted, allow_overlap, split)
     detector = open_single_scale(checkpoint, config, settings)
     if gate not in detector.network.backbone.attentions:
         raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
-    pairs = crater_pairs(opened, open_dataset(counterfactual), removed, split, config.labels)
+    pairs = crater_pairs(opened, open_single(counterfactual), removed, split, config.labels)
     start_run(run, "explain", settings, inputs, state)
     rng = np.random.default_rng([settings.seed, 3])
     versions, shifts = _versions(opened, pairs, split, config.labels, settings, rng)
@@ -101,12 +101,12 @@ def causal_run(
     tables = {"mask_effects": moved, "detection_effects": found, "gate_effects": gates}
     tables |= {"mask_bins": figures.binned(moved, "change"), "detection_bins": figures.binned(found, "found")}
     if turned is not None:
-        tables["turned_sun"] = _turned(detector, opened, open_dataset(turned), split, checkpoint)
+        tables["turned_sun"] = _turned(detector, opened, open_single(turned), split, checkpoint)
     if pose is not None:
         navigator, architecture = load_navigator(pose[2], "stack")
         navigator = navigator.to(choose_device(settings.device))
         tables["pose_effects"] = pose_effects(
-            navigator, architecture, open_dataset(pose[0]), open_dataset(pose[1]), split
+            navigator, architecture, open_single(pose[0]), open_single(pose[1]), split
         )
     for title, table in tables.items():
         with written_aside(run.root / f"{title}.parquet") as aside:

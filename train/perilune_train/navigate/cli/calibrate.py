@@ -24,7 +24,7 @@ def calibrate(
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
     # torch takes seconds to load.
-    from perilune_shared.dataset.manifest import open_dataset
+    from perilune_shared.dataset.manifest import open_single
     from perilune_train.evaluation.provenance import check_calibration, read_provenance, split_terrain
     from perilune_train.navigate.covariance import FILE
     from perilune_train.navigate.covariance import calibrate as fit
@@ -37,7 +37,7 @@ def calibrate(
     fusion = fusion_of(best, load_weights(best)["architecture"])
     if fusion != "warp":
         raise UserError(best, "fusion", fusion, "warp; the paper's network states no covariance")
-    opened = open_dataset(dataset)
+    opened = open_single(dataset)
     check_calibration(read_provenance(load_weights(best), best), split_terrain(opened, split, "calibrated"), opened)
     network, architecture = load_navigator(best, fusion)
     fit(run, network, architecture, load_split(opened, split))

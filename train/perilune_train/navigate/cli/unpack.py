@@ -38,9 +38,9 @@ def unpack(
         if not 0 < value < 1e4:
             raise UserError(name, "deviation", value, "above 0, below 10000")
     # pyarrow and pandas take a second to load.
-    from perilune_shared.dataset.manifest import open_dataset
+    from perilune_shared.dataset.manifest import open_single
     from perilune_train.navigate.fly.unpack import unpack_descent
 
-    count = unpack_descent(open_dataset(dataset), (ids[0], ids[1]), out, grade, exact, offset, seed)
+    count = unpack_descent(open_single(dataset), (ids[0], ids[1]), out, grade, exact, offset, seed)
     names = "frames, camera.yaml, catalogue.parquet, imu.csv, ranges.csv, prior.yaml, truth.csv"
     console.print(f"{out}: {count} frames; {names}")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.storage.files import new_folder, sha256_of, write_text
@@ -106,7 +106,7 @@ def _pairs(architecture: dict[str, Any], fusion: Fusion, dataset: Address | None
         focal_px = side * architecture.get("focal_over_width", 1.0)
         camera = Camera(side, side, focal_px, focal_px, side / 2, side / 2)
         return Pairs(first, second, falling, torch.linspace(1500, 300, _PAIRS)), camera
-    descents = load_split(open_dataset(dataset), "val")
+    descents = load_split(open_single(dataset), "val")
     if not descents:
         raise UserError(dataset, "split val", "no descent", "at least one, to compare the file with torch")
     trajectory = descents[0].shrunk(side)

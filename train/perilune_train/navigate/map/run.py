@@ -9,7 +9,7 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.storage.files import new_folder, write_text
@@ -51,7 +51,7 @@ def map_scenes(address: Address, detector: Path, out: Path, allow_overlap: bool 
     new folder `out`, or nothing. Raises UserError if a scene has not two frames, or if the detector was fitted to the
     terrain, unless `allow_overlap`.
     """
-    dataset = open_dataset(address)
+    dataset = open_single(address)
     frames = dataset.table("frames").to_pandas().sort_values("frame_id")
     for scene_id, own in frames.groupby("scene_id"):
         if len(own) != 2:

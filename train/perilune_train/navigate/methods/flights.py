@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from perilune_shared.dataset.manifest import Dataset
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 from perilune_shared.terminal import progress_bar
@@ -36,7 +37,7 @@ def flights(
     The starts are off, drawn by the place of the descent.
     """
     tables = []
-    mounting, sigmas = np.array(dataset.info.camera.rotation_camera_from_body), default_sigmas(grade, attitude_deg)
+    mounting, sigmas = mounting_of(dataset), default_sigmas(grade, attitude_deg)
     with progress_bar() as progress:
         task = progress.add_task(
             f"{'smoother' if smooth else 'filter'}, {attitude_deg:g} deg", total=len(descents), unit="descents", note=""
@@ -49,6 +50,15 @@ def flights(
             tables.append(flown.assign(seconds=(time.process_time() - begun) / max(len(flown), 1)))
             progress.advance(task)
     return pd.concat(tables, ignore_index=True)
+
+
+def mounting_of(dataset: Dataset) -> Array:
+    """rotation_camera_from_body (3, 3). Raises UserError unless the camera is at the body's origin."""
+    camera = dataset.info.camera
+    if any(camera.position_in_body_m):
+        where = dataset.store.at("dataset.json")
+        raise UserError(where, "camera.position_in_body_m", list(camera.position_in_body_m), "[0, 0, 0]")
+    return np.array(camera.rotation_camera_from_body)
 
 
 def default_sigmas(grade: InertialGrade, attitude_deg: float) -> Array:

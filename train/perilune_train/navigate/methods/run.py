@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.geometry.frames import Array
 from perilune_shared.storage.files import new_folder, write_text
 from perilune_shared.storage.store import Address
@@ -46,7 +46,7 @@ def fly_methods(
     and pictures to the new folder `out`, or nothing. Raises UserError if a network was fitted to the terrain of the
     split, unless `allow_overlap`, or if the dataset lacks frames.
     """
-    dataset = open_dataset(address)
+    dataset = open_single(address)
     best = {name: RunFolder(run).best for name, run in (("navigator", navigator), ("detector", detector))}
     contents = {name: load_weights(path) for name, path in best.items()}
     fusion = fusion_of(best["navigator"], contents["navigator"]["architecture"])

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from perilune_shared.dataset.manifest import Dataset, open_dataset
+from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import InertialGrade
@@ -30,7 +30,7 @@ from perilune_train.navigate.craters.catalogue import (
 )
 from perilune_train.navigate.data.trajectories import load_split
 from perilune_train.navigate.filter.flight import Instruments
-from perilune_train.navigate.methods.flights import default_sigmas, flight
+from perilune_train.navigate.methods.flights import default_sigmas, flight, mounting_of
 from perilune_train.navigate.methods.seen import SeenDescent, seen_descents
 from perilune_train.navigate.monte_carlo.draw import drawn
 from perilune_train.navigate.monte_carlo.figures import draw_bands, draw_consistency
@@ -92,7 +92,7 @@ def fly_draws(
     or nothing. The result does not depend on the number of workers. Raises UserError if the detector was fitted to the
     terrain of the split, unless `allow_overlap`, or if the dataset lacks frames or inertial measurements.
     """
-    dataset = open_dataset(address)
+    dataset = open_single(address)
     best = RunFolder(detector).best
     check = check_terrain(read_provenance(load_weights(best), best), dataset, split, allow_overlap)
     with new_folder(out) as folder:
@@ -101,7 +101,7 @@ def fly_draws(
         descents, _ = seen_descents(dataset, trajectories, detector)
         exact = {scene: exact_catalogue(dataset, scene, LEAST_DIAMETER_M) for scene in {one.ids[0] for one in descents}}
         sites = [Site(one, references[one.ids], exact[one.ids[0]]) for one in descents]
-        mounting = np.array(dataset.info.camera.rotation_camera_from_body)
+        mounting = mounting_of(dataset)
         job = Job(sites, mounting, default_sigmas(GRADE, attitude_deg), scenario, seed)
         begun = time.perf_counter()
         rows = pd.concat(_all_draws(job, draws, workers or os.cpu_count() or 1), ignore_index=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import lightning
 from torch import Tensor
 
-from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
 from perilune_train.data.shares import Share
@@ -70,7 +70,7 @@ def navigate_run(
     states = {fusion: state_of(folders[fusion], "navigate", settings, inputs[fusion], overwrite) for fusion in fusions}
     if set(states.values()) == {"finished"}:
         return list(folders.values())
-    opened = open_dataset(dataset_address)
+    opened = open_single(dataset_address)
     own = training_provenance(opened)
     terrain = {"warp": own, "stack": own.joined(inherited)}
     # One check for both, because the table of the warp run includes the metrics of stack.

@@ -1,0 +1,45 @@
+"""The camera of a configuration."""
+
+import numpy as np
+
+from perilune_render.config_cameras import CameraConfig
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
+
+_LARGEST_COVER = 9
+"""Largest ratio of rendered pixels to the camera's pixels."""
+
+
+def camera_of(config: CameraConfig, section: str = "dataset.camera") -> Camera:
+    """The camera of a configuration's section. Raises UserError if its distortion is too strong.
+
+    Too strong means that it folds back within the image, or that the pinhole that covers the view has more than
+    _LARGEST_COVER times the camera's pixels.
+    """
+    width, height, lens = config.width_px, config.height_px, config.distortion
+    focal = config.focal_length_px or width / 2 / np.tan(np.radians(config.horizontal_fov_deg) / 2)
+    camera = Camera(
+        width,
+        height,
+        float(focal),
+        float(focal),
+        width / 2 if config.principal_x_px is None else config.principal_x_px,
+        height / 2 if config.principal_y_px is None else config.principal_y_px,
+        (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3),
+    )
+    if camera.folds_back():
+        raise UserError(
+            "configuration",
+            f"{section}.distortion",
+            camera.distortion,
+            "a distortion that does not fold back within the image: weaker, or a narrower view",
+        )
+    covering = camera.covering_pinhole()
+    if covering.width_px * covering.height_px > _LARGEST_COVER * width * height:
+        raise UserError(
+            "configuration",
+            f"{section}.distortion",
+            camera.distortion,
+            f"a weaker one (this one needs a rendering of {covering.width_px} x {covering.height_px} pixels)",
+        )
+    return camera

@@ -1,0 +1,131 @@
+"""The rig: the cameras on the body, and the poses of each along a trajectory of the body.
+
+The body's pose is given as that of a camera with the default mounting: at the body's origin, looking along -Z_B. This
+is the camera of a lander with a single one.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perilune_render.config import DatasetConfig, FlightConfig
+from perilune_render.config_cameras import MountingConfig
+from perilune_render.flight.lens import camera_of
+from perilune_render.flight.trajectories import Flight
+from perilune_shared.dataset.metadata import CameraRecord
+from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
+from perilune_shared.geometry.frames import (
+    Array,
+    matrix_from_quaternion,
+    matrix_from_rotation_vector,
+    quaternion_from_matrix,
+)
+
+_LOWEST_RAY = 0.01
+"""Smallest z, along -Z_B, of a ray of length 1 through the image's corner: less shows the horizon."""
+
+
+@dataclass(frozen=True, slots=True)
+class MountedCamera:
+    """A camera on the body."""
+
+    camera: Camera
+    """Camera of its frames."""
+    exr_camera: Camera
+    """Camera of its renderings and EXRs: a pinhole that covers the view of `camera`."""
+    rotation_camera_from_body: Array
+    """Rotation matrix (3, 3)."""
+    position_in_body_m: Array
+    """Centre of projection in O_B, metres (3,)."""
+
+    def records(self) -> tuple[CameraRecord, CameraRecord]:
+        """What dataset.json records: the camera and that of the EXRs, with the mounting."""
+        x, y, z = self.position_in_body_m.tolist()
+        mounting = self.rotation_camera_from_body, (x, y, z)
+        return CameraRecord.of(self.camera, *mounting), CameraRecord.of(self.exr_camera, *mounting)
+
+    def poses(self, position_m: Array, rotation_wxyz: Array) -> tuple[Array, Array]:
+        """Positions (N, 3), O_L, metres, and rotation_camera_from_site (N, 4) for poses of the body."""
+        body_from_site = ROTATION_CAMERA_FROM_BODY.T @ matrix_from_quaternion(rotation_wxyz)
+        position = position_m + np.einsum("nji,j->ni", body_from_site, self.position_in_body_m)
+        rotations = self.rotation_camera_from_body @ body_from_site
+        return position, np.stack([quaternion_from_matrix(rotation) for rotation in rotations])
+
+    def body_position(self, position_m: Array, rotation_wxyz: Array) -> Array:
+        """Positions of the body (N, 3), O_L, metres, for poses of this camera."""
+        body_from_site = self.rotation_camera_from_body.T @ matrix_from_quaternion(rotation_wxyz)
+        return position_m - np.einsum("nji,j->ni", body_from_site, self.position_in_body_m)
+
+    def flight_of(self, body: Flight) -> Flight:
+        """The flight of this camera on a body.
+
+        Its velocity is that of the body: the rotation of the body about its origin is left out, since it moves a camera
+        within the body by less than a pixel during an exposure. `motion` stays that of the body.
+        """
+        position, rotation = self.poses(body.position_m, body.rotation_wxyz)
+        turn = body.angular_velocity_radps
+        if turn is not None:
+            # Given in the axes of the default mounting.
+            turn = turn @ (self.rotation_camera_from_body @ ROTATION_CAMERA_FROM_BODY.T).T
+        return replace(body, position_m=position, rotation_wxyz=rotation, angular_velocity_radps=turn)
+
+    def levelled(self) -> Camera:
+        """A pinhole at the body's origin, with the default attitude, that sees all ground that this camera sees.
+
+        Its focal length is so large that no pixel of this camera shows less ground than one of its own. Raises
+        UserError if the camera could see the horizon of a level body.
+        """
+        if np.array_equal(self.rotation_camera_from_body, ROTATION_CAMERA_FROM_BODY):
+            return self.exr_camera
+        corners = np.array(
+            [[u, v] for u in (0, self.exr_camera.width_px) for v in (0, self.exr_camera.height_px)], np.float64
+        )
+        rays = self.exr_camera.rays(corners) @ self.rotation_camera_from_body
+        if (-rays[:, 2] < _LOWEST_RAY * np.linalg.norm(rays, axis=1)).any():
+            raise UserError("configuration", "dataset.cameras", "a view with the horizon", "a view of the ground alone")
+        half = float(np.abs(rays[:, :2] / rays[:, 2:]).max())
+        # Between the image and a level one, lengths grow by at most the square of the ratio of the depths.
+        focal = max(self.exr_camera.fx_px, self.exr_camera.fy_px) * max(1.0, float(-rays[:, 2].min())) ** 2
+        side = int(np.ceil(2 * half * focal))
+        return Camera(side, side, focal, focal, side / 2, side / 2)
+
+    def flight_settings(self, flight: FlightConfig) -> FlightConfig:
+        """Flight settings whose spread of the position also has the distance of the camera from the body's origin."""
+        lever_m = float(np.linalg.norm(self.position_in_body_m))
+        return flight.model_copy(update={"position_sigma_m": flight.position_sigma_m + lever_m / 3})
+
+
+Rig = Mapping[str | None, MountedCamera]
+"""Cameras by name, in the order of the names; a single one without a name has the key None."""
+
+
+def rig_of(config: DatasetConfig) -> dict[str | None, MountedCamera]:
+    """The cameras of a configuration. Raises UserError if a distortion is too strong."""
+    if not config.cameras:
+        camera = camera_of(config.camera)
+        return {None: MountedCamera(camera, camera.covering_pinhole(), ROTATION_CAMERA_FROM_BODY, np.zeros(3))}
+    rig: dict[str | None, MountedCamera] = {}
+    for name, settings in config.cameras.items():
+        camera, mounting = camera_of(settings, f"dataset.cameras.{name}"), settings.mounting
+        place = np.array(mounting.position_in_body_m)
+        rig[name] = MountedCamera(camera, camera.covering_pinhole(), _rotation(mounting), place)
+    return rig
+
+
+def mounted(camera: Camera) -> MountedCamera:
+    """A camera with the default mounting."""
+    return MountedCamera(camera, camera.covering_pinhole(), ROTATION_CAMERA_FROM_BODY, np.zeros(3))
+
+
+def _rotation(mounting: MountingConfig) -> Array:
+    """rotation_camera_from_body (3, 3)."""
+    if mounting.rotation_camera_from_body_wxyz is not None:
+        return matrix_from_quaternion(mounting.rotation_camera_from_body_wxyz)
+    if not any(mounting.turned_deg):
+        return ROTATION_CAMERA_FROM_BODY
+    turned = np.eye(3)
+    for axis, angle_deg in zip(np.eye(3), mounting.turned_deg, strict=True):
+        turned = matrix_from_rotation_vector(np.radians(angle_deg) * axis) @ turned
+    return ROTATION_CAMERA_FROM_BODY @ turned.T
