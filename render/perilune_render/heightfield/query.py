@@ -33,7 +33,6 @@ def heights_m(surface: Surface, x_m: Array, y_m: Array, *, boulders: bool = True
 def _hits(ground, rocks, origins, directions):
     """See `first_hits`; places are relative to the grid's centre."""
     distance, normal = np.empty(len(origins)), np.zeros((len(origins), 3))
-    facet, curve = np.empty(3), np.empty(3)
     for k in range(len(origins)):
         ox, oy, oz = origins[k]
         dx, dy, dz = directions[k]
@@ -44,6 +43,6 @@ def _hits(ground, rocks, origins, directions):
         if rock >= 0:
             normal[k, 0], normal[k, 1], normal[k, 2] = rock_normal(rocks, rock, face)
         elif t < np.inf:
-            ground_at(ground, part, row, column, triangle, ox + t * dx, oy + t * dy, facet, curve)
-            normal[k] = facet
+            shading = ground_at(ground, part, row, column, triangle, ox + t * dx, oy + t * dy)
+            normal[k, 0], normal[k, 1], normal[k, 2] = shading[4], shading[5], shading[6]
     return distance, normal
