@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from perilune_render.config import DatasetConfig
+from perilune_render.heightfield.horizon import NOWHERE, Horizon, horizon_of
 from perilune_render.heightfield.shade import see
 from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.imaging.photometry import reflectance_factor
@@ -22,7 +23,14 @@ from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import plane_basis
 from perilune_shared.geometry.frames import Array
 
+_TILE_PX = 64
+"""Width of the tiles of an image that are rendered one after another."""
 _RAYS_AT_ONCE = 8192
+"""Rays of a tile, if a row of it has no more: their photometry fits the cache of a core."""
+_LIT = 1e-4
+"""Radiance factor above which a pixel counts as sunlit."""
+_RAYS_PER_VERTEX = 0.3
+"""Rays, in numbers of vertices, after which the horizon is made: without it they have taken as long as it takes."""
 
 
 class HeightfieldEngine:
@@ -48,9 +56,9 @@ class HeightfieldEngine:
         self.camera, self.sun = camera, np.asarray(sun, np.float64)
         self.surface = surface if surface is not None else surface_of(scene)
         self._law, self._samples = config.light.photometry, config.render.samples
-        self._disc_rad = np.radians(config.light.sun_angular_diameter_deg) / 2
+        self._disc_rad = np.float32(np.radians(config.light.sun_angular_diameter_deg) / 2)
         self._far_m = scene.grid.farthest_m
-        self._centres = camera.pixel_centres().reshape(-1, 2)
+        self.horizon, self._n_rays = NOWHERE, 0
         self._threads = ThreadPoolExecutor(n_threads, "rays")
 
     def close(self) -> None:
@@ -70,57 +78,79 @@ class HeightfieldEngine:
 
         The first sample of a pixel is at its centre. `approach_deg` is not used: the ground is one mesh.
         """
-        everything = slice(0, len(self._centres))
-        return self._render([(everything, (position_m, rotation_camera_from_site))], seed)
+        shape = self.camera.height_px, self.camera.width_px
+        found = Radiance.empty(shape)
+        pose = position_m, rotation_camera_from_site
+        self._cast(found, slice(0, shape[0]), pose, self._drawn(seed), self._horizon_now())
+        return found
 
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
         """Render one frame with a pose for each row of the sensor; a depth is along the axis at its row's pose."""
-        bands = poses.bands(len(poses.time_s))
-        return self._render([(np.flatnonzero(pixels), pose) for pixels, pose in bands if pixels.any()], seed)
-
-    def _render(self, bands: list[tuple[slice | np.ndarray, Pose]], seed: int) -> Radiance:
-        """Render one frame of which each band of pixels, by their indices, has its own pose."""
-        n_pixels = len(self._centres)
-        rng = stream(seed, "rays")
-        moved = rng.random((self._samples, n_pixels, 2), np.float32) - np.float32(0.5)
-        moved[0] = 0.0
-        disc = rng.random((self._samples, n_pixels, 2), np.float32)
-        parts = [
-            (sample, pixels[first : first + _RAYS_AT_ONCE], pose)
-            for sample in range(self._samples)
-            for pixels, pose in ((np.arange(n_pixels)[band], pose) for band, pose in bands)
-            for first in range(0, len(pixels), _RAYS_AT_ONCE)
-        ]
-        radiance = np.zeros((self._samples, n_pixels), np.float32)
-        depth, normal = np.empty(n_pixels, np.float32), np.empty((n_pixels, 3), np.float32)
-
-        def cast(part: tuple[int, np.ndarray, Pose]) -> None:
-            sample, pixels, (position_m, rotation_camera_from_site) = part
-            origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
-            rays = self.camera.rays(self._centres[pixels] + moved[sample, pixels]) @ rotation_camera_from_site
-            own_depth, own_normal, seen = self._see(origin, np.ascontiguousarray(rays), disc[sample, pixels])
-            radiance[sample, pixels] = seen
-            if sample == 0:
-                depth[pixels], normal[pixels] = own_depth, own_normal
-
-        list(self._threads.map(cast, parts))
         shape = self.camera.height_px, self.camera.width_px
-        mean = radiance.mean(axis=0)
-        return Radiance(
-            mean.reshape(shape), depth.reshape(shape), normal.reshape(*shape, 3), (mean > 1e-4).reshape(shape)
+        whole, band, drawn, horizon = (
+            Radiance.empty(shape),
+            Radiance.empty(shape),
+            self._drawn(seed),
+            self._horizon_now(),
         )
+        for pixels, pose in poses.bands(len(poses.time_s)):
+            seen = np.flatnonzero(pixels.any(axis=1))
+            if not len(seen):
+                continue
+            # A row of a sensor with distortion crosses several rows of the rendering.
+            rows = slice(int(seen[0]), int(seen[-1]) + 1)
+            self._cast(band, rows, pose, drawn, horizon)
+            whole.take_from(band, rows, pixels[rows])
+        return whole
 
-    def _see(self, origin: Array, rays: Array, disc: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Depth (N,), normal (N, 3) and radiance factor (N,) of rays (N, 3) with z = 1 along the camera's axis."""
-        n = len(rays)
-        across, along = plane_basis(self.sun)
-        radius, angle = self._disc_rad * np.sqrt(disc[:, :1]), 2 * np.pi * disc[:, 1:]
-        suns = self.sun + np.tan(radius) * (np.cos(angle) * across + np.sin(angle) * along)
-        suns /= np.linalg.norm(suns, axis=1, keepdims=True)
-        depth, normal = np.empty(n), np.empty((n, 3))
-        angles, lit = np.empty((n, 4)), np.empty(n)
+    def _drawn(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Places of the samples in their pixels and uniform numbers for the Sun's disc: (samples, h, w, 2) each."""
+        rng, shape = stream(seed, "rays"), (self._samples, self.camera.height_px, self.camera.width_px, 2)
+        moved = rng.random(shape, np.float32) - np.float32(0.5)
+        moved[0] = 0.0
+        return moved, rng.random(shape, np.float32)
+
+    def _cast(
+        self, found: Radiance, rows: slice, pose: Pose, drawn: tuple[np.ndarray, np.ndarray], horizon: Horizon
+    ) -> None:
+        """Render rows of an image from one pose into `found`, in tiles by all threads."""
+        position_m, rotation_camera_from_site = pose
+        moved, disc = drawn
+        origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
+        basis, plane = _rays_of(self.camera) @ rotation_camera_from_site, np.stack(plane_basis(self.sun))
         ground, rocks = self.surface.ground, self.surface.rocks
-        see(ground, rocks, origin, rays, suns, self.sun, self._far_m, depth, normal, angles, lit)
-        mu0, mu, cos_phase, albedo = angles.astype(np.float32).T
-        seen = reflectance_factor(self._law, mu0, mu, cos_phase) * albedo * lit.astype(np.float32)
-        return depth, normal, seen
+
+        def cast(first: tuple[int, int]) -> None:
+            last_row = min(first[0] + tile_rows, rows.stop)
+            tile = slice(first[0], last_row), slice(first[1], first[1] + _TILE_PX)
+            places, suns = moved[:, *tile], self._disc(disc[:, *tile])
+            angles = np.empty((5, *places.shape[:3]), np.float32)
+            light = horizon, origin, basis, self.sun, plane
+            see(ground, rocks, *light, self._far_m, first, places, suns, found.depth_m, found.normal, angles)
+            mu0, mu, cos_phase, albedo, lit = angles
+            seen = (reflectance_factor(self._law, mu0, mu, cos_phase) * albedo * lit).mean(axis=0)
+            found.radiance_factor[tile], found.sunlit[tile] = seen, seen > _LIT
+
+        tile_rows = max(_RAYS_AT_ONCE // (_TILE_PX * self._samples), 1)
+        columns = range(0, self.camera.width_px, _TILE_PX)
+        firsts = [(row, column) for row in range(rows.start, rows.stop, tile_rows) for column in columns]
+        list(self._threads.map(cast, firsts))
+
+    def _disc(self, drawn: np.ndarray) -> np.ndarray:
+        """Uniform places (..., 2) on the Sun's disc at unit distance, for uniform random numbers (..., 2)."""
+        radius, angle = self._disc_rad * np.sqrt(drawn[..., 0]), np.float32(2 * np.pi) * drawn[..., 1]
+        length = np.tan(radius)
+        return np.stack([length * np.cos(angle), length * np.sin(angle)], axis=-1)
+
+    def _horizon_now(self) -> Horizon:
+        """The horizon for a frame; `NOWHERE` as long as it costs less. Frames are the same with any horizon."""
+        self._n_rays += self._samples * self.camera.width_px * self.camera.height_px
+        if self.horizon is NOWHERE and self._n_rays > _RAYS_PER_VERTEX * len(self.surface.ground.vertex):
+            self.horizon = horizon_of(self.surface.ground, self.sun, float(self._disc_rad))
+        return self.horizon
+
+
+def _rays_of(camera: Camera) -> Array:
+    """Rows (3, 3): how a ray of a camera without distortion changes with u, with v, and the ray at u = v = 0."""
+    start, right, down = camera.rays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    return np.stack([right - start, down - start, start])

@@ -40,7 +40,6 @@ def heights_m(surface: Surface, x_m: Array, y_m: Array, *, boulders: bool = True
 def _hits(ground, rocks, origins, directions):
     """See `first_returns`; places are relative to the grid's centre."""
     distance, normal, albedo = np.empty(len(origins)), np.zeros((len(origins), 3)), np.zeros(len(origins))
-    facet, curve = np.empty(3), np.empty(3)
     for k in range(len(origins)):
         ox, oy, oz = origins[k]
         dx, dy, dz = directions[k]
@@ -52,6 +51,7 @@ def _hits(ground, rocks, origins, directions):
             normal[k, 0], normal[k, 1], normal[k, 2] = rock_normal(rocks, rock, face)
             albedo[k] = 1.0
         elif t < np.inf:
-            albedo[k] = ground_at(ground, part, row, column, triangle, ox + t * dx, oy + t * dy, facet, curve)[3]
-            normal[k] = facet
+            shading = ground_at(ground, part, row, column, triangle, ox + t * dx, oy + t * dy)
+            normal[k, 0], normal[k, 1], normal[k, 2] = shading[4], shading[5], shading[6]
+            albedo[k] = shading[3]
     return distance, normal, albedo

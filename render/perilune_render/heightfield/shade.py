@@ -3,7 +3,8 @@
 import numpy as np
 
 from perilune_render.heightfield.cast import first_hit
-from perilune_render.heightfield.surface import place_of, vertex
+from perilune_render.heightfield.horizon import surely_lit
+from perilune_render.heightfield.surface import WITHOUT_COUNTS, place_of, vertex
 from perilune_render.provenance.kernels import njit
 
 _LIFT = 1e-9
@@ -13,26 +14,22 @@ _TERMINATOR = 0.1
 surface that its vertex normals describe (its shadow terminator geometry offset, at its default)."""
 
 
-@njit(inline="always", error_model="numpy")
+@njit(inline="always", **WITHOUT_COUNTS)
 def _dot(ax, ay, az, bx, by, bz):
     return ax * bx + ay * by + az * bz
 
 
-@njit(inline="always", error_model="numpy")
+@njit(inline="always", **WITHOUT_COUNTS)
 def _normal(vertices, k):
     """Unit normal of a vertex, which points upwards."""
     x, y = float(vertices[k, 0]), float(vertices[k, 1])
     return x, y, np.sqrt(max(1 - x * x - y * y, 0.0))
 
 
-@njit(error_model="numpy")
-def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
-    """Shading at a place of a triangle: normal, albedo.
-
-    Writes the facet's unit normal into `facet` (3,), and into `curve` (3,) the vector by which Cycles lifts a grazing
-    shadow ray from the facet: to the lowest of the vertices' tangent planes, each raised over the triangle, or to half
-    the height of a quadratic patch that has the vertex normals.
-    """
+@njit(inline="always", **WITHOUT_COUNTS)
+def _corners(ground, part, row, column, triangle, x, y):
+    """Of a triangle: its vertices, the edges from the first to the others, their cross product's z, and the weights of
+    the second and third vertex at a place."""
     n, half, vertices = ground.n_half, ground.half_widths_m, ground.vertex
     a, b = (1, 2) if triangle == 0 else (2, 3)
     v0, v1, v2 = (
@@ -48,10 +45,36 @@ def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
     area = e1x * e2y - e1y * e2x
     v = ((x - x0) * e2y - (y - y0) * e2x) / area
     w = (e1x * (y - y0) - e1y * (x - x0)) / area
+    return v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, area, v, w
+
+
+@njit(**WITHOUT_COUNTS)
+def ground_at(ground, part, row, column, triangle, x, y):
+    """Shading at a place of a triangle: unit normal, albedo, and the unit normal of the triangle."""
+    vertices = ground.vertex
+    v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, area, v, w = _corners(ground, part, row, column, triangle, x, y)
     u = 1 - v - w
     fx, fy, fz = e1y * e2z - e1z * e2y, e1z * e2x - e1x * e2z, area
-    length = 1 / np.sqrt(fx * fx + fy * fy + fz * fz)
-    facet[0], facet[1], facet[2] = fx * length, fy * length, fz * length
+    size = 1 / np.sqrt(fx * fx + fy * fy + fz * fz)
+    ax, ay, az = _normal(vertices, v0)
+    bx, by, bz = _normal(vertices, v1)
+    cx, cy, cz = _normal(vertices, v2)
+    nx, ny, nz = u * ax + v * bx + w * cx, u * ay + v * by + w * cy, u * az + v * bz + w * cz
+    albedo = u * abs(vertices[v0, 3]) + v * abs(vertices[v1, 3]) + w * abs(vertices[v2, 3])
+    length = 1 / np.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx * length, ny * length, nz * length, albedo, fx * size, fy * size, fz * size
+
+
+@njit(**WITHOUT_COUNTS)
+def lift_at(ground, part, row, column, triangle, x, y):
+    """The vector by which Cycles lifts a grazing shadow ray at a place of a triangle from the facet.
+
+    It is that to the lowest of the vertices' tangent planes, each raised over the triangle, or to half the height of a
+    quadratic patch that has the vertex normals.
+    """
+    vertices = ground.vertex
+    v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, _, v, w = _corners(ground, part, row, column, triangle, x, y)
+    u = 1 - v - w
     ax, ay, az = _normal(vertices, v0)
     bx, by, bz = _normal(vertices, v1)
     cx, cy, cz = _normal(vertices, v2)
@@ -70,13 +93,10 @@ def ground_at(ground, part, row, column, triangle, x, y, facet, curve):
     over_1 = max(over_1 - _dot(px - e1x, py - e1y, pz - e1z, bx, by, bz), 0.0)
     over_2 = max(over_2 - _dot(px - e2x, py - e2y, pz - e2z, cx, cy, cz), 0.0)
     bulge = max(min(min(over_0, over_1), over_2), 0.5 * bulge)
-    curve[0], curve[1], curve[2] = bulge * nx, bulge * ny, bulge * nz
-    albedo = u * abs(vertices[v0, 3]) + v * abs(vertices[v1, 3]) + w * abs(vertices[v2, 3])
-    length = 1 / np.sqrt(nx * nx + ny * ny + nz * nz)
-    return nx * length, ny * length, nz * length, albedo
+    return bulge * nx, bulge * ny, bulge * nz
 
 
-@njit(error_model="numpy")
+@njit(**WITHOUT_COUNTS)
 def rock_normal(rocks, k, face):
     """Unit normal of a face of boulder k, O_L."""
     m, px, py, pz = rocks.rows[k], rocks.planes[face, 0], rocks.planes[face, 1], rocks.planes[face, 2]
@@ -89,51 +109,63 @@ def rock_normal(rocks, k, face):
     return nx / length, ny / length, nz / length
 
 
-@njit(error_model="numpy")
-def see(ground, rocks, origin, rays, suns, sun, far_m, depth, normal, angles, lit):
-    """Cast rays (N, 3) with z = 1 along the camera's axis from `origin` (3,), and a shadow ray from each hit.
+@njit(**WITHOUT_COUNTS)
+def see(ground, rocks, horizon, origin, basis, sun, plane, far_m, first, moved, disc, depth, normal, angles):
+    """Cast the rays of a tile of the image from `origin` (3,), and a shadow ray from each hit that may be dark.
 
-    `suns` (N, 3) are unit vectors to points of the Sun's disc, `sun` (3,) to its centre. Writes for each ray the depth
-    (inf for a miss), the unit shading normal (N, 3), `angles` (N, 4): mu0, mu, cosine of the phase angle, albedo, and
-    `lit`: the cosine of incidence of the point of the disc, 0 in shadow.
+    The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2], with z = 1 along the camera's axis.
+    `first` is the tile's first row and column. `moved` (S, h, w, 2) has the places of its samples, pixels from the
+    pixel's centre. `disc` (S, h, w, 2) has places on the Sun's disc: a ray there is along the unit vector `sun` (3,)
+    to the centre, plus the place times `plane` (2, 3). Writes for the first sample the depth (inf for a miss)
+    and the unit shading normal into the images `depth` and `normal`. Writes for each sample `angles` (5, S, h, w): mu0,
+    mu, cosine of the phase angle, albedo, and the cosine of incidence of the point of the disc, 0 in shadow.
+    The samples of a pixel come one after another, since they read the same memory.
     """
-    facet, curve = np.empty(3), np.empty(3)
     nothing = (-1, -1, -1, -1, -1)
-    for k in range(rays.shape[0]):
-        dx, dy, dz = rays[k, 0], rays[k, 1], rays[k, 2]
+    n_samples, height, width, _ = moved.shape
+    for i, j, s in np.ndindex(height, width, n_samples):
+        u, v = first[1] + j + 0.5 + moved[s, i, j, 0], first[0] + i + 0.5 + moved[s, i, j, 1]
+        dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
+        dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
+        dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
         t, rock, face, part, row, column, triangle = first_hit(
             ground, rocks, origin[0], origin[1], origin[2], dx, dy, dz, 0.0, far_m, nothing
         )
-        depth[k] = t
-        lit[k] = 0.0
-        if t == np.inf:
-            normal[k, 0], normal[k, 1], normal[k, 2] = 0.0, 0.0, 0.0
-            angles[k, 0], angles[k, 1], angles[k, 2], angles[k, 3] = 1.0, 1.0, 1.0, 0.0
-            continue
+        nx, ny, nz, albedo, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
         if rock >= 0:
             nx, ny, nz = rock_normal(rocks, rock, face)
             albedo = 1.0
-            skip = (-1, -1, -1, -1, rock)
-            facet[0], facet[1], facet[2] = nx, ny, nz
-        else:
-            nx, ny, nz, albedo = ground_at(ground, part, row, column, triangle, x, y, facet, curve)
-            skip = (part, row, column, triangle, -1)
-        length = np.sqrt(dx * dx + dy * dy + dz * dz)
-        normal[k, 0], normal[k, 1], normal[k, 2] = nx, ny, nz
-        angles[k, 0] = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 1e-4)
-        angles[k, 1] = max(-(nx * dx + ny * dy + nz * dz) / length, 1e-4)
-        angles[k, 2] = -(sun[0] * dx + sun[1] * dy + sun[2] * dz) / length
-        angles[k, 3] = albedo
-        lx, ly, lz = suns[k, 0], suns[k, 1], suns[k, 2]
+        elif t < np.inf:
+            nx, ny, nz, albedo, fx, fy, fz = ground_at(ground, part, row, column, triangle, x, y)
+        if s == 0:
+            at = first[0] + i, first[1] + j
+            depth[at], normal[at[0], at[1], 0], normal[at[0], at[1], 1], normal[at[0], at[1], 2] = t, nx, ny, nz
+        p, q = disc[s, i, j, 0], disc[s, i, j, 1]
+        lx, ly = sun[0] + p * plane[0, 0] + q * plane[1, 0], sun[1] + p * plane[0, 1] + q * plane[1, 1]
+        lz = sun[2] + p * plane[0, 2] + q * plane[1, 2]
+        to_disc = 1 / np.sqrt(lx * lx + ly * ly + lz * lz)
+        lx, ly, lz = lx * to_disc, ly * to_disc, lz * to_disc
+        per_length = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
         cosine = nx * lx + ny * ly + nz * lz
+        angles[0, s, i, j] = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 1e-4)
+        angles[1, s, i, j] = max(-(nx * dx + ny * dy + nz * dz) * per_length, 1e-4)
+        angles[2, s, i, j] = -(sun[0] * dx + sun[1] * dy + sun[2] * dz) * per_length
+        angles[3, s, i, j] = albedo
+        angles[4, s, i, j] = 0.0
         if cosine <= 0:
             continue
+        skip = (-1, -1, -1, -1, rock)
         if rock < 0:
-            on_facet = facet[0] * lx + facet[1] * ly + facet[2] * lz
-            moved = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
-            moved = min(max(moved, 0.0), 1.0)
-            if moved > 0:
-                x, y, z = x + moved * curve[0], y + moved * curve[1], z + moved * curve[2]
+            skip = (part, row, column, triangle, -1)
+            on_facet = fx * lx + fy * ly + fz * lz
+            moves = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
+            moves = min(max(moves, 0.0), 1.0)
+            if moves > 0:
+                mx, my, mz = lift_at(ground, part, row, column, triangle, x, y)
+                x, y, z = x + moves * mx, y + moves * my, z + moves * mz
+            elif surely_lit(horizon, x, y, z):
+                angles[4, s, i, j] = cosine
+                continue
         if first_hit(ground, rocks, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0] == np.inf:
-            lit[k] = cosine
+            angles[4, s, i, j] = cosine

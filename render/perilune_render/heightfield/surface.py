@@ -22,6 +22,8 @@ from perilune_render.terrain.grid import vertex_of_ring
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array
 
+WITHOUT_COUNTS = {"error_model": "numpy", "_nrt": False}
+"""Options of kernels that make no arrays: no counts of references to arrays, which all threads would write."""
 _MOST_LEVELS = 16
 _MARGIN_M = 0.01
 """Between the heights where rays begin and end, and the surface: a ray must cross the ground between them."""
@@ -102,7 +104,7 @@ def ring_vertex(ring, place, n):
     return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place if ring > 0 else vertex_of_ring(ring, place, n)
 
 
-@njit(error_model="numpy")
+@njit(**WITHOUT_COUNTS)
 def vertex(part, row, column, k, n):
     """Index of vertex k (0 to 3, as in `Grid.quads`) of a cell, in the grid's order."""
     if part == 0:
@@ -111,7 +113,7 @@ def vertex(part, row, column, k, n):
     return ring_vertex(row + (1 if k == 1 or k == 2 else 0), place, n)
 
 
-@njit(error_model="numpy")
+@njit(**WITHOUT_COUNTS)
 def place_of(part, row, column, k, n, half_widths):
     """x and y of vertex k of a cell, relative to the grid's centre."""
     if part == 0:

@@ -21,3 +21,14 @@ class Radiance:
     """Whether the pixel is sunlit (h, w) bool."""
     blurred: np.ndarray | None = None
     """Mean radiance factor over the exposure (h, w) float32, if several poses were rendered; not in an EXR."""
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int]) -> "Radiance":
+        """A rendering (h, w) whose values are not set yet."""
+        radiance, depth = np.empty(shape, np.float32), np.empty(shape, np.float32)
+        return cls(radiance, depth, np.empty((*shape, 3), np.float32), np.empty(shape, bool))
+
+    def take_from(self, other: "Radiance", rows: slice, chosen: np.ndarray) -> None:
+        """Copy chosen pixels, (rows, w) bool, of some rows of another rendering of the same size."""
+        for name in ("radiance_factor", "depth_m", "normal", "sunlit"):
+            getattr(self, name)[rows][chosen] = getattr(other, name)[rows][chosen]

@@ -10,6 +10,7 @@ from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.frame_source import FrameSource, Shot
 from perilune_render.heightfield.engine import HeightfieldEngine
+from perilune_render.heightfield.horizon import NOWHERE, horizon_of
 from perilune_render.heightfield.query import first_hits
 from perilune_render.imaging.photometry import radiance_factor
 from perilune_render.labels.frame_labels import RimCircles
@@ -154,6 +155,28 @@ def test_the_number_of_threads_changes_no_bit(scene, engine):
         first, second = engine.render(position, rotation, 5), alone.render(position, rotation, 5)
     for name in ("radiance_factor", "depth_m", "normal", "sunlit"):
         assert (getattr(first, name) == getattr(second, name)).all()
+
+
+def test_the_horizon_changes_no_bit(scene, engine):
+    """It only leaves out shadow rays that hit nothing, with most of the lit ground among them."""
+    for azimuth, elevation in ((0, 8), (60, 30), (200, 15), (315, 50)):
+        sun = sun_direction(azimuth, elevation)
+        with HeightfieldEngine(scene, settings(), CAMERA, sun, 2, engine.surface) as one:
+            horizon = horizon_of(one.surface.ground, sun, np.radians(0.533 / 2))
+            for position, rotation in places(scene):
+                found = []
+                for one.horizon in (NOWHERE, horizon):
+                    found.append(one.render(position, rotation, 5))
+                assert (found[0].radiance_factor == found[1].radiance_factor).all()
+        assert 0.2 < np.isfinite(horizon.clear_m).mean() < 0.99
+
+
+def test_the_horizon_is_made_after_many_rays(scene, engine):
+    position, rotation = pose(scene, *POSES[0])
+    with HeightfieldEngine(scene, settings(samples=64), CAMERA, SUN, 2, engine.surface) as one:
+        frames = [one.render(position, rotation, 5) for _ in range(2)]
+        assert one.horizon is not NOWHERE
+    assert (frames[0].radiance_factor == frames[1].radiance_factor).all()
 
 
 @pytest.mark.parametrize("name", ["bounce", "earthshine"])
