@@ -111,8 +111,16 @@ def trained(folder: Path, config: NavigateConfig, dataset: Path, pid: int | None
     torch.manual_seed(config.seed)
     task = NavigationTask(config, "warp", load_trajectories(opened), stream=stream)
     cpu, wall = processor_s(pid), time.monotonic()
-    options = {"label": folder.name, "monitor": "val/position_rmse_vector_m", "mode": "min", "device": "cpu"}
-    fit(run, task, epochs=config.warp.fine_epochs, precision="float32", **options)
+    fit(
+        run,
+        task,
+        label=folder.name,
+        epochs=config.warp.fine_epochs,
+        monitor="val/position_rmse_vector_m",
+        mode="min",
+        precision="float32",
+        device="cpu",
+    )
     spent = {"processor_s": processor_s(pid) - cpu, "wall_s": time.monotonic() - wall}
     task.close()
     torch.save(task.network.state_dict(), folder / "last.pt")

@@ -35,7 +35,7 @@ class Key:
 def keys(section: str, config: Section) -> Iterator[Key]:
     """Yield every key of a resolved section, in the order of the configuration file.
 
-    After a section that is null come its keys, with their defaults as values.
+    The keys of an optional section that is not given follow it; `required` stands for a default that they lack.
     """
     plain = config.model_dump(mode="json")
     for name, field in type(config).model_fields.items():
@@ -45,16 +45,10 @@ def keys(section: str, config: Section) -> Iterator[Key]:
         else:
             default = None if field.is_required() else _default(field)
             yield Key(full, field, _meaning(field), _choices(field), default, _flow(plain[name]))
-            for kind in _optional_sections(field) if value is None else ():
-                yield from keys(full, kind())
-
-
-def _optional_sections(field: FieldInfo) -> Iterator[type[Section]]:
-    """Yield the sections without required keys that a field may have in place of null."""
-    for kind in typing.get_args(field.annotation):
-        is_section = isinstance(kind, type) and issubclass(kind, Section)
-        if is_section and not any(each.is_required() for each in kind.model_fields.values()):
-            yield kind
+            if value is None and (optional := _section_of(field)):
+                for inner, own in optional.model_fields.items():
+                    usual = "required" if own.is_required() else _default(own)
+                    yield Key(f"{full}.{inner}", own, _meaning(own), _choices(own), usual, usual)
 
 
 def annotated_yaml(section: str, config: Section) -> str:
@@ -90,6 +84,12 @@ def _choices(field: FieldInfo) -> tuple[str, ...]:
     return tuple(
         str(value) for kind in kinds if typing.get_origin(kind) is typing.Literal for value in typing.get_args(kind)
     )
+
+
+def _section_of(field: FieldInfo) -> type[Section] | None:
+    """The section of an optional one; None for any other field."""
+    kinds = typing.get_args(field.annotation)
+    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Section)), None)
 
 
 def _one_of(field: FieldInfo) -> str:

@@ -131,6 +131,6 @@ def _check_camera(address: str, served: Camera, own: Camera) -> None:
         (c.fx_px / w, c.fy_px / h, c.cx_px / w, c.cy_px / h, w / h, *c.distortion)
         for c, (w, h) in zip((served, own), sizes, strict=True)
     ]
-    if not np.allclose(*views, rtol=0, atol=_CAMERA_TOLERANCE):
+    if not np.allclose(views[0], views[1], rtol=0, atol=_CAMERA_TOLERANCE):
         expected = f"{own}, that of the dataset, or one with the same view and another size"
         raise UserError(address, "camera", served, expected)
