@@ -11,7 +11,7 @@ from perilune_render.provenance.fingerprint import fingerprint
 _SETTINGS = "perilune_render.processor:SETTINGS"
 GROUND = (
     _SETTINGS,
-    "perilune_render.flight.view:view_envelope",
+    "perilune_render.flight.view:rig_envelope",
     "perilune_render.flight.view:scene_view",
     "perilune_render.terrain.scene:grow_scene",
 )
