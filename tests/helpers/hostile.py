@@ -16,7 +16,7 @@ import pytest
 from perilune_shared.cli import main as cli
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.packed import SHARDS, packed_rows, shard_name
-from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.schema import TABLES, complete
 from perilune_shared.errors import UserError, run_command_line
 from perilune_shared.validation.validate import validate
 from tests.helpers.drawn_dataset import seal
@@ -59,7 +59,7 @@ def edit(change: Callable[[dict], object]) -> Callable[[Path], None]:
 
 def pack(root: Path, change: Callable[[list[dict]], object] = lambda rows: None, schema=SHARDS, **options) -> None:
     """Pack the frames in one shard for each split, with `change` applied to all rows."""
-    frames, labels = pq.read_table(part_of(root, "frames")), pq.read_table(part_of(root, "labels"))
+    frames, labels = (complete(name, pq.read_table(part_of(root, name))) for name in ("frames", "labels"))
     pngs = [(root / path).read_bytes() for path in frames["png_path"].to_pylist()]
     rows = packed_rows(frames, labels, pngs).to_pylist()
     splits = {row["frame_id"]: row["split"] for row in rows}

@@ -7,6 +7,7 @@ from perilune_render.config import DatasetConfig
 from perilune_render.dataset.finish import remove_work
 from perilune_render.dataset.work import FOLDER
 from perilune_render.flight.plan import Plan
+from perilune_render.flight.rig import MountedCamera
 from perilune_render.provenance.versions import all_versions
 from perilune_shared.dataset.info_file import INFO_NAME, info_bytes
 from perilune_shared.dataset.manifest import Dataset, open_dataset
@@ -26,10 +27,10 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
     split_by = settings.split_by
     if split_by == "scene" and config.terrain.dem is not None and settings.n_scenes > 1:
         split_by = "trajectory"  # all scenes show the same elevation model
-    camera, exr_camera = plan.first.records()
+    camera, exr_camera = camera_records(plan.first)
 
     def named(which: int) -> dict[str, CameraRecord]:
-        return {str(name): each.records()[which] for name, each in plan.rig.items()}
+        return {str(name): camera_records(each)[which] for name, each in plan.rig.items()}
 
     return DatasetInfo(
         name=f"perilune-{config.name}-{recipe.kind}",
@@ -46,6 +47,13 @@ def new_info(config: DatasetConfig, plan: Plan, recipe: Recipe) -> DatasetInfo:
         counts=Counts(),
         licence=LICENCE,
     )
+
+
+def camera_records(mounted: MountedCamera) -> tuple[CameraRecord, CameraRecord]:
+    """What dataset.json records of a camera: the camera of the frames and that of the EXRs, with the mounting."""
+    x, y, z = mounted.position_in_body_m.tolist()
+    mounting = mounted.rotation_camera_from_body, (x, y, z)
+    return CameraRecord.of(mounted.camera, *mounting), CameraRecord.of(mounted.exr_camera, *mounting)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from perilune_render.config import DatasetConfig, FlightConfig
-from perilune_render.dataset.begin import new_info
+from perilune_render.dataset.begin import camera_records, new_info
 from perilune_render.flight.motion import Motion, draw_motion
 from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan
 from perilune_render.flight.rig import MountedCamera, Rig, mounted, rig_of
@@ -81,8 +81,8 @@ def _rig_of_frames(manifest: Dataset, rig: Rig) -> Rig:
         raise UserError(where, "cameras", sorted(map(str, names)), f"those of its recipe, {sorted(map(str, rig))}")
     own = {name: each for name, each in rig.items() if name in names}
     for name, each in own.items():
-        if (recorded := info.camera_of(name)) != each.records()[0]:
-            raise UserError(where, "camera", recorded, f"that of its recipe, {each.records()[0]}")
+        if (recorded := info.camera_of(name)) != camera_records(each)[0]:
+            raise UserError(where, "camera", recorded, f"that of its recipe, {camera_records(each)[0]}")
     return own or rig
 
 

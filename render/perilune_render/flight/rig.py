@@ -13,7 +13,6 @@ from perilune_render.config import DatasetConfig, FlightConfig
 from perilune_render.config_cameras import MountingConfig
 from perilune_render.flight.lens import camera_of
 from perilune_render.flight.trajectories import Flight
-from perilune_shared.dataset.metadata import CameraRecord
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import (
@@ -39,12 +38,6 @@ class MountedCamera:
     """Rotation matrix (3, 3)."""
     position_in_body_m: Array
     """Centre of projection in O_B, metres (3,)."""
-
-    def records(self) -> tuple[CameraRecord, CameraRecord]:
-        """What dataset.json records: the camera and that of the EXRs, with the mounting."""
-        x, y, z = self.position_in_body_m.tolist()
-        mounting = self.rotation_camera_from_body, (x, y, z)
-        return CameraRecord.of(self.camera, *mounting), CameraRecord.of(self.exr_camera, *mounting)
 
     def poses(self, position_m: Array, rotation_wxyz: Array) -> tuple[Array, Array]:
         """Positions (N, 3), O_L, metres, and rotation_camera_from_site (N, 4) for poses of the body."""

@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-import yaml
 from tests.helpers import in_process
 
 from perilune_render.cli.main import main
@@ -36,7 +35,7 @@ CONFIG = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cameras")
-    (folder / "own.yaml").write_text(yaml.safe_dump({"dataset": CONFIG}))
+    (folder / "own.yaml").write_text(json.dumps({"dataset": CONFIG}))
     options = ["--preset", "tiny", "--config", folder / "own.yaml", "--kind", "nav", "--workers", 0]
     done = in_process.call(main, "dataset", *options, "--out", folder)
     assert done.returncode == 0, done.stderr

@@ -33,8 +33,8 @@ def rendered(tmp_path_factory):
 
 
 def warning(done, n_frames):
-    """Count and first frame of the one warning that a command printed."""
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("warning")]
+    """Count and first frame of the one warning of dark frames that a command printed."""
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("warning") and " dark (" in line]
     pattern = r"warning: scene-0000: (\d) of (\d) frames are dark \(less than 1% .* first (\S+); the Sun is 0\.1 .*"
     n_dark, n, first = re.fullmatch(pattern, line).groups()
     assert int(n) == n_frames

@@ -20,7 +20,7 @@ from tests.helpers import in_process
 from perilune_render.cli.main import main
 from perilune_render.dataset.regenerate import exr_outlier_share, png_outlier_share, regenerate, spread
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.schema import complete
 from perilune_shared.editing.diff import differences
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack
@@ -150,7 +150,7 @@ def test_a_frame_from_elsewhere_is_compared_and_reported(tiny_detect, tmp_path):
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(path), np.where(image < 200, image + shift, image).astype(np.uint8))
         rows.at[row, "png_sha256"] = "0" * 64
-    pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["frames"], preserve_index=False), part)
+    pq.write_table(complete("frames", pa.Table.from_pandas(rows, preserve_index=False)), part)
     ids = [f"scene-0000/trajectory-0000/00000{k}" for k in range(3)]
     outcomes = again(tiny_detect, tmp_path / "out", ids)
     assert [o.png for o in outcomes] == ["within tolerance", "different", "identical"]
@@ -164,7 +164,7 @@ def test_another_ground_is_reported(tiny_detect):
     part = tiny_detect / "manifest/scenes/all.parquet"
     rows = pq.read_table(part).to_pandas()
     rows["content_sha256"] = "0" * 64
-    pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["scenes"], preserve_index=False), part)
+    pq.write_table(complete("scenes", pa.Table.from_pandas(rows, preserve_index=False)), part)
     result = run("regenerate", "--manifest", tiny_detect, "--verify", "--frames", "scene-0001/trajectory-0000/000000")
     assert result.returncode == 2 and "1 identical" in result.stdout and "terrain hash mismatch" in result.stdout
 
@@ -213,7 +213,7 @@ def open_dataset_with_right_key(root):
     for part in (root / "manifest/scenes").glob("*.parquet"):
         rows = pq.read_table(part).to_pandas()
         rows["recipe"] = key
-        pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["scenes"], preserve_index=False), part)
+        pq.write_table(complete("scenes", pa.Table.from_pandas(rows, preserve_index=False)), part)
     return root
 
 

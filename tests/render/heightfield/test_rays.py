@@ -14,8 +14,11 @@ from perilune_render.heightfield.horizon import NOWHERE, horizon_of
 from perilune_render.heightfield.query import first_hits
 from perilune_render.imaging.photometry import radiance_factor
 from perilune_render.labels.frame_labels import RimCircles
+from perilune_render.poses.plan import scene_seed
+from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.errors import UserError
+from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import sun_direction
 
 SUN = sun_direction(60, 30)
@@ -155,6 +158,22 @@ def test_the_number_of_threads_changes_no_bit(scene, engine):
         first, second = engine.render(position, rotation, 5), alone.render(position, rotation, 5)
     for name in ("radiance_factor", "depth_m", "normal", "sunlit"):
         assert (getattr(first, name) == getattr(second, name)).all()
+
+
+def test_ground_does_not_shadow_itself_at_an_edge_of_its_triangles():
+    """Rays of a camera above the site meet the mesh on the diagonals of its cells, where no shadow ray may start wrong.
+
+    Without the horizon, the engine casts those rays; with it, it casts none.
+    """
+    focal_px = 32 / np.tan(np.radians(20))
+    camera, sun = Camera(64, 48, focal_px, focal_px, 32.0, 24.0), sun_direction(100, 25)
+    views = ViewEnvelope(np.array([150.0, 1000.0]), np.array([200.0, 500.0]), focal_px)
+    config = config_with(terrain=TerrainConfig(spacing_px=2.0), render=RenderConfig(samples=1))
+    with HeightfieldEngine(grow_scene(config, views, scene_seed(config)), config, camera, sun, 1) as one:
+        found, horizon = [], horizon_of(one.surface.ground, sun, np.radians(0.533 / 2))
+        for one.horizon in (NOWHERE, horizon):
+            found.append(one.render(np.array([0.0, 0.0, 500.0]), np.diag([1.0, -1.0, -1.0]), 5).sunlit)
+        assert (found[0] == found[1]).all()
 
 
 def test_the_horizon_changes_no_bit(scene, engine):

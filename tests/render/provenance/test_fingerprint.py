@@ -105,8 +105,8 @@ def test_a_call_changes_the_hashes_of_what_makes_it(copy, module, pattern, repla
         ("perilune_render.terrain.relief", r"raise UserError\(", "raise UserError('more', "),
         ("perilune_render.cli.main", '"Folder', '"Another folder'),
         ("perilune_render.preview.contact_sheet", "n_frames: int = 4", "n_frames: int = 5"),
-        ("perilune_render.dataset.overview", "^_SHEET_FRAMES = 12", "_SHEET_FRAMES = 13"),
-        ("perilune_render.config", "= 256$", "= 257"),
+        ("perilune_render.dataset.overview", "= 12, 3, 6$", "= 13, 3, 6"),
+        ("perilune_render.config_cameras", "= 256$", "= 257"),
         ("perilune_render.config", "_GROUND_FIELDS = ", "_GROUND_FIELDS = 1, "),
         ("perilune_render.config", "gt=0", "gt=1"),
         ("perilune_shared.export.card", "^def ", "def another():\n    return 1\n\n\ndef "),
@@ -171,4 +171,4 @@ def test_every_library_that_computes_is_recorded():
 def test_compiled_functions_are_found_in_every_module():
     known = {name.partition(":")[0].rpartition(".")[2] for name in compiled_functions()}
     terrain = {"grid", "albedo", "older_ground", "stamp", "noise", "interpolation", "level_ground"}
-    assert known == terrain | {"pixels", "surface", "rocks", "cast", "shade", "query", "hazard"}
+    assert known == terrain | {"pixels", "surface", "rocks", "cast", "shade", "query", "horizon", "hazard"}

@@ -13,7 +13,7 @@ from perilune_shared.dataset.info_file import write_info
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import Recipe
 from perilune_shared.dataset.parts import write_part
-from perilune_shared.dataset.schema import TABLES
+from perilune_shared.dataset.schema import complete
 from perilune_shared.editing.attach import attach
 from perilune_shared.editing.merge import merge
 from perilune_shared.editing.pack import pack, unpack
@@ -164,7 +164,7 @@ def test_a_damaged_table_is_not_copied(drawn, tmp_path):
     part = broken / "manifest/labels/all.parquet"
     rows = pq.read_table(part).to_pandas()
     rows.loc[3, "contrast"] = 777.0
-    pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["labels"], preserve_index=False), part)
+    pq.write_table(complete("labels", pa.Table.from_pandas(rows, preserve_index=False)), part)
     dataset, out = open_dataset(broken), tmp_path / "out"
     for act in (
         lambda: subset(dataset, out),
@@ -187,7 +187,7 @@ def test_a_trajectory_developed_twice_is_one_trajectory(drawn, tmp_path):
     (other / "dataset.json").write_text(json.dumps({**info, "recipes": {key: recipe}}))
     part = other / "manifest/scenes/all.parquet"
     rows = pq.read_table(part).to_pandas().assign(recipe=key)
-    pq.write_table(pa.Table.from_pandas(rows, schema=TABLES["scenes"], preserve_index=False), part)
+    pq.write_table(complete("scenes", pa.Table.from_pandas(rows, preserve_index=False)), part)
     seal(other)
     split_dataset(open_dataset(other), tmp_path / "split", val_share=0.2, test_share=0.2, seed=1)
     merge([open_dataset(drawn), open_dataset(tmp_path / "split")], tmp_path / "m")

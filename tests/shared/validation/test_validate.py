@@ -15,7 +15,7 @@ from perilune_shared.cli.main import main
 from perilune_shared.dataset import manifest
 from perilune_shared.dataset.manifest import count_rows, open_dataset
 from perilune_shared.dataset.parts import read_part, write_part
-from perilune_shared.dataset.schema import OPTIONAL_TABLES, SCHEMA_VERSION, TABLES
+from perilune_shared.dataset.schema import OPTIONAL_TABLES, SCHEMA_VERSION, TABLES, complete
 from perilune_shared.errors import UserError
 from perilune_shared.export.stats import summary
 from perilune_shared.validation.faults import part_faults
@@ -29,7 +29,7 @@ def rewrite(root, table, change, part=0):
     path = sorted((root / "manifest" / table).glob("*.parquet"))[part]
     frame = pq.read_table(path).to_pandas()
     change(frame)
-    pq.write_table(pa.Table.from_pandas(frame, schema=TABLES[table], preserve_index=False), path)
+    pq.write_table(complete(table, pa.Table.from_pandas(frame, preserve_index=False)), path)
 
 
 def put(column, value, row=0):
