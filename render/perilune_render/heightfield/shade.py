@@ -8,8 +8,8 @@ from perilune_render.heightfield.surface import WITHOUT_COUNTS, place_of, vertex
 from perilune_render.provenance.kernels import njit
 
 _LIFT = 1e-4
-"""Start of a shadow ray, metres. Its own triangle and boulder are left out; a ray that starts on an edge of its triangle
-must not hit the next one by rounding."""
+"""Start of a shadow ray, metres. Its own triangle and boulder are left out; a ray from an edge of its triangle must not
+hit the next one by rounding."""
 _TERMINATOR = 0.1
 """Cosine between ground and Sun below which Cycles moves the start of a shadow ray from the facet to the curved
 surface that its vertex normals describe (its shadow terminator geometry offset, at its default)."""
