@@ -87,12 +87,8 @@ class HeightfieldEngine:
     def render_rows(self, poses: RowPoses, seed: int = 0, approach_deg: int = 0) -> Radiance:
         """Render one frame with a pose for each row of the sensor; a depth is along the axis at its row's pose."""
         shape = self.camera.height_px, self.camera.width_px
-        whole, band, drawn, horizon = (
-            Radiance.empty(shape),
-            Radiance.empty(shape),
-            self._drawn(seed),
-            self._horizon_now(),
-        )
+        whole, band = Radiance.empty(shape), Radiance.empty(shape)
+        drawn, horizon = self._drawn(seed), self._horizon_now()
         for pixels, pose in poses.bands(len(poses.time_s)):
             seen = np.flatnonzero(pixels.any(axis=1))
             if not len(seen):

@@ -230,8 +230,8 @@ MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {
     "frames": (*_ABSENT_IN_FRAMES, "camera"),
     "shards": _ABSENT_IN_FRAMES,
 }
-"""Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls,
-writers always write them. To add one, append a column with `nullable=True` to its table and add its name here."""
+"""Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls.
+To add one, append a column with `nullable=True` to its table and add its name here, and to ONLY_IF_USED."""
 ONLY_IF_USED: dict[str, tuple[str, ...]] = {"scenes": _HAZARD, "frames": (*ANGULAR_VELOCITY, *_LIDAR, "camera")}
 """Columns of MAY_BE_ABSENT that are written only if a row has a value, so that other datasets keep their bytes."""
 KEYS: dict[str, list[str]] = {
