@@ -16,8 +16,8 @@ from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.labels.drawing import draw_labels, enlarge, padded, write_sheet
 from perilune_render.labels.frame_labels import RimCircles
-from perilune_render.preview.horizon import horizon_of, warn_of_shadow
 from perilune_render.preview.map_picture import map_picture
+from perilune_render.preview.site_horizon import site_horizon_of, warn_of_shadow
 from perilune_render.preview.site_map import site_map
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation.model import ElevationModel
@@ -40,7 +40,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, map_path: Path, 
     scene = cached_scene(config, plan.view, scene_plan.seed)
     check_trajectories(plan, trajectories, scene, f"configuration: dataset.{kind}")
     model = model_of(config.terrain)
-    horizon = horizon_of(scene, scene_plan.sun_azimuth_deg)
+    horizon = site_horizon_of(scene, scene_plan.sun_azimuth_deg)
     warn_of_shadow(scene_plan, horizon)
     pictures, dark = [], []
     for trajectory in trajectories:

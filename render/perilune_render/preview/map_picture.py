@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from perilune_render.flight.plan import ScenePlan
-from perilune_render.preview.horizon import Horizon
+from perilune_render.preview.site_horizon import SiteHorizon
 from perilune_render.preview.site_map import SiteMap
 from perilune_shared.geometry.frames import Array
 
@@ -27,7 +27,7 @@ def map_picture(
     plan: ScenePlan,
     place_deg: tuple[float, float],
     tracks: Sequence[Array],
-    horizon: Horizon,
+    horizon: SiteHorizon,
 ) -> np.ndarray:
     """The picture (h, w, 3) uint8, BGR, north up. `tracks` are places (N, 2 or more) of O_L from the first frame on."""
     relief = cv2.resize(_shaded(site_map), (_MAP_PX, _MAP_PX), interpolation=cv2.INTER_AREA)
@@ -107,7 +107,7 @@ def _draw_legend(
     plan: ScenePlan,
     place_deg: tuple[float, float],
     n_tracks: int,
-    horizon: Horizon,
+    horizon: SiteHorizon,
 ) -> None:
     left, top = _MAP_PX + 2 * _EDGE_PX, _EDGE_PX + 18
     height = site_map.height_m[np.isfinite(site_map.height_m)]

@@ -9,7 +9,7 @@ from tests.helpers.elevation_models import POLAR, write
 from tests.helpers.scenes import flat_scene
 
 from perilune_render.cli.main import main
-from perilune_render.preview.horizon import horizon_of
+from perilune_render.preview.site_horizon import site_horizon_of
 from perilune_render.preview.site_map import site_map
 from perilune_render.terrain.elevation.model import read_elevation
 from perilune_shared.geometry.frames import sun_direction
@@ -33,19 +33,19 @@ def walled(n=201, extent_m=400.0):
 
 
 def test_the_horizon_is_that_of_the_ground_towards_the_azimuth():
-    east = horizon_of(walled(), 90.0)
+    east = site_horizon_of(walled(), 90.0)
     assert east.elevation_deg == pytest.approx(np.degrees(np.arctan2(20, 100)), abs=0.3)
     assert east.distance_m == pytest.approx(100, abs=2) and east.height_m == pytest.approx(20)
-    slanted = horizon_of(walled(), 45.0)
+    slanted = site_horizon_of(walled(), 45.0)
     assert slanted.elevation_deg == pytest.approx(np.degrees(np.arctan2(20, 100 * np.sqrt(2))), abs=0.3)
-    assert horizon_of(walled(), 270.0).elevation_deg == 0
+    assert site_horizon_of(walled(), 270.0).elevation_deg == 0
 
 
 def test_a_slope_that_faces_away_from_the_sun_has_a_horizon():
     _, x = np.mgrid[:101, -50:51] * 4.0
     scene = flat_scene(400, 101, height_m=-np.tan(np.radians(20)) * x)
-    assert horizon_of(scene, 90.0).elevation_deg == pytest.approx(20, abs=0.01)
-    assert horizon_of(scene, 270.0).elevation_deg == pytest.approx(-20, abs=0.01)
+    assert site_horizon_of(scene, 90.0).elevation_deg == pytest.approx(20, abs=0.01)
+    assert site_horizon_of(scene, 270.0).elevation_deg == pytest.approx(-20, abs=0.01)
 
 
 def test_shadows_fall_away_from_the_sun_and_east_is_right():

@@ -13,7 +13,7 @@ from perilune_shared.progress import say
 
 
 @dataclass(frozen=True, slots=True)
-class Horizon:
+class SiteHorizon:
     """The ground that stands highest above the site in one direction."""
 
     elevation_deg: float
@@ -24,7 +24,7 @@ class Horizon:
     """Height above the site, metres."""
 
 
-def horizon_of(scene: Scene, azimuth_deg: float) -> Horizon:
+def site_horizon_of(scene: Scene, azimuth_deg: float) -> SiteHorizon:
     """The horizon seen from the ground at the site, at an azimuth clockwise from north.
 
     Only the ground of the scene counts, without boulders. The ground beyond its edge casts no shadow in frames either.
@@ -36,7 +36,7 @@ def horizon_of(scene: Scene, azimuth_deg: float) -> Horizon:
     height = value_at(heights, scene.grid, *(distance[:, None] * towards).T) - at_site
     elevation = np.degrees(np.arctan2(height, distance))
     highest = int(np.argmax(elevation))
-    return Horizon(float(elevation[highest]), float(distance[highest]), float(height[highest]))
+    return SiteHorizon(float(elevation[highest]), float(distance[highest]), float(height[highest]))
 
 
 def _distances(grid: Grid, towards: Array) -> Array:
@@ -49,7 +49,7 @@ def _distances(grid: Grid, towards: Array) -> Array:
     return np.concatenate([inner, rings]) / slant
 
 
-def warn_of_shadow(plan: ScenePlan, horizon: Horizon) -> None:
+def warn_of_shadow(plan: ScenePlan, horizon: SiteHorizon) -> None:
     """Print a warning if the Sun of a scene is below the site's horizon."""
     if horizon.elevation_deg > plan.sun_elevation_deg:
         say(
