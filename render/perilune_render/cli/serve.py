@@ -71,6 +71,8 @@ def serve(
     conventions = Conventions(sun_azimuth, roll, allow_quit)
     limits = Limits(clients=max_clients, idle_s=idle_s)
     with open_world(config) as world, Grounds(world, scenes, say) as grounds:
+        say("rendering a first frame")
+        world.prepare()
         start = _start(world)
 
         async def handle(connection: Connection) -> None:

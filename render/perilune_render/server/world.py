@@ -8,8 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from perilune_render.config import DatasetConfig
+from perilune_render.config_scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines import open_engine
+from perilune_render.flight.lens import camera_of
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.heightfield.query import first_hits, heights_m
 from perilune_render.heightfield.surface import Surface, surface_of
@@ -19,11 +21,13 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array
+from perilune_shared.geometry.frames import Array, sun_direction
 
 LEAST_CLEARANCE_M = 0.1
 """Smallest height of a camera above the surface below it, metres."""
 _MOST_SOURCES = 8
+_PREPARED_AT_M = 500.0
+_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +67,17 @@ class World:
         for _, stack in self._sources.values():
             stack.close()
         self._sources.clear()
+
+    def prepare(self) -> None:
+        """Render a frame of the site with the camera and the Sun of the configuration, and label it.
+
+        The first frame in a new installation waits for the compilation of the kernels: half a minute of one core.
+        """
+        stated = self.config.scene or SceneConfig()
+        position = np.array([0.0, 0.0, float(self.heights_m(np.zeros(1), np.zeros(1))[0]) + _PREPARED_AT_M])
+        sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)
+        view = View(position, _DOWN, camera_of(self.config.camera), sun)
+        self.labels(view, self.frame(view, 0, 0))
 
     @cached_property
     def content_sha256(self) -> str:

@@ -35,6 +35,7 @@ def world():
     )
     pinhole = camera_of(config.camera)
     with World(grow_scene(config, scene_view(config.scene, pinhole), scene_seed(config)), config) as world:
+        world.prepare()  # kernels are compiled here, not while a client waits
         yield world
 
 

@@ -10,6 +10,7 @@ from tests.render.server.native_running import NativeRunning
 from perilune_render.flight.plan import make_plan
 from perilune_render.poses.plan import scene_seed
 from perilune_render.server.grounds import MOST_KEPT, Grounds, served_scene
+from perilune_render.server.world import World
 from perilune_render.terrain.scene import grow_scene
 from perilune_shared.client import SceneClient
 from perilune_shared.errors import UserError
@@ -42,6 +43,20 @@ def test_no_dataset_has_the_terrain_of_a_further_scene():
         served = {served_scene(config, number).seed for number in range(1, 1000)}
         assert len(served) == 999
         assert not served & (planned | {scene_seed(config)})
+
+
+def test_a_prepared_world_opens_no_engine_for_the_first_client(world, monkeypatch):
+    with World(world.scene, world.config) as own:
+        own.prepare()
+        monkeypatch.setattr("perilune_render.server.world.open_engine", None)
+        running = NativeRunning(Grounds(own))
+        try:
+            with SceneClient(running.address) as client:
+                assert image(client, 0).shape == (48, 64)
+                with pytest.raises(UserError, match="TypeError"):
+                    client.frame((0, 0, 500), DOWN, sun_deg=(10, 20))
+        finally:
+            running.close()
 
 
 def test_a_further_scene_is_that_of_its_seed_under_a_drawn_sun(address, world):
