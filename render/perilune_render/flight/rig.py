@@ -54,15 +54,19 @@ class MountedCamera:
     def flight_of(self, body: Flight) -> Flight:
         """The flight of this camera on a body.
 
-        Its velocity is that of the body: the rotation of the body about its origin is left out, since it moves a camera
-        within the body by less than a pixel during an exposure. `motion` stays that of the body.
+        Its velocity is that of the body, and that of its rotation about the body's origin. `motion` stays that of the
+        body.
         """
         position, rotation = self.poses(body.position_m, body.rotation_wxyz)
+        seen = replace(body, position_m=position, rotation_wxyz=rotation)
         turn = body.angular_velocity_radps
-        if turn is not None:
-            # Given in the axes of the default mounting.
-            turn = turn @ (self.rotation_camera_from_body @ ROTATION_CAMERA_FROM_BODY.T).T
-        return replace(body, position_m=position, rotation_wxyz=rotation, angular_velocity_radps=turn)
+        if turn is None:
+            return seen
+        # Given in the axes of the default mounting.
+        in_site = np.einsum("nji,nj->ni", matrix_from_quaternion(body.rotation_wxyz), turn)
+        velocity = body.velocity_mps + np.cross(in_site, position - body.position_m)
+        turn = turn @ (self.rotation_camera_from_body @ ROTATION_CAMERA_FROM_BODY.T).T
+        return replace(seen, velocity_mps=velocity, angular_velocity_radps=turn)
 
     def levelled(self) -> Camera:
         """A pinhole at the body's origin, with the default attitude, that sees all ground that this camera sees.
