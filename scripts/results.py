@@ -251,7 +251,7 @@ def enclosing_table(row: Row, records: dict[str, Record]) -> dict[str, Any]:
     """The innermost table of a record that contains the figure of a row."""
     found: Any = records[row.record].figures
     for key in row.keys[:-1]:
-        found = found[key]
+        found = found[int(key)] if isinstance(found, list) else found[key]
     return found
 
 
