@@ -49,7 +49,7 @@ def dataset(dataset_nav):
 
 
 def settings(address, **changes):
-    stream = {"address": address, "n_scenes": 3, "pairs_per_scene": 12, "timeout_s": 120.0} | changes
+    stream = {"address": address, "n_scenes": 3, "pairs_per_scene": 12, "timeout_s": 20.0} | changes
     own = {"precision": "float32", "device": "cpu", "fusion": "warp", "warp": _NETWORK, "stack": _NETWORK}
     return NavigateConfig(**own, stream=StreamConfig(**stream))
 
