@@ -9,7 +9,7 @@ Ground is crossed where the ray's height over a triangle changes its sign, so no
 
 import numpy as np
 
-from perilune_render.heightfield.surface import WITHOUT_COUNTS, ring_vertex
+from perilune_render.heightfield.surface import INLINED, WITHOUT_COUNTS, ring_vertex
 from perilune_render.provenance.kernels import njit
 
 NO_PART = -1
@@ -76,7 +76,7 @@ def crossing(above_0, above_1, t0, t1):
     return t0 + (t1 - t0) * above_0 / (above_0 - above_1)
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def _cross_inner(vertex, n, i, j, p0, dp, q0, dq, oz, dz, t0, t1, skipped_triangle):
     """Where a ray crosses the two triangles of a cell of the inner square: parameter and triangle; inf and -1."""
     low, high = j * (2 * n + 1) + i, (j + 1) * (2 * n + 1) + i
@@ -108,7 +108,7 @@ def _cross_inner(vertex, n, i, j, p0, dp, q0, dq, oz, dz, t0, t1, skipped_triang
     return np.inf, -1
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def _cross_sector(vertex, half_widths, n, side, ring, place, a0, da, d0, dd, oz, dz, t0, t1, skipped_triangle):
     """Where a ray crosses the two triangles of a cell of a sector: parameter and triangle; inf and -1."""
     along = side * 2 * n + place
@@ -148,7 +148,7 @@ def _cross_sector(vertex, half_widths, n, side, ring, place, a0, da, d0, dd, oz,
     return np.inf, -1
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit in the inner square between t0 and t1; see `first_hit`."""
     n, coarsest = ground.n_half, ground.level[0, -1]
@@ -224,7 +224,7 @@ def _ring_at(half_widths, d, low, high):
     return low
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit in a sector between t0 and t1; see `first_hit`."""
     n, coarsest = ground.n_half, ground.level[1, -1]
@@ -303,7 +303,7 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     return np.inf, -1, -1, -1, -1, -1, -1
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def first_hit(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit of the ray o + t d, relative to the grid's centre, with t0 < t < t1.
 

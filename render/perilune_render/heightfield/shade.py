@@ -4,7 +4,7 @@ import numpy as np
 
 from perilune_render.heightfield.cast import first_hit
 from perilune_render.heightfield.horizon import surely_lit
-from perilune_render.heightfield.surface import WITHOUT_COUNTS, place_of, vertex
+from perilune_render.heightfield.surface import INLINED, WITHOUT_COUNTS, place_of, vertex
 from perilune_render.provenance.kernels import njit
 
 _LIFT = 1e-4
@@ -49,7 +49,7 @@ def _corners(ground, part, row, column, triangle, x, y):
     return v0, v1, v2, e1x, e1y, e1z, e2x, e2y, e2z, area, v, w
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def ground_at(ground, part, row, column, triangle, x, y):
     """Shading at a place of a triangle: unit normal, albedo, and the unit normal of the triangle."""
     vertices = ground.vertex
@@ -66,7 +66,7 @@ def ground_at(ground, part, row, column, triangle, x, y):
     return nx * length, ny * length, nz * length, albedo, fx * size, fy * size, fz * size
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def lift_at(ground, part, row, column, triangle, x, y):
     """The vector by which Cycles lifts a grazing shadow ray at a place of a triangle from the facet.
 
@@ -97,7 +97,7 @@ def lift_at(ground, part, row, column, triangle, x, y):
     return bulge * nx, bulge * ny, bulge * nz
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def rock_normal(rocks, k, face):
     """Unit normal of a face of boulder k, O_L."""
     m, px, py, pz = rocks.rows[k], rocks.planes[face, 0], rocks.planes[face, 1], rocks.planes[face, 2]

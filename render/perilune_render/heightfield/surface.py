@@ -24,6 +24,8 @@ from perilune_shared.geometry.frames import Array
 
 WITHOUT_COUNTS = {"error_model": "numpy", "_nrt": False}
 """Options of kernels that make no arrays: no counts of references to arrays, which all threads would write."""
+INLINED = WITHOUT_COUNTS | {"forceinline": True}
+"""Options of kernels that are compiled into their callers: a call passes `Ground` and `Rocks` as about 70 numbers."""
 _MOST_LEVELS = 16
 _MARGIN_M = 0.01
 """Between the heights where rays begin and end, and the surface: a ray must cross the ground between them."""
@@ -104,7 +106,7 @@ def ring_vertex(ring, place, n):
     return (2 * n + 1) ** 2 + (ring - 1) * 8 * n + place if ring > 0 else vertex_of_ring(ring, place, n)
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def vertex(part, row, column, k, n):
     """Index of vertex k (0 to 3, as in `Grid.quads`) of a cell, in the grid's order."""
     if part == 0:
@@ -113,7 +115,7 @@ def vertex(part, row, column, k, n):
     return ring_vertex(row + (1 if k == 1 or k == 2 else 0), place, n)
 
 
-@njit(**WITHOUT_COUNTS)
+@njit(**INLINED)
 def place_of(part, row, column, k, n, half_widths):
     """x and y of vertex k of a cell, relative to the grid's centre."""
     if part == 0:
