@@ -14,7 +14,7 @@ from perilune_render.provenance.kernels import njit
 
 NO_PART = -1
 """Part of the mesh in a hit on nothing; 0 is the inner square, 1 to 4 are the sectors."""
-_FIRST_LEVEL = 4
+_FIRST_LEVEL = 1
 """Level of the pyramid at which a walk begins."""
 _BEHIND = 1e-6
 """Relative distance behind a ray's present place from which a line is taken as not ahead."""

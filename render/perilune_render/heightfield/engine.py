@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from perilune_render.config import DatasetConfig
+from perilune_render.heightfield.beam import tops_of
 from perilune_render.heightfield.horizon import NOWHERE, Horizon, horizon_of
 from perilune_render.heightfield.shade import see
 from perilune_render.heightfield.surface import Surface, surface_of
@@ -55,6 +56,7 @@ class HeightfieldEngine:
                 )
         self.camera, self.sun = camera, np.asarray(sun, np.float64)
         self.surface = surface if surface is not None else surface_of(scene)
+        self.tops = tops_of(self.surface.ground)
         self._law, self._samples = config.light.photometry, config.render.samples
         self._disc_rad = np.float32(np.radians(config.light.sun_angular_diameter_deg) / 2)
         self._far_m = scene.grid.farthest_m
@@ -113,7 +115,7 @@ class HeightfieldEngine:
         position_m, rotation_camera_from_site = pose
         moved, disc = drawn
         origin = np.asarray(position_m, np.float64) - [*self.surface.centre_m, 0.0]
-        basis, plane = _rays_of(self.camera) @ rotation_camera_from_site, np.stack(plane_basis(self.sun))
+        basis, plane = rays_of(self.camera) @ rotation_camera_from_site, np.stack(plane_basis(self.sun))
         ground, rocks = self.surface.ground, self.surface.rocks
 
         def cast(first: tuple[int, int]) -> None:
@@ -122,7 +124,7 @@ class HeightfieldEngine:
             places, suns = moved[:, *tile], self._disc(disc[:, *tile])
             angles = np.empty((5, *places.shape[:3]), np.float32)
             light = horizon, origin, basis, self.sun, plane
-            see(ground, rocks, *light, self._far_m, first, places, suns, found.depth_m, found.normal, angles)
+            see(ground, rocks, self.tops, *light, self._far_m, first, places, suns, found.depth_m, found.normal, angles)
             mu0, mu, cos_phase, albedo, lit = angles
             seen = (reflectance_factor(self._law, mu0, mu, cos_phase) * albedo * lit).mean(axis=0)
             found.radiance_factor[tile], found.sunlit[tile] = seen, seen > _LIT
@@ -146,7 +148,7 @@ class HeightfieldEngine:
         return self.horizon
 
 
-def _rays_of(camera: Camera) -> Array:
+def rays_of(camera: Camera) -> Array:
     """Rows (3, 3): how a ray of a camera without distortion changes with u, with v, and the ray at u = v = 0."""
     start, right, down = camera.rays([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     return np.stack([right - start, down - start, start])

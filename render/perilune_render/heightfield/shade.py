@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from perilune_render.heightfield.beam import BLOCK_PX, begin_m
 from perilune_render.heightfield.cast import first_hit
 from perilune_render.heightfield.horizon import surely_lit
 from perilune_render.heightfield.surface import INLINED, WITHOUT_COUNTS, place_of, vertex
@@ -110,63 +111,96 @@ def rock_normal(rocks, k, face):
     return nx / length, ny / length, nz / length
 
 
+@njit(**INLINED)
+def _see(ground, rocks, horizon, begin, origin, basis, sun, plane, far_m, first, s, i, j, moved, disc, out):
+    """Cast the ray of one sample, which begins at the height `begin`, and its shadow ray; see `see`."""
+    depth, normal, angles = out
+    u, v = first[1] + j + 0.5 + moved[s, i, j, 0], first[0] + i + 0.5 + moved[s, i, j, 1]
+    dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
+    dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
+    dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
+    start = max((begin - origin[2]) / dz, 0.0) if begin < np.inf else 0.0
+    t, rock, face, part, row, column, triangle = first_hit(
+        ground, rocks, origin[0], origin[1], origin[2], dx, dy, dz, start, far_m, (-1, -1, -1, -1, -1)
+    )
+    nx, ny, nz, albedo, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
+    if rock >= 0:
+        nx, ny, nz = rock_normal(rocks, rock, face)
+        albedo = 1.0
+    elif t < np.inf:
+        nx, ny, nz, albedo, fx, fy, fz = ground_at(ground, part, row, column, triangle, x, y)
+    if s == 0:
+        at = first[0] + i, first[1] + j
+        depth[at], normal[at[0], at[1], 0], normal[at[0], at[1], 1], normal[at[0], at[1], 2] = t, nx, ny, nz
+    p, q = disc[s, i, j, 0], disc[s, i, j, 1]
+    lx, ly = sun[0] + p * plane[0, 0] + q * plane[1, 0], sun[1] + p * plane[0, 1] + q * plane[1, 1]
+    lz = sun[2] + p * plane[0, 2] + q * plane[1, 2]
+    to_disc = 1 / np.sqrt(lx * lx + ly * ly + lz * lz)
+    lx, ly, lz = lx * to_disc, ly * to_disc, lz * to_disc
+    per_length = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
+    cosine = nx * lx + ny * ly + nz * lz
+    angles[0, s, i, j] = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 1e-4)
+    angles[1, s, i, j] = max(-(nx * dx + ny * dy + nz * dz) * per_length, 1e-4)
+    angles[2, s, i, j] = -(sun[0] * dx + sun[1] * dy + sun[2] * dz) * per_length
+    angles[3, s, i, j] = albedo
+    angles[4, s, i, j] = 0.0
+    if cosine <= 0:
+        return
+    skip = (-1, -1, -1, -1, rock)
+    if rock < 0:
+        skip = (part, row, column, triangle, -1)
+        on_facet = fx * lx + fy * ly + fz * lz
+        moves = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
+        moves = min(max(moves, 0.0), 1.0)
+        if moves > 0:
+            mx, my, mz = lift_at(ground, part, row, column, triangle, x, y)
+            x, y, z = x + moves * mx, y + moves * my, z + moves * mz
+        elif surely_lit(horizon, x, y, z):
+            angles[4, s, i, j] = cosine
+            return
+    if first_hit(ground, rocks, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0] == np.inf:
+        angles[4, s, i, j] = cosine
+
+
 @njit(**WITHOUT_COUNTS)
-def see(ground, rocks, horizon, origin, basis, sun, plane, far_m, first, moved, disc, depth, normal, angles):
+def see(ground, rocks, tops, horizon, origin, basis, sun, plane, far_m, first, moved, disc, depth, normal, angles):
     """Cast the rays of a tile of the image from `origin` (3,), and a shadow ray from each hit that may be dark.
 
     The ray at image coordinates (u, v) is u basis[0] + v basis[1] + basis[2], with z = 1 along the camera's axis.
-    `first` is the tile's first row and column. `moved` (S, h, w, 2) has the places of its samples, pixels from the
-    pixel's centre. `disc` (S, h, w, 2) has places on the Sun's disc: a ray there is along the unit vector `sun` (3,)
-    to the centre, plus the place times `plane` (2, 3). Writes for the first sample the depth (inf for a miss)
-    and the unit shading normal into the images `depth` and `normal`. Writes for each sample `angles` (5, S, h, w): mu0,
-    mu, cosine of the phase angle, albedo, and the cosine of incidence of the point of the disc, 0 in shadow.
+    `tops` tells where the rays of a block of pixels begin. `first` is the tile's first row and column. `moved`
+    (S, h, w, 2) has the places of its samples, pixels from the pixel's centre. `disc` (S, h, w, 2) has places on the
+    Sun's disc: a ray there is along the unit vector `sun` (3,) to the centre, plus the place times `plane` (2, 3).
+    Writes for the first sample the depth (inf for a miss) and the unit shading normal into the images `depth` and
+    `normal`. Writes for each sample `angles` (5, S, h, w): mu0, mu, cosine of the phase angle, albedo, and the cosine
+    of incidence of the point of the disc, 0 in shadow.
     The samples of a pixel come one after another, since they read the same memory.
     """
-    nothing = (-1, -1, -1, -1, -1)
     n_samples, height, width, _ = moved.shape
-    for i, j, s in np.ndindex(height, width, n_samples):
-        u, v = first[1] + j + 0.5 + moved[s, i, j, 0], first[0] + i + 0.5 + moved[s, i, j, 1]
-        dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
-        dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
-        dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
-        t, rock, face, part, row, column, triangle = first_hit(
-            ground, rocks, origin[0], origin[1], origin[2], dx, dy, dz, 0.0, far_m, nothing
-        )
-        nx, ny, nz, albedo, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
-        if rock >= 0:
-            nx, ny, nz = rock_normal(rocks, rock, face)
-            albedo = 1.0
-        elif t < np.inf:
-            nx, ny, nz, albedo, fx, fy, fz = ground_at(ground, part, row, column, triangle, x, y)
-        if s == 0:
-            at = first[0] + i, first[1] + j
-            depth[at], normal[at[0], at[1], 0], normal[at[0], at[1], 1], normal[at[0], at[1], 2] = t, nx, ny, nz
-        p, q = disc[s, i, j, 0], disc[s, i, j, 1]
-        lx, ly = sun[0] + p * plane[0, 0] + q * plane[1, 0], sun[1] + p * plane[0, 1] + q * plane[1, 1]
-        lz = sun[2] + p * plane[0, 2] + q * plane[1, 2]
-        to_disc = 1 / np.sqrt(lx * lx + ly * ly + lz * lz)
-        lx, ly, lz = lx * to_disc, ly * to_disc, lz * to_disc
-        per_length = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
-        cosine = nx * lx + ny * ly + nz * lz
-        angles[0, s, i, j] = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 1e-4)
-        angles[1, s, i, j] = max(-(nx * dx + ny * dy + nz * dz) * per_length, 1e-4)
-        angles[2, s, i, j] = -(sun[0] * dx + sun[1] * dy + sun[2] * dz) * per_length
-        angles[3, s, i, j] = albedo
-        angles[4, s, i, j] = 0.0
-        if cosine <= 0:
-            continue
-        skip = (-1, -1, -1, -1, rock)
-        if rock < 0:
-            skip = (part, row, column, triangle, -1)
-            on_facet = fx * lx + fy * ly + fz * lz
-            moves = 2 - (on_facet + cosine) / _TERMINATOR if cosine < _TERMINATOR else 1 - on_facet / _TERMINATOR
-            moves = min(max(moves, 0.0), 1.0)
-            if moves > 0:
-                mx, my, mz = lift_at(ground, part, row, column, triangle, x, y)
-                x, y, z = x + moves * mx, y + moves * my, z + moves * mz
-            elif surely_lit(horizon, x, y, z):
-                angles[4, s, i, j] = cosine
-                continue
-        if first_hit(ground, rocks, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0] == np.inf:
-            angles[4, s, i, j] = cosine
+    out = depth, normal, angles
+    for row in range(0, height, BLOCK_PX):
+        for column in range(0, width, BLOCK_PX):
+            last_row, last_column = min(row + BLOCK_PX, height), min(column + BLOCK_PX, width)
+            u, v = first[1] + column, first[0] + row
+            begin = begin_m(tops, ground, origin, basis, u, u + last_column - column, v, v + last_row - row)
+            for i in range(row, last_row):
+                for j in range(column, last_column):
+                    for s in range(n_samples):
+                        _see(
+                            ground,
+                            rocks,
+                            horizon,
+                            begin,
+                            origin,
+                            basis,
+                            sun,
+                            plane,
+                            far_m,
+                            first,
+                            s,
+                            i,
+                            j,
+                            moved,
+                            disc,
+                            out,
+                        )

@@ -9,7 +9,8 @@ from perilune_render.config import LightConfig, RenderConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.frame_source import FrameSource, Shot
-from perilune_render.heightfield.engine import HeightfieldEngine
+from perilune_render.heightfield.beam import begin_m, tops_of
+from perilune_render.heightfield.engine import HeightfieldEngine, rays_of
 from perilune_render.heightfield.horizon import NOWHERE, horizon_of
 from perilune_render.heightfield.query import first_hits
 from perilune_render.imaging.photometry import radiance_factor
@@ -188,6 +189,33 @@ def test_the_horizon_changes_no_bit(scene, engine):
                     found.append(one.render(position, rotation, 5))
                 assert (found[0].radiance_factor == found[1].radiance_factor).all()
         assert 0.2 < np.isfinite(horizon.clear_m).mean() < 0.99
+
+
+def test_where_the_rays_begin_changes_no_hit(scene, engine):
+    """Without the raster all rays begin above the highest ground; only the rounding of their way differs."""
+    tops = tops_of(engine.surface.ground)
+    with HeightfieldEngine(scene, settings(), CAMERA, SUN, 2, engine.surface) as one:
+        for position, rotation in places(scene):
+            found = []
+            for one.tops in (tops, tops._replace(top_m=np.full_like(tops.top_m, np.inf))):
+                found.append(one.render(position, rotation, 5))
+            assert np.allclose(found[0].depth_m, found[1].depth_m, rtol=1e-9, atol=0)
+            assert np.allclose(found[0].normal, found[1].normal, atol=1e-6)
+            assert (found[0].sunlit == found[1].sunlit).mean() >= 0.9999
+
+
+def test_rays_begin_near_the_ground_that_they_hit(scene, engine):
+    """From 500 m above the site, a block of pixels begins a few metres above its ground, not above the highest."""
+    ground, tops = engine.surface.ground, tops_of(engine.surface.ground)
+    position, rotation = np.array([0.0, 0.0, 500.0]), np.diag([1.0, -1.0, -1.0])
+    depth = engine.render(position, rotation).depth_m
+    above = []
+    for row in range(0, CAMERA.height_px - 8, 8):
+        for column in range(0, CAMERA.width_px - 8, 8):
+            height = begin_m(tops, ground, position, rays_of(CAMERA) @ rotation, column, column + 8, row, row + 8)
+            above.append(height - (500 - depth[row : row + 8, column : column + 8].min()))
+    assert min(above) > 0
+    assert np.median(above) < 0.3 * (ground.highest_m - ground.lowest_m)
 
 
 def test_the_horizon_is_made_after_many_rays(scene, engine):
