@@ -43,7 +43,7 @@ def test_a_changed_figure_changes_the_tables():
         if row.record:
             records = {name: record.model_copy(deep=True) for name, record in RECORDS.items()}
             near = results.enclosing_table(row, records)
-            near[row.keys[-1]] = 2 * near[row.keys[-1]]
+            near[row.keys[-1]] = 2 * near[row.keys[-1]] or 1  # also a figure of 0
             assert results.table(False, ROWS, records) != before, row.metric
 
 

@@ -112,9 +112,9 @@ def rock_normal(rocks, k, face):
 
 
 @njit(**INLINED)
-def _see(ground, rocks, horizon, begin, origin, basis, sun, plane, far_m, first, s, i, j, moved, disc, out):
+def _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out):
     """Cast the ray of one sample, which begins at the height `begin`, and its shadow ray; see `see`."""
-    depth, normal, angles = out
+    (origin, basis, sun, plane, far_m), (moved, disc), (depth, normal, angles) = view, drawn, out
     u, v = first[1] + j + 0.5 + moved[s, i, j, 0], first[0] + i + 0.5 + moved[s, i, j, 1]
     dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
     dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
@@ -177,7 +177,7 @@ def see(ground, rocks, tops, horizon, origin, basis, sun, plane, far_m, first, m
     The samples of a pixel come one after another, since they read the same memory.
     """
     n_samples, height, width, _ = moved.shape
-    out = depth, normal, angles
+    view, drawn, out = (origin, basis, sun, plane, far_m), (moved, disc), (depth, normal, angles)
     for row in range(0, height, BLOCK_PX):
         for column in range(0, width, BLOCK_PX):
             last_row, last_column = min(row + BLOCK_PX, height), min(column + BLOCK_PX, width)
@@ -186,21 +186,4 @@ def see(ground, rocks, tops, horizon, origin, basis, sun, plane, far_m, first, m
             for i in range(row, last_row):
                 for j in range(column, last_column):
                     for s in range(n_samples):
-                        _see(
-                            ground,
-                            rocks,
-                            horizon,
-                            begin,
-                            origin,
-                            basis,
-                            sun,
-                            plane,
-                            far_m,
-                            first,
-                            s,
-                            i,
-                            j,
-                            moved,
-                            disc,
-                            out,
-                        )
+                        _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out)

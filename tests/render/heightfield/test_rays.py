@@ -205,7 +205,7 @@ def test_where_the_rays_begin_changes_no_hit(scene, engine):
 
 
 def test_rays_begin_near_the_ground_that_they_hit(scene, engine):
-    """From 500 m above the site, a block of pixels begins a few metres above its ground, not above the highest."""
+    """From 500 m above the site, a block of pixels begins above its ground, but far below the highest of the scene."""
     ground, tops = engine.surface.ground, tops_of(engine.surface.ground)
     position, rotation = np.array([0.0, 0.0, 500.0]), np.diag([1.0, -1.0, -1.0])
     depth = engine.render(position, rotation).depth_m
