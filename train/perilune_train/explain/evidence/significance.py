@@ -16,6 +16,8 @@ LEVEL = 0.05
 UNDECIDED = f"undecided: fewer than {MIN_UNITS} scenes"
 UNDEFINED = "undefined: the mask is constant"
 BEATS = "beats every null"
+PAIRWISE = ("pcc2",)
+"""Measures whose value for a frame is a mean over its pairs with the other frames."""
 _FLIPS = 4096
 """Sign flips; all of them with up to 12 units."""
 _GROUP = ["task", "kind", "map", "measure"]
@@ -26,13 +28,14 @@ def summary(table: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
 
     `value` is the mean over the frames where it is defined, `low` and `high` its 95 % interval by bootstrap over units.
     The unit is the scene; the trajectory, the part of frame_id before its last "/", if there is one scene. NaN with
-    fewer than 5 units. `undefined` is the number of NaN among the `count` values.
+    fewer than 5 units. `undefined` is the number of NaN among the `count` values. Of PAIRWISE measures each pair of
+    frames counts in both (`pairwise`).
     """
     rows = []
     for _, task in table.groupby("task", sort=False):
         frames = _Frames.of(task, rng)
         for key, own in task.groupby(_GROUP, sort=False):
-            values = frames.aligned(own)
+            values = pairwise(str(key[-1]), frames.aligned(own))
             mean = frames.mean(values)
             missing = {"undefined": int(own["value"].isna().sum()), "count": len(own)}
             rows.append(dict(zip(_GROUP, key, strict=True)) | mean.columns("value") | missing)
@@ -73,7 +76,7 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
             nulls = [one for one in own.loc[own["kind"] == "null", "map"].unique() if np.isfinite(values[one]).any()]
             for gate in own.loc[own["kind"] == kind, "map"].unique():
                 for null in (one for one in nulls if _applies(one, gate)):
-                    difference = signed[gate] - signed[null]
+                    difference = pairwise(str(measure), signed[gate] - signed[null])
                     means = {"value": _mean(signed[gate]), "null_value": _mean(signed[null])}
                     p_values = {"p_bootstrap": frames.bootstrap_p(difference), "p": frames.sign_flip_p(difference)}
                     who = {"task": name, "measure": measure, "map": gate, "null": null.partition("/")[0]}
@@ -81,11 +84,26 @@ def null_differences(table: pd.DataFrame, signs: Signs, rng: np.random.Generator
     return pd.DataFrame(rows)
 
 
+def pairwise(measure: str, values: Array) -> Array:
+    """Values (N,) of frames whose spread over units is that of their mean; unchanged unless the measure is PAIRWISE.
+
+    The mean over all pairs of frames is a U-statistic of order 2: a unit moves it by twice the deviation of its own
+    mean over pairs (Hoeffding 1948, doi 10.1214/aoms/1177730196). Deviations from the mean are doubled, the mean stays.
+    """
+    if measure not in PAIRWISE:
+        return values
+    return 2 * values - _mean(values)
+
+
 def unit_sign_flip_p(values: Array) -> float:
     """One-sided p of a mean above 0 of the values (U,) of independent units, by sign flips.
 
-    All 2^U flips up to 12 units, else 4096 random ones of a fixed seed.
+    All 2^U flips up to 12 units, else 4096 random ones of a fixed seed. Units without a value, NaN, are left out; NaN
+    if none has one.
     """
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return float("nan")
     flips = _flips(len(values), np.random.default_rng(0))
     return float(np.mean(flips @ values >= values.sum() - 1e-12 * np.abs(values).sum()))
 
