@@ -110,11 +110,24 @@ def test_a_run_writes_values_tests_interventions_claims_and_pictures(
     assert tables["summary"].query("task == 'detect'")["low"].isna().all()
     assert not tables["tested"]["beats_all"].any()
     claims = json.loads((run.root / "claims.json").read_text())
-    assert len(claims) == 14 and all(set(one) == set(claims[0]) for one in claims)
+    assert len(claims) == 16 and all(set(one) == set(claims[0]) for one in claims)
     assert {(run.root / one["picture"]).is_file() for one in claims} == {True}
     verdicts = [one["verdict"] for one in claims if "is constant" not in one["claim"]]
     assert all(verdict.startswith("undecided") for verdict in verdicts)
     assert "follows craters" in metrics["headline"] and "PCC4" in metrics["headline"]
+    assert metrics["headline"].count("removing what it attends to hurts 3 times as much as controls: undecided") == 2
+    # Every figure of the page is on record: nulls, forced gates, removed pixels, stability, random weights.
+    for key in (
+        "pcc1_craterness_null/B_11/edge",
+        "auc_null/B_11/untrained",
+        "detect/forced/all gates",
+        "detect/stability/noise 2 DN/B_11",
+        "detect/randomised/bottom_up/stage 1/B_11",
+        "detect/removal/edge/stage_1/inpaint/most",
+        "auc/occlusion",
+        "pcc4_minus_pcc3_null/B_11/contrast",
+    ):
+        assert isinstance(metrics[key], float), key
     captions = json.loads((run.root / "captions.json").read_text())
     assert captions == CAPTIONS and {path.name for path in run.root.glob("*.png")} == set(captions)
     for name in captions:

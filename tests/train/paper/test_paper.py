@@ -37,10 +37,11 @@ def navigator_metrics(position_m, ms):
     return found
 
 
-def explained(shallow=0.4, deep=0.9, moved=0.2):
-    """Gates as the paper describes them."""
+def explained(shallow=0.4, deep=0.9, moved=0.2, scenes=5):
+    """Gates as the paper describes them, over a number of scenes, and edge maps that follow craters more."""
     gates = [f"B_{i}{j}" for i, n in ((1, 1), (2, 2), (3, 8), (4, 8), (5, 4)) for j in range(1, n + 1)]
     found = {f"pcc1_background/{gate}": shallow for gate in gates} | {f"pcc2/{gate}": deep for gate in gates}
+    found |= {f"pcc1_background_null/{gate}/edge": 0.45 for gate in gates} | {"scenes": scenes, "pair_scenes": scenes}
     for number, gate in enumerate(gates):
         for pixels in ("", "_all_pixels"):
             found |= {f"pcc3{pixels}/{gate}": 0.5, f"pcc4{pixels}/{gate}": 0.5 + (moved if number < 9 else -moved)}
@@ -101,6 +102,7 @@ def test_the_page_has_the_papers_figures_beside_ours(runs, dataset):
         "holds",
         "does not hold",
         "within the spread",
+        "undecided",
         "not measured",
     }
 
@@ -115,6 +117,12 @@ def test_verdicts(runs):
     assert answers["attention lowers the position RMSE (per component)"] == "within the spread", "no intervals"
     assert answers["a pair takes as long with attention as without"] == "holds"
     assert [answer for claim, answer in answers.items() if claim.startswith("PCC")] == ["holds"] * 6
+    (shallow,) = [one.measured for one in verdicts(PaperRuns(runs), 0.9) if one.claim.startswith("PCC1")]
+    assert shallow == "2 of 2: B_11 0.40, B_35 0.40; nulls: edge 0.45 to 0.45; 5 scenes"
+    # One scene decides nothing on masks.
+    write_metrics(PaperRuns(runs).explained, explained(scenes=1))
+    assert [answer for claim, answer in answers_of(runs).items() if claim.startswith("PCC")] == ["undecided"] * 6
+    write_metrics(PaperRuns(runs).explained, explained())
     (large,) = [answer for claim, answer in answers.items() if "large craters" in claim]
     assert large == "holds"
     assert answers_of(runs, 1.02)[next(c for c in answers if "large craters" in c)] == "does not hold"

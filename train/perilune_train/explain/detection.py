@@ -15,8 +15,8 @@ from perilune_train.detect.inference.detector import Detector
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import detector_values
 from perilune_train.explain.evidence.gates import forced_gates, gate_means
-from perilune_train.explain.evidence.localisation import localisation
-from perilune_train.explain.evidence.nulls import detector_nulls
+from perilune_train.explain.evidence.localisation import MEASURES, localisation
+from perilune_train.explain.evidence.nulls import detector_nulls, of_other_rows, renamed
 from perilune_train.explain.evidence.performance import DetectionPerformance
 from perilune_train.explain.evidence.permutation import detector_permutations
 from perilune_train.explain.evidence.randomisation import randomised
@@ -61,20 +61,22 @@ def explain_detector(
 
     some = evenly_spaced(len(frames.images), settings.n_attributed)
     attributed = attributions(settings, network, frames.images[some])
-    chosen = pd.DataFrame({"frame_id": frames.frame_ids, "scene_id": frames.scene_ids})
-    stage = strongest[2]
-    nulls = {name: one for name, one in baseline_maps(frames.images).items() if name.endswith(f"/stage_{stage}")}
     plain |= dict.fromkeys(attributed, 1)
-    values = pd.concat(
+    nulls = baseline_maps(frames.images) | renamed("untrained", blank)
+    nulls |= renamed("other frame", of_other_rows(masks, frames.scene_ids, rng))
+    chosen = pd.DataFrame({"frame_id": frames.frame_ids, "scene_id": frames.scene_ids})
+    located = pd.concat(
         [
-            values,
-            _attribution_values(frames, some, attributed),
             localisation(masks, frames.craters, plain, chosen, TASK, "gate"),
             localisation(nulls, frames.craters, plain, chosen, TASK, "null"),
             localisation(attributed, frames.craters[some], plain, chosen.iloc[some], TASK, "attribution"),
         ],
         ignore_index=True,
     )
+    compared = null_differences(located[located["measure"].isin(MEASURES)], signs, rng)
+    values = pd.concat([values, _attribution_values(frames, some, attributed), located], ignore_index=True)
+    differences = pd.concat([differences, compared], ignore_index=True)
+    stage = strongest[2]
     changed = evenly_spaced(len(frames.images), settings.n_changed)
     images, ids = frames.images[changed], chosen.iloc[changed].reset_index(drop=True)
     measure = DetectionPerformance(detector, [frames.labels[i] for i in changed], frames.radius_px)

@@ -36,6 +36,8 @@ class LabelledFrames:
     """Ids of the frames."""
     scene_ids: list[str]
     """Scene of each frame."""
+    height_m: list[float]
+    """Height of each camera above the plane of the landing site, metres."""
 
     @property
     def craters(self) -> NDArray[np.bool_]:
@@ -57,6 +59,8 @@ class Pairs:
     """Scene, trajectory and step of each pair, separated by "/"."""
     scene_ids: list[str]
     """Scene of each pair."""
+    height_m: list[float]
+    """Height of the earlier camera of each pair above the plane of the landing site, metres."""
 
 
 def labelled_frames(
@@ -89,6 +93,7 @@ def frames_of(split: DetectSplit, chosen: Sequence[int], ring_factors: tuple[flo
         split.radius_px,
         table["frame_id"].tolist(),
         table["scene_id"].tolist(),
+        [float(position[2]) for position in table["position_m"]],
     )
 
 
@@ -106,9 +111,19 @@ def consecutive_pairs(dataset: Dataset, split: str, count: int) -> Pairs:
     descents = navigation.load_split(dataset, split)
     length = min(RUN_PAIRS, *(one.n_pairs for one in descents))
     places = [(one, start) for one in descents for start in range(0, one.n_pairs - length + 1, length)]
-    runs = [places[i] for i in evenly_spaced(len(places), max(1, count // length))]
-    images, homographies, translations, ids, scenes = [], [], [], [], []
-    for one, start in runs:
+    return _pairs_of([(*places[i], length) for i in evenly_spaced(len(places), max(1, count // length))])
+
+
+def pairs_of_descent(dataset: Dataset, split: str, count: int) -> Pairs:
+    """At most `count` pairs of the split's first trajectory, evenly spaced from its highest to its lowest one."""
+    first = navigation.load_split(dataset, split)[0]
+    return _pairs_of([(first, step, 1) for step in evenly_spaced(first.n_pairs, count)])
+
+
+def _pairs_of(runs: Sequence[tuple[navigation.Trajectory, int, int]]) -> Pairs:
+    """Pairs of runs of equal length: trajectory, first step, number of pairs."""
+    images, homographies, translations, ids, scenes, heights = [], [], [], [], [], []
+    for one, start, length in runs:
         translations.append(one.motion[0][start : start + length])
         for step in range(start, start + length):
             images.append(np.concatenate([one.images[step], one.images[step + 1]]))
@@ -116,7 +131,8 @@ def consecutive_pairs(dataset: Dataset, split: str, count: int) -> Pairs:
             homographies.append(true_homography(one.camera, *poses[0], *poses[1]))
             ids.append("/".join([*one.ids, str(step)]))
             scenes.append(one.ids[0])
-    return Pairs(np.stack(images), np.stack(homographies), np.stack(translations), ids, scenes)
+            heights.append(float(one.position_m[step][2]))
+    return Pairs(np.stack(images), np.stack(homographies), np.stack(translations), ids, scenes, heights)
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:

@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from perilune_shared.dataset.manifest import open_single
@@ -15,13 +14,20 @@ from perilune_train.detect.evaluate.split_evaluation import selection_entries
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.train.guide import GUIDED
 from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import Metrics, write_metrics
+from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.explain import detection, navigation
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import PCC1_SIGN
 from perilune_train.explain.evidence.tables import TABLES, Evidence
-from perilune_train.explain.inputs import consecutive_pairs, first_descent, frames_of, labelled_frames
-from perilune_train.explain.maps.masks import Masks, detector_masks
+from perilune_train.explain.figures import figures_of
+from perilune_train.explain.inputs import (
+    consecutive_pairs,
+    first_descent,
+    frames_of,
+    labelled_frames,
+    pairs_of_descent,
+)
+from perilune_train.explain.maps.masks import Masks, detector_masks, navigator_masks
 from perilune_train.explain.networks import folder_of, open_single_scale, terrain_marks
 from perilune_train.explain.page import claims as page
 from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
@@ -73,22 +79,28 @@ def explain_run(
     pairs = consecutive_pairs(flown, "test", settings.n_pairs)
     known_pairs = consecutive_pairs(flown, "val", settings.n_validation)
     descent = frames_of(split, first_descent(split), settings.ring_factors)
+    flight = pairs_of_descent(flown, "test", settings.n_drawn)
     start_run(run, "explain", settings, inputs, state)
 
     found, masks = detection.explain_detector(settings, opened, frames, known_frames, detector)
-    draw_detector(run.root, settings, frames, masks, found)
-    save_masks(
-        run.root / "masks_detect.npz", descent.frame_ids, detector_masks(opened.network, descent.images, detector)
-    )
+    along = detector_masks(opened.network, descent.images, detector)
+    draw_detector(run.root, settings, frames, masks, found, descent, along)
+    save_masks(run.root / "masks_detect.npz", descent.frame_ids, along)
     seen, stacked = navigation.explain_navigator(settings, stack, architecture, pairs, known_pairs, navigator)
-    draw_navigator(run.root, settings, pairs, stacked, seen)
+    flown_masks = navigator_masks(stack, flight.images, architecture["size_px"], navigator)
+    draw_navigator(run.root, settings, pairs, stacked, seen, flight, flown_masks)
 
     guided = GUIDED if own.loss.lambda_guide > 0 else ()
     claims = page.detector_claims(found, _deviations(masks), guided) + page.navigator_claims(seen, _deviations(stacked))
     _write_tables(run, {detection.TASK: found, navigation.TASK: seen})
     write_text(run.root / "claims.json", json.dumps([one.plain() for one in claims], indent=2) + "\n")
     write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
-    metrics = _figures(found) | _figures(seen) | selection_entries(own, split) | terrain
+    metrics = (
+        figures_of(found, detection.TASK, higher_is_better=True)
+        | figures_of(seen, navigation.TASK, higher_is_better=False)
+        | selection_entries(own, split)
+        | terrain
+    )
     metrics |= {f"mask_deviation/{block}": value for block, value in _deviations(masks).items()}
     metrics |= {f"mask_deviation_stack/{block}": value for block, value in _deviations(stacked).items()}
     metrics |= {
@@ -97,6 +109,8 @@ def explain_run(
         "pcc1_sign": PCC1_SIGN,
         "frames": len(frames.images),
         "pairs": len(pairs.images),
+        "scenes": len(set(frames.scene_ids)),
+        "pair_scenes": len(set(pairs.scene_ids)),
         "detector": detector.as_posix(),
         "navigator": navigator.as_posix(),
     }
@@ -107,30 +121,6 @@ def explain_run(
     console.print(page.headline(claims), markup=False, soft_wrap=True)
     write_metrics(run.root, metrics)
     return run
-
-
-def _figures(found: Evidence) -> Metrics:
-    """Means of all gates by measure, with their intervals where there are five units or more."""
-    rows = found.summary[found.summary["kind"] == "gate"]
-    metrics: Metrics = {}
-    for row in rows.to_dict("records"):
-        key = f"{row['measure']}/{row['map']}"
-        metrics[key] = float(row["value"])
-        if np.isfinite(row["low"]):
-            metrics |= {f"{key}_low": float(row["low"]), f"{key}_high": float(row["high"])}
-    for tested in found.tested.to_dict("records"):
-        metrics[f"{tested['measure']}_beats_nulls/{tested['map']}"] = bool(tested["beats_all"])
-    task = str(found.values["task"].iloc[0])
-    harm = page.removal_row(found, higher_is_better=task == detection.TASK)
-    metrics |= {f"{task}/removal_{name}": float(harm[name]) for name in ("most", "least", "random", "shifted")}
-    # Without harm by a control there is no ratio.
-    metrics[f"{task}/removal_ratio"] = float(harm["ratio"]) if np.isfinite(harm["ratio"]) else 0.0
-    metrics[f"{task}/strongest_gate"] = found.strongest
-    for measure in ("pcc1_craterness", "pcc1_partial") if task == detection.TASK else ("pcc4", "pcc4_minus_pcc3"):
-        metrics[f"{task}/{measure}_beating_to_stride_8"] = len(page.beating_gates(found, measure))
-        metrics[f"{task}/{measure}_beating"] = len(page.beating_gates(found, measure, "12345"))
-    metrics[f"{task}/undefined"] = int(rows["undefined"].sum())
-    return metrics
 
 
 def _deviations(masks: Masks) -> dict[str, float]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from perilune_train.evaluation.metrics_file import Metrics
-from perilune_train.evaluation.spread import read_spread
+from perilune_train.evaluation.spread import MIN_UNITS, read_spread
 from perilune_train.paper.claimed import (
     DEEP_ALIKE,
     DEEP_ALIKE_GATES,
@@ -19,7 +19,7 @@ from perilune_train.paper.claimed import (
 )
 from perilune_train.paper.runs import PaperRuns
 
-Answer = Literal["holds", "does not hold", "within the spread", "not measured"]
+Answer = Literal["holds", "does not hold", "within the spread", "undecided", "not measured"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,8 @@ class Verdict:
     measured: str
     """Ours, with intervals where there are five units or more."""
     answer: Answer
-    """within the spread: the difference has the claimed sign, but the intervals overlap, or there are none."""
+    """within the spread: the difference has the claimed sign, but the intervals overlap, or there are none. undecided:
+    masks were measured over fewer than five scenes."""
 
 
 def verdicts(runs: PaperRuns, large_width_ratio: float | None) -> list[Verdict]:
@@ -136,19 +137,47 @@ def _as_fast(bare: Metrics, gated: Metrics) -> Verdict:
 
 
 def _gates(explained: Metrics) -> list[Verdict]:
-    """Claims on attention gates; single figures without an interval, so each is a plain comparison."""
+    """Claims on attention gates, with the range of each null over the same gates.
+
+    Single figures without an interval, so each is a plain comparison; over fewer than five scenes it decides nothing.
+    """
 
     def of(measure: str, gates: Sequence[str]) -> dict[str, float]:
         found = {gate: explained.get(f"{measure}/{gate}") for gate in gates}
         return {gate: float(value) for gate, value in found.items() if isinstance(value, int | float)}
 
-    def judged(claim: str, claimed: str, gates: Sequence[str], values: dict[str, float], ok: Callable) -> Verdict:
+    def nulls(measure: str, gates: Sequence[str]) -> str:
+        found: dict[str, list[float]] = {}
+        for gate in gates:
+            prefix = f"{measure}_null/{gate}/"
+            for key, value in explained.items():
+                if key.startswith(prefix) and isinstance(value, float):
+                    found.setdefault(key.removeprefix(prefix), []).append(value)
+        ranges = ", ".join(f"{null} {min(values):.2f} to {max(values):.2f}" for null, values in found.items())
+        return f"; nulls: {ranges}" if ranges else ""
+
+    def judged(
+        claim: str,
+        claimed: str,
+        gates: Sequence[str],
+        values: dict[str, float],
+        ok: Callable,
+        null: str,
+        scenes: str,
+    ) -> Verdict:
         if not values:
             return Verdict(claim, claimed, "-", "not measured")
         fit = [gate for gate, value in values.items() if ok(value)]
         listed = ", ".join(f"{gate} {value:.2f}" for gate, value in values.items())
-        measured = f"{len(fit)} of {len(gates)}: {listed}"
-        return Verdict(claim, claimed, measured, "holds" if len(fit) == len(gates) else "does not hold")
+        n_scenes = explained.get(scenes)
+        few = not isinstance(n_scenes, int) or n_scenes < MIN_UNITS
+        measured = f"{len(fit)} of {len(gates)}: {listed}{nulls(null, gates)}"
+        return Verdict(
+            claim,
+            claimed,
+            f"{measured}; {n_scenes if isinstance(n_scenes, int) else 'unknown number of'} scenes",
+            "undecided" if few else "holds" if len(fit) == len(gates) else "does not hold",
+        )
 
     def difference(gates: Sequence[str], pixels: str) -> dict[str, float]:
         still, moved = of(f"pcc3{pixels}", gates), of(f"pcc4{pixels}", gates)
@@ -163,6 +192,8 @@ def _gates(explained: Metrics) -> list[Verdict]:
             SHALLOW_CRATER_GATES,
             craters,
             lambda value: abs(value) >= MODERATE,
+            "pcc1_background",
+            "scenes",
         ),
         judged(
             f"PCC2 of {', '.join(DEEP_ALIKE_GATES)} is above {DEEP_ALIKE}",
@@ -170,6 +201,8 @@ def _gates(explained: Metrics) -> list[Verdict]:
             DEEP_ALIKE_GATES,
             deep,
             lambda value: value > DEEP_ALIKE,
+            "pcc2",
+            "scenes",
         ),
         *(
             judged(
@@ -178,6 +211,8 @@ def _gates(explained: Metrics) -> list[Verdict]:
                 MOTION_GATES,
                 difference(MOTION_GATES, pixels),
                 lambda value: value > 0,
+                "" if pixels else "pcc4_minus_pcc3",
+                "pair_scenes",
             )
             for pixels, words in _PIXELS.items()
         ),
@@ -188,6 +223,8 @@ def _gates(explained: Metrics) -> list[Verdict]:
                 STILL_GATES,
                 difference(STILL_GATES, pixels),
                 lambda value: value < 0,
+                "" if pixels else "pcc4_minus_pcc3",
+                "pair_scenes",
             )
             for pixels, words in _PIXELS.items()
         ),

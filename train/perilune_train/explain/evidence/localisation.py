@@ -10,6 +10,8 @@ from scipy.stats import rankdata
 
 from perilune_train.explain.correlation.pearson import is_constant
 
+MEASURES = ("auc", "relevance_mass", "pointing")
+"""Measures in which gates are tested against nulls."""
 TOLERANCE_PX = 3
 """Distance to a crater's pixel within which the top pixel of a map is a hit, pixels."""
 

@@ -36,7 +36,7 @@ def detector_nulls(
     the order of the frames. The other arguments are those of `detector_values`.
     """
     maps = baseline_maps(images, px_per_input_px) | renamed("untrained", untrained)
-    exchanged = renamed("other frame", _of_other_rows(masks, scene_ids, rng))
+    exchanged = renamed("other frame", of_other_rows(masks, scene_ids, rng))
     known, shuffled = (
         detector_values(one, truth, brightness, gradient, frame_ids, scene_ids, "null", other_scenes)
         for one in (maps, exchanged)
@@ -65,7 +65,7 @@ def pair_nulls(
     upper, lower = (baseline_maps(images, px_per_input_px) for images in (first, second))
     maps = {name: np.concatenate([upper[name], lower[name]], axis=1) for name in upper}
     height = first.shape[1]
-    for gate, other in _of_other_rows(masks, scene_ids, rng).items():
+    for gate, other in of_other_rows(masks, scene_ids, rng).items():
         maps[f"other pair/{gate}"] = np.concatenate([masks[gate][:, :height], other[:, height:]], axis=1)
     return pair_values(maps | renamed("untrained", untrained), homographies, pair_ids, scene_ids, "null", False)
 
@@ -75,8 +75,8 @@ def renamed(null: str, masks: Masks) -> Masks:
     return {f"{null}/{gate}": found for gate, found in masks.items()}
 
 
-def _of_other_rows(masks: Masks, scene_ids: Sequence[str], rng: np.random.Generator) -> Masks:
-    """Masks (N, height, width) in the order of `other_rows`; NaN if there is one frame."""
+def of_other_rows(masks: Masks, scene_ids: Sequence[str], rng: np.random.Generator) -> Masks:
+    """Masks (N, height, width) of other frames, in the order of `other_rows`; NaN if there is one frame."""
     if len(scene_ids) < 2:
         return {gate: np.full_like(found, np.nan) for gate, found in masks.items()}
     other = other_rows(scene_ids, rng)

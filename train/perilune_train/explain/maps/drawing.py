@@ -1,5 +1,6 @@
 """Sheets of attention masks beside their images."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -15,9 +16,10 @@ _MOST_COLUMNS = 8
 _WHITE = (255, 255, 255)
 
 
-def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
+def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks, height_m: Sequence[float]) -> None:
     """Draw a PNG sheet: for each image (N, height, width) the frame, then every block's mask, then a colour bar.
 
+    Below each frame is the height of its camera, `height_m`, metres.
     All masks of the sheet share one scale, from the smallest to the largest value. Below each mask is its own range, or
     "constant" if it does not vary.
     """
@@ -29,7 +31,7 @@ def draw_masks(path: Path, images: NDArray[np.uint8], masks: Masks) -> None:
         height = round(_CELL_PX * image.shape[0] / image.shape[1])
         grey = np.clip(image / max(1.0, float(np.percentile(image, 99.5))) * 255, 0, 255).astype(np.uint8)
         frame = cv2.cvtColor(cv2.resize(grey, (_CELL_PX, height), interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
-        cells = [_labelled(frame, "frame")]
+        cells = [_labelled(frame, f"{height_m[n]:.0f} m high")]
         for name, found in masks.items():
             mask = cv2.resize(found[n], (_CELL_PX, height))
             cells.append(_labelled(_coloured(mask, low, high), caption(name, found[n])))

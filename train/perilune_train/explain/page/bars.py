@@ -130,9 +130,32 @@ def draw_randomisation(path: Path, randomisation: pd.DataFrame) -> None:
     save_figure(path, figure, dpi=110)
 
 
+def draw_stability(path: Path, stability: pd.DataFrame) -> None:
+    """Draw the mean correlation of each gate's mask with that of the changed image, by change."""
+    table = stability.pivot_table(index="change", columns="map", values="pearson", sort=False, dropna=False)
+    figure = Figure(figsize=(3 + 0.55 * table.shape[1], 3.6), layout="constrained")
+    axis = figure.subplots()
+    values = table.to_numpy(np.float64)
+    picture = axis.imshow(values, cmap="cividis", vmin=0, vmax=1, aspect="auto")
+    for row, column in np.ndindex(*values.shape):
+        value = values[row, column]
+        text = f"{value:.2f}" if np.isfinite(value) else "-"
+        axis.text(column, row, text, ha="center", va="center", fontsize=7, color="black" if value > 0.6 else "white")
+    axis.set_xticks(np.arange(table.shape[1]), table.columns, rotation=60, fontsize=8)
+    axis.set_yticks(np.arange(len(table)), table.index, fontsize=8)
+    figure.colorbar(picture, ax=axis, label="correlation with the mask before")
+    save_figure(path, figure, dpi=110)
+
+
 def draw_localisation(path: Path, summary: pd.DataFrame) -> None:
     """Draw the ROC-AUC of every map on crater pixels: gates, nulls and attribution methods; chance is 0.5."""
-    own = summary[summary["measure"] == "auc"].reset_index(drop=True)
+    own = summary[summary["measure"] == "auc"]
+    for null in ("untrained", "other frame"):
+        # There is one of these nulls for each gate: draw the strongest.
+        ones = own["map"].str.startswith(f"{null}/")
+        best = own.loc[ones, "value"].max()
+        own = own[~ones | (own["value"] == best)]
+    own = own.reset_index(drop=True)
     colours = own["kind"].map({"gate": BLUE, "null": GREY, "attribution": ORANGE})
     figure = Figure(figsize=(12, 3.6), layout="constrained")
     axis = figure.subplots()

@@ -13,6 +13,7 @@ from perilune_train.explain.page.bars import (
     draw_localisation,
     draw_randomisation,
     draw_removal,
+    draw_stability,
 )
 from perilune_train.explain.page.pairs import draw_removed
 
@@ -27,13 +28,15 @@ _NAVIGATE = {
     "pcc4_minus_pcc3": "PCC4 - PCC3",
 }
 _SHARED = {
-    "masks": "Attention masks of all gates on one scale, at high, middle and low altitude.",
+    "masks": "Attention masks of all gates on one scale, at high, middle and low altitude of one descent.",
     "pcc": "Correlations of all gates, with 95 % intervals over scenes where there are five or more. Filled bars beat"
     " every null; markers are nulls.",
     "gates": "Harm of forcing masks to their means: single gates, stages, all gates. Dots: scenes.",
     "removal": "Harm of replacing a share of the pixels: most attended, two controls, least attended.",
     "randomisation": "Similarity of masks to the trained ones when stages get random weights, from the top and from the"
     " bottom.",
+    "stability": "Mean correlation of the masks with those of the same image with noise, shifted, or through another"
+    " lens.",
     "before_after": "The same image with the most attended pixels, random ones of the same brightness, the same shape"
     " elsewhere, and the least attended pixels inpainted.",
 }
@@ -51,10 +54,22 @@ PICTURES = {
 """Picture files of each network."""
 
 
-def draw_detector(folder: Path, settings: ExplainConfig, frames: LabelledFrames, masks: Masks, found: Evidence) -> None:
-    """Draw all pictures of the detector into a folder."""
-    drawn = evenly_spaced(len(frames.images), settings.n_drawn)
-    draw_masks(folder / "masks_detect.png", frames.images[drawn], {name: one[drawn] for name, one in masks.items()})
+def draw_detector(
+    folder: Path,
+    settings: ExplainConfig,
+    frames: LabelledFrames,
+    masks: Masks,
+    found: Evidence,
+    descent: LabelledFrames,
+    along: Masks,
+) -> None:
+    """Draw all pictures of the detector into a folder.
+
+    `along` are the masks of the frames of one descent, of which `n_drawn` are drawn, from the highest to the lowest.
+    """
+    drawn = evenly_spaced(len(descent.images), settings.n_drawn)
+    shown = {name: one[drawn] for name, one in along.items()}
+    draw_masks(folder / "masks_detect.png", descent.images[drawn], shown, [descent.height_m[k] for k in drawn])
     draw_correlations(folder / "pcc_detect.png", found.summary, found.differences, found.tested, _DETECT)
     draw_localisation(folder / "localisation_detect.png", found.summary)
     _draw_interventions(folder, "detect", found, "decrease of the AP of a frame", higher_is_better=True)
@@ -69,10 +84,11 @@ def draw_detector(folder: Path, settings: ExplainConfig, frames: LabelledFrames,
     )
 
 
-def draw_navigator(folder: Path, settings: ExplainConfig, pairs: Pairs, masks: Masks, found: Evidence) -> None:
-    """Draw all pictures of the navigator into a folder."""
-    drawn = evenly_spaced(len(pairs.images), settings.n_drawn)
-    draw_masks(folder / "masks_navigate.png", pairs.images[drawn], {name: one[drawn] for name, one in masks.items()})
+def draw_navigator(
+    folder: Path, settings: ExplainConfig, pairs: Pairs, masks: Masks, found: Evidence, descent: Pairs, along: Masks
+) -> None:
+    """Draw all pictures of the navigator into a folder; `along` are the masks of the drawn pairs of one descent."""
+    draw_masks(folder / "masks_navigate.png", descent.images, along, descent.height_m)
     draw_correlations(folder / "pcc_navigate.png", found.summary, found.differences, found.tested, _NAVIGATE)
     _draw_interventions(folder, "navigate", found, "increase of the position error, m", higher_is_better=False)
     middle = len(pairs.images) // 2
@@ -90,3 +106,4 @@ def _draw_interventions(folder: Path, task: str, found: Evidence, unit: str, *, 
     draw_gates(folder / f"gates_{task}.png", found.gates, unit, higher_is_better)
     draw_removal(folder / f"removal_{task}.png", found.removal, unit, higher_is_better)
     draw_randomisation(folder / f"randomisation_{task}.png", found.randomisation)
+    draw_stability(folder / f"stability_{task}.png", found.stability)
