@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from perilune_train.detect.evaluate.matching import Detections
+from perilune_train.explain.causal.bins import binned
 from perilune_train.explain.causal.effects import (
     detection_effects,
     empty_shift,
@@ -12,7 +13,7 @@ from perilune_train.explain.causal.effects import (
     mask_effects,
     region,
 )
-from perilune_train.explain.causal.figures import binned, by_gate
+from perilune_train.explain.causal.figures import by_gate
 from perilune_train.explain.causal.pairs import CraterPairs
 
 CRATER = {

@@ -41,7 +41,8 @@ def crater_pairs(
     """Load the frames of a counterfactual dataset and the same frames of the dataset that it was rendered from.
 
     `removed` is the table of `read_removed`. Only craters that `selection` accepts in the factual frame, whole in the
-    image, are listed. Raises UserError if the second dataset has frames that the first does not have.
+    image, are listed. Raises UserError if there are none, or if the second dataset has frames that the first does not
+    have.
     """
     rows = frame_table(counterfactual, split)
     whole = frame_table(factual, split)
@@ -49,8 +50,12 @@ def crater_pairs(
     if known["frame_id"].tolist() != rows["frame_id"].tolist():
         found = f"{len(rows)} frames, {len(known)} of them in {factual.store}"
         raise UserError(counterfactual.store, "frames", found, "frames of the dataset that it was rendered from")
+    craters = _shown(factual, removed, rows, split, selection)
+    if craters.empty:
+        expected = "removed craters that are labelled and whole in a frame; remove more, with --craters-per-scene"
+        raise UserError(counterfactual.store, f"craters of split {split}", f"none of {len(removed)}", expected)
     images = load_images(factual, known, split), load_images(counterfactual, rows, split)
-    return CraterPairs(*images, rows[["frame_id", "scene_id"]], _shown(factual, removed, rows, split, selection))
+    return CraterPairs(*images, rows[["frame_id", "scene_id"]], craters)
 
 
 def read_removed(address: Address) -> pd.DataFrame:
