@@ -1,6 +1,7 @@
 """Effects of removed craters by size, freshness and Sun: tables, pictures, figures of metrics.json."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +24,20 @@ BINS = {
     "sun_elevation_deg": ("Sun, degrees", (0, 20, 35, 50, 90)),
 }
 """Label and edges of the bins of each property of a crater."""
+OUTSIDE = "outside"
+"""Name of the bin of values in no other bin; not drawn."""
 MOST_ROWS = 6
 """Gates that are drawn as bars, one row of panels each; more are drawn as a heat map."""
 
 
 def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
-    """Means of a column by bins of radius, freshness and Sun: property, bin, version, value, n, and map if present."""
+    """Means of a column by bins of radius, freshness and Sun: property, bin, version, value, n, and map if present.
+
+    The bin 3-5 has values above 3 and up to 5; "outside" has those in no bin.
+    """
     parts, keys = [], [name for name in ("map", "version") if name in table]
     for name, (label, edges) in BINS.items():
-        bins = pd.cut(table[name], edges).astype(str)
+        bins = pd.cut(table[name], edges, labels=_bin_names(edges)).astype(object).fillna(OUTSIDE)
         grouped = table.assign(bin=bins).dropna(subset=value).groupby([*keys, "bin"], sort=False)[value]
         means = grouped.agg(["mean", "size"]).reset_index()
         parts.append(means.rename(columns={"mean": "value", "size": "n"}).assign(property=label))
@@ -41,18 +47,12 @@ def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
 def bin_metrics(table: pd.DataFrame, prefix: str) -> Metrics:
     """Figures of `binned` for metrics.json: means <prefix>/<version>[/<map>]/<property>/<bin>, and numbers of views.
 
-    The bin of radii above 3 and up to 5 px is radius_px/3-5; radius_px/outside has the craters in no bin. The number of
-    crater views, the same for all maps, is <prefix>/<version>/<property>/<bin>_n.
+    The number of crater views, the same for all maps, is <prefix>/<version>/<property>/<bin>_n.
     """
     names = {label: name for name, (label, _) in BINS.items()}
-    short = {
-        (label, text): f"{low:g}-{high:g}"
-        for label, edges in BINS.values()
-        for text, low, high in zip(_bin_names(edges), edges[:-1], edges[1:], strict=True)
-    }
     metrics: Metrics = {}
     for row in table.to_dict("records"):
-        place = f"{names[row['property']]}/{short.get((row['property'], row['bin']), 'outside')}"
+        place = f"{names[row['property']]}/{row['bin']}"
         own = f"{row['version']}/{row['map']}" if "map" in row else row["version"]
         metrics[f"{prefix}/{own}/{place}"] = float(row["value"])
         metrics[f"{prefix}/{row['version']}/{place}_n"] = int(row["n"])
@@ -124,4 +124,4 @@ def _ticks(table: pd.DataFrame, bins: list[str]) -> list[str]:
 
 
 def _bin_names(edges: tuple[float, ...]) -> list[str]:
-    return [str(one) for one in pd.cut(pd.Series([], dtype=float), edges).cat.categories]
+    return [f"{low:g}-{high:g}" for low, high in pairwise(edges)]

@@ -12,6 +12,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
+from perilune_train.data.frames import load_images
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
@@ -22,8 +23,8 @@ from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.explain.causal import bins, figures
 from perilune_train.explain.causal.claims import Tested, detection_claim, pose_claim, reaction_claim
 from perilune_train.explain.causal.effects import detection_effects, filled_frames, mask_effects, with_found
-from perilune_train.explain.causal.pairs import CraterPairs, crater_pairs, read_removed
-from perilune_train.explain.causal.pose import pose_effects
+from perilune_train.explain.causal.pairs import CraterPairs, crater_pairs, read_removed, same_frames
+from perilune_train.explain.causal.pose import check_descents, pose_effects
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.stability import between
 from perilune_train.explain.inputs import frames_of
@@ -90,6 +91,12 @@ def causal_run(
     if gate not in detector.network.backbone.attentions:
         raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
     pairs = crater_pairs(opened, open_single(counterfactual), removed, split, config.labels)
+    # Report faults of the other inputs before anything is written.
+    if turned is not None:
+        same_frames(opened, open_single(turned), split)
+    if pose is not None:
+        check_descents(open_single(pose[0]), open_single(pose[1]), split)
+        navigator, architecture = load_navigator(pose[2], "stack")
     start_run(run, "explain", settings, inputs, state)
     rng = np.random.default_rng([settings.seed, 3])
     versions, shifts = _versions(opened, pairs, split, config.labels, settings, rng)
@@ -104,7 +111,6 @@ def causal_run(
     if turned is not None:
         tables["turned_sun"] = _turned(detector, opened, open_single(turned), split, checkpoint)
     if pose is not None:
-        navigator, architecture = load_navigator(pose[2], "stack")
         navigator = navigator.to(choose_device(settings.device))
         tables["pose_effects"] = pose_effects(
             navigator, architecture, open_single(pose[0]), open_single(pose[1]), split
@@ -150,15 +156,9 @@ def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, c
 
     Raises UserError if the second dataset has frames that the first does not have.
     """
-    labels = detector.config.labels
-    one, other = (load_split(dataset, split, labels).frames for dataset in (factual, turned))
-    known = int(other.table["frame_id"].isin(one.table["frame_id"]).sum())
-    if known < len(other.table):
-        found = f"{len(other.table)} frames, {known} of them in {factual.store}"
-        raise UserError(turned.store, "frames", found, "frames of the dataset that it was rendered from")
-    place = {frame_id: index for index, frame_id in enumerate(one.table["frame_id"])}
-    same = one.images[[place[frame_id] for frame_id in other.table["frame_id"]]]
-    masks = [detector_masks(detector.network, images, checkpoint) for images in (same, other.images)]
+    tables = same_frames(factual, turned, split)
+    images = [load_images(dataset, rows, split) for dataset, rows in zip((factual, turned), tables, strict=True)]
+    masks = [detector_masks(detector.network, one, checkpoint) for one in images]
     return between(masks[0], masks[1], "turned Sun")
 
 
