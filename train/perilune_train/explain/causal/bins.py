@@ -102,6 +102,7 @@ def _bars(axis: Axes, table: pd.DataFrame, bins: list[str]) -> None:
         name, colour = VERSIONS.get(str(version), ("with the crater", "black"))
         axis.bar(np.arange(len(bins)) + 0.2 * k, rows["value"], 0.19, color=colour, label=name)
     axis.set_xticks(np.arange(len(bins)) + 0.2, _ticks(table, bins), fontsize=8)
+    axis.set_xlim(-0.2, len(bins) - 0.2)
     axis.axhline(0, color="black", linewidth=0.8)
     axis.grid(axis="y", alpha=0.3)
 
