@@ -6,6 +6,7 @@ images, poses, labels and times are consistent.
 
 import hashlib
 import json
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import cv2
@@ -39,12 +40,13 @@ _PARABOLA = {"start_altitude_m": 1400.0, "end_altitude_m": 400.0, "downrange_m":
 class _Ground:
     """Craters on a plane and its brightness texture; every fourth crater is eroded."""
 
-    def __init__(self, rng: np.random.Generator, count: int):
+    def __init__(self, rng: np.random.Generator, count: int, removed: Collection[int] = ()):
         self.diameter_m = np.sort(np.clip(25.0 * (1 - rng.random(count)) ** -0.6, 25.0, 400.0))[::-1]
         half = _GROUND_TEXELS * _TEXEL_M / 2
         self.xy_m = rng.uniform(-half, half, (count, 2))
         worn = np.arange(count) % 4 == 3
         self.depth_m = self.diameter_m * np.where(worn, 0.01, 0.15)
+        self.depth_m[list(removed)] = 0
         axis = (np.arange(_GROUND_TEXELS) + 0.5) * _TEXEL_M - half
         height = cv2.GaussianBlur(rng.standard_normal((_GROUND_TEXELS, _GROUND_TEXELS)).astype(np.float32), (0, 0), 2)
         height *= 0.8
@@ -87,10 +89,12 @@ def build_dataset(
     seed: int = 7,
     jitter_m: float = 4.0,
     jitter_deg: float = 0.3,
+    removed: Mapping[str, Collection[int]] | None = None,
 ) -> Path:
     """Write a dataset with a number of trajectories for each split in `splits`.
 
-    Each trajectory has its own terrain, unless `scenes` gives the number of terrains.
+    Each trajectory has its own terrain, unless `scenes` gives the number of terrains. `removed` are craters without
+    depth by scene; their labels and all else stay.
     """
     splits = splits or {"train": 3, "val": 1, "test": 1}
     camera = Camera.from_field_of_view(side_px, side_px, 40.0)
@@ -105,7 +109,9 @@ def build_dataset(
         trajectory = f"t{number:03d}"
         rng = np.random.default_rng([seed, number])
         if scene not in grounds:
-            grounds[scene] = _Ground(np.random.default_rng([seed, 1000, int(scene[1:])]), craters)
+            grounds[scene] = _Ground(
+                np.random.default_rng([seed, 1000, int(scene[1:])]), craters, (removed or {}).get(scene, ())
+            )
             _add_scene(rows, scene, grounds[scene], recipe.key)
         nominal = NominalTrajectory.parabola(**_PARABOLA, azimuth_deg=float(rng.uniform(0, 360)))
         rows["trajectories"].append(

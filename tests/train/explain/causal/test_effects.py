@@ -11,8 +11,9 @@ from perilune_train.explain.causal.effects import (
     filled_frames,
     mask_effects,
     region,
+    with_found,
 )
-from perilune_train.explain.causal.figures import binned, by_gate
+from perilune_train.explain.causal.figures import by_gate
 from perilune_train.explain.causal.pairs import CraterPairs
 
 CRATER = {
@@ -114,18 +115,9 @@ def test_intervals_need_five_scenes():
     assert enough["low"] < 1.35 < enough["high"]
 
 
-def test_bins_keep_every_view():
+def test_a_placebo_that_was_not_drawn_finds_nothing():
     rows = [
-        {
-            "version": "factual",
-            "found": float(k % 2),
-            "radius_px": 2.0 + k,
-            "depth_ratio": 0.07,
-            "sun_elevation_deg": 25,
-        }
-        for k in range(6)
+        {"crater": k, "version": version, "score": 0.2 + 0.5 * k} for version in ("factual", "placebo") for k in (0, 1)
     ]
-    table = binned(pd.DataFrame(rows), "found")
-    by_size = table[table["property"] == "radius, px"]
-    assert by_size["n"].sum() == 6
-    assert (by_size["value"] * by_size["n"]).sum() == pytest.approx(3)
+    table = with_found(pd.DataFrame(rows), 0.6, [(3.0, 4.0), None])
+    assert table["found"].tolist()[:3] == [0, 1, 0] and np.isnan(table["found"].iloc[3])

@@ -27,8 +27,21 @@ def noise_image(rng, size=128):
 
 def test_block_means_by_hand():
     np.testing.assert_array_equal(block_means(np.arange(16).reshape(4, 4), 2), [[2.5, 4.5], [10.5, 12.5]])
-    with pytest.raises(ValueError, match=r"20 x 16 px.*multiples of 8 px"):
-        block_means(np.zeros((20, 16)), 8)
+
+
+def test_blocks_at_the_edges_may_be_smaller(rng):
+    np.testing.assert_array_equal(block_means(np.arange(15).reshape(3, 5), 2), [[3, 5, 6.5], [10.5, 12.5, 14]])
+    image = noise_image(rng)[:67, :101]
+    attended = rng.random(image.shape)
+    chosen = chosen_pixels(attended, 0.2, "most", 1, rng)
+    means, taken = block_means(attended, 8), block_means(chosen, 8)
+    assert means.shape == (9, 13) and set(np.unique(taken)) == {0, 1}
+    assert taken.sum() == round(0.2 * 9 * 13)
+    assert means[taken == 1].min() > means[taken == 0].max()
+    for moved in (random_like(image, chosen, rng), shifted_like(chosen, rng)):
+        assert moved.shape == image.shape and block_means(moved, 8).sum() == taken.sum()
+    effects = removal_effect(image[None], {"B_11": attended[None]}, {"B_11": 1}, lambda one: one.mean((1, 2)), rng)
+    assert np.isfinite(effects["after"]).all()
 
 
 @pytest.mark.parametrize(("which", "sign"), [("most", 1), ("least", 1), ("most", -1), ("least", -1)])
@@ -161,3 +174,25 @@ def test_the_ratio_is_to_the_stronger_control():
     errors = effects.assign(before=effects["after"], after=effects["before"])
     assert removal_summary(errors, higher_is_better=False)["ratio"].tolist() == [3.5]
     assert removal_summary(errors, higher_is_better=True)["ratio"].isna().all()
+
+
+def test_without_a_defined_measure_there_are_rows_and_no_ratio():
+    """AP is undefined in frames without labels; a map may have no other frames, or only in some removals."""
+    kinds = ("most", "least", "random", "shifted")
+    rows = [
+        {"map": name, "which": which, "how": "mean", "frame_index": 0, "overlap": 0.3, "before": before}
+        | {"after": after if which in defined else np.nan}
+        for name, before, after, defined in (
+            ("B_38", np.nan, 1.0, kinds),
+            ("B_11", 3.0, 1.0, kinds),
+            ("B_22", 3.0, 1.0, ("least", "random", "shifted")),
+        )
+        for which in kinds
+    ]
+    effects = pd.DataFrame(rows)
+    table = removal_summary(effects, higher_is_better=True).set_index("map")
+    assert list(table.index) == ["B_38", "B_11", "B_22"]
+    assert table.loc["B_38", [*kinds, "ratio"]].isna().all() and table["overlap"].tolist() == [0.3] * 3
+    assert table.loc["B_11", "ratio"] == 1 and np.isnan(table.loc["B_22", "ratio"])
+    alone = removal_summary(effects[effects["map"] == "B_38"], higher_is_better=True)
+    assert len(alone) == 1 and alone[[*kinds, "ratio"]].isna().all(axis=None)

@@ -135,5 +135,15 @@ def detection_effects(
     return pd.DataFrame(rows).merge(_facts(pairs), left_on="crater", right_index=True)
 
 
+def with_found(effects: pd.DataFrame, threshold: float, shifts: Sequence[tuple[float, float] | None]) -> pd.DataFrame:
+    """The table of `detection_effects` with the column found: 1 if the score reaches the threshold, else 0.
+
+    NaN for the placebo of a crater without free ground (a shift of None): nothing was inpainted for it.
+    """
+    missing = np.array([shift is None for shift in shifts], bool)[effects["crater"].to_numpy(int)]
+    found = (effects["score"] >= threshold).astype(float)
+    return effects.assign(found=found.mask((effects["version"] == "placebo") & missing))
+
+
 def _facts(pairs: CraterPairs) -> pd.DataFrame:
     return pairs.craters[["frame_id", "scene_id", "crater_id", "radius_px", "depth_ratio", "sun_elevation_deg"]]

@@ -10,19 +10,10 @@ from numpy.typing import NDArray
 
 from perilune_train.evaluation.pictures import save_figure, save_image
 from perilune_train.evaluation.spread import Resamples, draw_resamples, spreads
+from perilune_train.explain.causal.bins import VERSIONS
 from perilune_train.explain.causal.effects import region
 from perilune_train.explain.causal.pairs import CraterPairs
-from perilune_train.explain.page.bars import BLUE, GREY, ORANGE
 
-VERSIONS = {"rendered": ("crater removed, rendered again", BLUE), "inpainted": ("crater inpainted", ORANGE)} | {
-    "placebo": ("empty ground inpainted", GREY)
-}
-BINS = {
-    "radius_px": ("radius, px", (0, 3, 5, 10, 80)),
-    "depth_ratio": ("depth / diameter", (0, 0.05, 0.1, 0.15, 1)),
-    "sun_elevation_deg": ("Sun, degrees", (0, 20, 35, 50, 90)),
-}
-"""Label and edges of the bins of each property of a crater."""
 _CELL_PX = 256
 
 
@@ -30,10 +21,11 @@ def by_gate(effects: pd.DataFrame, rng: np.random.Generator) -> pd.DataFrame:
     """Mean change of every gate and version, with a 95 % interval over scenes: map, version, change, low, high, n.
 
     `effects` is the table of `mask_effects`. low and high are NaN with fewer than five scenes. n is the number of
-    crater views.
+    crater views with a value; without any, the change is NaN.
     """
     rows = []
-    for (block, version), own in effects.dropna(subset="change").groupby(["map", "version"], sort=False):
+    for (block, version), every in effects.groupby(["map", "version"], sort=False):
+        own = every.dropna(subset="change")
         low, high = scene_interval(own["change"].to_numpy(), own["scene_id"].tolist(), own["frame_id"].tolist(), rng)
         change = own["change"].mean()
         rows.append({"map": block, "version": version, "change": change, "low": low, "high": high, "n": len(own)})
@@ -54,17 +46,6 @@ def scene_interval(
     return interval or (float("nan"), float("nan"))
 
 
-def binned(table: pd.DataFrame, value: str) -> pd.DataFrame:
-    """Means of a column by bins of radius, freshness and Sun: property, bin, version, value, n, and map if present."""
-    parts, keys = [], [name for name in ("map", "version") if name in table]
-    for name, (label, edges) in BINS.items():
-        bins = pd.cut(table[name], edges).astype(str)
-        grouped = table.assign(bin=bins).dropna(subset=value).groupby([*keys, "bin"], sort=False)[value]
-        means = grouped.agg(["mean", "size"]).reset_index()
-        parts.append(means.rename(columns={"mean": "value", "size": "n"}).assign(property=label))
-    return pd.concat(parts, ignore_index=True)
-
-
 def draw_gate_effects(path: Path, gates: pd.DataFrame) -> None:
     """Draw the mean change of every gate in each version, with intervals where there are any."""
     blocks = list(dict.fromkeys(gates["map"]))
@@ -82,28 +63,6 @@ def draw_gate_effects(path: Path, gates: pd.DataFrame) -> None:
     axis.set_ylabel("mask with crater - without,\nstandard deviations of the gate", fontsize=9)
     axis.legend(fontsize=8)
     axis.grid(axis="y", alpha=0.3)
-    save_figure(path, figure)
-
-
-def draw_bins(path: Path, table: pd.DataFrame, label: str) -> None:
-    """Draw the means of `binned` as bars, one panel for each property; the number of crater views is below each bin."""
-    figure = Figure(figsize=(12, 3.6), layout="constrained")
-    for axis, (title, edges) in zip(figure.subplots(1, len(BINS), sharey=True), BINS.values(), strict=True):
-        names = [str(one) for one in pd.cut(pd.Series([], dtype=float), edges).cat.categories]
-        own = table[table["property"] == title]
-        versions = list(dict.fromkeys(own["version"]))
-        for k, version in enumerate(versions):
-            rows = own[own["version"] == version].set_index("bin").reindex(names)
-            name, colour = VERSIONS.get(version, ("with the crater", "black"))
-            axis.bar(np.arange(len(names)) + 0.2 * k, rows["value"], 0.19, color=colour, label=name)
-        counts = own.groupby("bin")["n"].max().reindex(names).fillna(0).astype(int)
-        ticks = [f"{one}\nn = {n}" for one, n in zip(names, counts, strict=True)]
-        axis.set_xticks(np.arange(len(names)) + 0.2, ticks, fontsize=8)
-        axis.axhline(0, color="black", linewidth=0.8)
-        axis.set_xlabel(title)
-    figure.axes[0].set_ylabel(label, fontsize=9)
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, names, ncols=4, loc="outside upper center", fontsize=8)
     save_figure(path, figure)
 
 

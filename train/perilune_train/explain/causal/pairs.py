@@ -41,16 +41,29 @@ def crater_pairs(
     """Load the frames of a counterfactual dataset and the same frames of the dataset that it was rendered from.
 
     `removed` is the table of `read_removed`. Only craters that `selection` accepts in the factual frame, whole in the
-    image, are listed. Raises UserError if the second dataset has frames that the first does not have.
+    image, are listed. Raises UserError if there are none, or if the second dataset has frames that the first does not
+    have.
     """
-    rows = frame_table(counterfactual, split)
-    whole = frame_table(factual, split)
+    known, rows = same_frames(factual, counterfactual, split)
+    craters = _shown(factual, removed, rows, split, selection)
+    if craters.empty:
+        expected = "removed craters that are labelled and whole in a frame; remove more, with --craters-per-scene"
+        raise UserError(counterfactual.store, f"craters of split {split}", f"none of {len(removed)}", expected)
+    images = load_images(factual, known, split), load_images(counterfactual, rows, split)
+    return CraterPairs(*images, rows[["frame_id", "scene_id"]], craters)
+
+
+def same_frames(factual: Dataset, other: Dataset, split: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The frames of a split of a dataset that `other` has too, and those of `other`: `frame_table`, in one order.
+
+    Raises UserError if the second dataset has frames that the first does not have.
+    """
+    rows, whole = (frame_table(dataset, split) for dataset in (other, factual))
     known = whole[whole["frame_id"].isin(rows["frame_id"])].reset_index(drop=True)
     if known["frame_id"].tolist() != rows["frame_id"].tolist():
         found = f"{len(rows)} frames, {len(known)} of them in {factual.store}"
-        raise UserError(counterfactual.store, "frames", found, "frames of the dataset that it was rendered from")
-    images = load_images(factual, known, split), load_images(counterfactual, rows, split)
-    return CraterPairs(*images, rows[["frame_id", "scene_id"]], _shown(factual, removed, rows, split, selection))
+        raise UserError(other.store, "frames", found, "frames of the dataset that it was rendered from")
+    return known, rows
 
 
 def read_removed(address: Address) -> pd.DataFrame:

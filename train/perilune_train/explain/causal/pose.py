@@ -1,5 +1,6 @@
 """Effect of removed craters on the motion that the stack navigator estimates."""
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -7,9 +8,12 @@ import pandas as pd
 
 from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
+from perilune_train.data.frames import frame_table
 from perilune_train.models.navigator import StackNavigator
 from perilune_train.navigate.data.trajectories import Trajectory, load_split
 from perilune_train.navigate.network import predict
+
+_TRAJECTORY = ["scene_id", "trajectory_id"]
 
 
 def pose_effects(
@@ -21,13 +25,11 @@ def pose_effects(
     difference between both estimates). Raises UserError if the counterfactual dataset lacks frames of a trajectory: its
     pairs would not be consecutive; render it with as many frames per trajectory as the dataset has.
     """
+    check_descents(factual, counterfactual, split)
     originals = {one.ids: one for one in load_split(factual, split)}
     tables = []
     for changed in load_split(counterfactual, split):
-        original = originals.get(changed.ids)
-        if original is None or original.n_pairs != changed.n_pairs:
-            found = f"{changed.n_pairs + 1} frames of {'/'.join(changed.ids)}"
-            raise UserError(counterfactual.store, "frames", found, "all frames of a trajectory of the dataset")
+        original = originals[changed.ids]
         estimates = [predict(navigator, architecture, one)[0] for one in (original, changed)]
         before, after = (_errors(one, original) for one in estimates)
         steps = ["/".join([*changed.ids, str(step)]) for step in range(changed.n_pairs)]
@@ -35,6 +37,18 @@ def pose_effects(
         columns = {"frame_id": steps, "scene_id": changed.ids[0], "before": before, "after": after, "moved_m": moved}
         tables.append(pd.DataFrame(columns))
     return pd.concat(tables, ignore_index=True)
+
+
+def check_descents(factual: Dataset, counterfactual: Dataset, split: str) -> None:
+    """Raise UserError unless the trajectories of a split of the second dataset have all frames of the first one."""
+    whole, changed = (
+        Counter(frame_table(one, split)[_TRAJECTORY].agg("/".join, axis=1)) for one in (factual, counterfactual)
+    )
+    for trajectory, count in changed.items():
+        if whole[trajectory] != count:
+            found = f"{count} frames of {trajectory}"
+            expected = "all frames of a trajectory of the dataset; render with --frames-per-trajectory 1000"
+            raise UserError(counterfactual.store, "frames", found, expected)
 
 
 def _errors(translation_m: np.ndarray, trajectory: Trajectory) -> np.ndarray:

@@ -12,6 +12,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
+from perilune_train.data.frames import load_images
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import Detections
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
@@ -19,10 +20,11 @@ from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
-from perilune_train.explain.causal import figures
-from perilune_train.explain.causal.effects import detection_effects, filled_frames, mask_effects
-from perilune_train.explain.causal.pairs import CraterPairs, crater_pairs, read_removed
-from perilune_train.explain.causal.pose import pose_effects
+from perilune_train.explain.causal import bins, figures
+from perilune_train.explain.causal.claims import Tested, detection_claim, pose_claim, reaction_claim
+from perilune_train.explain.causal.effects import detection_effects, filled_frames, mask_effects, with_found
+from perilune_train.explain.causal.pairs import CraterPairs, crater_pairs, read_removed, same_frames
+from perilune_train.explain.causal.pose import check_descents, pose_effects
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.stability import between
 from perilune_train.explain.inputs import frames_of
@@ -36,7 +38,7 @@ CAPTIONS = {
     "gates_causal.png": "Change of each gate's mask around single craters: crater removed from the ground and rendered"
     " again; the same pixels inpainted; empty ground inpainted.",
     "detections_causal.png": "Share of craters that the detector finds at its threshold, with and without the crater.",
-    "gate_causal.png": "Change of the headline's gate by size, freshness and Sun.",
+    "bins_causal.png": "Change of every gate by size, freshness and Sun. n: views of craters.",
     "before_after_causal.png": "A frame with craters, the same frame rendered without the outlined ones, and one"
     " gate's mask of both.",
 }
@@ -89,6 +91,12 @@ def causal_run(
     if gate not in detector.network.backbone.attentions:
         raise UserError("--gate", "gate", gate, f"one of {', '.join(detector.network.backbone.attentions)}")
     pairs = crater_pairs(opened, open_single(counterfactual), removed, split, config.labels)
+    # Report faults of the other inputs before anything is written.
+    if turned is not None:
+        same_frames(opened, open_single(turned), split)
+    if pose is not None:
+        check_descents(open_single(pose[0]), open_single(pose[1]), split)
+        navigator, architecture = load_navigator(pose[2], "stack")
     start_run(run, "explain", settings, inputs, state)
     rng = np.random.default_rng([settings.seed, 3])
     versions, shifts = _versions(opened, pairs, split, config.labels, settings, rng)
@@ -96,14 +104,13 @@ def causal_run(
     masks = {version: detector_masks(detector.network, images, checkpoint) for version, images in versions.items()}
     moved = mask_effects(pairs, masks, shifts)
     found = detection_effects(pairs, lambda images: _detect(detector, images), versions)
-    found = found.assign(found=(found["score"] >= threshold).astype(float))
+    found = with_found(found, threshold, shifts)
     gates = figures.by_gate(moved, rng)
     tables = {"mask_effects": moved, "detection_effects": found, "gate_effects": gates}
-    tables |= {"mask_bins": figures.binned(moved, "change"), "detection_bins": figures.binned(found, "found")}
+    tables |= {"mask_bins": bins.binned(moved, "change"), "detection_bins": bins.binned(found, "found")}
     if turned is not None:
         tables["turned_sun"] = _turned(detector, opened, open_single(turned), split, checkpoint)
     if pose is not None:
-        navigator, architecture = load_navigator(pose[2], "stack")
         navigator = navigator.to(choose_device(settings.device))
         tables["pose_effects"] = pose_effects(
             navigator, architecture, open_single(pose[0]), open_single(pose[1]), split
@@ -113,10 +120,9 @@ def causal_run(
             table.to_parquet(aside, index=False)
     _draw(run.root, pairs, masks, tables, gate)
     mark_files(run.root, list(CAPTIONS), "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark))
-    metrics = _metrics(tables, gate) | terrain
-    claims = _claims(metrics, gates, gate)
-    if pose is not None:
-        claims.append(_pose_claim(tables["pose_effects"], rng))
+    tested = _tested(tables, gate, rng)
+    metrics = _metrics(tables, gate) | _p_values(tested) | terrain
+    claims = [one.claim for one in tested.values()]
     write_text(run.root / "claims.json", json.dumps(claims, indent=2) + "\n")
     write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
     for claim in claims:
@@ -146,21 +152,20 @@ def _detect(detector: Detector, images: NDArray[np.uint8]) -> list[Detections]:
 
 
 def _turned(detector: Detector, factual: Dataset, turned: Dataset, split: str, checkpoint: Path) -> pd.DataFrame:
-    """Similarity of the masks of the same poses under both Suns: map, change, frame_index, pearson."""
-    labels = detector.config.labels
-    one, other = (load_split(dataset, split, labels).frames for dataset in (factual, turned))
-    place = {frame_id: index for index, frame_id in enumerate(one.table["frame_id"])}
-    same = one.images[[place[frame_id] for frame_id in other.table["frame_id"]]]
-    masks = [detector_masks(detector.network, images, checkpoint) for images in (same, other.images)]
+    """Similarity of the masks of the same poses under both Suns: map, change, frame_index, pearson.
+
+    Raises UserError if the second dataset has frames that the first does not have.
+    """
+    tables = same_frames(factual, turned, split)
+    images = [load_images(dataset, rows, split) for dataset, rows in zip((factual, turned), tables, strict=True)]
+    masks = [detector_masks(detector.network, one, checkpoint) for one in images]
     return between(masks[0], masks[1], "turned Sun")
 
 
 def _draw(folder: Path, pairs: CraterPairs, masks: dict, tables: dict[str, pd.DataFrame], gate: str) -> None:
     figures.draw_gate_effects(folder / "gates_causal.png", tables["gate_effects"])
-    figures.draw_bins(folder / "detections_causal.png", tables["detection_bins"], "share of craters that are found")
-    own = tables["mask_bins"][tables["mask_bins"]["map"] == gate]
-    label = f"change of {gate},\nstandard deviations of the gate"
-    figures.draw_bins(folder / "gate_causal.png", own, label)
+    bins.draw_bins(folder / "detections_causal.png", {"share of craters that are found": tables["detection_bins"]})
+    bins.draw_gate_bins(folder / "bins_causal.png", tables["mask_bins"])
     image = int(np.bincount(pairs.craters["image"].to_numpy()).argmax())
     both = {version: masks[version][gate] for version in ("factual", "rendered")}
     figures.draw_pair(folder / "before_after_causal.png", pairs, both, image, gate)
@@ -181,56 +186,19 @@ def _metrics(tables: dict[str, pd.DataFrame], gate: str) -> Metrics:
     if "turned_sun" in tables:
         means = tables["turned_sun"].groupby("map", sort=False)["pearson"].mean()
         metrics |= {f"turned_sun/{block}": float(value) for block, value in means.items()}
-    return metrics
+    metrics |= bins.bin_metrics(tables["mask_bins"], "bins")
+    return metrics | bins.bin_metrics(tables["detection_bins"], "found_bins")
 
 
-def _claims(metrics: Metrics, gates: pd.DataFrame, gate: str) -> list[dict[str, str]]:
-    own = gates[gates["map"] == gate].set_index("version")
-    rendered, placebo = own.loc["rendered"], own.loc["placebo"] if "placebo" in own.index else None
-    known = bool(np.isfinite(rendered["low"]))
-    outside = known and (rendered["low"] > 0 or rendered["high"] < 0)
-    nulls = f"crater inpainted {float(own['change']['inpainted']):.2f}"
-    if placebo is not None:
-        nulls += f"; empty ground inpainted {placebo['change']:.2f} ({placebo['low']:.2f} to {placebo['high']:.2f})"
-    beyond = placebo is None or abs(rendered["change"]) > abs(placebo["change"])
-    verdict = "undecided: fewer than 5 scenes" if not known else "holds" if outside and beyond else "does not hold"
-    found = {version: metrics.get(f"found/{version}") for version in ("factual", "rendered", "inpainted", "placebo")}
-    claims = [
-        {
-            "claim": f"Detector: {gate} reacts to single craters (mask with - without one, deviations of the gate)",
-            "figure": f"{rendered['change']:.2f}",
-            "interval": f"{rendered['low']:.2f} to {rendered['high']:.2f}" if known else "none: fewer than 5 scenes",
-            "nulls": nulls,
-            "verdict": verdict,
-            "picture": "gates_causal.png",
-        },
-        {
-            "claim": "The detector finds a crater because of the crater: found with it, not without it",
-            "figure": f"{found['factual']:.2f} with, {found['rendered']:.2f} without",
-            "interval": "by scene in detection_effects.parquet",
-            "nulls": f"inpainted {found['inpainted']:.2f}, other ground inpainted {found['placebo']:.2f}",
-            "verdict": "holds" if _below(found["rendered"], found["factual"]) else "does not hold",
-            "picture": "detections_causal.png",
-        },
-    ]
-    return claims
-
-
-def _pose_claim(effects: pd.DataFrame, rng: np.random.Generator) -> dict[str, str]:
-    before, after, moved_m = (np.sqrt((effects[name] ** 2).mean()) for name in ("before", "after", "moved_m"))
-    harm = (effects["after"] - effects["before"]).to_numpy()
-    low, high = figures.scene_interval(harm, effects["scene_id"].tolist(), effects["frame_id"].tolist(), rng)
-    known = bool(np.isfinite(low))
-    return {
-        "claim": "Navigator: single craters matter (position error of a step without the removed craters)",
-        "figure": f"r.m.s. {before:.3f} m with, {after:.3f} m without; estimates move by {moved_m:.3f} m",
-        "interval": f"mean increase {low:.3f} to {high:.3f} m" if known else "none: fewer than 5 scenes",
-        "nulls": "-",
-        "verdict": "undecided: fewer than 5 scenes" if not known else "holds" if low > 0 else "does not hold",
-        "picture": "before_after_causal.png",
+def _tested(tables: dict[str, pd.DataFrame], gate: str, rng: np.random.Generator) -> dict[str, Tested]:
+    """Claims with their p, by the prefix of their keys in metrics.json."""
+    tested = {
+        "gate": reaction_claim(tables["mask_effects"], tables["gate_effects"], gate),
+        "found": detection_claim(tables["detection_effects"], rng),
     }
+    return tested | ({"pose": pose_claim(tables["pose_effects"], rng)} if "pose_effects" in tables else {})
 
 
-def _below(share: object, other: object) -> bool:
-    """Whether a share is less than a tenth of another."""
-    return isinstance(share, float) and isinstance(other, float) and share < 0.1 * other
+def _p_values(tested: dict[str, Tested]) -> Metrics:
+    metrics: Metrics = {f"{name}_p": one.p for name, one in tested.items()}
+    return metrics | {f"{name}_p_placebo": tested[name].p_placebo for name in ("gate", "found")}

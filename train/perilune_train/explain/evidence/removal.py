@@ -135,34 +135,44 @@ def removal_summary(effects: pd.DataFrame, higher_is_better: bool) -> pd.DataFra
     `effects` is the table of `removal_effect`. Harm is the mean over frames of before - after, or of after - before if
     lower values are better. Columns: map, how, most, least, random, shifted (harms), control (the control that harms
     more), ratio (most / control; NaN unless the control's harm is above 0), overlap (mean share of the control's pixels
-    that are among the most attended ones; where the other pixels do no harm, the ratio is about 1 / overlap).
+    that are among the most attended ones; where the other pixels do no harm, the ratio is about 1 / overlap). A harm is
+    NaN if no frame has a value.
     """
     change = effects["before"] - effects["after"]
     harm = effects.assign(harm=change if higher_is_better else -change)
-    table = harm.pivot_table(index=["map", "how"], columns="which", values="harm", sort=False).reset_index()
-    table.columns.name = None
+    # A pivot table would leave out maps, and removals, without any value.
+    means = harm.groupby(["map", "how", "which"])["harm"].mean()
+    table = effects[["map", "how"]].drop_duplicates(ignore_index=True)
+    pairs = list(zip(table["map"], table["how"], strict=True))
+    for which in ("most", "least", *CONTROLS):
+        table[which] = [float(means.get((*pair, which), np.nan)) for pair in pairs]
     controls = table[list(CONTROLS)]
     table["control"] = controls.fillna(-np.inf).idxmax(axis=1)
     table["ratio"] = (table["most"] / controls.max(axis=1)).where(controls.max(axis=1) > 0)
     overlaps = effects.groupby(["map", "how", "which"])["overlap"].mean()
-    table["overlap"] = [overlaps[key] for key in zip(table["map"], table["how"], table["control"], strict=True)]
+    table["overlap"] = [overlaps[(*pair, control)] for pair, control in zip(pairs, table["control"], strict=True)]
     return table
 
 
 def block_means(values: NDArray, block_px: int) -> NDArray[np.float64]:
-    """Means (height / block_px, width / block_px) of the blocks of values (height, width).
+    """Means (rows, columns) of the blocks of values (height, width), from the upper left.
 
-    Raises ValueError if a side is not a multiple of block_px.
+    Blocks at the right and at the lower edge are smaller if a side is not a multiple of block_px.
     """
-    height, width = values.shape
-    if height % block_px or width % block_px:
-        raise ValueError(f"image of {height} x {width} px, expected sides that are multiples of {block_px} px")
-    blocks = values.reshape(height // block_px, block_px, width // block_px, block_px)
-    return blocks.mean(axis=(1, 3), dtype=np.float64)
+    sums, sizes = (_block_sums(one, block_px) for one in (values, np.ones(values.shape)))
+    return sums / sizes
+
+
+def _block_sums(values: NDArray, block_px: int) -> NDArray[np.float64]:
+    rows, columns = (-(-side // block_px) for side in values.shape)
+    padding = [(0, count * block_px - side) for count, side in zip((rows, columns), values.shape, strict=True)]
+    blocks = np.pad(values, padding).reshape(rows, block_px, columns, block_px)
+    return blocks.sum(axis=(1, 3), dtype=np.float64)
 
 
 def _pixels(blocks: NDArray[np.integer], shape: tuple[int, ...], block_px: int) -> NDArray[np.bool_]:
     """The pixels (height, width) of blocks given by their flat numbers."""
-    chosen = np.zeros((shape[0] // block_px, shape[1] // block_px), bool)
+    rows, columns = (-(-side // block_px) for side in shape)
+    chosen = np.zeros((rows, columns), bool)
     chosen.flat[blocks] = True
-    return chosen.repeat(block_px, axis=0).repeat(block_px, axis=1)
+    return chosen.repeat(block_px, axis=0).repeat(block_px, axis=1)[: shape[0], : shape[1]]
