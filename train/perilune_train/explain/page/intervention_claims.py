@@ -28,8 +28,10 @@ def removal_claim(found: Evidence, task: str, unit: str, picture: str, *, higher
     controls = (
         f"random {row['random']:.3f}, same shape elsewhere {row['shifted']:.3f}, least attended {row['least']:.3f}"
     )
-    scenes = found.removal["scene_id"].nunique()
-    if math.isfinite(row["ratio"]):
+    scenes = found.removal.loc[found.removal["before"].notna(), "scene_id"].nunique()
+    if math.isnan(row["most"]):
+        times = "no image with a value"
+    elif math.isfinite(row["ratio"]):
         times = f"{row['ratio']:.1f} times the stronger control"
     else:
         times = "the stronger control does no harm, so there is no ratio"
