@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import typer
 from PIL import Image
 from tests.helpers import in_process
 from tests.helpers.drawn_dataset import seal
@@ -18,6 +19,8 @@ from tests.train.report.conftest import BLOCKS, HOSTILE
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError, run_command_line
+from perilune_train.paper.detections import read_detections
+from perilune_train.report.command import report as report_of_command_line
 from perilune_train.report.detection import detection_section
 from perilune_train.report.explanation import explanation_section
 from perilune_train.report.frames import read_masks
@@ -145,6 +148,8 @@ def test_the_side_of_a_bowl_that_faces_the_sun_is_bright():
     [
         (lambda c: c.pop("low"), "low"),
         (lambda c: c.update(low=np.zeros(5, np.float32)), "low"),
+        (lambda c: c.update(low=np.array([0, np.nan], np.float32)), "low"),
+        (lambda c: c.update(high=np.array([np.inf, 2], np.float32)), "high"),
         (lambda c: c.update(B_11=np.zeros((4, 8, 8))), "B_11"),
         (lambda c: c.update(B_11=np.zeros((3, 8, 8), np.uint8)), "B_11"),
         (lambda c: c.update(frame_ids=np.array([{}], object)), "masks"),
@@ -200,6 +205,38 @@ def test_a_damaged_file_is_named_in_one_line(report_runs, tmp_path, read, name, 
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("column", "value"), [("x0_px", np.nan), ("x1_px", np.inf), ("score", np.inf), ("score", "high")]
+)
+def test_detections_that_are_no_finite_numbers_are_refused(report_data, report_runs, tmp_path, column, value):
+    run = Path(shutil.copytree(report_runs / "detect/demo", tmp_path / "demo"))
+    table = pd.read_parquet(run / "detections.parquet").assign(**{column: value})
+    table.to_parquet(run / "detections.parquet")
+    with pytest.raises(UserError, match=rf"detections\.parquet: {column}: got .*, expected finite numbers"):
+        read_detections(run, str(report_data / "detect"))
+
+
+def half(path: Path) -> None:
+    """Truncate a file to its first half."""
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+@pytest.mark.parametrize(
+    "name", ["runs/explain/demo/pcc_detect.png", "data/detect/frames/s004/t004/000001.png"], ids=["picture", "frame"]
+)
+def test_half_a_png_is_named_in_one_line(report_data, report_runs, tmp_path, name):
+    for folder, own in (("data", report_data), ("runs", report_runs)):
+        shutil.copytree(own, tmp_path / folder)
+    half(tmp_path / name)
+    given = ["--dataset", tmp_path / "data", "--runs", tmp_path / "runs", "--out", tmp_path / "out"]
+    done = report_command("--name", "demo", *given)
+    # A progress bar may be above the line of the error.
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error: "))
+    assert Path(name).name in line and not (tmp_path / "out").exists()
+
+
 def test_a_damaged_file_leaves_no_report(report_data, report_runs, tmp_path):
     runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
     (runs / "detect/demo/detections.parquet").write_text("no table")
@@ -208,24 +245,21 @@ def test_a_damaged_file_leaves_no_report(report_data, report_runs, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command(report_data, report_runs, tmp_path):
-    import typer
-
-    from perilune_train.report.command import report
-
+def report_command(*arguments: object):
+    """Call `perilune-train report` in this process."""
     app = typer.Typer(pretty_exceptions_enable=False)
-    app.command()(report)
+    app.command()(report_of_command_line)
+    return in_process.call(lambda: run_command_line(app), *arguments)
 
-    def call(*arguments: object):
-        return in_process.call(lambda: run_command_line(app), *arguments)
 
+def test_the_command(report_data, report_runs, tmp_path):
     given = ["--dataset", report_data, "--runs", report_runs, "--out", tmp_path / "out"]
-    done = call("--name", "demo", *given)
+    done = report_command("--name", "demo", *given)
     assert done.returncode == 0 and (tmp_path / "out/report.html").is_file(), done.stderr
-    done = call("--name", "../demo", *given)
+    done = report_command("--name", "../demo", *given)
     assert done.returncode == 2 and "--name" in done.stderr and done.stderr.count("\n") == 1
     nothing = tmp_path / "nothing"
-    done = call("--kind", "paper", "--dataset", nothing, "--runs", nothing, "--out", tmp_path / "none")
+    done = report_command("--kind", "paper", "--dataset", nothing, "--runs", nothing, "--out", tmp_path / "none")
     assert done.returncode == 2 and "no dataset" in done.stderr and not (tmp_path / "none").exists()
 
 
