@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import typer
 from PIL import Image
+from tests.helpers import in_process
 from tests.helpers.drawn_dataset import build_dataset
 
 from perilune_shared.config import to_yaml
 from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.errors import run_command_line
 from perilune_train.detect.config import DetectConfig
 from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.report.command import report as report_of_command_line
 from perilune_train.report.content import Report
 from perilune_train.report.page import SUMMARY, gather, html_of
 from perilune_train.report.summary import summary_of
@@ -83,6 +87,13 @@ def make_data(root: Path) -> Path:
     build_dataset(root / "detect", "detect", n_frames=4)
     build_dataset(root / "nav", "nav", splits={"train": 1, "val": 1, "test": 1}, scenes=1, n_frames=4)
     return root
+
+
+def report_command(*arguments: object):
+    """Call `perilune-train report` in this process."""
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(report_of_command_line)
+    return in_process.call(lambda: run_command_line(app), *arguments)
 
 
 @pytest.fixture(scope="session")
