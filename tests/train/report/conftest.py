@@ -26,6 +26,7 @@ HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.ha
 """A name that runs code wherever it is not escaped, and that matplotlib reads as mathematics."""
 BLOCKS = {"B_11": 48, "B_31": 12}
 """Gates of the masks, and the side of their masks, pixels."""
+HEADLINE = "the mask of B_11 follows craters: holds (detector); removing what it marks hurts 4.1 times as much: holds."
 METHODS = ("stack", "klt", "nominal")
 
 
@@ -67,7 +68,7 @@ def make_runs(root: Path, data: Path, hostile: str = "") -> Path:
     write_metrics(navigate, errors)
     explain = root / "explain" / "demo"
     explain.mkdir(parents=True)
-    write_metrics(explain, {"frames": 4})
+    write_metrics(explain, {"frames": 4, "headline": HEADLINE + hostile})
     Image.fromarray(np.zeros((40, 2000, 3), np.uint8)).save(explain / "pcc_detect.png")
     claims = [
         {"claim": f"gates see craters {hostile}", "figure": "0.3", "verdict": "holds", "picture": "pcc_detect.png"}

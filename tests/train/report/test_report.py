@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from tests.helpers.drawn_dataset import seal
 from tests.helpers.hostile import rewrite
-from tests.train.report.conftest import BLOCKS, HOSTILE, report_command
+from tests.train.report.conftest import BLOCKS, HEADLINE, HOSTILE, report_command
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
@@ -154,8 +154,27 @@ def test_the_summary_has_the_figures(report):
     assert "| gates see craters | 0.3 | - | - | holds | pcc\\_detect.png |" in text.replace("craters  |", "craters |")
 
 
+def test_the_headline_of_the_explanation_is_first(report, page):
+    assert report.summary[0] == f"demo: {HEADLINE}"
+    (section,) = (one for one in report.sections if one.title == "Explanation")
+    assert section.lead[0] == HEADLINE and section.lead[1].startswith("Claims: ")
+    lines = summary_of(report).splitlines()
+    assert lines[2].replace("\\", "") == f"- demo: {HEADLINE}"
+    assert re.search(r"<h1>.*?<li>(.*?)</li>", page.read_text(), re.S)[1] == f"demo: {HEADLINE}"
+
+
+@pytest.mark.parametrize("headline", [None, "", 3])
+def test_a_run_without_a_headline_shows_its_claims(report_data, report_runs, tmp_path, headline):
+    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    write_metrics(runs / "explain/demo", {} if headline is None else {"headline": headline})
+    report = gather("demo", "demo", report_data, runs)
+    (section,) = (one for one in report.sections if one.title == "Explanation")
+    assert section.lead == ("Claims: 1; holds: 1.",) and report.summary[0].startswith("demo: AP")
+
+
 def test_hostile_names_stay_texts(hostile_page):
     text = hostile_page.read_text()
+    assert html.escape(HEADLINE + HOSTILE[:9]) in text
     assert "window.hacked" in text
     assert not re.search(r"<script>window|<img src=x", text)
     assert "\u2028" not in re.search(r"<script type=.application/json.*?</script>", text, re.S)[0]

@@ -166,7 +166,9 @@ def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
 
 
 def _headlines(opened: _Opened) -> list[str]:
-    lines = [detection.headline(run) for run in opened.detect]
+    """One line for each run; what the gates show is first."""
+    lines = [f"{run.name}: {found}" for run in opened.explain if (found := explanation.headline_of(run))]
+    lines += [detection.headline(run) for run in opened.detect]
     lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
     return lines + [navigation.headline(run) for run in opened.navigate]
 
