@@ -20,6 +20,7 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of
 from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.report import command
 from perilune_train.report.ground import shaded_ground
 from perilune_train.report.page import SUMMARY, gather, json_block, write_report
 from perilune_train.report.pictures import drawing, svg_of
@@ -219,11 +220,21 @@ def test_the_command(report_data, report_runs, tmp_path):
     given = ["--dataset", report_data, "--runs", report_runs, "--out", tmp_path / "out"]
     done = report_command("--name", "demo", *given)
     assert done.returncode == 0 and (tmp_path / "out/report.html").is_file(), done.stderr
+    assert re.search(r"report\.html: \d\.\d MB, ", done.stderr.replace("\n", " ")) and "warning" not in done.stderr
     done = report_command("--name", "../demo", *given)
     assert done.returncode == 2 and "--name" in done.stderr and done.stderr.count("\n") == 1
     nothing = tmp_path / "nothing"
     done = report_command("--kind", "paper", "--dataset", nothing, "--runs", nothing, "--out", tmp_path / "none")
     assert done.returncode == 2 and "no dataset" in done.stderr and not (tmp_path / "none").exists()
+
+
+def test_a_page_above_15_mb_is_written_with_a_warning(report_data, report_runs, tmp_path, monkeypatch):
+    assert command.USUAL_MB == 15
+    monkeypatch.setattr(command, "USUAL_MB", 0.05)
+    done = report_command("--name", "demo", "--dataset", report_data, "--runs", report_runs, "--out", tmp_path / "out")
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("warning: "))
+    size = (tmp_path / "out/report.html").stat().st_size / 1e6
+    assert done.returncode == 0 and f"report.html: size: got {size:.1f} MB, expected below 0.05 MB" in line
 
 
 def test_hostile_names_of_frames_are_refused(report_data, report_runs, tmp_path):
