@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import typer
 from PIL import Image
+from tests.helpers import in_process
 from tests.helpers.drawn_dataset import build_dataset
 
 from perilune_shared.config import to_yaml
 from perilune_shared.dataset.manifest import open_dataset
+from perilune_shared.errors import run_command_line
 from perilune_train.detect.config import DetectConfig
 from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.report.command import report as report_of_command_line
 from perilune_train.report.content import Report
 from perilune_train.report.page import SUMMARY, gather, html_of
 from perilune_train.report.summary import summary_of
@@ -22,6 +26,7 @@ HOSTILE = "</script><script>window.hacked=1</script><img src=x onerror=window.ha
 """A name that runs code wherever it is not escaped, and that matplotlib reads as mathematics."""
 BLOCKS = {"B_11": 48, "B_31": 12}
 """Gates of the masks, and the side of their masks, pixels."""
+HEADLINE = "the mask of B_11 follows craters: holds (detector); removing what it marks hurts 4.1 times as much: holds."
 METHODS = ("stack", "klt", "nominal")
 
 
@@ -63,7 +68,7 @@ def make_runs(root: Path, data: Path, hostile: str = "") -> Path:
     write_metrics(navigate, errors)
     explain = root / "explain" / "demo"
     explain.mkdir(parents=True)
-    write_metrics(explain, {"frames": 4})
+    write_metrics(explain, {"frames": 4, "headline": HEADLINE + hostile})
     Image.fromarray(np.zeros((40, 2000, 3), np.uint8)).save(explain / "pcc_detect.png")
     claims = [
         {"claim": f"gates see craters {hostile}", "figure": "0.3", "verdict": "holds", "picture": "pcc_detect.png"}
@@ -83,6 +88,13 @@ def make_data(root: Path) -> Path:
     build_dataset(root / "detect", "detect", n_frames=4)
     build_dataset(root / "nav", "nav", splits={"train": 1, "val": 1, "test": 1}, scenes=1, n_frames=4)
     return root
+
+
+def report_command(*arguments: object):
+    """Call `perilune-train report` in this process."""
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(report_of_command_line)
+    return in_process.call(lambda: run_command_line(app), *arguments)
 
 
 @pytest.fixture(scope="session")

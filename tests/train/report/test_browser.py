@@ -3,6 +3,7 @@
 import importlib.resources
 import io
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.train.report.needed import needed
+from tests.train.report.pdf import images_of
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.ellipse import Ellipses
@@ -20,7 +23,7 @@ _path = next((found for name in BROWSERS if (found := shutil.which(name))), None
 # Continuous integration must not skip these tests.
 if _path is None and not os.environ.get("CI"):
     pytest.skip("no Chromium: sudo apt-get install chromium", allow_module_level=True)
-pytest.importorskip("playwright")
+needed("playwright")
 
 YELLOW, ORANGE = (240, 228, 66), (230, 159, 0)
 
@@ -239,4 +242,19 @@ def test_narrow_pages_do_not_scroll_sideways_and_the_switch_changes_colours(brow
     opened.page.emulate_media(media="print")
     assert opened.page.evaluate(ground) == "rgb(255, 255, 255)"
     assert not opened.page.is_visible("#place") and opened.page.is_visible("#frame")
+    opened.page.context.close()
+
+
+def test_printing_to_pdf_shows_the_frame_that_was_chosen(browser, page, report_data):
+    opened = load(browser, page)
+    opened.page.locator("#place").fill("2")
+    whole = opened.page.pdf(print_background=True)
+    assert whole.startswith(b"%PDF-") and len(re.findall(rb"/Type\s*/Page\b", whole)) >= 3
+    frame = open_dataset(str(report_data / "detect"))["s004/t004/000002"].image
+    assert any(np.array_equal(image, frame) for image in images_of(whole))
+    # The whole page also has all four frames with labels. Without them only the viewer's is left.
+    opened.page.evaluate("document.querySelectorAll('main > section:not(#viewer)').forEach(one => one.remove())")
+    (only,) = images_of(opened.page.pdf(print_background=True))
+    np.testing.assert_array_equal(only, frame)
+    assert opened.errors == [] and opened.requests == []
     opened.page.context.close()

@@ -1,6 +1,7 @@
 """Content of the report: marks, masks, provenance, what is missing, hostile names, damaged files."""
 
 import base64
+import html
 import io
 import json
 import re
@@ -11,21 +12,18 @@ import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
-from tests.helpers import in_process
 from tests.helpers.drawn_dataset import seal
 from tests.helpers.hostile import rewrite
-from tests.train.report.conftest import BLOCKS, HOSTILE
+from tests.train.report.conftest import BLOCKS, HEADLINE, HOSTILE, report_command
 
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.errors import UserError, run_command_line
-from perilune_train.report.detection import detection_section
-from perilune_train.report.explanation import explanation_section
-from perilune_train.report.frames import read_masks
+from perilune_shared.errors import UserError
+from perilune_shared.storage.files import sha256_of
+from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.report import command
 from perilune_train.report.ground import shaded_ground
-from perilune_train.report.navigation import navigation_section
 from perilune_train.report.page import SUMMARY, gather, json_block, write_report
 from perilune_train.report.pictures import drawing, svg_of
-from perilune_train.report.sources import read_run
 from perilune_train.report.summary import summary_of
 
 
@@ -80,6 +78,63 @@ def test_each_figure_states_its_source(report, page):
     assert f"dataset {'ab' * 6}" in text and "ab" * 32 in text
 
 
+def facts_of(text: str) -> dict[str, dict[str, str]]:
+    """What the provenance of a page states, by the anchor of each source."""
+    lists = re.findall(r'<dl id="(source-[0-9a-f]+)">(.*?)</dl>', text, re.S)
+    pair = re.compile(r"<dt>(.*?)</dt><dd>(.*?)</dd>", re.S)
+    return {anchor: {name: html.unescape(value) for name, value in pair.findall(own)} for anchor, own in lists}
+
+
+def test_each_figure_leads_to_command_configuration_seed_commit_versions_and_hashes(page, report_data, report_runs):
+    text = page.read_text()
+    facts = facts_of(text)
+    sourced = re.findall(r"<(figcaption|caption)>(.*?)</\1>", text, re.S)
+    anchors = [re.findall(r'class="source"><a href="#(.*?)">', own) for _, own in sourced]
+    assert len(anchors) > 15 and all(own and set(own) <= facts.keys() for own in anchors)
+    expected = {"command", "SHA-256 of the configuration", "random seed", "commit", "versions", "date", "hardware"}
+    assert all(expected <= own.keys() and all(own.values()) for own in facts.values())
+    by_source = {own["source"]: own for own in facts.values()}
+    metrics = json.loads((report_runs / "detect/demo/metrics.json").read_text())
+    found = by_source["detect/demo"]
+    for name in ("command", "commit", "versions", "date"):
+        assert found[name] == metrics[f"run/{name}"]
+    assert found["random seed"] == "0" and found["SHA-256 of dataset"] == "ab" * 32
+    assert found["SHA-256 of the configuration"] == sha256_of(report_runs / "detect/demo/config.yaml")
+    # The run of explanation in this test has no configuration.
+    assert by_source["explain/demo"]["random seed"] == "not recorded"
+    assert by_source["explain/demo"]["versions"] == metrics["run/versions"]
+    # Both datasets have one name.
+    for kind in ("detect", "nav"):
+        info = open_dataset(str(report_data / kind)).info
+        (recipe,) = info.recipes.values()
+        found = by_source[f"dataset {info.name} ({kind})"]
+        assert found["versions"] == ", ".join(sorted(f"{name} {version}" for name, version in recipe.versions.items()))
+        assert found["random seed"] == str(recipe.seed) and found["command"] == found["commit"] == "not recorded"
+        assert found["SHA-256 of dataset.json"] == sha256_of(report_data / kind / "dataset.json")
+
+
+def test_the_methods_have_their_record_and_an_older_folder_says_that_it_has_none(report_data, report_runs, tmp_path):
+    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    folder = runs / "navigate/demo-methods"
+    folder.mkdir()
+    rows = {"method": ["klt", "fix"], "kind": ["relative", "absolute"], "position_rmse_m": [1.0, 3.0]}
+    pd.DataFrame(rows).to_parquet(folder / "navigation.parquet")
+
+    def provenance() -> dict[str, str]:
+        (found,) = (one for one in gather("demo", "demo", report_data, runs).provenance if "methods" in one.source)
+        return dict(found.facts)
+
+    older = provenance()
+    assert older["SHA-256 of navigation.parquet"] == sha256_of(folder / "navigation.parquet")
+    assert {older[name] for name in ("command", "commit", "versions", "random seed")} == {"not recorded"}
+    write_metrics(folder, {"split": "test", "seed": "fixed in the code"})
+    (folder / "inputs.json").write_text(json.dumps({"detector": "cd" * 32}))
+    recorded = provenance()
+    assert "torch" in recorded["versions"] and recorded["random seed"] == "fixed in the code"
+    assert recorded["SHA-256 of detector"] == "cd" * 32
+    assert recorded["SHA-256 of navigation.parquet"] == older["SHA-256 of navigation.parquet"]
+
+
 def test_missing_parts_are_named_and_left_out(report_data, report_runs, page, tmp_path):
     assert "methods demo-methods" in page.read_text()
     (tmp_path / "data").mkdir()
@@ -95,11 +150,32 @@ def test_the_summary_has_the_figures(report):
     text = summary_of(report)
     assert "- demo: AP 0.750, precision 0.750, recall 0.750, F1 0.750" in text
     assert "| stack | 2.000 |" in text
+    own = text.partition("- detect/demo")[2].partition("\n- ")[0]
+    assert "\n  - versions: perilune\\_train " in own and "\n  - random seed: 0\n" in own
     assert "| gates see craters | 0.3 | - | - | holds | pcc\\_detect.png |" in text.replace("craters  |", "craters |")
+
+
+def test_the_headline_of_the_explanation_is_first(report, page):
+    assert report.summary[0] == f"demo: {HEADLINE}"
+    (section,) = (one for one in report.sections if one.title == "Explanation")
+    assert section.lead[0] == HEADLINE and section.lead[1].startswith("Claims: ")
+    lines = summary_of(report).splitlines()
+    assert lines[2].replace("\\", "") == f"- demo: {HEADLINE}"
+    assert re.search(r"<h1>.*?<li>(.*?)</li>", page.read_text(), re.S)[1] == f"demo: {HEADLINE}"
+
+
+@pytest.mark.parametrize("headline", [None, "", 3])
+def test_a_run_without_a_headline_shows_its_claims(report_data, report_runs, tmp_path, headline):
+    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
+    write_metrics(runs / "explain/demo", {} if headline is None else {"headline": headline})
+    report = gather("demo", "demo", report_data, runs)
+    (section,) = (one for one in report.sections if one.title == "Explanation")
+    assert section.lead == ("Claims: 1; holds: 1.",) and report.summary[0].startswith("demo: AP")
 
 
 def test_hostile_names_stay_texts(hostile_page):
     text = hostile_page.read_text()
+    assert html.escape(HEADLINE + HOSTILE[:9]) in text
     assert "window.hacked" in text
     assert not re.search(r"<script>window|<img src=x", text)
     assert "\u2028" not in re.search(r"<script type=.application/json.*?</script>", text, re.S)[0]
@@ -140,93 +216,25 @@ def test_the_side_of_a_bowl_that_faces_the_sun_is_bright():
     assert image[50, 62] < flat - 30
 
 
-@pytest.mark.parametrize(
-    ("damage", "field"),
-    [
-        (lambda c: c.pop("low"), "low"),
-        (lambda c: c.update(low=np.zeros(5, np.float32)), "low"),
-        (lambda c: c.update(B_11=np.zeros((4, 8, 8))), "B_11"),
-        (lambda c: c.update(B_11=np.zeros((3, 8, 8), np.uint8)), "B_11"),
-        (lambda c: c.update(frame_ids=np.array([{}], object)), "masks"),
-        (lambda c: c.update(frame_ids=np.array([], str)), "frame_ids"),
-    ],
-)
-def test_damaged_masks_are_refused(report_runs, tmp_path, damage, field):
-    with np.load(report_runs / "explain/demo/masks_detect.npz") as file:
-        content = dict(file)
-    damage(content)
-    np.savez(tmp_path / "masks.npz", **content)
-    with pytest.raises(UserError) as raised:
-        read_masks(tmp_path / "masks.npz")
-    assert raised.value.field == field
-
-
-def _explain(runs: Path) -> object:
-    run = read_run(runs / "explain/demo", runs)
-    assert run is not None
-    return explanation_section(run, "key", "title")
-
-
-def _detect(runs: Path) -> object:
-    run = read_run(runs / "detect/demo", runs)
-    assert run is not None
-    return detection_section([run], None)
-
-
-def _navigate(runs: Path) -> object:
-    run = read_run(runs / "navigate/demo-stack", runs)
-    assert run is not None
-    return navigation_section([run], None)
-
-
-@pytest.mark.parametrize(
-    ("read", "name", "content"),
-    [
-        (_explain, "explain/demo/claims.json", "{"),
-        (_explain, "explain/demo/claims.json", '["a"]'),
-        (_explain, "explain/demo/captions.json", "[]"),
-        (_explain, "explain/demo/pcc_detect.png", "no picture"),
-        (_detect, "detect/demo/precision_recall.parquet", "no table"),
-        (_detect, "detect/demo/inputs.json", "[]"),
-        (_detect, "detect/demo/metrics.json", "["),
-        (_navigate, "navigate/demo-stack/errors.parquet", "no table"),
-    ],
-)
-def test_a_damaged_file_is_named_in_one_line(report_runs, tmp_path, read, name, content):
-    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
-    (runs / name).write_text(content)
-    with pytest.raises(UserError, match=Path(name).name) as raised:
-        read(runs)
-    assert "\n" not in str(raised.value)
-
-
-def test_a_damaged_file_leaves_no_report(report_data, report_runs, tmp_path):
-    runs = Path(shutil.copytree(report_runs, tmp_path / "runs"))
-    (runs / "detect/demo/detections.parquet").write_text("no table")
-    with pytest.raises(UserError, match=r"detections\.parquet"):
-        write_report("demo", "demo", report_data, runs, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_command(report_data, report_runs, tmp_path):
-    import typer
-
-    from perilune_train.report.command import report
-
-    app = typer.Typer(pretty_exceptions_enable=False)
-    app.command()(report)
-
-    def call(*arguments: object):
-        return in_process.call(lambda: run_command_line(app), *arguments)
-
     given = ["--dataset", report_data, "--runs", report_runs, "--out", tmp_path / "out"]
-    done = call("--name", "demo", *given)
+    done = report_command("--name", "demo", *given)
     assert done.returncode == 0 and (tmp_path / "out/report.html").is_file(), done.stderr
-    done = call("--name", "../demo", *given)
+    assert re.search(r"report\.html: \d\.\d MB, ", done.stderr.replace("\n", " ")) and "warning" not in done.stderr
+    done = report_command("--name", "../demo", *given)
     assert done.returncode == 2 and "--name" in done.stderr and done.stderr.count("\n") == 1
     nothing = tmp_path / "nothing"
-    done = call("--kind", "paper", "--dataset", nothing, "--runs", nothing, "--out", tmp_path / "none")
+    done = report_command("--kind", "paper", "--dataset", nothing, "--runs", nothing, "--out", tmp_path / "none")
     assert done.returncode == 2 and "no dataset" in done.stderr and not (tmp_path / "none").exists()
+
+
+def test_a_page_above_15_mb_is_written_with_a_warning(report_data, report_runs, tmp_path, monkeypatch):
+    assert command.USUAL_MB == 15
+    monkeypatch.setattr(command, "USUAL_MB", 0.05)
+    done = report_command("--name", "demo", "--dataset", report_data, "--runs", report_runs, "--out", tmp_path / "out")
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("warning: "))
+    size = (tmp_path / "out/report.html").stat().st_size / 1e6
+    assert done.returncode == 0 and f"report.html: size: got {size:.1f} MB, expected below 0.05 MB" in line
 
 
 def test_hostile_names_of_frames_are_refused(report_data, report_runs, tmp_path):

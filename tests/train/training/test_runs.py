@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from torch import nn
 
+import perilune_train
 from perilune_shared.config import Section
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
@@ -47,8 +49,12 @@ def test_metrics_are_plain_json(tmp_path):
     assert {key: found[key] for key in "abcd"} == {"a": 1, "b": None, "c": "text", "d": 0.5}
     assert found["run/commit"] == run_record().commit
     assert {key for key in found if len(key) > 1} == {
-        f"run/{key}" for key in ("commit", "hardware", "load", "command", "date", "gpu")
+        f"run/{key}" for key in ("commit", "hardware", "load", "command", "date", "gpu", "versions")
     }
+    versions = (
+        f"perilune_train {perilune_train.__version__}, torch {torch.__version__}, numpy {np.__version__}, Python "
+    )
+    assert found["run/versions"] == versions + platform.python_version()
 
 
 def test_weights_come_back(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import platform
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -9,14 +10,19 @@ from pathlib import Path
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import write_text
+from perilune_train import __version__
 
 METRICS_FILE = "metrics.json"
 Metrics = dict[str, float | int | str | None]
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None], name: str = METRICS_FILE) -> None:
-    """Write metrics.json, or `name`; values that are not finite become null. Adds run/... (commit, hardware)."""
+    """Write metrics.json, or `name`; values that are not finite become null.
+
+    Adds run/...: commit, hardware, load, command, date, GPU and versions.
+    """
     # Imported here, so that reading metrics does not need torch.
+    import numpy as np
     import torch
 
     plain = {
@@ -24,6 +30,9 @@ def write_metrics(folder: Path, metrics: Mapping[str, float | int | str | None],
     }
     plain |= {f"run/{key}": value for key, value in asdict(run_record()).items()}
     plain["run/gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    packages = {"perilune_train": __version__, "torch": torch.__version__, "numpy": np.__version__}
+    packages["Python"] = platform.python_version()
+    plain["run/versions"] = ", ".join(f"{package} {version}" for package, version in packages.items())
     write_text(folder / name, json.dumps(plain, indent=2, allow_nan=False) + "\n")
 
 

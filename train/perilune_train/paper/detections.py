@@ -42,6 +42,12 @@ def read_detections(run: Path, dataset: Address) -> Detected:
         table = pd.read_parquet(path, columns=["frame_id", *_BOX, "score"])
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         raise UserError(path, "detections", error, f"columns frame_id, {', '.join(_BOX)}, score") from None
+    for name in (*_BOX, "score"):
+        if not pd.api.types.is_numeric_dtype(table[name]):
+            raise UserError(path, name, table[name].dtype, "finite numbers")
+        unusable = table[name][~np.isfinite(table[name])]
+        if len(unusable):
+            raise UserError(path, name, unusable.iloc[0], "finite numbers")
     table = table[table["score"] >= chosen_threshold(run)]
     of_frame = {str(name): own for name, own in table.groupby("frame_id")}
     names = split.frames.table["frame_id"].tolist()

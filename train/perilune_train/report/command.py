@@ -9,6 +9,9 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import is_plain
 from perilune_shared.terminal import console
 
+USUAL_MB = 15
+"""Size below which the page of `small` is to be, MB (1e6 bytes); a larger page opens slowly."""
+
 
 def report(
     kind: Annotated[
@@ -41,4 +44,7 @@ def report(
     root = runs or (Path("runs") / chosen if kind == "paper" else Path("runs"))
     page = write_report(kind, chosen, data, root, out or Path("runs/report") / chosen)
     megabytes = page.stat().st_size / 1e6
+    if megabytes > USUAL_MB:
+        text = f"warning: {page}: size: got {megabytes:.1f} MB, expected below {USUAL_MB} MB; it opens slowly"
+        console.print(text, markup=False, soft_wrap=True)
     console.print(f"{page}: {megabytes:.1f} MB, open it in a browser; {SUMMARY} has the tables", soft_wrap=True)

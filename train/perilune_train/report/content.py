@@ -1,5 +1,6 @@
 """The content of a report: sections of figures, tables and labelled frames. Plain data, without HTML of its own."""
 
+import hashlib
 from dataclasses import dataclass, field
 
 from markupsafe import Markup
@@ -10,7 +11,7 @@ class Provenance:
     """What a figure was made from."""
 
     source: str
-    """Folder of the run below the folder of all runs, or name of the dataset."""
+    """Folder of the run below the folder of all runs, or name and kind of the dataset."""
     settings_sha256: str = ""
     """SHA-256 of config.yaml, or of the dataset's recipes; empty if there is none."""
     inputs: dict[str, str] = field(default_factory=dict)
@@ -22,13 +23,37 @@ class Provenance:
     command: str = ""
     """Command line; empty if not recorded."""
     hardware: str = ""
-    """Processor and memory; empty if not recorded."""
+    """Processor, memory and GPU; empty if not recorded."""
     seed: str = ""
-    """Random seed; empty if there is none."""
+    """Random seed; empty if not recorded."""
     versions: str = ""
     """Versions of packages; empty if not recorded."""
+    edits: str = ""
+    """Edits of a dataset since rendering; empty if there are none."""
     settings: str = ""
     """Content of config.yaml, or the dataset's recipes."""
+
+    @property
+    def anchor(self) -> str:
+        """Anchor of this source in the page; datasets of one name differ by their hashes."""
+        return "source-" + hashlib.sha256(repr((self.source, self.inputs)).encode()).hexdigest()[:12]
+
+    @property
+    def facts(self) -> tuple[tuple[str, str], ...]:
+        """All that is known of the source, by name; what the files do not record is `not recorded`."""
+        known = {
+            "command": self.command,
+            "SHA-256 of the configuration": self.settings_sha256,
+            "random seed": self.seed,
+            "commit": self.commit,
+            "versions": self.versions,
+            "date": self.date,
+            "hardware": self.hardware,
+        }
+        stated = [(name, value or "not recorded") for name, value in known.items()]
+        inputs = [(f"SHA-256 of {name}", sha256) for name, sha256 in self.inputs.items()]
+        edits = [("edits", self.edits)] if self.edits else []
+        return (("source", self.source), *stated, *inputs, *edits)
 
     @property
     def line(self) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from perilune_shared.errors import UserError
+from perilune_shared.errors import UserError, one_line
 from perilune_train.report.content import Figure, Provenance, Section, Table
 from perilune_train.report.pictures import picture_of
 from perilune_train.report.sources import Run, read_json
@@ -22,7 +22,7 @@ _ORDER = ("masks_", "pcc_", "gates_", "removal_", "before_after_")
 
 
 def explanation_section(run: Run, key: str, title: str) -> Section:
-    """Show an explain run: its claims as a table, all of its pictures with their captions."""
+    """Show an explain run: its headline, its claims as a table, all of its pictures with their captions."""
     claims = read_claims(run.folder / CLAIMS_FILE)
     captions = _captions(run.folder / CAPTIONS_FILE)
     pictures = {path.name: f"{key}-picture-{number}" for number, path in enumerate(_ordered(run.folder))}
@@ -32,8 +32,15 @@ def explanation_section(run: Run, key: str, title: str) -> Section:
         for path in _ordered(run.folder)
         for caption in [captions.get(path.name) or _CAPTIONS.get(path.name) or _words(path)]
     ]
-    lead = (f"Claims: {_counted([claim['verdict'] for claim in claims])}.",)
-    return Section(key, title, lead if claims else (), tuple(tables), tuple(figures))
+    lead = [text for text in [headline_of(run)] if text]
+    lead += [f"Claims: {_counted([claim['verdict'] for claim in claims])}."] if claims else []
+    return Section(key, title, tuple(lead), tuple(tables), tuple(figures))
+
+
+def headline_of(run: Run) -> str:
+    """What the run found on the gates, one text; empty for a run without one, as of rendered interventions."""
+    found = run.metrics.get("headline")
+    return one_line(found) if isinstance(found, str) else ""
 
 
 def paper_section(folder: Path, run: Run) -> Section:

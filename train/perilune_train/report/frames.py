@@ -146,9 +146,9 @@ def viewer_of(frames: LabelledFrames, masks: Path | None, mask_provenance: Prove
 
 
 def read_masks(path: Path) -> dict[str, NDArray[Any]]:
-    """Read masks_detect.npz: frame_ids (N,), blocks (B,), low and high (B,), and uint8 (N, h, w) for each block.
+    """Read masks_detect.npz: frame_ids (N,), blocks (B,), finite low and high (B,), uint8 (N, h, w) for each block.
 
-    Raises UserError if an array is missing, has another shape or type, or if the file is damaged or too large.
+    Raises UserError if an array is missing, has another shape, type or range, or if the file is damaged or too large.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -168,6 +168,9 @@ def read_masks(path: Path) -> dict[str, NDArray[Any]]:
     for name in ("low", "high"):
         if content[name].shape != blocks.shape or content[name].dtype.kind != "f":
             raise UserError(path, name, f"{content[name].dtype} {content[name].shape}", f"floats {blocks.shape}")
+        unusable = content[name][~np.isfinite(content[name])]
+        if len(unusable):
+            raise UserError(path, name, unusable[0], "finite numbers")
     for block in blocks:
         own = content.get(str(block))
         if own is None or own.dtype != np.uint8 or own.ndim != 3 or len(own) != count or 0 in own.shape:

@@ -18,6 +18,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.split import DetectSplit, load_split
+from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
 from perilune_train.paper.detections import read_detections
 from perilune_train.report import detection, explanation, navigation
 from perilune_train.report.content import Provenance, Report, Section, Viewer
@@ -143,9 +144,11 @@ def _run_sections(folders: Folders, opened: _Opened, frames: LabelledFrames | No
         sections.append(navigation.scores_section(others))
     for folder in folders.methods:
         if (folder / "navigation.parquet").is_file():
-            # The folder has no record of its own.
+            # An older folder has no record of its own.
+            metrics = read_metrics(folder) if (folder / METRICS_FILE).is_file() else {}
+            source = provenance_of(folder, root, metrics)
             table = {"navigation.parquet": sha256_of(folder / "navigation.parquet")}
-            source = replace(provenance_of(folder, root, {}), inputs=table)
+            source = replace(source, inputs=source.inputs | table)
             sections.append(navigation.methods_section(folder, (source,)))
     for number, run in enumerate(opened.explain):
         title = "Explanation: rendered interventions" if run.name.endswith("-causal") else "Explanation"
@@ -163,7 +166,9 @@ def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
 
 
 def _headlines(opened: _Opened) -> list[str]:
-    lines = [detection.headline(run) for run in opened.detect]
+    """One line for each run; what the gates show is first."""
+    lines = [f"{run.name}: {found}" for run in opened.explain if (found := explanation.headline_of(run))]
+    lines += [detection.headline(run) for run in opened.detect]
     lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
     return lines + [navigation.headline(run) for run in opened.navigate]
 
@@ -172,8 +177,8 @@ def _provenance(sections: Sequence[Section], viewer: Viewer | None) -> tuple[Pro
     found: dict[str, Provenance] = {}
     for section in sections:
         groups = (section.tables, section.figures, section.frames)
-        found |= {own.source: own for group in groups for one in group for own in one.sources}
-    found |= {own.source: own for own in (viewer.sources if viewer else ())}
+        found |= {own.anchor: own for group in groups for one in group for own in one.sources}
+    found |= {own.anchor: own for own in (viewer.sources if viewer else ())}
     return tuple(found.values())
 
 

@@ -151,7 +151,7 @@ def picture_of(path: Path, description: str) -> Markup:
             if picture.width * picture.height > LARGEST_IMAGE_PX:
                 raise ValueError(f"{picture.width} x {picture.height} pixels")
             colours = picture.convert("RGB")
-    except (ValueError, SyntaxError, Image.DecompressionBombError, Image.UnidentifiedImageError) as error:
+    except (ValueError, OSError, SyntaxError, Image.DecompressionBombError) as error:
         raise UserError(path, "picture", error, f"a PNG of at most {LARGEST_IMAGE_PX} pixels") from None
     # A dimension too large for the page is reduced; a small picture is not enlarged.
     colours.thumbnail((_LARGEST_SIDE_PX, 4 * _LARGEST_SIDE_PX))

@@ -110,38 +110,48 @@ def sources_of(runs: Sequence[Run]) -> tuple[Provenance, ...]:
 def provenance_of(folder: Path, root: Path, metrics: Mapping[str, Any]) -> Provenance:
     """Provenance of a run's folder: config.yaml, inputs.json and the entries run/... of its metrics, as far as known.
 
+    The random seed is that of config.yaml, or the entry `seed` of the metrics of a folder without one.
+
     Raises UserError if a file is damaged.
     """
-    recorded = {key: str(metrics.get(f"run/{key}") or "") for key in ("commit", "date", "command", "hardware")}
+    names = ("commit", "date", "command", "hardware", "versions")
+    recorded = {key: str(metrics.get(f"run/{key}") or "") for key in names}
+    if metrics.get("run/gpu"):
+        recorded["hardware"] += f", {metrics['run/gpu']}"
     inputs: dict[str, str] = {}
     if (folder / "inputs.json").is_file():
         content = read_json(folder / "inputs.json")
         if not isinstance(content, dict):
             raise UserError(folder / "inputs.json", "content", type(content).__name__, "an object of hashes")
         inputs = {str(name): str(sha256) for name, sha256 in content.items() if sha256}
-    text, sha256, seed = "", "", ""
+    text, sha256, seed = "", "", str(metrics.get("seed") or "")
     if (folder / "config.yaml").is_file():
         sections = read_config_file(folder / "config.yaml")
         seeds = {str(own["seed"]) for own in sections.values() if isinstance(own, dict) and "seed" in own}
         content_bytes = (folder / "config.yaml").read_bytes()
         text, sha256 = content_bytes.decode(), hashlib.sha256(content_bytes).hexdigest()
-        seed = ", ".join(sorted(seeds))
+        seed = ", ".join(sorted(seeds)) or seed
     source = folder.relative_to(root).as_posix() if folder.is_relative_to(root) else folder.name
     return Provenance(source, sha256, inputs, seed=seed, settings=text, **recorded)
 
 
 def provenance_of_dataset(dataset: Dataset) -> Provenance:
-    """Provenance of a dataset: hash of its dataset.json, random seeds, versions and settings of its recipes."""
+    """Provenance of a dataset: hash of its dataset.json, random seeds, versions and settings of its recipes.
+
+    A dataset records no command, commit or date, so that equal datasets are equal byte for byte. The versions contain
+    hashes of the renderer's code.
+    """
     recipes = list(dataset.info.recipes.values())
     settings = json.dumps([recipe.config for recipe in recipes], indent=2, sort_keys=True)
     versions = {f"{name} {version}" for recipe in recipes for name, version in recipe.versions.items()}
     return Provenance(
-        f"dataset {dataset.info.name}",
+        f"dataset {dataset.info.name} ({dataset.info.kind})",
         hashlib.sha256(settings.encode()).hexdigest(),
         {"dataset.json": dataset.store.sha256(INFO_NAME)},
         seed=", ".join(sorted({str(recipe.seed) for recipe in recipes})),
         versions=", ".join(sorted(versions)),
         settings=settings,
+        edits="; ".join(dataset.info.history),
     )
 
 

@@ -21,7 +21,11 @@ def summary_of(report: Report) -> str:
             lines += [f"{_escaped(own.caption)}:", "", *table([_escaped(cell) for cell in own.head], rows), ""]
     if report.missing:
         lines += ["## Not in this report", "", *[f"- {_escaped(part)}" for part in report.missing], ""]
-    lines += ["## Provenance", "", *[f"- {_escaped(source.line)}" for source in report.provenance], ""]
+    lines += ["## Provenance", ""]
+    for source in report.provenance:
+        lines += [f"- {_escaped(source.source)}"]
+        lines += [f"  - {_escaped(name)}: {_escaped(value)}" for name, value in source.facts[1:]]
+    lines.append("")
     return "\n".join(lines)
 
 

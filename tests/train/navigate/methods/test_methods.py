@@ -1,9 +1,12 @@
 """All methods over a rendered dataset, from the command to its page."""
 
+import json
+
 import numpy as np
 import pandas as pd
 from tests.helpers import in_process
 
+from perilune_shared.storage.files import sha256_of
 from perilune_train.cli import main
 
 
@@ -39,6 +42,9 @@ def test_a_page_with_every_method(tiny, tmp_path):
     for name in ("altitude.png", "flights.png"):
         assert (out / name).stat().st_size > 10_000
         assert f"]({name})" in page
+    record, inputs = (json.loads((out / name).read_text()) for name in ("metrics.json", "inputs.json"))
+    assert record["split"] == "test" and "torch" in record["run/versions"] and record["run/commit"]
+    assert inputs["dataset"] == sha256_of(tiny / "nav/dataset.json") and set(inputs) > {"navigator", "detector"}
     again = methods("--dataset", tiny / "nav", "--out", out)
     assert again.returncode == 2
     assert len(again.stderr.strip().splitlines()) == 1

@@ -32,8 +32,8 @@ def methods(
     """Fly all methods over a split: learned and classical motion, poses from craters, lost in space, the filter.
 
     Writes methods.md (tables and pictures), navigation.parquet (one row per method), frames.parquet (one row per
-    frame and absolute method), altitude.png, flights.png, matches_high.png and matches_low.png. Catalogues, priors and
-    starts are drawn with a fixed seed.
+    frame and absolute method), altitude.png, flights.png, matches_high.png, matches_low.png, inputs.json and
+    metrics.json (hashes, command, commit, versions). Catalogues, priors and starts are drawn with a fixed seed.
     """
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))

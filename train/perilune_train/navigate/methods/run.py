@@ -1,5 +1,6 @@
 """Fly all methods over the descents of a split and write tables, a page and pictures."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,11 @@ import pandas as pd
 
 from perilune_shared.dataset.manifest import open_single
 from perilune_shared.geometry.frames import Array
+from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import new_folder, write_text
 from perilune_shared.storage.store import Address
 from perilune_train.evaluation.marks import mark_files
+from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.evaluation.provenance import check_terrain, read_provenance
 from perilune_train.navigate.covariance import stated_covariances
 from perilune_train.navigate.craters.catalogue import Catalogue
@@ -25,6 +28,7 @@ from perilune_train.navigate.methods.figures import draw_by_altitude, draw_fligh
 from perilune_train.navigate.methods.page import page_of
 from perilune_train.navigate.methods.seen import SeenDescent, seen_descents
 from perilune_train.navigate.network import load_navigator, predict
+from perilune_train.training.begin import hashes_of
 from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, TABLE, FRAMES = "methods.md", "navigation.parquet", "frames.parquet"
@@ -42,10 +46,13 @@ def fly_methods(
 ) -> pd.DataFrame:
     """Fly all methods over a split; returns one row per method. `maps` is the folder of a map by our own detector.
 
-    Writes methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame)
-    and pictures to the new folder `out`, or nothing. Raises UserError if a network was fitted to the terrain of the
-    split, unless `allow_overlap`, or if the dataset lacks frames.
+    Writes methods.md, navigation.parquet (one row per method), frames.parquet (one row per absolute method and frame),
+    pictures, inputs.json (hashes) and metrics.json (split, commit, command) to the new folder `out`, or nothing. Raises
+    UserError if a network was fitted to the terrain of the split, unless `allow_overlap`, or if the dataset lacks
+    frames.
     """
+    # Record the commit at the start: the checkout may change meanwhile.
+    run_record()
     dataset = open_single(address)
     best = {name: RunFolder(run).best for name, run in (("navigator", navigator), ("detector", detector))}
     contents = {name: load_weights(path) for name, path in best.items()}
@@ -77,6 +84,8 @@ def fly_methods(
         write_text(folder / PAGE, page_of(dataset, split, rows, descents, detection_s, drawn))
         for check in checks:
             mark_files(folder, (PAGE, TABLE, FRAMES, *drawn), str(check.metrics()["terrain/mark"]))
+        write_text(folder / "inputs.json", json.dumps(hashes_of({"dataset": address, **best}), indent=2) + "\n")
+        write_metrics(folder, {"split": split, "seed": "fixed in the code"})
     return rows
 
 
