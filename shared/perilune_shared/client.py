@@ -7,8 +7,9 @@
         print(frame.image.shape, len(frame.labels["crater_id"]))
 
 A request is one message of ZeroMQ: JSON. A reply is several: JSON, then the bytes of each array that it lists, in C
-order. Nothing else is sent, so other languages need a ZeroMQ and a JSON library alone. A head with `"ready": false` and
-no arrays says that the scene of the request is being generated: send the request again.
+order. Nothing else is sent, so other languages need a ZeroMQ and a JSON library alone. A head without arrays may say
+that the same request may be answered later: with `"ready": false` the scene of the request is not generated yet, with
+`"busy": true` the server has too many clients. Other heads with `"error"` say what is wrong with the request.
 """
 
 import json
@@ -100,7 +101,7 @@ class ServedGround:
 class SceneClient:
     """A connection to a server. Use it as a context manager, in one thread.
 
-    Every method raises UserError if the server refuses a request or does not answer within `timeout_s`.
+    Every method raises UserError if the server refuses a request, or does not answer or is busy for `timeout_s`.
     """
 
     def __init__(self, address: str = f"tcp://127.0.0.1:{PORT}", timeout_s: float = 60.0):
@@ -157,6 +158,7 @@ class SceneClient:
         rotation_wxyz: Sequence[float] | Array,
         *,
         velocity_mps: Sequence[float] | Array = (0.0, 0.0, 0.0),
+        angular_velocity_radps: Sequence[float] | Array | None = None,
         sun_deg: tuple[float, float] | None = None,
         index: int | None = None,
         depth: bool = False,
@@ -166,24 +168,29 @@ class SceneClient:
         """Render a frame.
 
         `position_m` (3,) is in O_L, `rotation_wxyz` (4,) is rotation_camera_from_site as in a manifest, `velocity_mps`
-        (3,), O_L, blurs the frame, `sun_deg` is azimuth and elevation of the Sun. `index` sets the noise; without it
-        each frame of this client has the next one. With `depth` the frame has depth and normals. `scene` is the number
-        of the scene; one that is not in the server's memory is waited for.
+        (3,), O_L, and `angular_velocity_radps` (3,), O_C, blur the frame, `sun_deg` is azimuth and elevation of the
+        Sun. `index` sets the noise; without it each frame that this client received has the next one. With `depth` the
+        frame has depth and normals. `scene` is the number of the scene; one that is not in the server's memory is
+        waited for.
         """
-        if index is None:
-            index, self._next_index = self._next_index, self._next_index + 1
         request: dict[str, Any] = {
             "request": "frame",
             "position_m": [float(value) for value in position_m],
             "rotation_wxyz": [float(value) for value in rotation_wxyz],
             "velocity_mps": [float(value) for value in velocity_mps],
-            "index": index,
+            "index": self._next_index if index is None else index,
             "depth": depth,
             "labels": labels,
         } | _of(scene)
+        if angular_velocity_radps is not None:
+            request["angular_velocity_radps"] = [float(value) for value in angular_velocity_radps]
         if sun_deg is not None:
             request["sun_deg"] = [float(value) for value in sun_deg]
         _, arrays = self._ask(request)
+        if "image" not in arrays:
+            raise UserError(self.address, "image", "none", "a reply of `perilune-render serve`")
+        if index is None:
+            self._next_index += 1
         columns = {name.partition(".")[2]: value for name, value in arrays.items() if name.startswith("labels.")}
         return ServedFrame(arrays["image"], arrays.get("depth_m"), arrays.get("normal"), columns if labels else None)
 
@@ -203,7 +210,7 @@ class SceneClient:
         """Head and arrays by name of the reply to a request; with `wait`, once its scene is generated."""
         end = time.monotonic() + _GENERATION_S
         while True:
-            head, arrays = self._ask_once(request)
+            head, arrays = self._ask_until_answered(request)
             if head.get("ready") is not False or not wait:
                 return head, arrays
             if time.monotonic() > end:
@@ -211,6 +218,18 @@ class SceneClient:
                 raise UserError(
                     self.address, f"scene {request.get('scene', 0)}", found, "a server with less other work"
                 )
+            time.sleep(_POLL_S)
+
+    def _ask_until_answered(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Send a request, and again while the server is busy; returns the head of the reply and its arrays by name."""
+        end = time.monotonic() + self._timeout_ms / 1000
+        while True:
+            head, arrays = self._ask_once(request)
+            if "error" not in head:
+                return head, arrays
+            if head.get("busy") is not True or time.monotonic() > end:
+                expected = "a request that it can render"
+                raise UserError(self.address, str(request["request"]), head["error"], expected)
             time.sleep(_POLL_S)
 
     def _ask_once(self, request: dict[str, Any]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -230,8 +249,6 @@ class SceneClient:
             found = {one["name"]: _array(one, part) for one, part in zip(arrays, parts, strict=True)}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(self.address, "reply", error, "one of `perilune-render serve`") from None
-        if "error" in head:
-            raise UserError(self.address, str(request["request"]), head["error"], "a request that it can render")
         return head, found
 
 

@@ -63,7 +63,7 @@ def serve(
         config = config.model_copy(update={"camera": read_camera(camera)})
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
     from perilune_render.server.grounds import Grounds
-    from perilune_render.server.native import serve_native
+    from perilune_render.server.native_serve import serve_native
     from perilune_render.server.pangu_serve import serve_pangu
     from perilune_render.server.pangu_session import Conventions, Session
     from perilune_render.server.serve import Ask, Connection, Limits, Server
@@ -79,7 +79,7 @@ def serve(
             await serve_pangu(connection, lambda: Session(world, *start, conventions), server.stop)
 
         async def native(ask: Ask, ready: Callable[[int], object]) -> None:
-            await serve_native(f"tcp://{host}:{native_port}", grounds, ask, ready)
+            await serve_native(f"tcp://{host}:{native_port}", grounds, ask, ready, limits, say)
 
         server = Server(host, port, handle, limits, say, native)
         server.begin()

@@ -59,10 +59,10 @@ class Grounds:
         self._kept.clear()
 
     def world(self, number: int, client: object) -> World | None:
-        """The world of a scene; None if it is not in memory, and then it is being generated or waits for that.
+        """The world of a scene; None if it is not in memory: ask again.
 
-        Raises UserError for a number that the server does not have, if too many scenes wait, or if the scene could not
-        be generated.
+        It is then being generated or waits for that, unless another scene of the client or MOST_WAITING scenes wait.
+        Raises UserError for a number that the server does not have, and the error if the scene could not be generated.
         """
         if number >= self.n_scenes:
             raise UserError("request", "scene", number, f"below {self.n_scenes}, the server's --scenes")
@@ -71,9 +71,8 @@ class Grounds:
             raise self._failed.pop(number)
         if number == 0 or number in self._kept:
             return self._used(number)
-        if number not in self._waiting and client not in self._waiting.values():
-            if len(self._waiting) >= MOST_WAITING:
-                raise UserError("request", "scene", f"{MOST_WAITING} scenes wait to be generated", "fewer; try again")
+        is_full = client in self._waiting.values() or len(self._waiting) >= MOST_WAITING
+        if number not in self._waiting and not is_full:
             self._waiting[number] = client
             self._asked.put(number)
         return None

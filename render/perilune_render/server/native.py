@@ -1,19 +1,16 @@
 """Our own interface over ZeroMQ: requests in JSON, replies in JSON with raw arrays (`perilune_shared.client`)."""
 
-import asyncio
 import json
-from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import zmq
-import zmq.asyncio
 from pydantic import Field, ValidationError
 
 from perilune_render.config_scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables, label_table
 from perilune_render.flight.lens import camera_of
+from perilune_render.frame_source import Frame, Shot
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.world import View, World
@@ -22,9 +19,6 @@ from perilune_shared.config import Section
 from perilune_shared.errors import UserError, one_line
 from perilune_shared.geometry.frames import matrix_from_quaternion, sun_direction
 
-LARGEST_REQUEST_BYTES = 4_000_000
-MOST_WAITING = 64
-"""Largest number of requests that wait for the renderer."""
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Three = tuple[_Number, _Number, _Number]
 
@@ -55,6 +49,7 @@ class FrameRequest(_OfScene):
     position_m: _Three
     rotation_wxyz: tuple[_Number, _Number, _Number, _Number]
     velocity_mps: _Three = (0.0, 0.0, 0.0)
+    angular_velocity_radps: _Three = (0.0, 0.0, 0.0)
     sun_deg: tuple[_Number, Annotated[float, Field(gt=0, le=90)]] | None = None
     index: Annotated[int, Field(ge=0, lt=2**31)] = 0
     depth: bool = False
@@ -84,6 +79,8 @@ _REQUESTS: dict[str, type[Section]] = {
     "heights": HeightsRequest,
 }
 _LENGTH_TOLERANCE = 0.01
+_LARGEST_MPS, _LARGEST_RADPS = 12_000.0, 100.0
+"""Largest velocity and angular velocity of a camera, as for given poses."""
 
 
 def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
@@ -103,9 +100,10 @@ def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
         return refusal(str(error))
 
 
-def refusal(text: str) -> list[bytes]:
-    """A reply that says what is wrong."""
-    return [json.dumps({"error": one_line(text)[:900]}).encode()]
+def refusal(text: str, *, busy: bool = False) -> list[bytes]:
+    """A reply that says what is wrong; if the server is `busy`, the same request may be answered later."""
+    head: dict[str, Any] = {"error": one_line(text)[:900]}
+    return [json.dumps(head | {"busy": True} if busy else head).encode()]
 
 
 def _parsed(content: bytes) -> Section:
@@ -172,8 +170,7 @@ def _frame(world: World, request: FrameRequest) -> dict[str, np.ndarray]:
     sun = sun_direction(*(request.sun_deg or (stated.sun_azimuth_deg, stated.sun_elevation_deg)))
     rotation = matrix_from_quaternion(-quaternion if quaternion[0] < 0 else quaternion)
     view = View(np.array(request.position_m), rotation, camera_of(world.config.camera), sun)
-    seed = trajectory_seed(world.scene.seed, 0)
-    frame = world.frame(view, seed, request.index, np.array(request.velocity_mps))
+    frame = _taken(world, view, request)
     found = {"image": frame.image}
     if request.depth:
         found |= {"depth_m": frame.radiance.depth_m, "normal": frame.radiance.normal}
@@ -183,54 +180,26 @@ def _frame(world: World, request: FrameRequest) -> dict[str, np.ndarray]:
     return found
 
 
+def _taken(world: World, view: View, request: FrameRequest) -> Frame:
+    """The frame of a view, as `World.frame`, which has no angular velocity."""
+    velocity = _limited(request.velocity_mps, "velocity_mps", _LARGEST_MPS, "m/s")
+    turn = _limited(request.angular_velocity_radps, "angular_velocity_radps", _LARGEST_RADPS, "rad/s")
+    world.check(view.position_m)
+    place = view.position_m, view.rotation_camera_from_site
+    shot = Shot(*place, velocity, trajectory_seed(world.scene.seed, 0), request.index, angular_velocity_radps=turn)
+    return world._source(view).take(shot)
+
+
+def _limited(values: _Three, field: str, largest: float, unit: str) -> np.ndarray:
+    """A vector (3,) of a request. Raises UserError if it is too long."""
+    found = np.array(values)
+    if np.linalg.norm(found) > largest:
+        raise UserError("camera", field, found.tolist(), f"at most {largest:g} {unit}")
+    return found
+
+
 def _reply(head: dict[str, Any], arrays: dict[str, np.ndarray]) -> list[bytes]:
     """The parts of a reply: the head, which lists the arrays, then each array."""
     plain = {name: np.ascontiguousarray(value) for name, value in arrays.items()}
     listed = [{"name": name, "dtype": value.dtype.str, "shape": value.shape} for name, value in plain.items()]
     return [json.dumps({**head, "arrays": listed}).encode(), *(value.tobytes() for value in plain.values())]
-
-
-async def serve_native(
-    address: str, grounds: Grounds, ask: Callable[[Callable[[], Any]], Awaitable[Any]], ready: Callable[[int], object]
-) -> None:
-    """Answer requests at a ZeroMQ address until cancelled; `ready` is called with the port.
-
-    A client has one request at a time: another one before the reply is refused, and so is one if too many wait.
-    """
-    context = zmq.asyncio.Context()
-    socket = context.socket(zmq.ROUTER)
-    socket.setsockopt(zmq.LINGER, 0)
-    socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_REQUEST_BYTES)
-    waiting: set[bytes] = set()
-    tasks: set[asyncio.Task] = set()
-
-    async def handle(client: bytes, envelope: list[bytes], content: bytes) -> None:
-        try:
-            reply = await ask(lambda: answer(grounds, content, client))
-        except Exception as error:
-            reply = refusal(f"{type(error).__name__}: {error}")
-        finally:
-            waiting.discard(client)
-        await socket.send_multipart([client, *envelope, *reply])
-
-    try:
-        try:
-            socket.bind(address)
-        except zmq.ZMQError as error:
-            raise OSError(f"{address}: {error}") from None
-        ready(int(socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2]))
-        while True:
-            client, *envelope, content = await socket.recv_multipart()
-            if client in waiting or len(waiting) >= MOST_WAITING:
-                text = "one request at a time" if client in waiting else "too many requests wait; try again"
-                await socket.send_multipart([client, *envelope, *refusal(text)])
-                continue
-            waiting.add(client)
-            task = asyncio.ensure_future(handle(client, envelope, content))
-            tasks.add(task)
-            task.add_done_callback(tasks.discard)
-    finally:
-        for task in tasks:
-            task.cancel()
-        socket.close()
-        context.term()

@@ -2,25 +2,33 @@
 
 import threading
 
-from perilune_render.server import native
 from perilune_render.server.grounds import Grounds
+from perilune_render.server.native_serve import serve_native
 from perilune_render.server.serve import Limits, Server
 
 
 class NativeRunning:
     """Answers clients at `address` until `close`."""
 
-    def __init__(self, grounds: Grounds):
+    def __init__(self, grounds: Grounds, limits: Limits = Limits()):  # noqa: B008
+        self.notes: list[str] = []
+
         async def refuse(connection):
             connection.writer.close()
 
         async def other(ask, ready):
-            await native.serve_native("tcp://127.0.0.1:0", grounds, ask, ready)
+            await serve_native("tcp://127.0.0.1:0", grounds, ask, ready, limits, self.notes.append)
 
-        self.server = Server("127.0.0.1", 0, refuse, Limits(), lambda note: None, other)
+        self.server = Server("127.0.0.1", 0, refuse, limits, self.notes.append, other)
         self.server.begin()
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
+
+    def __enter__(self) -> "NativeRunning":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     @property
     def address(self) -> str:
