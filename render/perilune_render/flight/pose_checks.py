@@ -19,6 +19,8 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 LEAST_CLEARANCE_M = 1.0
 """Smallest height of the camera above the ground below it, metres."""
+LARGEST_MPS, LARGEST_RADPS = 12_000.0, 100.0
+"""Largest velocity, metres per second, five times that of escape, and largest angular velocity, radians per second."""
 _CHECKED_FRAMES = 20_000
 """Number of frames that `check_plan` checks, about: a few seconds' work."""
 _POINTS_PER_SIDE = 8

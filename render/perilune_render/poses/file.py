@@ -22,6 +22,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from perilune_render.flight.pose_checks import LARGEST_MPS, LARGEST_RADPS
 from perilune_shared.config_errors import nearest
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, site_from_selenographic
@@ -205,13 +206,25 @@ def _checked(source: _Source, latitude_deg: float, longitude_deg: float) -> Give
     time = source.numbers(_TIME)[:, 0]
     late = np.concatenate([[False], (np.diff(time) <= 0) & (np.diff(trajectory) == 0)])
     source.refuse(late, "time_s", lambda row: f"{time[row]:g} after {time[row - 1]:g}", "increasing times")
-    velocity = source.numbers(_VELOCITY) if _VELOCITY[0] in table else np.zeros((len(table), 3))
+    velocity = _motion(source, "velocity", _VELOCITY, LARGEST_MPS, "m/s")
+    turn = _motion(source, "angular velocity", _TURN, LARGEST_RADPS, "rad/s")
     sun = source.numbers(_SUN) if _SUN[0] in table else None
     if sun is not None:
         low = (sun[:, 1] <= 0) | (sun[:, 1] > 90)
         source.refuse(low, _SUN[1], lambda row: f"{sun[row, 1]:g}", "above 0 (the horizon), at most 90 degrees")
-    turn = source.numbers(_TURN) if _TURN[0] in table else None
+    velocity = np.zeros((len(table), 3)) if velocity is None else velocity
     return GivenPoses(time, place, _unit_quaternions(source), velocity, sun, trajectory, turn)
+
+
+def _motion(source: _Source, field: str, names: tuple[str, ...], largest: float, unit: str) -> Array | None:
+    """Vectors (N, 3) of at most this length; None if the file has none."""
+    if names[0] not in source.table:
+        return None
+    values = source.numbers(names)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(values, axis=1)
+    source.refuse(length > largest, field, lambda row: f"{length[row]:.4g} {unit}", f"at most {largest:g} {unit}")
+    return values
 
 
 def _check_columns(path: Path, found: list[str], names: tuple[str, ...]) -> None:

@@ -12,6 +12,7 @@ from perilune_render.config_scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines import open_engine
 from perilune_render.flight.lens import camera_of
+from perilune_render.flight.pose_checks import LARGEST_MPS
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.heightfield.query import first_hits, heights_m
 from perilune_render.heightfield.surface import Surface, surface_of
@@ -86,9 +87,11 @@ class World:
         return content_sha256(tables["craters"], tables["boulders"])
 
     def frame(self, view: View, seed: int, index: int, velocity_mps: Array | None = None) -> Frame:
-        """Render and develop a frame. Raises UserError if the camera is off the ground or below its surface."""
+        """Render and develop a frame. Raises UserError as `check`, and above LARGEST_MPS."""
         self.check(view.position_m)
         velocity = np.zeros(3) if velocity_mps is None else velocity_mps
+        if not np.abs(velocity).max() <= LARGEST_MPS or np.linalg.norm(velocity) > LARGEST_MPS:
+            raise UserError("camera", "velocity_mps", velocity.tolist(), f"at most {LARGEST_MPS:g} m/s")
         shot = Shot(view.position_m, view.rotation_camera_from_site, velocity, seed, index)
         return self._source(view).take(shot)
 
@@ -97,7 +100,7 @@ class World:
         return self._source(view).labels(frame)
 
     def radiance(self, view: View) -> Radiance:
-        """Depth and normals of a view; the radiance has one sample and no sensor."""
+        """Radiance, depth and normals of a view, with the samples of the configuration and without a sensor."""
         self.check(view.position_m)
         return self._source(view).render(Shot(view.position_m, view.rotation_camera_from_site, np.zeros(3), 0))
 

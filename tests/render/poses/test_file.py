@@ -102,6 +102,14 @@ GOOD = "0,0,0,300,0,1,0,0\n"
         (HEADER + "0,0,0,3e7,0,1,0,0\n", "line 3: position: got 3e+07 m from the site"),
         (HEADER.replace("# frame", "# rotation: up\n# frame") + GOOD, "rotation: got up"),
         (
+            HEADER.strip() + ",vx_mps,vy_mps,vz_mps\n" + GOOD.strip() + ",1e25,0,0\n",
+            "line 3: velocity: got 1e+25 m/s, expected at most 12000 m/s",
+        ),
+        (
+            HEADER.strip() + ",wx_radps,wy_radps,wz_radps\n" + GOOD.strip() + ",0,99,99\n",
+            "line 3: angular velocity: got 140 rad/s, expected at most 100 rad/s",
+        ),
+        (
             HEADER.strip() + ",sun_azimuth_deg,sun_elevation_deg\n" + GOOD.strip() + ",0,-3\n",
             "line 3: sun_elevation_deg: got -3",
         ),

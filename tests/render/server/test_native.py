@@ -64,6 +64,12 @@ def test_sun_and_velocity_change_the_frame(scene):
     assert along[1] < 0.8 * along[0]
 
 
+def test_absurd_velocities_are_refused(scene):
+    for velocity in ((1e8, 0, 0), (9000, 9000, 0)):
+        with pytest.raises(UserError, match=r"velocity_mps: got .*expected at most 12000 m/s"):
+            scene.frame((0, 0, 500), DOWN, velocity_mps=velocity)
+
+
 def test_craters_are_those_of_the_ground(scene, world):
     found = scene.craters()
     assert found["crater_id"].tolist() == world.scene.crater_id.tolist()
