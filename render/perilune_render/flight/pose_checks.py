@@ -32,7 +32,7 @@ class Poses:
     """Poses of the camera in N frames of one scene."""
 
     frame_id: Sequence[str]
-    """Ids of the frames (N,)."""
+    """Ids of the frames (N,), for messages; with the place in the user's file if the poses are from one."""
     position_m: Array
     """Position of the camera, O_L, metres (N, 3)."""
     rotation_wxyz: Array
@@ -42,10 +42,16 @@ class Poses:
     def planned(cls, trajectories: Sequence[TrajectoryPlan]) -> "Poses":
         """Poses of all frames of these trajectories, all of one scene."""
         return cls(
-            [t.frame_id(i) for t in trajectories for i in range(len(t.splits))],
+            [_named(t, i) for t in trajectories for i in range(len(t.splits))],
             np.concatenate([t.flight.position_m for t in trajectories]),
             np.concatenate([t.flight.rotation_wxyz for t in trajectories]),
         )
+
+
+def _named(trajectory: TrajectoryPlan, place: int) -> str:
+    """Id of a frame, with the place of its pose in the user's file."""
+    frame_id = trajectory.frame_id(place)
+    return frame_id if trajectory.origin is None else f"{frame_id}, {trajectory.origin(place)}"
 
 
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:

@@ -173,7 +173,13 @@ def _trajectory(poses: GivenPoses, rows: np.ndarray, scene: ScenePlan, number: i
     # Number frames across a change of the Sun: equal numbers would have equal noise.
     begin = int(rows[0] - np.flatnonzero(poses.trajectory == number)[0])
     index = range(begin, begin + len(rows))
-    return TrajectoryPlan(scene.scene_id, name, seed, index, (_SPLIT,) * len(rows), part, is_drawn=False)
+    origin = partial(_origin, poses, rows)
+    return TrajectoryPlan(scene.scene_id, name, seed, index, (_SPLIT,) * len(rows), part, is_drawn=False, origin=origin)
+
+
+def _origin(poses: GivenPoses, rows: np.ndarray, place: int) -> str:
+    """The place in the poses' file of the pose at index `place` of `rows`."""
+    return poses.origin(int(rows[place]))
 
 
 def _flight(poses: GivenPoses, rows: np.ndarray) -> Flight:
@@ -196,4 +202,4 @@ def _three(values: Array) -> tuple[float, float, float]:
 def _refuse(wrong: np.ndarray, poses: GivenPoses, where: object, found, expected: str) -> None:
     if wrong.any():
         n = int(np.argmax(wrong))
-        raise UserError(where, f"pose {n} at {poses.time_s[n]:g} s", found(n), expected)
+        raise UserError(where, f"{poses.origin(n)}: pose at {poses.time_s[n]:g} s", found(n), expected)

@@ -5,13 +5,18 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from tests.helpers.scenes import config_with, flat_scene
 
+from perilune_render.config_scene import SceneConfig, ViewConfig
+from perilune_render.flight.pose_checks import check_trajectories
 from perilune_render.poses.file import read_poses
+from perilune_render.poses.plan import given_plan
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import matrix_from_quaternion, selenographic_from_site
 
 SITE = (-45.5, 177.6)
 HEADER = "# frame: O_L\ntime_s,x_m,y_m,z_m,qw,qx,qy,qz\n"
+NAMES = HEADER.split()[-1].split(",")
 TURNED = (0.1, 0.9, 0.3, 0.2)
 """A quaternion that is not of length 1 and no half turn, so that its direction matters."""
 
@@ -91,11 +96,16 @@ GOOD = "0,0,0,300,0,1,0,0\n"
         (HEADER.replace(",qz", "") + "0,0,0,300,0,1,0\n", "column: got no qz"),
         (HEADER.replace("qz", "qz,vx_mps") + "0,0,0,300,0,1,0,0,1\n", "column: got no vy_mps"),
         (HEADER, "poses: got 0"),
-        ("", "table: got No columns"),
+        ("", "table: got no line"),
         (HEADER + "0,0,nan,300,0,1,0,0\n", "line 3: y_m: got nan"),
         (HEADER + GOOD + "1,0,inf,300,0,1,0,0\n", "line 4: y_m: got inf"),
         (HEADER + "0,0,down,300,0,1,0,0\n", "line 3: y_m: got down"),
-        (HEADER + "0,0,0,300,0,1,0\n", "line 3: qz: got nan"),
+        (HEADER + "0,0,0,300,0,1,0\n", "line 3: got 7 values, expected 8"),
+        (HEADER + GOOD.strip() + ",0\n", "line 3: got 9 values, expected 8"),
+        (HEADER + GOOD + "\n\n1,0,0,300,0,1,0,0,0\n", "line 6: got 9 values, expected 8"),
+        (HEADER + GOOD + "\n1,0,nan,300,0,1,0,0\n", "line 5: y_m: got nan"),
+        (HEADER + "\n" + GOOD + "1,,0,300,0,1,0,0\n", "line 5: x_m: got empty"),
+        (HEADER.strip() + ",qz\n" + GOOD.strip() + ",0\n", "column: got qz twice"),
         (HEADER + "0,0,0,300,0,0,0,0\n", "line 3: quaternion: got length 0"),
         (HEADER + "0,0,0,300,0,2,0,0\n", "line 3: quaternion: got length 2"),
         (HEADER + GOOD + GOOD, "line 4: time_s: got 0 after 0"),
@@ -124,6 +134,30 @@ def test_a_faulty_file_is_refused_with_its_line(tmp_path, text, message):
     with pytest.raises(UserError) as raised:
         read_poses(path, *SITE)
     assert str(raised.value).startswith(f"{path}: {message}")
+
+
+def test_the_lines_of_a_tum_file_count_comments_and_blank_lines(tmp_path):
+    path = write(tmp_path, "# frame: O_L\n0 0 0 300 1 0 0 0\n# turn\n\n1 0 nan 300 1 0 0 0\n", "poses.tum")
+    with pytest.raises(UserError, match="line 5: y_m: got nan"):
+        read_poses(path, *SITE)
+
+
+@pytest.mark.parametrize(("height_m", "message"), [(-3, "line 5: pose at 1 s: got z -3.0 m"), (1e-3, "line 5: got a")])
+def test_a_pose_that_does_not_fit_the_ground_is_refused_with_its_line(tmp_path, height_m, message):
+    path = write(tmp_path, HEADER + GOOD + f"\n1,0,0,{height_m},0,1,0,0\n")
+    views = (ViewConfig(height_m=100, reach_m=200), ViewConfig(height_m=300, reach_m=300))
+    stated = config_with(scene=SceneConfig(views=views) if height_m > 0 else SceneConfig())
+    with pytest.raises(UserError, match=message) as raised:
+        plan, _ = given_plan(read_poses(path, *SITE), stated, "nav", path)
+        check_trajectories(plan, plan.trajectories, flat_scene(1000.0, 51), path)
+    assert str(raised.value).startswith(str(path))
+
+
+def test_a_row_of_parquet_is_named(tmp_path):
+    path, table = tmp_path / "poses.parquet", pd.DataFrame([[0, 0, 0, 3e7, 0, 1, 0, 0]], columns=NAMES)
+    pq.write_table(pa.Table.from_pandas(table).replace_schema_metadata({"frame": "O_L"}), path)
+    with pytest.raises(UserError, match="row 0: position"):
+        read_poses(path, *SITE)
 
 
 def test_a_missing_file_another_format_and_damaged_files_are_refused(tmp_path):
