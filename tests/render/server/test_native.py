@@ -129,8 +129,12 @@ def test_frames_are_those_of_the_command_frames(tmp_path, world):
         ({"request": "frame", "position_m": [0, 0, 500]}, "rotation_wxyz"),
         ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 0, 0, 0]}, "length 0"),
         ({"request": "frame", "position_m": [0, 0, float("nan")], "rotation_wxyz": [0, 1, 0, 0]}, "position_m"),
-        ({"request": "frame", "position_m": [0, 0, -9], "rotation_wxyz": [0, 1, 0, 0]}, "above the surface"),
-        ({"request": "frame", "position_m": [9e4, 0, 500], "rotation_wxyz": [0, 1, 0, 0]}, "over the ground"),
+        ({"request": "frame", "position_m": [0, 0, -9], "rotation_wxyz": [0, 1, 0, 0]}, "above the ground"),
+        ({"request": "frame", "position_m": [9e4, 0, 500], "rotation_wxyz": [0, 1, 0, 0]}, "over the terrain"),
+        ({"request": "frame", "position_m": [0, 0, 0.6], "rotation_wxyz": [0, 1, 0, 0]}, "at least 1 m"),
+        ({"request": "frame", "position_m": [400, 0, 900], "rotation_wxyz": [0, 1, 0, 0]}, "beyond the terrain's edge"),
+        ({"request": "frame", "position_m": [0, 0, 1e8], "rotation_wxyz": [0, 1, 0, 0]}, "beyond the terrain's edge"),
+        ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [1, 0, 0, 0]}, "with the horizon in view"),
         ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 1, 0, 0], "index": -1}, "index"),
         ({"request": "heights", "x_m": [1, 2], "y_m": [1]}, "y_m"),
         ({"request": "heights", "x_m": [0] * 100_001, "y_m": [0] * 100_001}, "x_m"),
@@ -146,7 +150,7 @@ def test_a_faulty_request_is_refused_and_the_server_lives(scene, request_, messa
 
 
 def test_the_client_says_what_the_server_refused(scene):
-    with pytest.raises(UserError, match="above the surface"):
+    with pytest.raises(UserError, match="above the ground"):
         scene.frame((0, 0, -50), DOWN)
 
 

@@ -37,6 +37,8 @@ def test_a_horizon_without_views_shows_the_sky_to_the_descents_of_the_preset():
     with open_world(config) as world:
         assert world.scene.view.horizon
         depth_m = world.frame(view_of(config, 60.0, 5.0), 0, 0).radiance.depth_m
+        with pytest.raises(UserError, match="beyond the terrain's edge"):
+            world.frame(view_of(config, 5000.0, 5.0), 0, 0)
     assert 0.2 < np.isinf(depth_m).mean() < 0.8
 
 
