@@ -153,6 +153,24 @@ def test_a_pose_that_does_not_fit_the_ground_is_refused_with_its_line(tmp_path, 
     assert str(raised.value).startswith(str(path))
 
 
+def test_frames_of_one_sun_share_a_scene_and_keep_the_times_of_the_whole_trajectory(tmp_path):
+    names = HEADER.strip() + ",sun_azimuth_deg,sun_elevation_deg,trajectory\n"
+    suns = [(0, 20), (359.98, 20.02), (30, 10), (0.02, 20), (30, 10), (0, 20)]
+    rows = [f"{7 + 2 * t},{t},0,300,0,1,0,0,{sun[0]},{sun[1]},{t // 5}\n" for t, sun in enumerate(suns)]
+    found, _ = given_plan(read_poses(write(tmp_path, names + "".join(rows)), *SITE), config_with(), "nav", "file")
+    assert [(scene.sun_azimuth_deg, scene.sun_elevation_deg) for scene in found.scenes] == [(0, 20), (30, 10)]
+    parts = {f"{each.scene_id}/{each.trajectory_id}": each for each in found.trajectories}
+    assert {key: (list(each.frame_index), each.flight.time_s.tolist()) for key, each in parts.items()} == {
+        "scene-0000/trajectory-0000": ([0, 1, 3], [0, 2, 6]),
+        "scene-0000/trajectory-0001": ([0], [0]),
+        "scene-0001/trajectory-0000": ([2, 4], [4, 8]),
+    }
+    part = parts["scene-0001/trajectory-0000"]
+    assert part.flight.position_m[:, 0].tolist() == [2, 4]
+    assert np.allclose(part.flight.nominal.position_at(part.flight.time_s), part.flight.position_m)
+    assert [part.origin(k) for k in range(2)] == ["line 5", "line 7"]
+
+
 def test_a_row_of_parquet_is_named(tmp_path):
     path, table = tmp_path / "poses.parquet", pd.DataFrame([[0, 0, 0, 3e7, 0, 1, 0, 0]], columns=NAMES)
     pq.write_table(pa.Table.from_pandas(table).replace_schema_metadata({"frame": "O_L"}), path)
