@@ -1,14 +1,19 @@
 """The command `frames` with the engine `heightfield`: Suns that alternate, hazard channels, errors with their lines."""
 
+import cv2
+import numpy as np
 import pytest
+import rasterio
 import yaml
 from tests.helpers import in_process
+from tests.helpers.elevation_models import POLAR, write
 
 from perilune_render.cli.main import main
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.validation.validate import validate
 
 NAMES = "time_s,x_m,y_m,z_m,qw,qx,qy,qz"
+PIT = POLAR, rasterio.Affine(10, 0, 1e5, 0, -10, 0)
 VIEWS = [{"height_m": 100, "reach_m": 150}, {"height_m": 300, "reach_m": 300}]
 
 
@@ -53,3 +58,29 @@ def test_the_line_of_a_pose_that_does_not_fit_is_named(tmp_path, z_m, message):
     done = frames(tmp_path, written(tmp_path, NAMES, rows, scene=scene))
     assert done.returncode == 2 and message in done.stderr, done.stderr
     assert not (tmp_path / "out" / "dataset.json").exists()
+
+
+def test_frames_and_preview_warn_of_each_sun_that_leaves_the_site_in_shadow(tmp_path):
+    column, row = np.meshgrid(np.arange(300) + 0.5, np.arange(300) + 0.5)
+    dem = write(tmp_path / "pit.tif", -120 * np.clip(1 - (np.hypot(column - 150, row - 150) / 30) ** 2, 0, None), *PIT)
+    rows = [f"{k},{20 * k},0,{250 - 30 * k},0,1,0,0,{90 * k},{sun}" for k, sun in enumerate((15, 60, 10))]
+    arguments = written(tmp_path, f"{NAMES},sun_azimuth_deg,sun_elevation_deg", rows)
+    out = [("--out", tmp_path / name, "--workers", n) for n, name in enumerate(("here", "worker"))]
+    commands = [*(("frames", *where) for where in out), ("preview", "--out", tmp_path / "p.png")]
+    for command in commands:
+        done = in_process.call(main, command[0], *arguments, "--dem", dem, *command[1:])
+        assert done.returncode == 0, done.stderr
+        found = [line.split(":")[1].strip() for line in done.stderr.splitlines() if "lies in shadow" in line]
+        assert found == ["scene-0000", "scene-0002"]
+    picture = cv2.imread(str(tmp_path / "p-map.png"))
+    assert picture.shape[:2] == (940, 1280)
+    track = (np.abs(picture[20:920, 20:920].astype(int) - [40, 160, 255]) < 30).all(axis=-1)
+    assert 20 < track.sum() < 2000  # the poses of all three Suns, near the site
+
+
+def test_preview_refuses_a_scene_without_poses(tmp_path):
+    arguments = written(tmp_path, NAMES, ["0,0,0,200,0,1,0,0"])
+    done = in_process.call(main, "preview", arguments[3], "--out", tmp_path / "p.png")
+    assert done.returncode == 2 and "preview --poses" in done.stderr
+    done = in_process.call(main, "preview", *arguments[2:], "--out", tmp_path / "p.png")
+    assert done.returncode == 2 and "--poses as well" in done.stderr
