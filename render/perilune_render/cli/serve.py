@@ -1,6 +1,7 @@
 """The command `perilune-render serve`."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -117,6 +118,9 @@ def open_world(config: DatasetConfig) -> "World":
         view = scene_view(scene, pinhole)
     else:
         view = (horizon_envelope if scene.horizon else view_envelope)(pinhole, config.nav.flight)
+    if config.render.engine == "cycles":
+        # No mesh in levels, which hold only the ground of one descent: a ground that is too large is refused.
+        view = replace(view, seen=None)
     check_ground(config, view)
     say("generating the ground")
     return World(cached_scene(config, view, scene_seed(config)), config, say)

@@ -9,7 +9,9 @@ from perilune_render.cli.serve import open_world
 from perilune_render.config import CameraConfig, RenderConfig
 from perilune_render.config_scene import SceneConfig
 from perilune_render.flight.lens import camera_of
+from perilune_render.flight.view import view_envelope
 from perilune_render.server.world import View
+from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import sun_direction
 
@@ -46,3 +48,15 @@ def test_a_horizon_of_too_high_descents_is_refused():
     config = config_of(SceneConfig(horizon=True), start_altitude_m=30_000.0)
     with pytest.raises(UserError, match=r"dataset.scene.views: got none"):
         open_world(config)
+
+
+def test_blender_refuses_a_ground_of_which_it_would_show_only_one_descent():
+    config = config_of(None)
+    config = config.model_copy(update={"render": config.render.model_copy(update={"engine": "cycles"})})
+    whole = graded_grid(config.terrain, view_envelope(camera_of(config.camera), config.nav.flight)).n_vertices
+    limited = config.terrain.model_copy(update={"max_vertices": whole - 1})
+    with pytest.raises(UserError, match=r"dataset.terrain.spacing_px: got 2.0 needs .* vertices"):
+        open_world(config.model_copy(update={"terrain": limited}))
+    just = config.terrain.model_copy(update={"max_vertices": whole})
+    with open_world(config.model_copy(update={"terrain": just})) as world:
+        assert world.scene.view.seen is None and world.scene.grid.n_vertices == whole
