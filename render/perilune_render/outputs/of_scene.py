@@ -1,13 +1,13 @@
 """The outputs beside the frames of one lit scene, as a configuration asks for them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from perilune_render.config import DatasetConfig
 from perilune_render.config_outputs import FlashLidarConfig
-from perilune_render.frame_source import Frame, FrameSource
+from perilune_render.frame_source import Frame
 from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.outputs.flash_lidar import flash
 from perilune_render.outputs.hazard import HazardMap, hazard_map
@@ -49,11 +49,11 @@ class SceneOutputs:
         hazard = hazard_map(surface, scene, sun, config.hazard)
         return cls(surface, hazard, config.hazard.frame_channels, config.flash_lidar)
 
-    def beside(self, frame: Frame, source: FrameSource) -> Beside:
-        """The outputs beside a frame of a source."""
+    def beside(self, frame: Frame, places_m: Callable[[Frame], Array]) -> Beside:
+        """The outputs beside a frame; `places_m` is that of its frame source."""
         channels: Mapping[str, np.ndarray] = {}
         if self.hazard is not None and self.has_channels:
-            places = source.places_m(frame)
+            places = places_m(frame)
             channels = self.hazard.at(places[..., 0], places[..., 1])
         if self.surface is None or self.flash_lidar is None:
             return Beside(channels)
