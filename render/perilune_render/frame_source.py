@@ -151,12 +151,30 @@ class FrameSource:
 
     def _render_at(self, shot: Shot, time_s: float, seed: int) -> Radiance:
         """The rendering of a shot at a time of its exposure, seconds from its middle, with the shutter's row times."""
-        if not (self.sensor.row_time_s and shot.moves):
+        if not self._rolls(shot):
             return self.engine.render(*shot.pose_at(time_s), seed, shot.approach_deg)
+        return self.engine.render_rows(self._row_poses(shot, time_s), seed, shot.approach_deg)
+
+    def _rolls(self, shot: Shot) -> bool:
+        """Whether the rows of a shot have different poses."""
+        return bool(self.sensor.row_time_s) and shot.moves
+
+    def _row_poses(self, shot: Shot, time_s: float = 0.0) -> RowPoses:
+        """Poses of the rows of a shot at a time of its exposure, seconds from its middle."""
         times_s = row_times_s(self.camera.height_px, self.sensor.row_time_s)
-        rows = sensor_rows(self.camera, self.engine.camera)
-        poses = RowPoses(rows, times_s, lambda t: shot.pose_at(time_s + t))
-        return self.engine.render_rows(poses, seed, shot.approach_deg)
+        return RowPoses(sensor_rows(self.camera, self.engine.camera), times_s, lambda t: shot.pose_at(time_s + t))
+
+    def places_m(self, frame: Frame) -> Array:
+        """Places (h, w, 3), O_L, metres, that pixels of the engine's camera show at their rows' poses; NaN for sky."""
+        shot, camera, depth_m = frame.shot, self.engine.camera, frame.radiance.depth_m.astype(np.float64)
+        depth_m = np.where(np.isfinite(depth_m), depth_m, np.nan)[..., None]
+        rays = camera.rays(camera.pixel_centres())
+        if not self._rolls(shot):
+            return depth_m * (rays @ shot.rotation_camera_from_site) + shot.position_m
+        rows = self._row_poses(shot)
+        position, rotation = (np.array(each) for each in zip(*map(rows.pose_at, rows.time_s.tolist()), strict=True))
+        turned = [sum(rays[..., i] * rotation[rows.row, i, j] for i in range(3)) for j in range(3)]
+        return depth_m * np.stack(turned, axis=-1) + position[rows.row]
 
     def develop(self, shot: Shot, radiance: Radiance) -> Frame:
         """Develop the rendering of a shot. Another thread may do this while the engine renders the next shot."""
@@ -185,7 +203,7 @@ class FrameSource:
 
     def _seen_circles(self, shot: Shot) -> RimCircles:
         """The rims moved to where the pose of the shot sees them as the row of each one's centre does."""
-        if not (self.sensor.row_time_s and shot.moves):
+        if not self._rolls(shot):
             return self.circles
         moving = Moving(*(each[None] for each in (*shot.pose, shot.velocity_mps, shot.angular_velocity_radps)))
         time = moving.row_times_s(self.circles.centre_m, self.camera, self.sensor.row_time_s)

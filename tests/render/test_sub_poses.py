@@ -1,6 +1,6 @@
 """Rolling shutter and motion blur by several poses in one exposure."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from perilune_render.config import LightConfig, RenderConfig, SensorConfig
 from perilune_render.engines import open_engine
 from perilune_render.frame_source import FrameSource, Shot
 from perilune_render.labels.frame_labels import RimCircles
+from perilune_render.outputs.of_scene import SceneOutputs
 from perilune_render.sub_poses import RowPoses, moved, row_times_s, sensor_rows
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
@@ -164,6 +165,31 @@ def test_row_poses_count_the_motion_of_the_whole_image():
     motion = rows.motion_px(np.full((64, 96), 400.0), CAMERA)
     assert motion == pytest.approx(CAMERA.fx_px * 100 * 0.63 / 400, rel=1e-6)
     assert [int(pixels.sum()) for pixels, _ in rows.bands(4)] == [16 * 96] * 4
+
+
+@dataclass(frozen=True)
+class PlaceMap:
+    """Stands for a hazard map whose values are the places themselves."""
+
+    def at(self, x_m, y_m):
+        return {"x": x_m, "y": y_m}
+
+
+@pytest.mark.parametrize("camera", [CAMERA, replace(CAMERA, distortion=(-0.05, 0.0, 0.0, 0.0, 0.0))])
+@pytest.mark.parametrize("turn", [(0, 0, 0), (0.2, -0.3, 1.0)])
+def test_channels_of_the_hazard_map_are_those_of_the_place_that_each_row_shows(scene, turn, camera):
+    one, config = shot((300, -200, -400), turn), config_of(row_time_s=1e-3)
+    with open_engine(scene, config, camera.covering_pinhole(), SUN) as engine:
+        source, exr_camera = FrameSource.of(engine, config, camera, CIRCLES), engine.camera
+        channels = SceneOutputs(hazard=PlaceMap(), has_channels=True).beside(source.take(one), source.places_m).channels
+    times_s, rows = row_times_s(64, 1e-3), sensor_rows(camera, exr_camera)
+    height, width = rows.shape
+    for row, column in ((1, 2), (height // 2, 5), (height - 2, width - 1)):
+        position, rotation = one.pose_at(times_s[rows[row, column]])
+        ray = exr_camera.rays(np.array([column + 0.5, row + 0.5])) @ rotation
+        x, y, _ = position - position[2] / ray[2] * ray
+        assert channels["x"][row, column] == pytest.approx(x, abs=2e-3)
+        assert channels["y"][row, column] == pytest.approx(y, abs=2e-3)
 
 
 def test_the_command_records_the_turn_and_the_manifest_gives_the_same_bytes(tmp_path):

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from perilune_render.cli.dataset import How, made_or_exit
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
+from perilune_render.config import DatasetConfig
 from perilune_render.config_cameras import CameraConfig
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.names import Kind
@@ -47,13 +48,7 @@ def frames(
     resume.
     """
     how = How.of("local", None, workers, threads, None, finish=False, dry_run=False)
-    config = resolved_config(preset, scene, setting, dem, catalogue, given_scene=True)
-    if camera is not None and config.cameras:
-        raise UserError(
-            "--camera", "dataset.cameras", ", ".join(config.cameras), "--camera or dataset.cameras, not both"
-        )
-    if camera is not None:
-        config = config.model_copy(update={"camera": read_camera(camera)})
+    config = with_camera(resolved_config(preset, scene, setting, dem, catalogue, given_scene=True), camera)
     store = open_store(out)
     from perilune_render.dataset.begin import new_info
     from perilune_render.jobs.job import Job
@@ -72,6 +67,16 @@ def frames(
             f"{made.store}: {counts.frames} frames, {counts.labels} labels; look at {made.store.at('overview.png')}",
             soft_wrap=True,
         )
+
+
+def with_camera(config: DatasetConfig, path: Path | None) -> DatasetConfig:
+    """A configuration with the camera of a file, if there is one. Raises UserError if it has several cameras."""
+    if path is None:
+        return config
+    if config.cameras:
+        expected = "--camera or dataset.cameras, not both"
+        raise UserError("--camera", "dataset.cameras", ", ".join(config.cameras), expected)
+    return config.model_copy(update={"camera": read_camera(path)})
 
 
 def read_camera(path: Path) -> CameraConfig:

@@ -10,7 +10,7 @@ from rich.console import Console
 import perilune_shared as ps
 from perilune_render.cli.counterfactual import counterfactual
 from perilune_render.cli.dataset import dataset
-from perilune_render.cli.frames import frames
+from perilune_render.cli.frames import frames, with_camera
 from perilune_render.cli.options import (
     Catalogue,
     Config,
@@ -162,18 +162,36 @@ def preview(
     kind: Annotated[
         KindChoice, typer.Option(help="Dataset whose first scene and trajectory are shown (detect or nav).")
     ] = "detect",
+    poses: Annotated[
+        Path | None, typer.Option(help="Poses as for `frames`, in place of the descents of the configuration.")
+    ] = None,
+    scene: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`; the same as CONFIG.")] = None,
+    camera: Annotated[Path | None, typer.Option(help="With --poses: as for `frames`.")] = None,
     out: Annotated[Path, typer.Option(help="PNG to write; the map is written beside it, as NAME-map.png.")] = Path(
         "preview.png"
     ),
 ) -> None:
     """Render a contact sheet of a configuration, with and without labels, and a map of its site, in seconds."""
-    resolved = resolved_config(preset, config, setting, dem, catalogue)
+    if poses is None and (scene is not None or camera is not None):
+        raise UserError("preview", "--scene or --camera", "no --poses", "--poses as well")
+    if scene is not None and config is not None:
+        raise UserError("preview", "--scene", f"{scene} and {config}", "one of them")
+    resolved = resolved_config(preset, scene or config, setting, dem, catalogue, given_scene=poses is not None)
+    resolved = with_camera(resolved, camera)
     if out.suffix != ".png":
         raise UserError(out, "format", out.suffix or "none", ".png")
+    from perilune_render.flight.plan import make_plan
+    from perilune_render.poses.file import read_poses
+    from perilune_render.poses.plan import given_plan
     from perilune_render.preview.contact_sheet import write_preview
+    from perilune_render.terrain.scene import site_of
 
+    if poses is None:
+        plan = make_plan(resolved, first_kind(kind))
+    else:
+        plan, resolved = given_plan(read_poses(poses, *site_of(resolved)), resolved, first_kind(kind), poses)
     map_path = out.with_name(f"{out.stem}-map.png")
-    write_preview(resolved, first_kind(kind), out, map_path)
+    write_preview(plan, resolved, poses or f"configuration: dataset.{first_kind(kind)}", out, map_path)
     Console().print(f"look at {out} and {map_path}", soft_wrap=True)
 
 

@@ -77,7 +77,9 @@ def resolved_config(
     """
     resolved = resolve(DatasetConfig, "dataset", "perilune_render", preset, config, tuple(setting or ()))
     if resolved.scene is not None and not given_scene:
-        raise UserError("configuration", "dataset.scene", "set", "null; `perilune-render frames` renders given poses")
+        raise UserError(
+            "configuration", "dataset.scene", "set", "null, or poses: `perilune-render frames`, `preview --poses`"
+        )
     if resolved.survey is not None:
         raise UserError("configuration", "dataset.survey", "set", "null; `perilune-render survey` renders from orbit")
     if resolved.counterfactual is not None:

@@ -1,6 +1,7 @@
 """The command `perilune-render serve`."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -105,15 +106,21 @@ def serve(
 def open_world(config: DatasetConfig) -> "World":
     """The world of a configuration: its ground is made for `dataset.scene.views`, or for the flights of `nav`."""
     from perilune_render.flight.lens import camera_of
-    from perilune_render.flight.view import scene_view, view_envelope
+    from perilune_render.flight.view import horizon_envelope, scene_view, view_envelope
     from perilune_render.poses.plan import scene_seed
     from perilune_render.server.world import World
     from perilune_render.terrain.cache import cached_scene
     from perilune_render.terrain.scene import check_ground
 
     pinhole = camera_of(config.camera).covering_pinhole()
-    stated = config.scene is not None and bool(config.scene.views)
-    view = scene_view(config.scene, pinhole) if stated and config.scene else view_envelope(pinhole, config.nav.flight)
+    scene = config.scene or SceneConfig()
+    if scene.views:
+        view = scene_view(scene, pinhole)
+    else:
+        view = (horizon_envelope if scene.horizon else view_envelope)(pinhole, config.nav.flight)
+    if config.render.engine == "cycles":
+        # No mesh in levels, which hold only the ground of one descent: a ground that is too large is refused.
+        view = replace(view, seen=None)
     check_ground(config, view)
     say("generating the ground")
     return World(cached_scene(config, view, scene_seed(config)), config, say)

@@ -163,7 +163,7 @@ def _of_scene(
                 frame = source.take(recorded_shot(row, trajectory["seed"], approach))
                 # Developed frames have no EXR, although their recipe has dataset.render.exr=true.
                 has_exr = row["exr_path"] is not None
-                beside = outputs.beside(frame, engine.camera)
+                beside = outputs.beside(frame, source.places_m)
                 new = write_frame(out, frame_id, source, frame, exr=has_exr, beside=beside)
                 png = _compared(dataset, row, "png", out, new)
                 exr = _compared(dataset, row, "exr", out, new) if has_exr else None

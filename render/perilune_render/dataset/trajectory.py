@@ -74,7 +74,7 @@ def _frames(
 
     def written(place: int, shot: Shot, radiance: Radiance) -> _Written:
         frame = source.develop(shot, radiance)
-        beside = outputs.beside(frame, source.engine.camera)
+        beside = outputs.beside(frame, source.places_m)
         files = write_frame(out, trajectory.frame_id(place), source, frame, exr=config.render.exr, beside=beside)
         return _labelled(trajectory.frame_id(place), files, source, frame, scene)
 

@@ -62,6 +62,8 @@ class TrajectoryPlan:
     """Whether the flight follows from the seed; otherwise it is recorded in a manifest."""
     camera: str | None = None
     """Name of its camera, one of several on the body; None if the body has one without a name."""
+    origin: Callable[[int], str] | None = None
+    """Returns the place in a user's file of the pose at an index of `frame_index`, for messages; None for none."""
 
     @cached_property
     def flight(self) -> Flight:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perilune_render.flight.plan import Plan, TrajectoryPlan
+from perilune_render.terrain.boulders import largest_height_m, tops_m
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene
@@ -18,7 +19,9 @@ from perilune_shared.geometry.curvature import hits_sphere, horizon_m
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 LEAST_CLEARANCE_M = 1.0
-"""Smallest height of the camera above the ground below it, metres."""
+"""Smallest height of the camera above the ground or the boulder below it, metres."""
+LARGEST_MPS, LARGEST_RADPS = 12_000.0, 100.0
+"""Largest velocity, metres per second, five times that of escape, and largest angular velocity, radians per second."""
 _CHECKED_FRAMES = 20_000
 """Number of frames that `check_plan` checks, about: a few seconds' work."""
 _POINTS_PER_SIDE = 8
@@ -30,7 +33,7 @@ class Poses:
     """Poses of the camera in N frames of one scene."""
 
     frame_id: Sequence[str]
-    """Ids of the frames (N,)."""
+    """Ids of the frames (N,), for messages; with the place in the user's file if the poses are from one."""
     position_m: Array
     """Position of the camera, O_L, metres (N, 3)."""
     rotation_wxyz: Array
@@ -40,10 +43,16 @@ class Poses:
     def planned(cls, trajectories: Sequence[TrajectoryPlan]) -> "Poses":
         """Poses of all frames of these trajectories, all of one scene."""
         return cls(
-            [t.frame_id(i) for t in trajectories for i in range(len(t.splits))],
+            [_named(t, i) for t in trajectories for i in range(len(t.splits))],
             np.concatenate([t.flight.position_m for t in trajectories]),
             np.concatenate([t.flight.rotation_wxyz for t in trajectories]),
         )
+
+
+def _named(trajectory: TrajectoryPlan, place: int) -> str:
+    """Id of a frame, with the place of its pose in the user's file."""
+    frame_id = trajectory.frame_id(place)
+    return frame_id if trajectory.origin is None else f"{frame_id}, {trajectory.origin(place)}"
 
 
 def check_plan(plan: Plan, grid: Grid, where: object) -> None:
@@ -75,24 +84,15 @@ def check_trajectories(plan: Plan, trajectories: Sequence[TrajectoryPlan], scene
 
 
 def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> None:
-    """Check poses against the ground of a scene.
+    """Check poses against the ground of a scene: `check_places`, and what the frames show.
 
-    The camera must be at least LEAST_CLEARANCE_M above the ground, and the ray through every tested point of the image
-    border must hit the mesh, unless the scene's views may show the sky. A ray that starts above the ground hits the
-    mesh if and only if it is below the mesh's edge where it leaves the mesh's square. Raises UserError with `where` and
-    the first frame that fails.
+    The ray through every tested point of the image border must hit the mesh, unless the scene's views may show the sky.
+    A ray that starts above the ground hits the mesh if and only if it is below the mesh's edge where it leaves the
+    mesh's square. Raises UserError with `where` and the first frame that fails.
     """
     horizon = scene.view is not None and scene.view.horizon
     rays = _check_mesh(poses, camera, scene.grid, where, horizon=horizon)
-    x, y, z = poses.position_m.T
-    ground = value_at(scene.height_m, scene.grid, x, y)
-    _refuse(
-        z < ground + LEAST_CLEARANCE_M,
-        poses,
-        where,
-        lambda n: f"a camera {z[n] - ground[n]:.1f} m above the ground",
-        lambda n: f"at least {LEAST_CLEARANCE_M:g} m: position_m[2] at least {ground[n] + LEAST_CLEARANCE_M:.1f}",
-    )
+    check_places(poses, scene, where)
     if horizon:
         return
     edge, leaves_x, leaves_y = _leaving(poses.position_m, rays, scene.grid.extent_m / 2)
@@ -106,11 +106,58 @@ def check_poses(poses: Poses, camera: Camera, scene: Scene, where: object) -> No
     )
 
 
+def check_places(poses: Poses, scene: Scene, where: object) -> None:
+    """Check that cameras are over the mesh of a scene, and LEAST_CLEARANCE_M above its ground and its boulders.
+
+    With horizon they must not be so high that it is beyond the mesh's edge. Raises UserError with `where` and the first
+    frame that fails.
+    """
+    _check_over(poses, scene.grid, where, horizon=scene.view is not None and scene.view.horizon)
+    x, y, z = poses.position_m.T
+    ground = value_at(scene.height_m, scene.grid, x, y)
+    _check_clearance(poses, ground, "ground", where)
+    low = np.flatnonzero(z < ground + LEAST_CLEARANCE_M + largest_height_m(scene.boulders))
+    top = np.full(len(z), -np.inf)
+    top[low] = tops_m(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed, x[low], y[low])
+    _check_clearance(poses, top, "boulder below it", where)
+
+
+def _check_clearance(poses: Poses, surface_m: Array, what: str, where: object) -> None:
+    """Check that cameras are LEAST_CLEARANCE_M above surfaces at these heights (N,)."""
+    z = poses.position_m[:, 2]
+    _refuse(
+        z < surface_m + LEAST_CLEARANCE_M,
+        poses,
+        where,
+        lambda n: f"a camera {z[n] - surface_m[n]:.1f} m above the {what}",
+        lambda n: f"at least {LEAST_CLEARANCE_M:g} m: position_m[2] at least {surface_m[n] + LEAST_CLEARANCE_M:.1f}",
+    )
+
+
 def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object, *, horizon: bool) -> Array:
     """Check that poses are over the mesh and show ground alone, or with `horizon` some ground.
 
     Returns rays (N, S, 3), O_L, through S image border points.
     """
+    _check_over(poses, grid, where, horizon=horizon)
+    matrices = matrix_from_quaternion(poses.rotation_wxyz)
+    rays = np.einsum("nji,sj->nsi", matrices, camera.rays(_edge_points(camera)))
+    if horizon:
+        _check_not_only_sky(poses, camera, matrices, where)
+        return rays
+    off_nadir = np.degrees(np.arccos(np.clip(-matrices[:, 2, 2], -1, 1)))
+    _refuse(
+        (rays[..., 2] >= 0).any(axis=1),
+        poses,
+        where,
+        lambda n: f"a camera axis {off_nadir[n]:.0f} degrees from straight down, with the horizon in view",
+        lambda n: "a view of the ground alone",
+    )
+    return rays
+
+
+def _check_over(poses: Poses, grid: Grid, where: object, *, horizon: bool) -> None:
+    """Check that poses are finite and over the mesh, which with `horizon` must reach the horizon of each."""
     position, rotation = poses.position_m, poses.rotation_wxyz
     unit = np.abs(np.linalg.norm(rotation, axis=1) - 1) <= _UNIT_TOLERANCE
     _refuse(
@@ -128,37 +175,24 @@ def _check_mesh(poses: Poses, camera: Camera, grid: Grid, where: object, *, hori
         lambda n: f"a camera at x {position[n, 0]:.0f} m, y {position[n, 1]:.0f} m",
         lambda n: f"|x| and |y| at most {half:.0f} m, over the terrain",
     )
-    matrices = matrix_from_quaternion(rotation)
-    rays = np.einsum("nji,sj->nsi", matrices, camera.rays(_edge_points(camera)))
-    if horizon:
-        _check_horizon(poses, camera, matrices, half, where)
-        return rays
-    off_nadir = np.degrees(np.arccos(np.clip(-matrices[:, 2, 2], -1, 1)))
-    _refuse(
-        (rays[..., 2] >= 0).any(axis=1),
-        poses,
-        where,
-        lambda n: f"a camera axis {off_nadir[n]:.0f} degrees from straight down, with the horizon in view",
-        lambda n: "a view of the ground alone",
-    )
-    return rays
-
-
-def _check_horizon(poses: Poses, camera: Camera, matrices: Array, half_m: float, where: object) -> None:
-    """Check that the ground reaches the horizon of each pose and that some of it is in view: not only sky."""
-    position = poses.position_m
+    if not horizon:
+        return
     farthest = np.abs(position[:, :2]).max(axis=1) + horizon_m(np.maximum(position[:, 2], 0))
     _refuse(
-        farthest > half_m,
+        farthest > half,
         poses,
         where,
         lambda n: f"a horizon {farthest[n]:.0f} m from the site, beyond the terrain's edge",
-        lambda n: f"at most {half_m:.0f} m: a last view of dataset.scene.views as high as the camera, and as far",
+        lambda n: f"at most {half:.0f} m: a last view of dataset.scene.views as high as the camera, and as far",
     )
+
+
+def _check_not_only_sky(poses: Poses, camera: Camera, matrices: Array, where: object) -> None:
+    """Check that some ground is in view of each pose: not only sky."""
     share = (np.arange(2 * _POINTS_PER_SIDE) + 0.5) / (2 * _POINTS_PER_SIDE)
     u, v = share * camera.width_px, share * camera.height_px
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    in_view = hits_sphere(position, np.einsum("nji,sj->nsi", matrices, camera.rays(points))).any(axis=1)
+    in_view = hits_sphere(poses.position_m, np.einsum("nji,sj->nsi", matrices, camera.rays(points))).any(axis=1)
     _refuse(~in_view, poses, where, lambda n: "a view of the sky alone", lambda n: "some ground in view")
 
 

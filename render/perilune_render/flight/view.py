@@ -3,7 +3,7 @@
 import numpy as np
 
 from perilune_render.config import DatasetConfig, FlightConfig
-from perilune_render.config_scene import SceneConfig
+from perilune_render.config_scene import HIGHEST_M, SceneConfig
 from perilune_render.flight.rig import Rig
 from perilune_render.terrain.envelope import SeenGround, ViewEnvelope
 from perilune_shared.errors import UserError
@@ -53,6 +53,23 @@ def _up_to_horizon(height_m: Array, reach_m: Array) -> tuple[Array, Array]:
     return np.maximum.accumulate(away.min(axis=1)), distance
 
 
+def horizon_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
+    """The views up to the horizon from all trajectories of a flight, up to three standard deviations from the nominal.
+
+    Raises UserError if they begin above HIGHEST_M.
+    """
+    altitude, spread = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, _N_ALTITUDES), _spread_m(flight)
+    highest = flight.start_altitude_m + spread
+    if highest > HIGHEST_M:
+        expected = f"views of at most {HIGHEST_M:g} m: with horizon, the descents of the preset begin too high"
+        raise UserError("configuration", "dataset.scene.views", "none", expected)
+    reach = np.maximum.accumulate(nominal_distance_m(flight, altitude) + max(spread, 0.1 * flight.end_altitude_m))
+    height = np.append(_lowest_m(flight, altitude), highest)
+    return ViewEnvelope(
+        *_up_to_horizon(height, np.append(reach, reach[-1])), max(camera.fx_px, camera.fy_px), horizon=True
+    )
+
+
 def rig_envelope(rig: Rig, flight: FlightConfig) -> ViewEnvelope:
     """The views of all cameras on a body: at each distance the finest spacing that one of them needs.
 
@@ -90,10 +107,20 @@ def view_envelope(camera: Camera, flight: FlightConfig) -> ViewEnvelope:
         wide = f"frames reach {np.degrees(angle):.0f} degrees from straight down"
         raise UserError("configuration", "dataset.camera", wide, f"at most {np.degrees(_WIDEST_RAD):.0f}")
     altitude = np.geomspace(flight.end_altitude_m, flight.start_altitude_m, _N_ALTITUDES)
-    # The ground may rise towards the camera by a twentieth of the altitude.
-    lowest = np.maximum(0.95 * altitude - 3 * flight.position_sigma_m, 0.2 * altitude)
     reach = np.maximum.accumulate(reach_m(camera, flight, altitude))
-    return ViewEnvelope(lowest, reach, max(camera.fx_px, camera.fy_px), seen_ground(camera, flight))
+    return ViewEnvelope(
+        _lowest_m(flight, altitude), reach, max(camera.fx_px, camera.fy_px), seen_ground(camera, flight)
+    )
+
+
+def _spread_m(flight: FlightConfig) -> float:
+    """Three standard deviations of the position, metres."""
+    return 3 * flight.position_sigma_m
+
+
+def _lowest_m(flight: FlightConfig, altitude_m: Array) -> Array:
+    """Lowest height above the ground at nominal altitudes (N,), which may rise by a twentieth of the altitude."""
+    return np.maximum(0.95 * altitude_m - _spread_m(flight), 0.2 * altitude_m)
 
 
 def view_angle(camera: Camera, flight: FlightConfig) -> float:

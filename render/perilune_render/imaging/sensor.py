@@ -248,7 +248,7 @@ def _blurred(light: np.ndarray, motion: np.ndarray) -> np.ndarray:
     if longest < _LEAST_MOTION_PX:
         return light
     # Gauss-Legendre nodes: two are enough to give the blur of a short motion its true width.
-    times, weights = np.polynomial.legendre.leggauss(min(int(2 * longest) + 2, 128))
+    times, weights = np.polynomial.legendre.leggauss(int(min(2 * longest, 126)) + 2)
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in light.shape[::-1]))
     mean = np.zeros_like(light)
     for time, weight in zip(times / 2, weights / 2, strict=True):

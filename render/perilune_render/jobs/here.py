@@ -8,6 +8,7 @@ from perilune_render.jobs.report import Report
 from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.work_list import WorkList
 from perilune_shared.errors import ends_run
+from perilune_shared.progress import say
 from perilune_shared.storage.store import Store
 
 
@@ -27,7 +28,8 @@ class Here:
 
     def check_scene(self, scene_id: str) -> None:
         """Generate a scene and check that its poses fit it. Raises UserError."""
-        self._renderer.grow(scene_id)
+        for line in self._renderer.check(scene_id):
+            say(line)
 
     def render(self, work: WorkList, report: Report) -> None:
         """Render all trajectories of a work list. Raises the first error that would also end all other trajectories."""

@@ -22,6 +22,7 @@ from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
 from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
+from perilune_shared.progress import say
 from perilune_shared.storage.store import Store, open_store
 
 WORKER = ("-m", "perilune_render.jobs.worker")
@@ -99,8 +100,11 @@ class LocalWorkers:
                 asked.append(ready[0])
                 ready[0].send("grow", scene_id)
             for worker in self._heard():
-                if self._receive(worker) == ("grown",):
+                message = self._receive(worker)
+                if message is not None and message[0] == "grown":
                     worker.scene_id = scene_id
+                    for line in message[1]:
+                        say(line)
                     return
 
     def render(self, work: WorkList, report: Report) -> None:

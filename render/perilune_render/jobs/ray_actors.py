@@ -20,6 +20,7 @@ from perilune_render.jobs.work_list import WorkList
 from perilune_render.processor import SETTINGS
 from perilune_shared.errors import UserError, ends_run
 from perilune_shared.interrupts import interrupts_held
+from perilune_shared.progress import say
 from perilune_shared.storage.store import Store
 
 
@@ -30,9 +31,9 @@ class _Renderer:
         """Receive the job. Raises UserError if the code of this process is not that of the job."""
         self._renderer = SceneRenderer(job, out)
 
-    def grow(self, scene_id: str) -> None:
-        """Generate a scene and check that its poses fit it."""
-        self._renderer.grow(scene_id)
+    def grow(self, scene_id: str) -> list[str]:
+        """Generate a scene and check that its poses fit it; returns warnings."""
+        return self._renderer.check(scene_id)
 
     def render(self, place: int) -> list[str]:
         """Render a trajectory; returns the ids of its dark frames."""
@@ -108,7 +109,7 @@ class RayActors:
             self._start(1)
             actor = self._actors[0]
             try:
-                ray.get([*self._pending, actor.handle.grow.remote(scene_id)])
+                warnings = ray.get([*self._pending, actor.handle.grow.remote(scene_id)])[-1]
             except RayActorError as error:
                 self._pending.clear()
                 self._lose_start(actor, error)
@@ -116,6 +117,8 @@ class RayActors:
                 raise error.cause from None
             else:
                 actor.scene_id = scene_id
+                for line in warnings:
+                    say(line)
                 return
 
     def render(self, work: WorkList, report: Report) -> None:

@@ -17,6 +17,7 @@ from perilune_render.jobs.records import RunningRecord
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.outputs.hazard_raster import hazard_tiff
 from perilune_render.outputs.of_scene import SceneOutputs
+from perilune_render.preview.site_horizon import shadow_warnings
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene
 from perilune_shared.dataset.names import scene_file_path
@@ -59,6 +60,11 @@ class SceneRenderer:
             check_trajectories(job.plan, trajectories, scene, job.where)
             self._grown = scene_id, scene
         return self._grown[1]
+
+    def check(self, scene_id: str) -> list[str]:
+        """`grow` a scene; returns warnings: Suns that leave the site in shadow, if the poses are given."""
+        scene, job = self.grow(scene_id), self._job
+        return [] if job.config.scene is None else shadow_warnings(scene, job.plan.scenes)
 
     def render(self, place: int, advance: Callable[[], object], note: Callable[[str], object]) -> list[str]:
         """Render a trajectory and write its files, labels and frames; returns the ids of its dark frames.

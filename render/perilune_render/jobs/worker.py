@@ -41,8 +41,7 @@ def _serve(connection: Connection) -> None:
         while True:
             command, target = connection.recv()
             if command == "grow":
-                renderer.grow(target)
-                connection.send(("grown",))
+                connection.send(("grown", renderer.check(target)))
                 continue
             try:
                 dark = renderer.render(

@@ -1,6 +1,6 @@
 """The outputs beside the frames of one lit scene, as a configuration asks for them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +12,6 @@ from perilune_render.heightfield.surface import Surface, surface_of
 from perilune_render.outputs.flash_lidar import flash
 from perilune_render.outputs.hazard import HazardMap, hazard_map
 from perilune_render.terrain.scene import Scene
-from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 
 
@@ -50,14 +49,12 @@ class SceneOutputs:
         hazard = hazard_map(surface, scene, sun, config.hazard)
         return cls(surface, hazard, config.hazard.frame_channels, config.flash_lidar)
 
-    def beside(self, frame: Frame, camera: Camera) -> Beside:
-        """The outputs beside a frame whose radiance is in the pixels of `camera`."""
+    def beside(self, frame: Frame, places_m: Callable[[Frame], Array]) -> Beside:
+        """The outputs beside a frame; `places_m` is that of its frame source."""
         channels: Mapping[str, np.ndarray] = {}
         if self.hazard is not None and self.has_channels:
-            depth = frame.radiance.depth_m.astype(np.float64)
-            rays = camera.rays(camera.pixel_centres()) @ frame.shot.rotation_camera_from_site
-            seen = np.where(np.isfinite(depth), depth, np.nan)[..., None] * rays + frame.shot.position_m
-            channels = self.hazard.at(seen[..., 0], seen[..., 1])
+            places = places_m(frame)
+            channels = self.hazard.at(places[..., 0], places[..., 1])
         if self.surface is None or self.flash_lidar is None:
             return Beside(channels)
         return Beside(channels, flash(self.surface, frame.shot, self.flash_lidar).exr())

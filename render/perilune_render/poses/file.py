@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 
+from perilune_render.flight.pose_checks import LARGEST_MPS, LARGEST_RADPS
+from perilune_render.poses.table import SITE_FROM_CAMERA, read_table
 from perilune_shared.config_errors import nearest
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, site_from_selenographic
@@ -36,11 +36,8 @@ _TIME, _ROTATION = ("time_s",), ("qw", "qx", "qy", "qz")
 _VELOCITY, _SUN = ("vx_mps", "vy_mps", "vz_mps"), ("sun_azimuth_deg", "sun_elevation_deg")
 _TURN = ("wx_radps", "wy_radps", "wz_radps")
 _TRAJECTORY = "trajectory"
-_TUM = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-_DIRECTIONS = ("camera_from_site", "site_from_camera")
-_KEYS = ("frame", "rotation", "origin_m", "site")
+_DIRECTIONS = ("camera_from_site", SITE_FROM_CAMERA)
 _MAX_POSES = 1_000_000
-_MAX_BYTES = 500_000_000
 _LENGTH_TOLERANCE = 0.01
 """Largest deviation of a quaternion's length from 1 that rounding of its digits explains."""
 _LARGEST_M = 1e6
@@ -66,8 +63,15 @@ class GivenPoses:
     angular_velocity_radps: Array | None = None
     """Angular velocity of the camera, O_C, radians per second (N, 3); None if the file has none."""
 
+    line: np.ndarray | None = None
+    """Line of each pose in the file, from 1 (N,); None if its poses have no lines but rows, from 0."""
+
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def origin(self, index: int) -> str:
+        """The place of a pose in its file, for messages."""
+        return f"row {index}" if self.line is None else f"line {self.line[index]}"
 
     @property
     def sha256(self) -> str:
@@ -82,15 +86,7 @@ class GivenPoses:
 
 def read_poses(path: Path, latitude_deg: float, longitude_deg: float) -> GivenPoses:
     """The poses of a file, for a site at these coordinates. Raises UserError with the first line that is wrong."""
-    if not path.is_file():
-        raise UserError(path, "poses", "no such file", "a file .csv, .parquet or .tum")
-    if path.stat().st_size > _MAX_BYTES:
-        raise UserError(path, "size", f"{path.stat().st_size} bytes", f"at most {_MAX_BYTES}")
-    readers = {".csv": _read_csv, ".parquet": _read_parquet, ".tum": _read_tum, ".txt": _read_tum}
-    if path.suffix not in readers:
-        raise UserError(path, "format", path.suffix or "none", ".csv, .parquet or .tum")
-    table, stated, first_line = readers[path.suffix](path)
-    return _checked(_Source(path, table, stated, first_line), latitude_deg, longitude_deg)
+    return _checked(_Source(path, *read_table(path)), latitude_deg, longitude_deg)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,15 +97,20 @@ class _Source:
     table: pd.DataFrame
     stated: dict[str, str]
     """What its header states: frame, rotation, origin_m."""
-    first_line: int
-    """Line of the first pose, or 0 if rows are counted from 0."""
+    line: np.ndarray | None
+    """Line of each pose (N,); None if rows are counted from 0."""
 
     def numbers(self, names: tuple[str, ...]) -> Array:
         """Columns as an array (N, k). Raises UserError for a value that is not a finite number."""
         columns = []
         for name in names:
             values = pd.to_numeric(self.table[name], errors="coerce").to_numpy(np.float64)
-            self.refuse(~np.isfinite(values), name, lambda row, name=name: self.table[name].iloc[row], "a number")
+            self.refuse(
+                ~np.isfinite(values),
+                name,
+                lambda row, name=name: str(self.table[name].iloc[row]) or "empty",
+                "a number",
+            )
             columns.append(values)
         return np.stack(columns, axis=1)
 
@@ -117,64 +118,8 @@ class _Source:
         """Raise UserError for the first true value of `wrong` (N,); `found` makes a text from its index."""
         if wrong.any():
             row = int(np.argmax(wrong))
-            place = f"line {self.first_line + row}" if self.first_line else f"row {row}"
+            place = f"row {row}" if self.line is None else f"line {self.line[row]}"
             raise UserError(self.path, f"{place}: {field}", found(row), expected)
-
-
-def _read_csv(path: Path) -> tuple[pd.DataFrame, dict[str, str], int]:
-    lines = _text(path).splitlines()
-    n_comments = next((n for n, line in enumerate(lines) if line.strip() and not line.startswith("#")), len(lines))
-    stated = _stated(path, lines[:n_comments])
-    try:
-        table = pd.read_csv(path, skiprows=n_comments, skipinitialspace=True, skip_blank_lines=False, dtype=str)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, ValueError) as error:
-        raise UserError(
-            path, "table", error, "a line with the names of the columns, then one line for each pose"
-        ) from None
-    table.columns = [str(name).strip() for name in table.columns]
-    return table, stated, n_comments + 2
-
-
-def _read_tum(path: Path) -> tuple[pd.DataFrame, dict[str, str], int]:
-    lines = _text(path).splitlines()
-    kept = [(n, line.split()) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    for n, words in kept:
-        if len(words) != len(_TUM):
-            raise UserError(path, f"line {n}", f"{len(words)} values", "timestamp tx ty tz qx qy qz qw")
-    stated = _stated(path, [line for line in lines if line.startswith("#")])
-    if stated.get("rotation", _DIRECTIONS[1]) != _DIRECTIONS[1]:
-        raise UserError(path, "rotation", stated["rotation"], f"{_DIRECTIONS[1]}, as in every TUM file")
-    table = pd.DataFrame([words for _, words in kept], columns=list(_TUM), dtype=str)
-    return table, stated | {"rotation": _DIRECTIONS[1]}, kept[0][0] if kept else 0
-
-
-def _read_parquet(path: Path) -> tuple[pd.DataFrame, dict[str, str], int]:
-    try:
-        read = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise UserError(path, "Parquet", error, "a Parquet file") from None
-    metadata = {
-        key.decode(errors="replace"): value.decode(errors="replace")
-        for key, value in (read.schema.metadata or {}).items()
-    }
-    return read.to_pandas(), {key: metadata[key] for key in _KEYS if key in metadata}, 0
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise UserError(path, "text", "bytes that are not UTF-8", "a text file") from None
-
-
-def _stated(path: Path, comments: list[str]) -> dict[str, str]:
-    """What comment lines `# key: value` state; other comments are ignored."""
-    found = {}
-    for line in comments:
-        key, colon, value = line.lstrip("#").partition(":")
-        if colon and key.strip() in _KEYS:
-            found[key.strip()] = value.strip()
-    return found
 
 
 def _checked(source: _Source, latitude_deg: float, longitude_deg: float) -> GivenPoses:
@@ -205,13 +150,25 @@ def _checked(source: _Source, latitude_deg: float, longitude_deg: float) -> Give
     time = source.numbers(_TIME)[:, 0]
     late = np.concatenate([[False], (np.diff(time) <= 0) & (np.diff(trajectory) == 0)])
     source.refuse(late, "time_s", lambda row: f"{time[row]:g} after {time[row - 1]:g}", "increasing times")
-    velocity = source.numbers(_VELOCITY) if _VELOCITY[0] in table else np.zeros((len(table), 3))
+    velocity = _motion(source, "velocity", _VELOCITY, LARGEST_MPS, "m/s")
+    turn = _motion(source, "angular velocity", _TURN, LARGEST_RADPS, "rad/s")
     sun = source.numbers(_SUN) if _SUN[0] in table else None
     if sun is not None:
         low = (sun[:, 1] <= 0) | (sun[:, 1] > 90)
         source.refuse(low, _SUN[1], lambda row: f"{sun[row, 1]:g}", "above 0 (the horizon), at most 90 degrees")
-    turn = source.numbers(_TURN) if _TURN[0] in table else None
-    return GivenPoses(time, place, _unit_quaternions(source), velocity, sun, trajectory, turn)
+    velocity = np.zeros((len(table), 3)) if velocity is None else velocity
+    return GivenPoses(time, place, _unit_quaternions(source), velocity, sun, trajectory, turn, source.line)
+
+
+def _motion(source: _Source, field: str, names: tuple[str, ...], largest: float, unit: str) -> Array | None:
+    """Vectors (N, 3) of at most this length; None if the file has none."""
+    if names[0] not in source.table:
+        return None
+    values = source.numbers(names)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(values, axis=1)
+    source.refuse(length > largest, field, lambda row: f"{length[row]:.4g} {unit}", f"at most {largest:g} {unit}")
+    return values
 
 
 def _check_columns(path: Path, found: list[str], names: tuple[str, ...]) -> None:

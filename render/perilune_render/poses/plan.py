@@ -19,7 +19,7 @@ from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 from perilune_shared.geometry.nominal_trajectory import NominalTrajectory
 
 SAME_SUN_DEG = 0.05
-"""Frames whose Suns differ by less share the Sun of the first of them: a tenth of the Sun's diameter."""
+"""Frames whose Suns differ by less share the Sun of the first of them in the file: a tenth of the Sun's diameter."""
 _MOST_SCENES = 1000
 _N_VIEWS = 24
 _LOWER = 0.9
@@ -125,8 +125,9 @@ def _rounded(value: float, towards) -> float:
 def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: object) -> tuple[Plan, DatasetConfig]:
     """The plan of given poses, and the configuration with the views and the hash of the poses.
 
-    Frames whose Suns differ by SAME_SUN_DEG or more are in different scenes over the same ground. Raises UserError if
-    the poses fit no ground, or for more than _MOST_SCENES Suns.
+    Frames whose Suns differ by SAME_SUN_DEG or more are in different scenes over the same ground. A trajectory under
+    several Suns has a part in the scene of each, with the indices and the times of the whole trajectory. Raises
+    UserError if the poses fit no ground, or for more than _MOST_SCENES Suns.
     """
     scene = config.scene or SceneConfig()
     rig = rig_of(config)
@@ -134,7 +135,7 @@ def given_plan(poses: GivenPoses, config: DatasetConfig, kind: Kind, where: obje
     scene = scene.model_copy(update={"views": views, "poses_sha256": poses.sha256})
     suns, lit_by = _suns(poses, scene)
     if len(suns) > _MOST_SCENES:
-        found = f"{len(suns)} Suns that differ by {SAME_SUN_DEG} degrees"
+        found = f"more than {_MOST_SCENES} Suns that differ by {SAME_SUN_DEG} degrees"
         raise UserError(where, "sun_azimuth_deg", found, f"at most {_MOST_SCENES}")
     seed = scene_seed(config)
     scenes = tuple(ScenePlan(f"scene-{k:04d}", seed, *map(float, sun)) for k, sun in enumerate(suns))
@@ -159,29 +160,51 @@ def _suns(poses: GivenPoses, scene: SceneConfig) -> tuple[list[Array], np.ndarra
     suns: list[Array] = []
     index = np.empty(len(poses), int)
     for n, sun in enumerate(poses.sun_deg):
-        turn = (sun[0] - suns[-1][0] + 180) % 360 - 180 if suns else np.inf
-        if not suns or max(abs(turn) * np.cos(np.radians(sun[1])), abs(sun[1] - suns[-1][1])) >= SAME_SUN_DEG:
-            suns.append(sun)
-        index[n] = len(suns) - 1
+        if n == 0 or not _is_same_sun(sun, suns[index[n - 1]]).item():
+            same = np.flatnonzero(_is_same_sun(sun, np.array(suns).reshape(-1, 2)))
+            if not len(same):
+                suns.append(sun)
+            if len(suns) > _MOST_SCENES:
+                return suns, index
+            index[n] = same[0] if len(same) else len(suns) - 1
+        else:
+            index[n] = index[n - 1]
     return suns, index
 
 
+def _is_same_sun(sun: Array, others: Array) -> np.ndarray:
+    """Whether a Sun (2,) differs by less than SAME_SUN_DEG from others (..., 2)."""
+    turn = (sun[0] - others[..., 0] + 180) % 360 - 180
+    across = np.abs(turn) * np.cos(np.radians(sun[1]))
+    return np.maximum(across, np.abs(sun[1] - others[..., 1])) < SAME_SUN_DEG
+
+
 def _trajectory(poses: GivenPoses, rows: np.ndarray, scene: ScenePlan, number: int) -> TrajectoryPlan:
+    """The frames `rows` of a user's trajectory; their indices and times are those in the whole trajectory."""
     name = f"trajectory-{number:04d}"
-    part = partial(_flight, poses, rows)
+    whole = np.flatnonzero(poses.trajectory == number)
+    part, origin = partial(_flight, poses, rows, whole), partial(_origin, poses, rows)
     seed = trajectory_seed(scene.seed, number)
     # Number frames across a change of the Sun: equal numbers would have equal noise.
-    begin = int(rows[0] - np.flatnonzero(poses.trajectory == number)[0])
-    index = range(begin, begin + len(rows))
-    return TrajectoryPlan(scene.scene_id, name, seed, index, (_SPLIT,) * len(rows), part, is_drawn=False)
+    index = (rows - whole[0]).tolist()
+    return TrajectoryPlan(scene.scene_id, name, seed, index, (_SPLIT,) * len(rows), part, is_drawn=False, origin=origin)
 
 
-def _flight(poses: GivenPoses, rows: np.ndarray) -> Flight:
-    """The flight through some of the poses; its nominal trajectory is a straight line from the first to the last."""
-    time, position = poses.time_s[rows] - poses.time_s[rows[0]], poses.position_m[rows]
-    duration = float(time[-1])
-    speed = (position[-1] - position[0]) / duration if duration > 0 else np.zeros(3)
-    nominal = NominalTrajectory(_three(position[0]), _three(speed), (0.0, 0.0, 0.0), duration or 1.0)
+def _origin(poses: GivenPoses, rows: np.ndarray, place: int) -> str:
+    """The place in the poses' file of the pose at index `place` of `rows`."""
+    return poses.origin(int(rows[place]))
+
+
+def _flight(poses: GivenPoses, rows: np.ndarray, whole: np.ndarray) -> Flight:
+    """The flight through the poses `rows` of a trajectory with the poses `whole`; its first one has the time 0.
+
+    The nominal trajectory is a straight line from the first pose of the whole one to the last.
+    """
+    first, last = whole[0], whole[-1]
+    duration = float(poses.time_s[last] - poses.time_s[first])
+    speed = (poses.position_m[last] - poses.position_m[first]) / duration if duration > 0 else np.zeros(3)
+    nominal = NominalTrajectory(_three(poses.position_m[first]), _three(speed), (0.0, 0.0, 0.0), duration or 1.0)
+    time, position = poses.time_s[rows] - poses.time_s[first], poses.position_m[rows]
     turn = None if poses.angular_velocity_radps is None else poses.angular_velocity_radps[rows]
     return Flight(
         nominal, time, position, poses.velocity_mps[rows], poses.rotation_wxyz[rows], angular_velocity_radps=turn
@@ -196,4 +219,4 @@ def _three(values: Array) -> tuple[float, float, float]:
 def _refuse(wrong: np.ndarray, poses: GivenPoses, where: object, found, expected: str) -> None:
     if wrong.any():
         n = int(np.argmax(wrong))
-        raise UserError(where, f"pose {n} at {poses.time_s[n]:g} s", found(n), expected)
+        raise UserError(where, f"{poses.origin(n)}: pose at {poses.time_s[n]:g} s", found(n), expected)

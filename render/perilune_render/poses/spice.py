@@ -68,6 +68,9 @@ class SpicePoses:
     """rotation_camera_from_site as unit quaternions (N, 4)."""
     velocity_mps: Array
     """Velocity relative to the ground, O_L, metres per second (N, 3)."""
+    turn_radps: Array | None
+    """Angular velocity of the camera relative to the ground, in its own axes, radians per second (N, 3); None if the
+    kernels lack it."""
     sun_deg: Array
     """Apparent azimuth and elevation of the Sun at the site, degrees (N, 2)."""
     start: str
@@ -113,7 +116,7 @@ def _read(source: SpiceSource, latitude_deg: float, longitude_deg: float, site_h
         fixed = _fixed_frame(spice, source.fixed_frame)
         _check_frame(spice, "--camera-frame", source.camera_frame)
         spacecraft = _body(spice, source.spacecraft)
-        rows = []
+        rows, turns = [], []
         for et in times:
             with _reported(spice, f"at {_utc(spice, et)}"):
                 state = spice.spkezr(spacecraft, et, fixed, "NONE", _MOON)[0]
@@ -122,6 +125,7 @@ def _read(source: SpiceSource, latitude_deg: float, longitude_deg: float, site_h
             rows.append(
                 (1000 * site_from_fixed @ (state[:3] - site_km), turned, 1000 * site_from_fixed @ state[3:], sun)
             )
+            turns.append(_turn_radps(spice, fixed, source.camera_frame, et, axes))
             _refuse_night(site_from_fixed @ sun, _utc(spice, et))
         start = _utc(spice, times[0])
     position, rotation, velocity, sun = (np.array(column) for column in zip(*rows, strict=True))
@@ -133,7 +137,18 @@ def _read(source: SpiceSource, latitude_deg: float, longitude_deg: float, site_h
             np.arcsin(towards[:, 2] / np.linalg.norm(towards, axis=1)),
         ]
     ).T
-    return SpicePoses(times - times[0], position, quaternions, velocity, sun_deg, start, fixed)
+    known = [turn for turn in turns if turn is not None]
+    turn = np.array(known) if len(known) == len(turns) else None
+    return SpicePoses(times - times[0], position, quaternions, velocity, turn, sun_deg, start, fixed)
+
+
+def _turn_radps(spice: Any, fixed: str, camera_frame: str, et: float, axes: Array) -> Array | None:
+    """Angular velocity (3,) of a camera's axes relative to the fixed frame, in the camera's axes; None without data."""
+    try:
+        rotation, turn = spice.xf2rav(spice.sxform(fixed, camera_frame, et))
+    except spice.exceptions.SpiceyError:
+        return None  # a CK without angular velocities; the attitude itself was read before
+    return axes @ rotation @ turn
 
 
 def camera_axes(text: str) -> Array:
@@ -156,9 +171,14 @@ def poses_csv(
         f"# height of the site above 1737.4 km: {height_m!r} m",
         f"# start: {poses.start} UTC",
         f"# {source.spacecraft}, {source.camera_frame} relative to {poses.fixed_frame}; kernels {kernels}",
-        "time_s,x_m,y_m,z_m,qw,qx,qy,qz,vx_mps,vy_mps,vz_mps,sun_azimuth_deg,sun_elevation_deg",
     ]
-    columns = (poses.time_s[:, None], poses.position_m, poses.rotation_wxyz, poses.velocity_mps, poses.sun_deg)
+    names = "time_s,x_m,y_m,z_m,qw,qx,qy,qz,vx_mps,vy_mps,vz_mps,sun_azimuth_deg,sun_elevation_deg"
+    columns = [poses.time_s[:, None], poses.position_m, poses.rotation_wxyz, poses.velocity_mps, poses.sun_deg]
+    if poses.turn_radps is None:
+        lines.append("# no angular velocities: the kernels (CK) have none at some of these times")
+    else:
+        names, columns = f"{names},wx_radps,wy_radps,wz_radps", [*columns, poses.turn_radps]
+    lines.append(names)
     lines += [",".join(map(repr, row)) for row in np.hstack(columns).tolist()]
     return "\n".join("".join(c if c.isprintable() else "?" for c in line) for line in lines) + "\n"
 

@@ -10,38 +10,45 @@ from perilune_render.dataset import tables
 from perilune_render.dataset.real_ground import draw_outline, outline_m
 from perilune_render.dataset.shots import planned_shot
 from perilune_render.engines import open_engine
-from perilune_render.flight.plan import TrajectoryPlan, make_plan
+from perilune_render.flight.plan import Plan, TrajectoryPlan
 from perilune_render.flight.pose_checks import check_trajectories
 from perilune_render.frame_source import FrameSource
 from perilune_render.imaging.darkness import is_dark, warn_of_dark_frames
 from perilune_render.labels.drawing import draw_labels, enlarge, padded, write_sheet
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.preview.map_picture import map_picture
-from perilune_render.preview.site_horizon import site_horizon_of, warn_of_shadow
+from perilune_render.preview.site_horizon import shadow_warnings, site_horizon_of
 from perilune_render.preview.site_map import site_map
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation.model import ElevationModel
 from perilune_render.terrain.scene import Scene, check_ground, model_of
 from perilune_shared.labels.selection import selected
 from perilune_shared.labels.thresholds import SELECTIONS
+from perilune_shared.progress import say
 from perilune_shared.storage.files import write_bytes
 
+_N_FRAMES = 4
+"""Largest number of frames of each camera."""
 
-def write_preview(config: DatasetConfig, kind: str, path: Path, map_path: Path, n_frames: int = 4) -> None:
+
+def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, map_path: Path) -> None:
     """Write a contact sheet of the first scene and trajectory, frames evenly spaced in time, and a map of the scene.
 
     Beneath each camera's frames are the same frames with labels and, if there is one, the outline of the elevation
-    model. The map shows the trajectories of the scene. Prints a warning if the site lies in shadow.
+    model. The map shows the trajectories over this ground. Prints a warning for each Sun that leaves the site in
+    shadow. Raises UserError, at `where`, if poses do not fit the ground.
     """
-    plan = make_plan(config, kind)
     scene_plan = plan.scenes[0]
     trajectories = [next(t for t in plan.of_scene(scene_plan.scene_id) if t.camera == name) for name in plan.rig]
     check_ground(config, plan.view)
     scene = cached_scene(config, plan.view, scene_plan.seed)
-    check_trajectories(plan, trajectories, scene, f"configuration: dataset.{kind}")
+    check_trajectories(plan, trajectories, scene, where)
     model = model_of(config.terrain)
     horizon = site_horizon_of(scene, scene_plan.sun_azimuth_deg)
-    warn_of_shadow(scene_plan, horizon)
+    same_ground = [each for each in plan.scenes if each.seed == scene_plan.seed]
+    for line in shadow_warnings(scene, same_ground):
+        say(line)
+    n_frames = min(_N_FRAMES, len(trajectories[0].splits))
     pictures, dark = [], []
     for trajectory in trajectories:
         mounted = plan.rig[trajectory.camera]
@@ -53,7 +60,7 @@ def write_preview(config: DatasetConfig, kind: str, path: Path, map_path: Path, 
     warn_of_dark_frames(scene_plan.scene_id, dark, n_frames * len(trajectories), scene_plan.sun_elevation_deg)
     if len(trajectories) > 1:
         pictures = padded(pictures, [n_frames] * 2 * len(trajectories), n_frames)
-    tracks = [each.flight.position_m for each in plan.of_scene(scene_plan.scene_id)]
+    tracks = [each.flight.position_m for lit in same_ground for each in plan.of_scene(lit.scene_id)]
     place = scene.latitude_deg, scene.longitude_deg
     picture = map_picture(config.name, site_map(scene, model, scene_plan.sun), scene_plan, place, tracks, horizon)
     write_sheet(path, pictures, n_frames)

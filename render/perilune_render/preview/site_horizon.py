@@ -1,5 +1,6 @@
 """The horizon of the landing site in the direction of the Sun: whether the site lies in shadow."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,8 @@ from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.interpolation import value_at
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.frames import Array, sun_direction
-from perilune_shared.progress import say
+
+_MOST_LINES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +51,16 @@ def _distances(grid: Grid, towards: Array) -> Array:
     return np.concatenate([inner, rings]) / slant
 
 
-def warn_of_shadow(plan: ScenePlan, horizon: SiteHorizon) -> None:
-    """Print a warning if the Sun of a scene is below the site's horizon."""
-    if horizon.elevation_deg > plan.sun_elevation_deg:
-        say(
-            f"warning: {plan.scene_id}: the site lies in shadow: the Sun at azimuth {plan.sun_azimuth_deg:.1f} is "
-            f"{plan.sun_elevation_deg:.1f} degrees high, and ground {horizon.distance_m:.0f} m away reaches "
-            f"{horizon.elevation_deg:.1f} degrees"
-        )
+def shadow_warnings(scene: Scene, plans: Sequence[ScenePlan]) -> list[str]:
+    """A line for each plan over this ground whose Sun is below the site's horizon; at most _MOST_LINES of them."""
+    lines = []
+    for plan in plans:
+        horizon = site_horizon_of(scene, plan.sun_azimuth_deg)
+        if horizon.elevation_deg > plan.sun_elevation_deg:
+            lines.append(
+                f"warning: {plan.scene_id}: the site lies in shadow: the Sun at azimuth {plan.sun_azimuth_deg:.1f} is "
+                f"{plan.sun_elevation_deg:.1f} degrees high, and ground {horizon.distance_m:.0f} m away reaches "
+                f"{horizon.elevation_deg:.1f} degrees"
+            )
+    more = len(lines) - _MOST_LINES
+    return lines if more <= 0 else [*lines[:_MOST_LINES], f"warning: the site lies in shadow under {more} more Suns"]

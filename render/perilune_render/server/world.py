@@ -12,6 +12,7 @@ from perilune_render.config_scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines import open_engine
 from perilune_render.flight.lens import camera_of
+from perilune_render.flight.pose_checks import LARGEST_MPS, Poses, check_places, check_poses
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.heightfield.query import first_hits, heights_m
 from perilune_render.heightfield.surface import Surface, surface_of
@@ -21,10 +22,8 @@ from perilune_render.terrain.scene import Scene
 from perilune_shared.content import content_sha256
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
-from perilune_shared.geometry.frames import Array, sun_direction
+from perilune_shared.geometry.frames import Array, quaternion_from_matrix, sun_direction
 
-LEAST_CLEARANCE_M = 0.1
-"""Smallest height of a camera above the surface below it, metres."""
 _MOST_SOURCES = 8
 _PREPARED_AT_M = 500.0
 _DOWN = np.diag([1.0, -1.0, -1.0])
@@ -77,7 +76,8 @@ class World:
         position = np.array([0.0, 0.0, float(self.heights_m(np.zeros(1), np.zeros(1))[0]) + _PREPARED_AT_M])
         sun = sun_direction(stated.sun_azimuth_deg, stated.sun_elevation_deg)
         view = View(position, _DOWN, camera_of(self.config.camera), sun)
-        self.labels(view, self.frame(view, 0, 0))
+        source = self._source(view)
+        source.labels(source.take(Shot(view.position_m, view.rotation_camera_from_site, np.zeros(3), 0)))
 
     @cached_property
     def content_sha256(self) -> str:
@@ -86,9 +86,11 @@ class World:
         return content_sha256(tables["craters"], tables["boulders"])
 
     def frame(self, view: View, seed: int, index: int, velocity_mps: Array | None = None) -> Frame:
-        """Render and develop a frame. Raises UserError if the camera is off the ground or below its surface."""
-        self.check(view.position_m)
+        """Render and develop a frame. Raises UserError as `check_view`, and above LARGEST_MPS."""
+        self.check_view(view)
         velocity = np.zeros(3) if velocity_mps is None else velocity_mps
+        if not np.abs(velocity).max() <= LARGEST_MPS or np.linalg.norm(velocity) > LARGEST_MPS:
+            raise UserError("camera", "velocity_mps", velocity.tolist(), f"at most {LARGEST_MPS:g} m/s")
         shot = Shot(view.position_m, view.rotation_camera_from_site, velocity, seed, index)
         return self._source(view).take(shot)
 
@@ -97,20 +99,18 @@ class World:
         return self._source(view).labels(frame)
 
     def radiance(self, view: View) -> Radiance:
-        """Depth and normals of a view; the radiance has one sample and no sensor."""
-        self.check(view.position_m)
+        """Radiance, depth and normals of a view, with the samples of the configuration and without a sensor."""
+        self.check_view(view)
         return self._source(view).render(Shot(view.position_m, view.rotation_camera_from_site, np.zeros(3), 0))
 
     def check(self, position_m: Array) -> None:
-        """Raise UserError if a camera is off the ground or not above its surface."""
-        half = self.scene.grid.extent_m / 2
-        if max(abs(position_m[0]), abs(position_m[1])) > half:
-            found = f"x {position_m[0]:.1f} m, y {position_m[1]:.1f} m"
-            raise UserError("camera", "position", found, f"|x| and |y| at most {half:.0f} m, over the ground")
-        surface = float(self.heights_m(position_m[:1], position_m[1:2])[0])
-        if position_m[2] < surface + LEAST_CLEARANCE_M:
-            found = f"{position_m[2] - surface:.2f} m above the surface"
-            raise UserError("camera", "position", found, f"at least {LEAST_CLEARANCE_M} m")
+        """Raise UserError if a camera is off the ground, or not above its surface, as `frames` does."""
+        check_places(_poses(position_m, _DOWN), self.scene, "request")
+
+    def check_view(self, view: View) -> None:
+        """Raise UserError for a view that `perilune-render frames` refuses."""
+        pinhole = view.camera.covering_pinhole()
+        check_poses(_poses(view.position_m, view.rotation_camera_from_site), pinhole, self.scene, "request")
 
     def hits(self, origins_m: Array, directions: Array, *, boulders: bool = True) -> tuple[Array, Array]:
         """Distances (N,) and normals (N, 3) of the first hits (`perilune_render.heightfield.query.first_hits`)."""
@@ -142,3 +142,8 @@ class World:
             open_engine(self.scene, self.config, pinhole, view.sun, None if cycles else self.surface)
         )
         return FrameSource.of(engine, self.config, view.camera, self._circles), stack
+
+
+def _poses(position_m: Array, rotation_camera_from_site: Array) -> Poses:
+    """One pose, to be checked."""
+    return Poses(["asked for"], np.asarray(position_m)[None], quaternion_from_matrix(rotation_camera_from_site)[None])

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from perilune_render.config_terrain import BouldersConfig
 from perilune_render.streams import stream
@@ -31,6 +32,8 @@ _FIELD_DECAY = 0.7
 """Decay length of a boulder field's density beyond the crater's rim, crater radii."""
 FULL_SPACINGS = 5.0
 """Smallest diameter, in vertex spacings, of a boulder with the finer mesh."""
+_FARTHEST = 0.9
+"""Largest distance of a rock's surface from its centre, mean diameters: that of the flattest, longest rock."""
 N_POINTS, N_FEW_POINTS = 60, 14
 """Numbers of points of a rock's finer and coarser mesh."""
 
@@ -159,6 +162,46 @@ def highest_points(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> Arr
         placed = solids[kinds[k]] @ rotation.T * boulders.diameter_m[k]
         points[k] += placed[np.argmax(placed[:, 2])]
     return points
+
+
+def largest_height_m(boulders: Boulders) -> float:
+    """Upper bound on the height of the boulders' tops above the ground, metres."""
+    return float(_FARTHEST + 0.5) * float(boulders.diameter_m.max(initial=0.0))
+
+
+def tops_m(boulders: Boulders, z_m: Array, grid: Grid, seed: int, x_m: Array, y_m: Array) -> Array:
+    """Heights (M,) of the highest boulder at places (M,), O_L, metres; -inf where none is. See `boulder_mesh`."""
+    tops = np.full(len(x_m), -np.inf)
+    widest = _FARTHEST * boulders.diameter_m.max(initial=0.0)
+    if not len(x_m) or not len(boulders):
+        return tops
+    near = (boulders.x_m > x_m.min() - widest) & (boulders.x_m < x_m.max() + widest)
+    near = np.flatnonzero(near & (boulders.y_m > y_m.min() - widest) & (boulders.y_m < y_m.max() + widest))
+    rocks, places = boulders.chosen(near), np.stack([x_m, y_m], axis=-1)
+    full = rocks.diameter_m >= FULL_SPACINGS * grid.spacing_under(rocks.x_m, rocks.y_m)
+    rotations = matrix_from_quaternion(rocks.rotation_wxyz.reshape(-1, 4))
+    around = cKDTree(np.stack([rocks.x_m, rocks.y_m], axis=-1)).query_ball_point(places, widest)
+    solids: dict[tuple[int, int], trimesh.Trimesh] = {}
+    for place, candidates in enumerate(around):
+        for k in candidates:
+            away = places[place] - [rocks.x_m[k], rocks.y_m[k]]
+            if np.hypot(*away) > _FARTHEST * rocks.diameter_m[k]:
+                continue
+            kind = int(rocks.shape_id[k]), N_POINTS if full[k] else N_FEW_POINTS
+            if kind not in solids:
+                solids[kind] = rock(kind[0], seed, kind[1])
+            top = _top(solids[kind], away @ rotations[k, :2] / rocks.diameter_m[k], rotations[k, 2])
+            tops[place] = max(tops[place], z_m[near[k]] + rocks.diameter_m[k] * top)
+    return tops
+
+
+def _top(solid: trimesh.Trimesh, origin: Array, direction: Array) -> float:
+    """Distance from `origin` to where a line leaves a convex solid; -inf if it misses the solid."""
+    normal, corner = solid.face_normals, solid.triangles[:, 0]
+    gap, slope = np.einsum("fi,fi->f", normal, corner - origin), normal @ direction
+    out, into = slope > 1e-9, slope < -1e-9
+    leaves, enters = (gap[out] / slope[out]).min(), (gap[into] / slope[into]).max()
+    return float(leaves) if leaves > enters else -np.inf
 
 
 def boulder_mesh(boulders: Boulders, z_m: Array, grid: Grid, seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,9 @@ from perilune_render.flight import pose_checks
 from perilune_render.flight.plan import make_plan
 from perilune_render.flight.pose_checks import Poses, check_plan, check_poses
 from perilune_render.flight.trajectories import fly
+from perilune_render.heightfield.query import heights_m
+from perilune_render.heightfield.surface import surface_of
+from perilune_render.terrain.boulders import Boulders, tops_m
 from perilune_shared.editing.writer import with_column
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import quaternion_from_matrix
@@ -154,3 +157,32 @@ def refusal(argv, monkeypatch, capsys):
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert stop.value.code == 2
     return line
+
+
+def rocky_scene():
+    """Flat ground with a boulder of 4 m at x 20 m, and small ones."""
+    scene = flat_scene(2000.0, 201)
+    rng = np.random.default_rng(3)
+    rotation = rng.normal(size=(12, 4))
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    x, y = np.append(20.0, rng.uniform(-8, 8, 11)), np.append(0.0, rng.uniform(-8, 8, 11))
+    boulders = Boulders(x, y, np.append(4.0, rng.uniform(1, 3, 11)), np.arange(12), rotation)
+    return replace(scene, boulders=boulders, boulder_z_m=boulders.centre_height_m(np.zeros(12)))
+
+
+def test_the_tops_of_boulders_are_those_that_rays_hit():
+    scene = rocky_scene()
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-10, 24, 60), np.linspace(-10, 10, 60)))
+    tops = tops_m(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed, x, y)
+    rays = heights_m(surface_of(scene), x, y)
+    assert (rays > 0.01).sum() > 100
+    assert np.allclose(np.maximum(tops, 0), rays, rtol=0, atol=1e-4)
+
+
+def test_a_camera_just_above_a_boulder_is_refused(camera):
+    scene = rocky_scene()
+    top = float(tops_m(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed, np.array([20.0]), np.zeros(1))[0])
+    assert 1.5 < top < 4
+    check_poses(pose(20.0, 0.0, top + 1.01), camera, scene, "plan")
+    with pytest.raises(UserError, match=r"s/t/000001: got a camera 0.9 m above the boulder below it"):
+        check_poses(pose(20.0, 0.0, top + 0.9), camera, scene, "plan")

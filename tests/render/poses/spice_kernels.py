@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perilune_shared.geometry.frames import matrix_from_quaternion
+from perilune_shared.geometry.frames import matrix_from_quaternion, matrix_from_rotation_vector
 
 DAY_S = 86400.0
 T0 = 5.366e8
@@ -132,8 +132,14 @@ def sun_at_km() -> np.ndarray:
     return MOON_KM + 1.496e8 * towards
 
 
-def write_kernels(folder: Path, duration_s: float = 20.0, sun_km: np.ndarray | None = None) -> Path:
-    """Write all kernels into a folder; returns their meta-kernel."""
+def write_kernels(
+    folder: Path, duration_s: float = 20.0, sun_km: np.ndarray | None = None, turn_radps: np.ndarray | None = None
+) -> Path:
+    """Write all kernels into a folder; returns their meta-kernel.
+
+    The camera is at rest in the Moon's axes, without angular velocities in the CK; with `turn_radps` (3,) it turns at
+    this rate, in its own axes, and the CK has its angular velocities in J2000.
+    """
     import spiceypy
 
     sun = sun_at_km() if sun_km is None else sun_km
@@ -157,7 +163,11 @@ def write_kernels(folder: Path, duration_s: float = 20.0, sun_km: np.ndarray | N
     spiceypy.spkcls(handle)
     ticks = 1000 * times
     fixed = matrix_from_quaternion(CAMERA_FROM_FIXED_WXYZ)
-    turns = np.array([spiceypy.m2q(fixed @ fixed_from_j2000(t)) for t in times])
+    rate = np.zeros(3) if turn_radps is None else turn_radps
+    attitudes = [matrix_from_rotation_vector(-(t - T0) * rate) @ fixed @ fixed_from_j2000(t) for t in times]
+    turns = np.array([spiceypy.m2q(attitude) for attitude in attitudes])
+    spin = fixed_from_j2000(T0).T @ [0, 0, np.radians(RATE) / DAY_S]
+    rates = np.array([attitude.T @ rate + spin for attitude in attitudes])
     handle = spiceypy.ckopn(str(folder / "a.bc"), "test", 0)
     spiceypy.ckw03(
         handle,
@@ -165,12 +175,12 @@ def write_kernels(folder: Path, duration_s: float = 20.0, sun_km: np.ndarray | N
         ticks[-1],
         -99001,
         "J2000",
-        False,
+        turn_radps is not None,
         "test",
         len(ticks),
         ticks,
         turns,
-        np.zeros((len(ticks), 3)),
+        rates,
         1,
         ticks[:1],
     )

@@ -107,7 +107,7 @@ def test_every_sun_of_the_poses_is_a_scene_over_the_same_ground(folder):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (f"0,0,0,-5,{DOWN}", "pose 0 at 0 s: got z -5.0 m"),
+        (f"0,0,0,-5,{DOWN}", "line 3: pose at 0 s: got z -5.0 m"),
         ("0,0,0,300,1,0,0,0", "a view with the horizon"),
         ("0,0,0,300,0.7071068,0.7071068,0,0", "a view with the horizon"),
     ],

@@ -23,6 +23,7 @@ from tests.render.poses.spice_kernels import (
 from perilune_render.cli.main import main
 from perilune_render.poses.file import read_poses
 from perilune_render.poses.spice import camera_axes
+from perilune_render.sub_poses import moved
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import matrix_from_quaternion
@@ -84,6 +85,28 @@ def test_poses_and_suns_are_those_by_hand(folder, tmp_path):
     assert np.abs(poses.sun_deg - suns).max() < 1e-4
     # Without light time and aberration the Sun would be where the kernels were made for.
     assert np.abs(poses.sun_deg[0] - [130, 20]).max() > 1e-3
+
+
+@pytest.mark.parametrize(("axes", "turned"), [("x,y,z", np.eye(3)), ("-y,x,z", [[0, -1, 0], [1, 0, 0], [0, 0, 1]])])
+def test_the_turn_of_the_camera_is_that_relative_to_the_ground_in_its_own_axes(tmp_path, axes, turned):
+    rate = np.array([0.02, -0.03, 0.05])
+    write_kernels(tmp_path, turn_radps=rate)
+    scene = {"terrain": {**SITE, "spacing_px": 3.0}}
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump({"dataset": {"name": "spice", **scene}}))
+    done = spice(tmp_path, tmp_path / "poses.csv", frames=6, last=5.0, **{"camera-axes": axes})
+    assert done.returncode == 0, done.stderr
+    poses = read_poses(tmp_path / "poses.csv", LATITUDE, LONGITUDE)
+    assert np.allclose(poses.angular_velocity_radps, turned @ rate, rtol=0, atol=1e-7)
+    # The rate carries each attitude to the next.
+    start = np.zeros(3), matrix_from_quaternion(poses.rotation_wxyz[0])
+    later = moved(start, np.zeros(3), poses.angular_velocity_radps[0], 1.0)[1]
+    assert np.allclose(later, matrix_from_quaternion(poses.rotation_wxyz[1]), rtol=0, atol=1e-6)
+
+
+def test_kernels_without_angular_velocities_give_a_file_without_them(folder, tmp_path):
+    assert spice(folder, tmp_path / "poses.csv").returncode == 0
+    assert read_poses(tmp_path / "poses.csv", LATITUDE, LONGITUDE).angular_velocity_radps is None
+    assert "# no angular velocities" in (tmp_path / "poses.csv").read_text()
 
 
 def test_steps_axes_and_frames_of_fixed_orientation(folder, tmp_path):

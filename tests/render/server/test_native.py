@@ -59,6 +59,12 @@ def test_sun_and_velocity_change_the_frame(scene):
     assert along[1] < 0.8 * along[0]
 
 
+def test_absurd_velocities_are_refused(scene):
+    for velocity in ((1e8, 0, 0), (9000, 9000, 0)):
+        with pytest.raises(UserError, match=r"velocity_mps: got .*expected at most 12000 m/s"):
+            scene.frame((0, 0, 500), DOWN, velocity_mps=velocity)
+
+
 def test_craters_are_those_of_the_ground(scene, world):
     found = scene.craters()
     assert found["crater_id"].tolist() == world.scene.crater_id.tolist()
@@ -79,8 +85,12 @@ def test_heights_are_those_of_the_ground(scene, world):
         ({"request": "frame", "position_m": [0, 0, 500]}, "rotation_wxyz"),
         ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 0, 0, 0]}, "length 0"),
         ({"request": "frame", "position_m": [0, 0, float("nan")], "rotation_wxyz": [0, 1, 0, 0]}, "position_m"),
-        ({"request": "frame", "position_m": [0, 0, -9], "rotation_wxyz": [0, 1, 0, 0]}, "above the surface"),
-        ({"request": "frame", "position_m": [9e4, 0, 500], "rotation_wxyz": [0, 1, 0, 0]}, "over the ground"),
+        ({"request": "frame", "position_m": [0, 0, -9], "rotation_wxyz": [0, 1, 0, 0]}, "above the ground"),
+        ({"request": "frame", "position_m": [9e4, 0, 500], "rotation_wxyz": [0, 1, 0, 0]}, "over the terrain"),
+        ({"request": "frame", "position_m": [0, 0, 0.6], "rotation_wxyz": [0, 1, 0, 0]}, "at least 1 m"),
+        ({"request": "frame", "position_m": [400, 0, 900], "rotation_wxyz": [0, 1, 0, 0]}, "beyond the terrain's edge"),
+        ({"request": "frame", "position_m": [0, 0, 1e8], "rotation_wxyz": [0, 1, 0, 0]}, "beyond the terrain's edge"),
+        ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [1, 0, 0, 0]}, "with the horizon in view"),
         ({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": [0, 1, 0, 0], "index": -1}, "index"),
         (
             {
@@ -105,7 +115,7 @@ def test_a_faulty_request_is_refused_and_the_server_lives(scene, request_, messa
 
 
 def test_the_client_says_what_the_server_refused(scene):
-    with pytest.raises(UserError, match="above the surface"):
+    with pytest.raises(UserError, match="above the ground"):
         scene.frame((0, 0, -50), DOWN)
 
 

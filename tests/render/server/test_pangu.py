@@ -238,8 +238,8 @@ def test_both_zeros_of_the_suns_azimuth():
     [
         ("0000000c" + floats(0, 0, 1000, 0, 0, 0, 0), "quaternion of length 0"),
         ("0000000b" + floats(0, 0, float("nan"), 0, -90, 0), "not finite"),
-        ("0000000b" + floats(0, 0, -50, 0, -90, 0), "above the surface"),
-        ("0000000b" + floats(1e5, 0, 1000, 0, -90, 0), "over the ground"),
+        ("0000000b" + floats(0, 0, -50, 0, -90, 0), "above the ground"),
+        ("0000000b" + floats(1e5, 0, 1000, 0, -90, 0), "over the terrain"),
         ("00000105" + floats(180), "field of view"),
         ("00000105" + floats(0), "field of view"),
         ("00000106" + floats(0), "aspect"),
