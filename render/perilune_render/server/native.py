@@ -10,7 +10,6 @@ from pydantic import Field, ValidationError
 from perilune_render.config_scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables, label_table
 from perilune_render.flight.lens import camera_of
-from perilune_render.frame_source import Frame, Shot
 from perilune_render.poses.plan import trajectory_seed
 from perilune_render.server.grounds import Grounds
 from perilune_render.server.world import View, World
@@ -79,8 +78,6 @@ _REQUESTS: dict[str, type[Section]] = {
     "heights": HeightsRequest,
 }
 _LENGTH_TOLERANCE = 0.01
-_LARGEST_MPS, _LARGEST_RADPS = 12_000.0, 100.0
-"""Largest velocity and angular velocity of a camera, as for given poses."""
 
 
 def answer(grounds: Grounds, content: bytes, client: object) -> list[bytes]:
@@ -170,31 +167,14 @@ def _frame(world: World, request: FrameRequest) -> dict[str, np.ndarray]:
     sun = sun_direction(*(request.sun_deg or (stated.sun_azimuth_deg, stated.sun_elevation_deg)))
     rotation = matrix_from_quaternion(-quaternion if quaternion[0] < 0 else quaternion)
     view = View(np.array(request.position_m), rotation, camera_of(world.config.camera), sun)
-    frame = _taken(world, view, request)
+    seed, moves = trajectory_seed(world.scene.seed, 0), (request.velocity_mps, request.angular_velocity_radps)
+    frame = world.frame(view, seed, request.index, *(np.array(one) for one in moves))
     found = {"image": frame.image}
     if request.depth:
         found |= {"depth_m": frame.radiance.depth_m, "normal": frame.radiance.normal}
     if request.labels:
         table = label_table("frame", world.labels(view, frame)).drop_columns("frame_id")
         found |= {f"labels.{name}": table[name].to_numpy() for name in table.column_names}
-    return found
-
-
-def _taken(world: World, view: View, request: FrameRequest) -> Frame:
-    """The frame of a view, as `World.frame`, which has no angular velocity."""
-    velocity = _limited(request.velocity_mps, "velocity_mps", _LARGEST_MPS, "m/s")
-    turn = _limited(request.angular_velocity_radps, "angular_velocity_radps", _LARGEST_RADPS, "rad/s")
-    world.check(view.position_m)
-    place = view.position_m, view.rotation_camera_from_site
-    shot = Shot(*place, velocity, trajectory_seed(world.scene.seed, 0), request.index, angular_velocity_radps=turn)
-    return world._source(view).take(shot)
-
-
-def _limited(values: _Three, field: str, largest: float, unit: str) -> np.ndarray:
-    """A vector (3,) of a request. Raises UserError if it is too long."""
-    found = np.array(values)
-    if np.linalg.norm(found) > largest:
-        raise UserError("camera", field, found.tolist(), f"at most {largest:g} {unit}")
     return found
 
 

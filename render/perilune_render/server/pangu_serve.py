@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from perilune_render.server import pangu_messages as m
-from perilune_render.server.pangu_answers import FAULTY, answer, error
+from perilune_render.server.pangu_answers import FAULTY, REFUSED, answer, error
 from perilune_render.server.pangu_session import Session
 from perilune_render.server.pangu_wire import doubles_from, expanded, floats_from, read_fields, size_of, unsigned
 from perilune_render.server.serve import Connection
@@ -17,7 +17,10 @@ _MAJOR, _LARGEST_MINOR = divmod(m.VERSION, 256)
 async def serve_pangu(connection: Connection, new_session: Callable[[], Session], quit_server: Callable) -> None:
     """One session, until the client says Goodbye or leaves."""
     _set_no_delay(connection)
-    major, minor = divmod(int.from_bytes(await connection.first(4), "big"), 256)
+    major, minor = divmod(int.from_bytes(await connection.hello(4), "big"), 256)
+    if connection.is_extra:
+        await connection.send(error(REFUSED, f"{connection.limits.clients} clients are connected, the most allowed"))
+        return
     if major != _MAJOR or minor > _LARGEST_MINOR:
         text = f"protocol version {major}.{minor}, expected {_MAJOR}.0 to {_MAJOR}.{_LARGEST_MINOR}"
         await connection.send(error(FAULTY, text))
@@ -38,6 +41,7 @@ async def serve_pangu(connection: Connection, new_session: Callable[[], Session]
             await connection.send(error(FAULTY, text))
             return
         data = await connection.rest(n_items * size_of(message.item))
+        connection.has_asked = True
         if number == m.GOODBYE:
             return
         if number == m.QUIT:

@@ -12,7 +12,7 @@ from perilune_render.config_scene import SceneConfig
 from perilune_render.dataset.tables import ground_tables
 from perilune_render.engines import open_engine
 from perilune_render.flight.lens import camera_of
-from perilune_render.flight.pose_checks import LARGEST_MPS, Poses, check_places, check_poses
+from perilune_render.flight.pose_checks import LARGEST_MPS, LARGEST_RADPS, Poses, check_places, check_poses
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.heightfield.query import first_hits, heights_m
 from perilune_render.heightfield.surface import Surface, surface_of
@@ -85,14 +85,20 @@ class World:
         tables = ground_tables("scene", self.scene)
         return content_sha256(tables["craters"], tables["boulders"])
 
-    def frame(self, view: View, seed: int, index: int, velocity_mps: Array | None = None) -> Frame:
-        """Render and develop a frame. Raises UserError as `check_view`, and above LARGEST_MPS."""
+    def frame(
+        self,
+        view: View,
+        seed: int,
+        index: int,
+        velocity_mps: Array | None = None,
+        angular_velocity_radps: Array | None = None,
+    ) -> Frame:
+        """Render and develop a frame. Raises UserError as `check_view`, and above LARGEST_MPS and LARGEST_RADPS."""
         self.check_view(view)
-        velocity = np.zeros(3) if velocity_mps is None else velocity_mps
-        if not np.abs(velocity).max() <= LARGEST_MPS or np.linalg.norm(velocity) > LARGEST_MPS:
-            raise UserError("camera", "velocity_mps", velocity.tolist(), f"at most {LARGEST_MPS:g} m/s")
-        shot = Shot(view.position_m, view.rotation_camera_from_site, velocity, seed, index)
-        return self._source(view).take(shot)
+        velocity = _limited(velocity_mps, "velocity_mps", LARGEST_MPS, "m/s")
+        turn = _limited(angular_velocity_radps, "angular_velocity_radps", LARGEST_RADPS, "rad/s")
+        place = view.position_m, view.rotation_camera_from_site
+        return self._source(view).take(Shot(*place, velocity, seed, index, angular_velocity_radps=turn))
 
     def labels(self, view: View, frame: Frame) -> Labels:
         """Labels of a frame."""
@@ -147,3 +153,12 @@ class World:
 def _poses(position_m: Array, rotation_camera_from_site: Array) -> Poses:
     """One pose, to be checked."""
     return Poses(["asked for"], np.asarray(position_m)[None], quaternion_from_matrix(rotation_camera_from_site)[None])
+
+
+def _limited(values: Array | None, field: str, largest: float, unit: str) -> Array:
+    """A vector (3,), 0 if it is not given. Raises UserError if it is longer than `largest`."""
+    found = np.zeros(3) if values is None else np.asarray(values, np.float64)
+    # The components first: the length of a very large vector overflows.
+    if not np.abs(found).max() <= largest or np.linalg.norm(found) > largest:
+        raise UserError("camera", field, found.tolist(), f"at most {largest:g} {unit}")
+    return found

@@ -91,7 +91,7 @@ class Client:
 class Running:
     """A server in a thread."""
 
-    def __init__(self, world, limits=Limits(message_s=2.0), conventions=Conventions()):  # noqa: B008
+    def __init__(self, world, limits=Limits(message_s=2.0), conventions=Conventions(), note=None):  # noqa: B008
         self.notes: list[str] = []
         start = (
             *SIZE,
@@ -103,7 +103,7 @@ class Running:
         async def handle(connection):
             await serve_pangu(connection, lambda: Session(world, *start, conventions), self.server.stop)
 
-        self.server = Server("127.0.0.1", 0, handle, limits, self.notes.append)
+        self.server = Server("127.0.0.1", 0, handle, limits, note or self.notes.append)
         self.server.begin()
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()

@@ -1,0 +1,106 @@
+"""Messages of PANGU's protocol that are faulty: errors, and a server that goes on."""
+
+import random
+
+import psutil
+import pytest
+from tests.render.server.conftest import Running
+from tests.render.server.pangu_words import DOWN_1000, floats
+
+from perilune_render.server import pangu_wire as wire
+from perilune_render.server.pangu_messages import MESSAGES
+from perilune_render.server.serve import Limits
+
+
+def test_every_setting_is_acknowledged_and_every_request_answered(client, world):
+    """All messages with zeros: none desynchronises the stream, which an echo after each one shows."""
+    for number, message in MESSAGES.items():
+        if number in (0, 27):
+            continue
+        count = {272: "00000009"}.get(number, "")
+        fields = wire.size_of(message.fields)
+        payload = "00" * fields
+        if count:
+            payload = "00" * 8 + count + "00" * 81
+        client.send(f"{number:08x}{payload}")
+        client.send("00000008 00000003 616263")
+        data = b""
+        while not data.endswith(b"\0\0\0\x08\0\0\0\x03abc"):
+            data += client.read(1)
+        assert len(data) >= 15
+        if message.effect == "read":
+            assert data[:4] == b"\0\0\0\0"
+        if message.effect == "refused":
+            assert data[:4] == b"\0\0\0\1"
+        if number in (256, 257, 268, 269, 278):
+            client.send(f"00000100 {DOWN_1000}")
+            assert client.number() == 0
+
+
+@pytest.mark.parametrize(
+    ("request_bytes", "message"),
+    [
+        ("0000000c" + floats(0, 0, 1000, 0, 0, 0, 0), "quaternion of length 0"),
+        ("0000000b" + floats(0, 0, float("nan"), 0, -90, 0), "not finite"),
+        ("0000000b" + floats(0, 0, -50, 0, -90, 0), "above the ground"),
+        ("0000000b" + floats(1e5, 0, 1000, 0, -90, 0), "over the terrain"),
+        ("00000105" + floats(180), "field of view"),
+        ("00000105" + floats(0), "field of view"),
+        ("00000106" + floats(0), "aspect"),
+        ("00000006" + floats(0, 0, 0), "direction of length 0"),
+        ("00000019 00" + floats(0, 0) + "ffffffff ffffffff" + floats(1, 0), "heights, expected"),
+        ("0000001f 00000002 00 00000001 00000001" + floats(1, 1, 1), "camera 2"),
+        ("00000120 00000009", "camera 9"),
+        ("00000022" + "00" * 100, "not simulated"),
+        ("0000001b", "--allow-quit"),
+    ],
+)
+def test_a_faulty_request_is_an_error_and_the_session_goes_on(client, request_bytes, message):
+    client.send(request_bytes)
+    assert message in client.error()
+    client.send("00000008 00000001 41")
+    assert [client.number(), client.number()] == [8, 1]
+    client.read(1)
+    client.send(f"0000000b {DOWN_1000}")
+    client.image()
+
+
+def test_an_unknown_message_or_too_large_an_array_ends_the_session_with_an_error(server):
+    for request, message in (("000003e7", "message 999"), ("00000003 7fffffff", "2147483647 items")):
+        with server.client() as client:
+            client.send(request)
+            assert message in client.error()
+            assert client.is_closed()
+
+
+def test_malformed_messages_neither_crash_nor_stall_the_server(world):
+    """Valid messages with random bytes changed, cut or added, over many connections; then a valid one."""
+    rng = random.Random(3)
+    valid = [
+        bytes.fromhex(f"{n:08x}") + b"\0" * wire.size_of(m.fields) for n, m in MESSAGES.items() if n not in (0, 27)
+    ]
+    valid.append(bytes.fromhex(("0000000b" + DOWN_1000).replace(" ", "")))
+    with Running(world, Limits(clients=64, message_s=0.05, items=1000)) as running:
+        before = psutil.Process().memory_info().rss
+        sent = 0
+        while sent < 10_000:
+            client = running.client()
+            client.socket.settimeout(0.02)
+            try:
+                for _ in range(rng.randint(1, 20)):
+                    data = bytearray(rng.choice(valid))
+                    for _ in range(rng.randint(0, 4)):
+                        data[rng.randrange(len(data))] = rng.randrange(256)
+                    if rng.random() < 0.2:
+                        data = data[: rng.randint(1, len(data))] + rng.randbytes(rng.randint(0, 9))
+                    client.socket.sendall(data)
+                    sent += 1
+                client.socket.recv(1 << 16)
+            except OSError:
+                pass
+            client.socket.close()
+        with running.client() as good:
+            good.send(f"0000000b {DOWN_1000}")
+            good.image()
+        assert running.thread.is_alive()
+        assert psutil.Process().memory_info().rss - before < 200e6
