@@ -7,26 +7,32 @@ from collections.abc import Callable
 
 import numpy as np
 
+from perilune_render.server import pangu_measures as measures
 from perilune_render.server import pangu_messages as m
-from perilune_render.server.pangu_session import Session, picture
+from perilune_render.server.pangu_replies import (
+    FAULTY,
+    REFUSED,
+    doubles,
+    error,
+    float_array,
+    valid_floats,
+    valid_points,
+)
+from perilune_render.server.pangu_session import CAMERAS, Session, check_camera
 from perilune_render.server.pangu_view import (
     camera_from_angles,
     rotation_from_angles,
     rotation_from_quaternion,
     sun_from_angles,
 )
-from perilune_render.server.pangu_wire import double_bytes, float_bytes, text_bytes, unsigned
+from perilune_render.server.pangu_wire import double_bytes, unsigned
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 
-RANGE_WIDTH = 256
-"""Pixels of the range texture, which is a ramp of grey values."""
-REFUSED, FAULTY = 1, 2
-"""Codes of errors: a request that this server does not simulate, and one with impossible values."""
-_CAMERAS = (0, 1)
-_MOST_HEIGHTS = 1_000_000
 _LARGEST = 1e16
 """Largest number in a message: the Sun's distance may be 1e15 metres."""
+_FASTEST_MPS = 10_000.0
+"""Largest speed of a camera: four times the escape velocity at the Moon's surface."""
 
 
 def answer(session: Session, message: m.Message, values: list, items: Array | bytes) -> bytes:
@@ -43,6 +49,8 @@ def answer(session: Session, message: m.Message, values: list, items: Array | by
         return error(FAULTY, f"{message.name}: {fault}")
     except ValueError as fault:
         return error(FAULTY, f"{message.name}: got {fault}")
+    except ArithmeticError as fault:
+        return error(FAULTY, f"{message.name}: got values that cannot be computed with ({fault})")
 
 
 def _check(values: list, items: Array | bytes) -> None:
@@ -51,34 +59,6 @@ def _check(values: list, items: Array | bytes) -> None:
     for part in (numbers, items):
         if not isinstance(part, bytes) and not (np.abs(part) <= _LARGEST).all():
             raise ValueError(f"a number that is not finite, or beyond {_LARGEST:g}")
-
-
-def error(code: int, text: str) -> bytes:
-    """An error as a message."""
-    return unsigned(m.ERROR, code) + text_bytes(text[:900] or "error")
-
-
-def _valid_floats(values: Array) -> bytes:
-    """Floats, each with a bool that says whether it is valid (finite)."""
-    good = np.isfinite(values)
-    words = float_bytes(np.where(good, values, 0.0))
-    return b"".join(words[4 * k : 4 * k + 4] + (b"\1" if good[k] else b"\0") for k in range(len(values)))
-
-
-def _valid_points(points: Array) -> bytes:
-    """Points (N, 3), each with a bool that says whether it is valid (finite)."""
-    good = np.isfinite(points).all(axis=1)
-    words = float_bytes(np.where(good[:, None], points, 0.0).ravel())
-    return b"".join(words[12 * k : 12 * k + 12] + (b"\1" if good[k] else b"\0") for k in range(len(points)))
-
-
-def _doubles(values: Array, *, valid: bool) -> bytes:
-    words = double_bytes(values)
-    return b"".join(words[8 * k : 8 * k + 8] + (b"\1" if valid else b"\0") for k in range(len(values)))
-
-
-def _float_array(values: Array) -> bytes:
-    return unsigned(m.FLOAT_ARRAY, len(values)) + _valid_floats(values)
 
 
 def _viewpoint(session: Session, values: list, scale: float) -> None:
@@ -108,105 +88,14 @@ def _imaged(set_view: Callable) -> Callable:
     return imaged
 
 
-def _elevations(session: Session, places: Array) -> Array:
-    distance, _ = session.world.hits(places, np.tile([0.0, 0.0, -1.0], (len(places), 1)))
-    return distance
-
-
-def _points(session: Session, directions: Array) -> Array:
-    """Points (N, 3) of the surface seen from the camera in directions (N, 3) of the world; infinite where none is."""
-    if (np.linalg.norm(directions, axis=1) == 0).any():
-        raise ValueError("a direction of length 0")
-    distance, _ = session.world.hits(np.tile(session.position_m, (len(directions), 1)), directions)
-    with np.errstate(invalid="ignore"):
-        return session.position_m + distance[:, None] * directions
-
-
-def _looked_up(session: Session, places: Array) -> Array:
-    """Points (N, 3) in places (N, 2) of the image: (0, 0) is its bottom left corner, (1, 1) the top right one."""
-    view = session.view()
-    pixels = np.stack([places[:, 0] * session.width_px, (1 - places[:, 1]) * session.height_px], axis=1)
-    found = _points(session, view.camera.rays(pixels) @ view.rotation_camera_from_site)
-    outside = ((places < 0) | (places > 1)).any(axis=1)
-    return np.where(outside[:, None], np.inf, found)
-
-
-def _pulse(session: Session, values: list, items: object) -> bytes:
-    origin, direction = np.array(values[:3]), np.array(values[3:])
-    length = np.linalg.norm(direction)
-    if length == 0:
-        raise ValueError("a direction of length 0")
-    distance, normal = session.world.hits(origin[None], direction[None])
-    hit = np.isfinite(distance[0])
-    found = [distance[0] * length, abs(float(normal[0] @ direction)) / length] if hit else [0.0, 0.0]
-    return unsigned(m.LIDAR_PULSE) + float_bytes(found)
-
-
-def _surface(session: Session, boulders: bool, places: Array) -> Array:
-    return session.world.heights_m(places[:, 0], places[:, 1], boulders=boulders)
-
-
-def _grid(nx: int, ny: int, dx: float, dy: float) -> tuple[Array, Array]:
-    """Places (ny, nx) on a grid about 0. Raises ValueError if there are none or too many."""
-    if not 1 <= nx * ny <= _MOST_HEIGHTS:
-        raise ValueError(f"{nx} x {ny} heights, expected 1 to {_MOST_HEIGHTS}")
-    x, y = np.meshgrid((np.arange(nx) - (nx - 1) / 2) * dx, (np.arange(ny) - (ny - 1) / 2) * dy)
-    return x, y
-
-
-def _patch(session: Session, values: list, items: object) -> bytes:
-    boulders, cx, cy, nx, ny, spacing, angle = values
-    x, y = _grid(nx, ny, spacing, spacing)
-    c, s = np.cos(angle), np.sin(angle)
-    places = np.stack([cx + c * x - s * y, cy + s * x + c * y], axis=-1).reshape(-1, 2)
-    return _float_array(_surface(session, boulders, places))
-
-
-def _view_as_dem(session: Session, values: list, items: object) -> bytes:
-    camera, boulders, nx, ny, dx, dy, reference = values
-    world = session.world
-    if camera != 1:
-        raise ValueError(f"camera {camera}, expected 1")
-    x, y = _grid(nx, ny, dx, -dy)
-    across, down, forward = session.rotation_camera_from_site
-    origins = session.position_m + x[..., None] * across - y[..., None] * down
-    rays = np.tile(forward, (nx * ny, 1))
-    distance, _ = world.hits(origins.reshape(-1, 3), rays, boulders=boulders)
-    return _float_array(reference - distance)
-
-
-def _range_image(session: Session, values: list, items: object) -> bytes:
-    offset, scale = values
-    radiance = session.world.radiance(session.view())
-    camera = session.view().camera
-    ranges = radiance.depth_m * np.linalg.norm(camera.rays(camera.pixel_centres()), axis=-1)
-    share = np.clip((ranges - offset) * scale, 0, 1) if scale else np.zeros_like(ranges)
-    return picture(np.floor(share * (RANGE_WIDTH - 1) + 0.5).astype(np.uint8))
-
-
 def _properties(session: Session, values: list, items: object) -> bytes:
-    if values[0] not in _CAMERAS:
+    if values[0] not in CAMERAS:
         return unsigned(m.CAMERA, 0)
     camera = session.view().camera
     vertical = 2 * np.arctan(camera.height_px / 2 / camera.fy_px)
     q = quaternion_from_matrix(session.rotation_camera_from_site.T)
     numbers = double_bytes([session.field_of_view_rad, vertical, *session.position_m, *q])
     return unsigned(m.CAMERA, 80, camera.width_px, camera.height_px) + numbers
-
-
-def _snapshot(session: Session, values: list, items: object) -> bytes:
-    if values[0] not in _CAMERAS:
-        raise ValueError(f"camera {values[0]}, expected 0 or 1")
-    position, rotation = np.array(values[1:4]), rotation_from_quaternion(np.array(values[4:]))
-    camera = session.view().camera
-    rays = camera.rays(camera.pixel_centres()).reshape(-1, 3) @ rotation
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    session.world.check(position)
-    distance, normal = session.world.hits(np.tile(position, (len(rays), 1)), rays)
-    hit = np.isfinite(distance)
-    cosine = np.abs(np.einsum("ij,ij->i", normal, rays))
-    data = np.stack([np.where(hit, distance, 0.0), cosine, hit], axis=1).astype(">f4").tobytes()
-    return unsigned(m.RAW_IMAGE, 0, 0, camera.width_px, camera.height_px, len(data)) + data
 
 
 def _field_of_view(session: Session, angle_rad: float) -> None:
@@ -224,46 +113,51 @@ def _sun(session: Session, azimuth_rad: float, elevation_rad: float) -> None:
 
 
 def _select(session: Session, values: list, items: object) -> None:
-    if values[0] not in _CAMERAS:
-        raise ValueError(f"camera {values[0]}, expected 0 or 1")
+    check_camera(values[0])
 
 
 def _projection(session: Session, values: list, items: object) -> None:
+    check_camera(values[0])
     if values[1] != 0:
         raise ValueError(f"projection {values[1]}, expected 0, perspective")
 
 
 def _motion(session: Session, values: list, items: object) -> None:
-    session.velocity_mps = np.array(values[1:4])
+    check_camera(values[0])
+    velocity = np.array(values[1:4])
+    speed_mps = float(np.linalg.norm(velocity))
+    if speed_mps > _FASTEST_MPS:
+        raise ValueError(f"a velocity of {speed_mps:g} m/s, expected at most {_FASTEST_MPS:g}")
+    session.velocity_mps = velocity
 
 
 def _time_tag(session: Session, values: list, items: object) -> bytes:
     valid = session.time_tag_us is not None
-    return unsigned(m.DOUBLE) + _doubles(np.array([session.time_tag_us or 0.0]), valid=valid)
+    return unsigned(m.DOUBLE) + doubles(np.array([session.time_tag_us or 0.0]), valid=valid)
 
 
 def _camera_image(session: Session, values: list, items: object) -> bytes:
-    return session.image() if values[0] in _CAMERAS else unsigned(m.IMAGE, 0)
+    return session.image() if values[0] in CAMERAS else unsigned(m.IMAGE, 0)
 
 
 def _zeros(n: int) -> Callable:
-    return lambda session, values, items: unsigned(m.DOUBLE_ARRAY, n) + _doubles(np.zeros(n), valid=False)
+    return lambda session, values, items: unsigned(m.DOUBLE_ARRAY, n) + doubles(np.zeros(n), valid=False)
 
 
 _ANSWERS: dict[int, Callable] = {
     1: lambda s, v, i: s.image(),
-    2: lambda s, v, i: unsigned(m.FLOAT) + _valid_floats(_elevations(s, s.position_m[None])),
-    3: lambda s, v, i: _float_array(_elevations(s, i)),
-    4: lambda s, v, i: unsigned(m.POINT) + _valid_points(_looked_up(s, np.array([v]))),
-    5: lambda s, v, i: unsigned(m.POINT_ARRAY, len(i)) + _valid_points(_looked_up(s, i)),
-    6: lambda s, v, i: unsigned(m.POINT) + _valid_points(_points(s, np.array([v]))),
-    7: lambda s, v, i: unsigned(m.POINT_ARRAY, len(i)) + _valid_points(_points(s, i)),
+    2: lambda s, v, i: unsigned(m.FLOAT) + valid_floats(measures.elevations(s, s.position_m[None])),
+    3: lambda s, v, i: float_array(measures.elevations(s, i)),
+    4: lambda s, v, i: unsigned(m.POINT) + valid_points(measures.looked_up(s, np.array([v]))),
+    5: lambda s, v, i: unsigned(m.POINT_ARRAY, len(i)) + valid_points(measures.looked_up(s, i)),
+    6: lambda s, v, i: unsigned(m.POINT) + valid_points(measures.points(s, np.array([v]))),
+    7: lambda s, v, i: unsigned(m.POINT_ARRAY, len(i)) + valid_points(measures.points(s, i)),
     8: lambda s, v, i: unsigned(m.ECHO, len(i)) + i,
-    9: _range_image,
-    10: lambda s, v, i: picture(np.arange(RANGE_WIDTH, dtype=np.uint8)[None]),
+    9: measures.range_image,
+    10: measures.range_texture,
     11: _imaged(_by_degrees),
     12: _imaged(_by_quaternion),
-    13: _pulse,
+    13: measures.pulse,
     16: _imaged(_by_degrees),
     17: _imaged(_by_quaternion),
     18: lambda s, v, i: unsigned(m.JOINTS, 0),
@@ -271,16 +165,16 @@ _ANSWERS: dict[int, Callable] = {
     20: lambda s, v, i: unsigned(m.FRAMES, 0),
     21: _zeros(12),
     22: _zeros(6),
-    23: lambda s, v, i: unsigned(m.FLOAT) + _valid_floats(_surface(s, v[0], np.array([v[1:]]))),
-    24: lambda s, v, i: _float_array(_surface(s, v[0], i)),
-    25: _patch,
+    23: lambda s, v, i: unsigned(m.FLOAT) + valid_floats(measures.surface(s, v[0], np.array([v[1:]]))),
+    24: lambda s, v, i: float_array(measures.surface(s, v[0], i)),
+    25: measures.patch,
     26: _imaged(_by_radians),
     28: lambda s, v, i: unsigned(m.IMAGE, 0),
     29: _properties,
     30: _camera_image,
-    31: _view_as_dem,
+    31: measures.view_as_dem,
     33: _time_tag,
-    35: _snapshot,
+    35: measures.snapshot,
     256: _by_degrees,
     257: _by_quaternion,
     261: lambda s, v, i: _field_of_view(s, np.radians(v[0])),

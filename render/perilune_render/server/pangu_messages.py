@@ -79,7 +79,7 @@ _ALL = (
     Message(30, "GetViewpointByCamera", "u", note="image of camera 0 or 1; of size 0 for others"),
     Message(31, "GetViewAsDEM", "ub2u3f", note="heights towards the camera on a grid across its axis"),
     Message(32, "GetLidarMeasurementD", "25d", effect="refused", note=_SCAN),
-    Message(33, "GetTimeTag", "", note="time of the last request of an image"),
+    Message(33, "GetTimeTag", "", note="when the last image that was sent had been asked for"),
     Message(34, "GetLidarMeasurementS", "25f", effect="refused", note=_SCAN),
     Message(35, "GetLidarSnapshot", "u7d", note="range, cosine of incidence and hit of each pixel"),
     Message(256, "SetViewpointByDegreesS", "6f"),
@@ -122,10 +122,10 @@ _ALL = (
     Message(293, "RenderToHoldBuffer", "2u", effect="read", note="has no effect: there is no window"),
     Message(294, "DisplayHoldBuffer", "u", effect="read", note="has no effect: there is no window"),
     Message(295, "SetCornerCubesD", "3u", "7d", effect="read", note="has no effect: there are no reflectors"),
-    Message(296, "SetProjectionMode", "2u", note="0, perspective; an error for others"),
+    Message(296, "SetProjectionMode", "2u", note="0, perspective; an error for others and for cameras beside 0 and 1"),
     Message(297, "SetOrthoFieldOfView", "u2d", effect="read", note="has no effect: the projection is perspective"),
     Message(298, "SetLidarScan", "3u", "8d", effect="read", note=_SCAN),
-    Message(299, "SetCameraMotion", "u18d", note="the velocity blurs images; other motion has no effect"),
+    Message(299, "SetCameraMotion", "u18d", note="the velocity, to 10 km/s, blurs images; other motion: no effect"),
 )
 MESSAGES = {message.number: message for message in _ALL}
 """All messages of a client, by number."""

@@ -1,12 +1,14 @@
 """Serve PANGU's protocol: read each message of a client whole, then answer it."""
 
 import socket
+import time
 from collections.abc import Callable
 
 import numpy as np
 
 from perilune_render.server import pangu_messages as m
-from perilune_render.server.pangu_answers import FAULTY, REFUSED, answer, error
+from perilune_render.server.pangu_answers import answer
+from perilune_render.server.pangu_replies import FAULTY, REFUSED, error
 from perilune_render.server.pangu_session import Session
 from perilune_render.server.pangu_wire import doubles_from, expanded, floats_from, read_fields, size_of, unsigned
 from perilune_render.server.serve import Connection
@@ -53,6 +55,7 @@ async def serve_pangu(connection: Connection, new_session: Callable[[], Session]
                 return
             continue
         items = items_of(message, data)
+        session.asked_us = time.time() * 1e6
         await connection.send(await connection.ask(lambda: answer(session, message, values, items)))  # noqa: B023
 
 

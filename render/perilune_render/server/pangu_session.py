@@ -1,6 +1,5 @@
 """State of one client of PANGU's protocol: its camera and Sun, and the images that it gets."""
 
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +10,8 @@ from perilune_render.server.pangu_wire import unsigned
 from perilune_render.server.world import View, World
 from perilune_shared.geometry.frames import Array
 
+CAMERAS = (0, 1)
+"""Numbers of the one camera of a session."""
 _START_M = 1000.0
 
 
@@ -54,8 +55,10 @@ class Session:
     """Velocity of the camera, O_L, metres per second (3,); blurs images."""
     n_images: int = 0
     """Number of images so far: the index of the next one's noise."""
+    asked_us: float = 0.0
+    """When the present message had arrived, microseconds since 1970."""
     time_tag_us: float | None = None
-    """Time of the last request of an image, microseconds since 1970; None before the first."""
+    """When the last image that was sent had been asked for, microseconds since 1970; None before the first."""
 
     def view(self) -> View:
         """The current view."""
@@ -64,11 +67,17 @@ class Session:
 
     def image(self) -> bytes:
         """The image of the current view, as a message."""
-        self.time_tag_us = time.time() * 1e6
         frame = self.world.frame(self.view(), self.seed, self.n_images, self.velocity_mps)
         self.n_images += 1
+        self.time_tag_us = self.asked_us
         grey = frame.image if frame.image.dtype == np.uint8 else frame.image >> (self.world.config.sensor.bits - 8)
         return picture(grey.astype(np.uint8))
+
+
+def check_camera(number: int) -> None:
+    """Raise ValueError if there is no camera of this number."""
+    if number not in CAMERAS:
+        raise ValueError(f"camera {number}, expected 0 or 1")
 
 
 def picture(grey: np.ndarray) -> bytes:

@@ -36,3 +36,13 @@ def doubles(*values):
 def as_float(data):
     word = int.from_bytes(data, "big")
     return struct.unpack(">f", struct.pack(">I", ((word >> 8 & 1) << 31) | ((word & 0xFF) << 23) | (word >> 9)))[0]
+
+
+def as_doubles(data):
+    """Doubles from the wire, by the definition."""
+    found = []
+    for at in range(0, len(data), 8):
+        word = int.from_bytes(data[at + 4 : at + 8] + data[at : at + 4], "big")
+        plain = ((word >> 11 & 1) << 63) | ((word & 0x7FF) << 52) | (word >> 12)
+        found.append(struct.unpack(">d", struct.pack(">Q", plain))[0])
+    return found

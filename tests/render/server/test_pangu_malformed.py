@@ -1,13 +1,16 @@
 """Messages of PANGU's protocol that are faulty: errors, and a server that goes on."""
 
 import random
+import time
 
+import numpy as np
 import psutil
 import pytest
 from tests.render.server.conftest import Running
-from tests.render.server.pangu_words import DOWN_1000, floats
+from tests.render.server.pangu_words import DOWN_1000, doubles, floats
 
 from perilune_render.server import pangu_wire as wire
+from perilune_render.server.pangu_answers import answer
 from perilune_render.server.pangu_messages import MESSAGES
 from perilune_render.server.serve import Limits
 
@@ -51,6 +54,11 @@ def test_every_setting_is_acknowledged_and_every_request_answered(client, world)
         ("00000019 00" + floats(0, 0) + "ffffffff ffffffff" + floats(1, 0), "heights, expected"),
         ("0000001f 00000002 00 00000001 00000001" + floats(1, 1, 1), "camera 2"),
         ("00000120 00000009", "camera 9"),
+        ("00000128 00000007 00000000", "camera 7"),
+        ("00000128 00000001 00000001", "projection 1"),
+        ("0000012b 00000007" + doubles(*[0.0] * 18), "camera 7"),
+        ("0000012b 00000000" + doubles(1e16, *[0.0] * 17), "velocity of 1e+16 m/s, expected at most 10000"),
+        ("00000023 00000002" + doubles(0, 0, 500, 0, 1, 0, 0), "camera 2"),
         ("00000022" + "00" * 100, "not simulated"),
         ("0000001b", "--allow-quit"),
     ],
@@ -63,6 +71,32 @@ def test_a_faulty_request_is_an_error_and_the_session_goes_on(client, request_by
     client.read(1)
     client.send(f"0000000b {DOWN_1000}")
     client.image()
+
+
+def test_the_fastest_camera_with_the_narrowest_view_gets_an_image(client, world):
+    z = float(world.heights_m(np.zeros(1), np.zeros(1))[0]) + 1.2
+    for request in (
+        "00000105" + floats(0.0101),
+        "0000012b 00000000" + doubles(6000, -8000, *[0.0] * 16),
+        "00000100" + floats(0, 0, z, 0, -90, 0),
+    ):
+        client.send(request)
+        assert client.number() == 0
+    start = time.monotonic()
+    client.send("00000001")
+    client.image()
+    assert time.monotonic() - start < 5
+
+
+@pytest.mark.parametrize("fault", [OverflowError("too large"), ZeroDivisionError("by zero"), ValueError("wrong")])
+def test_values_that_cannot_be_computed_with_are_an_error(fault):
+    class Failing:
+        def image(self):
+            raise fault
+
+    reply = answer(Failing(), MESSAGES[1], [], b"")
+    assert reply[:4] == b"\0\0\0\1"
+    assert str(fault).encode() in reply
 
 
 def test_an_unknown_message_or_too_large_an_array_ends_the_session_with_an_error(server):

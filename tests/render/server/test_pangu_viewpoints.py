@@ -1,11 +1,12 @@
 """PANGU's viewpoints, field of view, Sun and images by raw bytes."""
 
 import time
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
 from tests.render.server.conftest import SIZE
-from tests.render.server.pangu_words import DOUBLES, DOWN_1000, as_float, floats
+from tests.render.server.pangu_words import DOUBLES, DOWN_1000, as_doubles, as_float, floats
 
 from perilune_render.server import pangu_wire as wire
 from perilune_render.server.pangu_view import rotation_from_angles, rotation_from_quaternion, sun_from_angles
@@ -53,17 +54,28 @@ def test_the_sun_moves_and_darkens(client):
     assert client.image().mean() < 0.2 * lit.mean()
 
 
-def test_the_time_of_the_last_image(client):
+def time_tag_s(client):
+    """Time of the last image, seconds since 1970; None if there is none."""
     client.send("00000021")
     assert client.number() == 12
-    assert client.read(9)[-1] == 0
-    client.send("00000001")
+    data = client.read(9)
+    return as_doubles(data[:8])[0] / 1e6 if data[8] else None
+
+
+def test_the_time_of_the_last_image(server, client):
+    assert time_tag_s(client) is None
+    client.send("0000000b" + floats(0, 0, -50, 0, -90, 0))  # refused: no image
+    assert "above the surface" in client.error()
+    assert time_tag_s(client) is None
+    server.server._work.put((lambda: time.sleep(0.6), Future()))  # the renderer is busy
+    before = time.time()
+    client.send(f"0000000b {DOWN_1000}")
     client.image()
-    client.send("00000021")
-    assert client.number() == 12
-    microseconds = wire.doubles_from(client.read(8))[0]
-    assert client.read(1) == b"\1"
-    assert abs(microseconds / 1e6 - time.time()) < 60
+    tag = time_tag_s(client)
+    assert before - 0.01 <= tag < before + 0.3  # when the image was asked for, not when it was rendered
+    client.send("0000000b" + floats(0, 0, -50, 0, -90, 0))
+    client.error()
+    assert time_tag_s(client) == tag
 
 
 @pytest.mark.parametrize(
@@ -92,6 +104,13 @@ def test_roll_leans_the_top_to_the_stated_side():
 
 def test_viewpoints_by_quaternion():
     assert np.allclose(rotation_from_quaternion(np.array([0, 2.0, 0, 0])), rotation_from_angles(0, -np.pi / 2, 0))
+    # Camera x to world y, y to z, z to x: a third of a turn, which the opposite sense would send the other way.
+    rotation = rotation_from_quaternion(np.array([0.5, 0.5, 0.5, 0.5]))
+    assert np.allclose(rotation, [[0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    # Yaw 90, pitch -45: looks along -x and down, right is +y.
+    rotation = rotation_from_quaternion(np.array([0.270598, -0.653281, -0.653281, 0.270598]))
+    assert np.allclose(rotation[2], [-np.sqrt(0.5), 0, -np.sqrt(0.5)], atol=1e-6)
+    assert np.allclose(rotation[0], [0, 1, 0], atol=1e-6)
 
 
 def test_both_zeros_of_the_suns_azimuth():
