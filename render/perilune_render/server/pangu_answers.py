@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from perilune_render.flight.pose_checks import LARGEST_MPS
 from perilune_render.server import pangu_measures as measures
 from perilune_render.server import pangu_messages as m
 from perilune_render.server.pangu_replies import (
@@ -31,8 +32,6 @@ from perilune_shared.geometry.frames import Array, quaternion_from_matrix
 
 _LARGEST = 1e16
 """Largest number in a message: the Sun's distance may be 1e15 metres."""
-_FASTEST_MPS = 10_000.0
-"""Largest speed of a camera: four times the escape velocity at the Moon's surface."""
 
 
 def answer(session: Session, message: m.Message, values: list, items: Array | bytes) -> bytes:
@@ -126,8 +125,8 @@ def _motion(session: Session, values: list, items: object) -> None:
     check_camera(values[0])
     velocity = np.array(values[1:4])
     speed_mps = float(np.linalg.norm(velocity))
-    if speed_mps > _FASTEST_MPS:
-        raise ValueError(f"a velocity of {speed_mps:g} m/s, expected at most {_FASTEST_MPS:g}")
+    if speed_mps > LARGEST_MPS:
+        raise ValueError(f"a velocity of {speed_mps:g} m/s, expected at most {LARGEST_MPS:g}")
     session.velocity_mps = velocity
 
 

@@ -125,7 +125,7 @@ _ALL = (
     Message(296, "SetProjectionMode", "2u", note="0, perspective; an error for others and for cameras beside 0 and 1"),
     Message(297, "SetOrthoFieldOfView", "u2d", effect="read", note="has no effect: the projection is perspective"),
     Message(298, "SetLidarScan", "3u", "8d", effect="read", note=_SCAN),
-    Message(299, "SetCameraMotion", "u18d", note="the velocity, to 10 km/s, blurs images; other motion: no effect"),
+    Message(299, "SetCameraMotion", "u18d", note="the velocity, to 12 km/s, blurs images; other motion: no effect"),
 )
 MESSAGES = {message.number: message for message in _ALL}
 """All messages of a client, by number."""

@@ -1,4 +1,4 @@
-"""Each message that sets viewpoint, lens, Sun or motion, by raw bytes: where the camera then looks, and what it sees."""
+"""Each message that sets viewpoint, lens, Sun or motion, by raw bytes: where the camera looks, and what it sees."""
 
 import numpy as np
 import pytest

@@ -65,7 +65,7 @@ def time_tag_s(client):
 def test_the_time_of_the_last_image(server, client):
     assert time_tag_s(client) is None
     client.send("0000000b" + floats(0, 0, -50, 0, -90, 0))  # refused: no image
-    assert "above the surface" in client.error()
+    assert "above the ground" in client.error()
     assert time_tag_s(client) is None
     server.server._work.put((lambda: time.sleep(0.6), Future()))  # the renderer is busy
     before = time.time()
