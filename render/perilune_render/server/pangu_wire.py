@@ -37,7 +37,8 @@ def double_bytes(values: Sequence[float] | np.ndarray) -> bytes:
 def floats_from(data: bytes) -> np.ndarray:
     """Floats (N,) float64 from the wire; they may be infinite or NaN."""
     word = np.frombuffer(data, ">u4").astype(np.uint32)
-    return ((word >> 9) | (word << 23)).view(np.float32).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        return ((word >> 9) | (word << 23)).view(np.float32).astype(np.float64)
 
 
 def doubles_from(data: bytes) -> np.ndarray:

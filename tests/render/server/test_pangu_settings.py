@@ -5,7 +5,7 @@ import pytest
 from tests.render.server.conftest import FIELD_OF_VIEW_DEG, SIZE
 from tests.render.server.pangu_words import DOWN_1000, as_doubles, as_float, doubles, floats
 
-POSITION = (30.0, -40.0, 600.0)
+POSITION = (30.0, -40.0, 250.0)
 YAW, PITCH, ROLL = np.radians((30.0, -70.0, 10.0))
 DEGREES, RADIANS = (*POSITION, 30.0, -70.0, 10.0), (*POSITION, YAW, PITCH, ROLL)
 
@@ -111,9 +111,9 @@ def test_all_messages_of_a_viewpoint_set_the_same_one(client, number):
 
 
 def test_a_quaternion_in_hand_coded_words(client):
-    # (0, 0, 1000) and cos 15 degrees, -sin 15 degrees about x after straight down: (sin 15, cos 15, 0, 0).
-    okay(client, "00000101 00000000 00000000 f4000088 084bd17d ee8dd57e 00000000 00000000")
-    forward, _, _ = seen_axes(client, (0, 0, 1000))
+    # (0, 0, 400), and 150 degrees about x: (sin 15 degrees, cos 15 degrees, 0, 0). Not a half turn, so it has a sense.
+    okay(client, "00000101 00000000 00000000 90000087 0907dc7d ee8dd47e 00000000 00000000")
+    forward, _, _ = seen_axes(client, (0, 0, 400))
     assert np.allclose(forward, [0, -0.5, -np.sqrt(0.75)], atol=1e-5)
 
 
@@ -148,7 +148,7 @@ def test_the_velocity_blurs_along_its_direction(client):
         grey = image(client)
         return np.square(np.diff(grey, axis=1)).mean(), np.square(np.diff(grey, axis=0)).mean()
 
-    okay(client, f"00000100 {DOWN_1000}")
+    okay(client, "00000100" + floats(0, 0, 300, 0, -90, 0))
     still, along_x, along_y = steps((0, 0, 0)), steps((10_000, 0, 0)), steps((0, 10_000, 0))
     assert along_x[0] < 0.5 * still[0] and along_x[0] / along_x[1] < 0.7 * still[0] / still[1]
     assert along_y[1] < 0.5 * still[1] and along_y[0] / along_y[1] > 1.4 * still[0] / still[1]
