@@ -6,7 +6,7 @@ from concurrent.futures import Future
 import numpy as np
 import pytest
 from tests.render.server.conftest import SIZE
-from tests.render.server.pangu_words import DOUBLES, DOWN_1000, as_doubles, as_float, floats
+from tests.render.server.pangu.words import DOUBLES, DOWN_1000, as_doubles, as_float, floats
 
 from perilune_render.server import pangu_wire as wire
 from perilune_render.server.pangu_view import rotation_from_angles, rotation_from_quaternion, sun_from_angles

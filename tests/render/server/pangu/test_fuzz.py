@@ -7,8 +7,8 @@ from collections import Counter
 
 import psutil
 from tests.render.server.conftest import Running
-from tests.render.server.pangu_valid import VALID
-from tests.render.server.pangu_words import DOWN_1000
+from tests.render.server.pangu.valid import VALID
+from tests.render.server.pangu.words import DOWN_1000
 
 from perilune_render.server import pangu_serve
 from perilune_render.server import pangu_wire as wire

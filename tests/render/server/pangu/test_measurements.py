@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 from tests.render.server.conftest import FIELD_OF_VIEW_DEG, SIZE
-from tests.render.server.pangu_words import DOWN_1000, as_float, doubles, floats
+from tests.render.server.pangu.words import DOWN_1000, as_float, doubles, floats
 
 from perilune_render.terrain.interpolation import value_at
 

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from tests.render.server.pangu_words import DOWN_1000, doubles, floats
+from tests.render.server.pangu.words import DOWN_1000, doubles, floats
 
 from perilune_render.server import pangu_wire as wire
 from perilune_render.server.pangu_answers import answer

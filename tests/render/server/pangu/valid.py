@@ -1,6 +1,6 @@
 """A valid request of each kind of PANGU's protocol, with numbers other than 0."""
 
-from tests.render.server.pangu_words import doubles, floats
+from tests.render.server.pangu.words import doubles, floats
 
 PLACE, ANGLES = (12.0, -20.0, 400.0), (30.0, -80.0, 10.0)
 RADIANS = (0.5, -1.4, 0.2)

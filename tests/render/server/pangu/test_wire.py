@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.render.server.pangu_words import DOUBLES, FLOATS, doubles, floats
+from tests.render.server.pangu.words import DOUBLES, FLOATS, doubles, floats
 
 from perilune_render.server import pangu_wire as wire
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from tests.render.server.conftest import FIELD_OF_VIEW_DEG, SIZE
-from tests.render.server.pangu_words import DOWN_1000, as_doubles, as_float, doubles, floats
+from tests.render.server.pangu.words import DOWN_1000, as_doubles, as_float, doubles, floats
 
 POSITION = (30.0, -40.0, 250.0)
 YAW, PITCH, ROLL = np.radians((30.0, -70.0, 10.0))
