@@ -103,21 +103,16 @@ def first_descent(split: DetectSplit) -> list[int]:
     return np.flatnonzero((ids == ids.iloc[0]).all(axis=1)).tolist()
 
 
-def consecutive_pairs(dataset: Dataset, split: str, count: int) -> Pairs:
-    """At most `count` pairs of a split in runs of at most RUN_PAIRS, spread evenly over trajectories and altitudes.
-
-    Raises UserError if the dataset is of another kind or the split is empty.
-    """
-    descents = navigation.load_split(dataset, split)
+def consecutive_pairs(descents: Sequence[navigation.Trajectory], count: int) -> Pairs:
+    """At most `count` pairs of descents in runs of at most RUN_PAIRS, spread evenly over trajectories and altitudes."""
     length = min(RUN_PAIRS, *(one.n_pairs for one in descents))
     places = [(one, start) for one in descents for start in range(0, one.n_pairs - length + 1, length)]
     return _pairs_of([(*places[i], length) for i in evenly_spaced(len(places), max(1, count // length))])
 
 
-def pairs_of_descent(dataset: Dataset, split: str, count: int) -> Pairs:
-    """At most `count` pairs of the split's first trajectory, evenly spaced from its highest to its lowest one."""
-    first = navigation.load_split(dataset, split)[0]
-    return _pairs_of([(first, step, 1) for step in evenly_spaced(first.n_pairs, count)])
+def pairs_of_descent(descent: navigation.Trajectory, count: int) -> Pairs:
+    """At most `count` pairs of a descent, evenly spaced from its highest to its lowest one."""
+    return _pairs_of([(descent, step, 1) for step in evenly_spaced(descent.n_pairs, count)])
 
 
 def _pairs_of(runs: Sequence[tuple[navigation.Trajectory, int, int]]) -> Pairs:

@@ -32,6 +32,7 @@ from perilune_train.explain.networks import folder_of, open_single_scale, terrai
 from perilune_train.explain.page import claims as page
 from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
 from perilune_train.explain.page.viewer import save_masks
+from perilune_train.navigate.data.trajectories import load_split
 from perilune_train.navigate.network import load_navigator
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.runs import RunFolder, choose_device
@@ -76,10 +77,10 @@ def explain_run(
     labelled, flown = open_single(detect_data), open_single(nav_data)
     frames, split = labelled_frames(labelled, "test", own, settings.n_frames, settings.ring_factors)
     known_frames, _ = labelled_frames(labelled, "val", own, settings.n_validation, settings.ring_factors)
-    pairs = consecutive_pairs(flown, "test", settings.n_pairs)
-    known_pairs = consecutive_pairs(flown, "val", settings.n_validation)
+    descents = load_split(flown, "test")
+    pairs, flight = consecutive_pairs(descents, settings.n_pairs), pairs_of_descent(descents[0], settings.n_drawn)
+    known_pairs = consecutive_pairs(load_split(flown, "val"), settings.n_validation)
     descent = frames_of(split, first_descent(split), settings.ring_factors)
-    flight = pairs_of_descent(flown, "test", settings.n_drawn)
     start_run(run, "explain", settings, inputs, state)
 
     found, masks = detection.explain_detector(settings, opened, frames, known_frames, detector)
