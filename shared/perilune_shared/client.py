@@ -117,6 +117,7 @@ class SceneClient:
     def _connect(self) -> None:
         self._socket = self._context.socket(self._zmq.REQ)
         self._socket.setsockopt(self._zmq.LINGER, 0)
+        self._socket.setsockopt(self._zmq.IPV6, 1)
         try:
             self._socket.connect(self.address)
         except self._zmq.ZMQError as error:

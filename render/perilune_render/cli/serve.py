@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 _PORT = 10363
 _NATIVE_PORT = 10364
 _LOOPBACK = "127.0.0.1"
+_OWN = (_LOOPBACK, "::1", "localhost")
+"""Addresses that only this machine reaches."""
 _Zero = Literal["clockwise-from-y", "anticlockwise-from-x"]
 
 
@@ -64,7 +66,7 @@ def serve(
         config = config.model_copy(update={"camera": read_camera(camera)})
     config = config.model_copy(update={"render": config.render.model_copy(update={"engine": engine})})
     from perilune_render.server.grounds import Grounds
-    from perilune_render.server.native_serve import serve_native
+    from perilune_render.server.native_serve import native_address, serve_native
     from perilune_render.server.pangu_serve import serve_pangu
     from perilune_render.server.pangu_session import Conventions, Session
     from perilune_render.server.serve import Ask, Connection, Limits, Server
@@ -80,7 +82,7 @@ def serve(
             await serve_pangu(connection, lambda: Session(world, *start, conventions), server.stop)
 
         async def native(ask: Ask, ready: Callable[[int], object]) -> None:
-            await serve_native(f"tcp://{host}:{native_port}", grounds, ask, ready, limits, say)
+            await serve_native(native_address(host, native_port), grounds, ask, ready, limits, say)
 
         server = Server(host, port, handle, limits, say, native)
         server.begin()
@@ -97,8 +99,12 @@ def serve(
             f"not known of PANGU, so options: --sun-azimuth {sun_azimuth}, --roll {roll}; cameras 0 and 1 are the "
             "same, each client has its own camera and Sun"
         )
-        say(f"perilune_shared.client at tcp://{server.host}:{server.other_port}")
-        if host != _LOOPBACK:
+        say(
+            "not known either, and fixed: first viewpoint 1000 m above the site, straight down; a pulse that misses "
+            "has range 0 and cosine 0; error codes 1 (refused) and 2 (faulty); docs/reference/pangu.md has the rest"
+        )
+        say(f"perilune_shared.client at {native_address(server.host, server.other_port)}")
+        if host not in _OWN:
             say(f"{host}: others on the network can connect; the protocol has no password", style="yellow")
         server.run()
 

@@ -71,6 +71,11 @@ class Places:
         self._connection.pop(client, None)
 
 
+def native_address(host: str, port: int) -> str:
+    """The address for ZeroMQ; one of IPv6 is in brackets."""
+    return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
+
+
 async def serve_native(
     address: str,
     grounds: Grounds,
@@ -87,6 +92,7 @@ async def serve_native(
     context = zmq.asyncio.Context()
     socket = context.socket(zmq.ROUTER)
     socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.IPV6, 1)
     socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_REQUEST_BYTES)
     # With this option an error says that a client left, or that it has as many messages to read as may be queued.
     socket.setsockopt(zmq.ROUTER_MANDATORY, 1)

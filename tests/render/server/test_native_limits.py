@@ -1,6 +1,7 @@
 """Clients of our own interface that do not read, send too much or are too many hold up nobody."""
 
 import json
+import socket
 import threading
 import time
 from contextlib import contextmanager
@@ -187,3 +188,14 @@ def test_an_error_of_the_server_is_noted(world, monkeypatch):
         with SceneClient(running.address) as client, pytest.raises(UserError, match="ZeroDivisionError"):
             client.scene()
         assert running.notes == ["perilune_shared.client: ZeroDivisionError: division by zero"]
+
+
+def test_an_address_of_ip_version_6(world):
+    with socket.socket(socket.AF_INET6) as probe:
+        try:
+            probe.bind(("::1", 0))
+        except OSError:
+            pytest.skip("this machine has no IPv6")
+    with NativeRunning(Grounds(world), host="::1") as running, SceneClient(running.address) as client:
+        assert running.address.startswith("tcp://[::1]:")
+        assert client.scene().camera.width_px == 64
