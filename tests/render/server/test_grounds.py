@@ -123,6 +123,7 @@ def test_a_scene_that_cannot_be_generated_is_an_error_for_those_who_ask_for_it(w
 def test_a_number_of_no_scene_is_refused(address, scene, message):
     with SceneClient(address) as client:
         client._socket.send(json.dumps({"request": "ground", "scene": scene}).encode())
+        assert client._socket.poll(20_000)
         (reply,) = client._socket.recv_multipart()
         assert message in json.loads(reply)["error"]
         assert image(client, 0).dtype == np.uint8

@@ -109,6 +109,7 @@ def test_heights_are_those_of_the_ground(scene, world):
 )
 def test_a_faulty_request_is_refused_and_the_server_lives(scene, request_, message):
     scene._socket.send(json.dumps(request_).encode())
+    assert scene._socket.poll(20_000)
     (reply,) = scene._socket.recv_multipart()
     assert message in json.loads(reply)["error"]
     assert scene.frame((0, 0, 500), DOWN).image.shape == (48, 64)
@@ -128,13 +129,29 @@ def test_bytes_that_are_no_json_and_messages_without_envelopes_are_survived(addr
         dealer.send(content)
         assert dealer.poll(5000)
         assert "error" in json.loads(dealer.recv_multipart()[-1])
-    frame = json.dumps({"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": DOWN}).encode()
-    for _ in range(5):
-        dealer.send(frame)
-    replies = [json.loads(dealer.recv_multipart()[0]) for _ in range(5)]
-    assert any("one request at a time" in reply.get("error", "") for reply in replies)
     dealer.close()
     context.term()
+
+
+def test_requests_before_the_reply_are_refused_and_the_client_is_served_afterwards(address):
+    frame = {"request": "frame", "position_m": [0, 0, 500], "rotation_wxyz": DOWN}
+    with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
+        dealer.setsockopt(zmq.LINGER, 0)
+        dealer.connect(address)
+        for _ in range(5):
+            dealer.send(json.dumps(frame).encode())
+        assert dealer.poll(5000)
+        replies = [json.loads(dealer.recv_multipart()[0])]
+        # On a busy machine some of the five are discarded: they come faster than ZeroMQ's thread takes them.
+        while dealer.poll(3000):
+            replies.append(json.loads(dealer.recv_multipart()[0]))
+        assert 1 <= len(replies) <= 5
+        assert any("one request at a time" in reply.get("error", "") for reply in replies)
+        dealer.send(json.dumps(frame).encode())
+        assert dealer.poll(5000)
+        head, *arrays = dealer.recv_multipart()
+        assert [one["name"] for one in json.loads(head)["arrays"]] == ["image"]
+        assert len(arrays[0]) == 64 * 48
 
 
 def test_a_server_that_is_not_there_is_an_error_in_time():
