@@ -1,5 +1,9 @@
 """Console on standard error and progress bar of the command lines, both from Rich."""
 
+import time
+from collections.abc import Callable
+from typing import Any
+
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -13,6 +17,7 @@ from rich.text import Text
 
 console = Console(stderr=True)
 """Console for messages; text that it prints appears above a running progress bar."""
+_LOG_INTERVAL_S = 60.0
 
 
 class _Rate(ProgressColumn):
@@ -31,15 +36,43 @@ class _Note(ProgressColumn):
         return Text(task.fields.get("note", ""))
 
 
-def progress_bar() -> Progress:
-    """Create a progress bar on standard error: name, steps, rate, remaining time, and a note on the current step."""
-    return Progress(
+class _LoggedProgress(Progress):
+    """Progress that prints a line once a minute where the console is no terminal: Rich shows only the end there."""
+
+    def __init__(self, *columns: ProgressColumn, clock: Callable[[], float], **fields: Any) -> None:
+        super().__init__(*columns, get_time=clock, **fields)
+        self._printed_s = clock()
+
+    def advance(self, task_id: Any, advance: float = 1) -> None:
+        super().advance(task_id, advance)
+        self._log()
+
+    def update(self, task_id: Any, **fields: Any) -> None:
+        super().update(task_id, **fields)
+        self._log()
+
+    def _log(self) -> None:
+        with self._lock:
+            now_s = self.get_time()
+            if self.console.is_terminal or self.finished or now_s - self._printed_s < _LOG_INTERVAL_S:
+                return
+            self._printed_s = now_s
+            self.console.print(self.get_renderable())
+
+
+def progress_bar(clock: Callable[[], float] = time.monotonic) -> Progress:
+    """Create a progress bar on standard error: name, steps, rate, remaining time, and a note on the current step.
+
+    In a file or pipe it is a line per task, at most once a minute and at the end. `clock` returns the time, s.
+    """
+    return _LoggedProgress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         _Rate(),
         TimeRemainingColumn(),
         _Note(),
+        clock=clock,
         console=console,
         refresh_per_second=2,
     )
