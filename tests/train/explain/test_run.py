@@ -6,6 +6,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 import torch
+from tests.helpers import in_process
 from tests.helpers.stored_run import store_run
 from tests.helpers.terrain_record import store_record, uses_of
 
@@ -13,9 +14,11 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.labels.selection import read_labels, selected
 from perilune_shared.labels.thresholds import SELECTIONS
+from perilune_train.cli import main
 from perilune_train.detect.cli.evaluate import config_of_run
 from perilune_train.detect.inference.detector import load_detector
 from perilune_train.evaluation.provenance import training_provenance
+from perilune_train.explain import run as explained
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.evidence.tables import TABLES
 from perilune_train.explain.inputs import labelled_frames
@@ -23,7 +26,8 @@ from perilune_train.explain.maps.masks import detector_masks
 from perilune_train.explain.page.pictures import CAPTIONS
 from perilune_train.explain.run import explain_run
 from perilune_train.models.navigator import StackNavigator
-from perilune_train.training.runs import save_weights
+from perilune_train.shipped.models import shipped_run
+from perilune_train.training.runs import RunFolder, save_weights
 
 _BLOCKS = [f"B_{i + 1}{j + 1}" for i, count in enumerate((1, 2, 8, 8, 4)) for j in range(count)]
 _STACK = {
@@ -170,6 +174,37 @@ def test_test_terrain_that_a_network_was_fitted_to_is_refused_or_marked(dataset_
     assert marked == {name for name in CAPTIONS if "navigate" in name}
     table_mark = pq.read_schema(run.root / "summary.parquet").metadata[b"terrain_mark"].decode()
     assert table_mark == f"navigator: {metrics['navigator/terrain/mark']}"
+
+
+def test_one_network_alone(checkpoints, dataset_detect, tmp_path):
+    """No navigator and no navigation dataset are needed to explain a detector."""
+    run = _explain((checkpoints[0], None), dataset_detect, "missing", tmp_path)
+    assert {path.name for path in run.root.glob("*.png")} == {name for name in CAPTIONS if "detect" in name}
+    assert set(json.loads((run.root / "captions.json").read_text())) == {name for name in CAPTIONS if "detect" in name}
+    assert set(pd.read_parquet(run.root / "gates.parquet")["task"]) == {"detect"}
+    claims, metrics = (json.loads((run.root / name).read_text()) for name in ("claims.json", "metrics.json"))
+    assert len(claims) == 10 and not any("Navigator" in one["claim"] for one in claims)
+    assert metrics["headline"].startswith("Detector: ") and "Navigator" not in metrics["headline"]
+    assert not any("navigat" in key for key in metrics)
+    assert "navigat" not in (run.root / "inputs.json").read_text()
+
+
+def test_the_task_chooses_the_networks(dataset_detect, tmp_path, monkeypatch):
+    """Without a run of that name the installed detector is explained; a network of the other task is refused."""
+    calls = []
+    monkeypatch.setattr(explained, "explain_run", lambda *given: calls.append(given) or RunFolder(tmp_path / "made"))
+    common = ("explain", "--out", tmp_path, "--name", "a", "--dataset", "data")
+    assert in_process.call(main, *common, "--task", "detect").returncode == 0
+    installed = shipped_run("detect")
+    assert calls[-1][1:5] == ("data/detect", "data/nav", installed / "weights.safetensors", None)
+    (tmp_path / "detect" / "a").mkdir(parents=True)
+    assert in_process.call(main, *common, "--task", "detect").returncode == 0
+    own = tmp_path / "detect/a/checkpoints/best.ckpt", tmp_path / "navigate/a-stack/checkpoints/best.ckpt"
+    assert calls[-1][3:5] == (own[0], None)
+    assert in_process.call(main, *common).returncode == 0 and calls[-1][3:5] == own
+    assert in_process.call(main, *common, "--task", "navigate").returncode == 0 and calls[-1][3:5] == (None, own[1])
+    refused = in_process.call(main, *common, "--task", "detect", "--navigator", "a.ckpt")
+    assert refused.returncode == 2 and refused.stderr.startswith("error: --navigator: option: got a.ckpt, expected")
 
 
 def test_the_crater_mask_holds_what_the_run_selects(checkpoints, dataset_detect):

@@ -1,16 +1,32 @@
-"""The networks that are explained: loading, and the terrain that they were fitted to."""
+"""The networks that are explained and their images: loading, and the terrain that the networks were fitted to."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.store import Address
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.data.split import DetectSplit
+from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import Detector, open_detector
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
 from perilune_train.explain.config import ExplainConfig
-from perilune_train.training.runs import load_weights
+from perilune_train.explain.inputs import (
+    LabelledFrames,
+    Pairs,
+    consecutive_pairs,
+    first_descent,
+    frames_of,
+    labelled_frames,
+    pairs_of_descent,
+)
+from perilune_train.models.navigator import StackNavigator
+from perilune_train.navigate.data.trajectories import load_split
+from perilune_train.navigate.network import load_navigator
+from perilune_train.training.runs import choose_device, load_weights
 
 
 def folder_of(checkpoint: Path) -> Path:
@@ -40,3 +56,61 @@ def terrain_marks(
         figures = {"dataset/protocol": protocol_of(dataset.info), **check.metrics()}
         metrics |= {f"{part}/{key}": value for key, value in figures.items()}
     return marks, metrics
+
+
+@dataclass(frozen=True)
+class ExplainedDetector:
+    """A detector and the frames that it is explained on."""
+
+    checkpoint: Path
+    """Its weights."""
+    detector: Detector
+    """The network, at scale 1."""
+    config: DetectConfig
+    """Configuration of its run."""
+    split: DetectSplit
+    """The whole test split."""
+    frames: LabelledFrames
+    """Test frames."""
+    known_frames: LabelledFrames
+    """Validation frames: signs and gates are chosen on them."""
+    descent: LabelledFrames
+    """All frames of the first test descent."""
+
+
+@dataclass(frozen=True)
+class ExplainedNavigator:
+    """A stack navigator and the pairs of frames that it is explained on."""
+
+    checkpoint: Path
+    """Its weights."""
+    network: StackNavigator
+    """The network."""
+    architecture: dict[str, Any]
+    """Its form, as its checkpoint states it."""
+    pairs: Pairs
+    """Test pairs."""
+    known_pairs: Pairs
+    """Validation pairs: signs and gates are chosen on them."""
+    flight: Pairs
+    """Pairs of the first test descent, from high to low."""
+
+
+def open_detection(checkpoint: Path, data: Address, settings: ExplainConfig) -> ExplainedDetector:
+    """Load a detector, and its test and validation frames. Raises UserError if one is missing or invalid."""
+    config = config_of_run(folder_of(checkpoint), ())
+    detector, dataset = open_single_scale(checkpoint, config, settings), open_single(data)
+    frames, split = labelled_frames(dataset, "test", config, settings.n_frames, settings.ring_factors)
+    known_frames, _ = labelled_frames(dataset, "val", config, settings.n_validation, settings.ring_factors)
+    descent = frames_of(split, first_descent(split), settings.ring_factors)
+    return ExplainedDetector(checkpoint, detector, config, split, frames, known_frames, descent)
+
+
+def open_navigation(checkpoint: Path, data: Address, settings: ExplainConfig) -> ExplainedNavigator:
+    """Load a stack navigator, and its test and validation pairs. Raises UserError if one is missing or invalid."""
+    stack, architecture = load_navigator(checkpoint, "stack")
+    network, dataset = stack.to(choose_device(settings.device)), open_single(data)
+    descents = load_split(dataset, "test")
+    pairs, flight = consecutive_pairs(descents, settings.n_pairs), pairs_of_descent(descents[0], settings.n_drawn)
+    known_pairs = consecutive_pairs(load_split(dataset, "val"), settings.n_validation)
+    return ExplainedNavigator(checkpoint, network, architecture, pairs, known_pairs, flight)

@@ -2,58 +2,55 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
-from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.files import write_text, written_aside
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
 from perilune_train.detect.evaluate.split_evaluation import selection_entries
-from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.train.guide import GUIDED
 from perilune_train.evaluation.marks import mark_files
-from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.explain import detection, navigation
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.explain.correlation.measures import PCC1_SIGN
 from perilune_train.explain.evidence.tables import TABLES, Evidence
 from perilune_train.explain.figures import figures_of
-from perilune_train.explain.inputs import (
-    consecutive_pairs,
-    first_descent,
-    frames_of,
-    labelled_frames,
-    pairs_of_descent,
-)
 from perilune_train.explain.maps.masks import Masks, detector_masks, navigator_masks
-from perilune_train.explain.networks import folder_of, open_single_scale, terrain_marks
+from perilune_train.explain.networks import (
+    ExplainedDetector,
+    ExplainedNavigator,
+    open_detection,
+    open_navigation,
+    terrain_marks,
+)
 from perilune_train.explain.page import claims as page
+from perilune_train.explain.page.claim import Claim
 from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
 from perilune_train.explain.page.viewer import save_masks
-from perilune_train.navigate.data.trajectories import load_split
-from perilune_train.navigate.network import load_navigator
 from perilune_train.training.begin import hashes_of, start_run, state_of
-from perilune_train.training.runs import RunFolder, choose_device
+from perilune_train.training.runs import RunFolder
 
 
 def explain_run(
     settings: ExplainConfig,
     detect_data: Address,
     nav_data: Address,
-    detector: Path,
-    navigator: Path,
+    detector: Path | None,
+    navigator: Path | None,
     runs: Path,
     name: str,
     overwrite: bool = False,
     allow_overlap: bool = False,
 ) -> RunFolder:
-    """Compute the evidence on the attention gates of two networks on test data; writes runs/explain/<name>.
+    """Compute the evidence on the attention gates of one or two networks on test data; writes runs/explain/<name>.
 
     `detector` is checkpoints/best.ckpt of a run, or the weights of an installed network: the config.yaml of its folder
-    defines the selected craters. Leaves a finished run of the same settings, datasets and checkpoints unchanged;
-    `overwrite` replaces any existing run.
+    defines the selected craters. A network that is None is not explained, and its dataset is not opened. Leaves a
+    finished run of the same settings, datasets and checkpoints unchanged; `overwrite` replaces any existing run.
     Signs and the gates whose pixels are removed are chosen on the validation splits.
 
     Raises UserError if the existing run has other settings, datasets or checkpoints; if a dataset, a checkpoint or
@@ -61,67 +58,76 @@ def explain_run(
     (unless `allow_overlap`).
     """
     run = RunFolder(runs / "explain" / name)
-    inputs = hashes_of(
-        {"detection dataset": detect_data, "navigation dataset": nav_data, "detector": detector, "navigator": navigator}
-    )
+    detecting = {} if detector is None else {"detection dataset": detect_data, "detector": detector}
+    navigating = {} if navigator is None else {"navigation dataset": nav_data, "navigator": navigator}
+    inputs = hashes_of(detecting | navigating)
     state = state_of(run, "explain", settings, inputs, overwrite)
     if state == "finished":
         return run
-    stack, architecture = load_navigator(navigator, "stack")
-    stack = stack.to(choose_device(settings.device))
-    marks, terrain = terrain_marks(
-        {"detector": (detector, detect_data), "navigator": (navigator, nav_data)}, allow_overlap
-    )
-    own = config_of_run(folder_of(detector), ())
-    opened = open_single_scale(detector, own, settings)
-    labelled, flown = open_single(detect_data), open_single(nav_data)
-    frames, split = labelled_frames(labelled, "test", own, settings.n_frames, settings.ring_factors)
-    known_frames, _ = labelled_frames(labelled, "val", own, settings.n_validation, settings.ring_factors)
-    descents = load_split(flown, "test")
-    pairs, flight = consecutive_pairs(descents, settings.n_pairs), pairs_of_descent(descents[0], settings.n_drawn)
-    known_pairs = consecutive_pairs(load_split(flown, "val"), settings.n_validation)
-    descent = frames_of(split, first_descent(split), settings.ring_factors)
+    given = {"detector": (detector, detect_data), "navigator": (navigator, nav_data)}
+    networks = {part: (path, data) for part, (path, data) in given.items() if path is not None}
+    flown = None if navigator is None else open_navigation(navigator, nav_data, settings)
+    marks, metrics = terrain_marks(networks, allow_overlap)
+    seen = None if detector is None else open_detection(detector, detect_data, settings)
     start_run(run, "explain", settings, inputs, state)
 
-    found, masks = detection.explain_detector(settings, opened, frames, known_frames, detector)
-    along = detector_masks(opened.network, descent.images, detector)
-    draw_detector(run.root, settings, frames, masks, found, descent, along)
-    save_masks(run.root / "masks_detect.npz", descent.frame_ids, along)
-    seen, stacked = navigation.explain_navigator(settings, stack, architecture, pairs, known_pairs, navigator)
-    flown_masks = navigator_masks(stack, flight.images, architecture["size_px"], navigator)
-    draw_navigator(run.root, settings, pairs, stacked, seen, flight, flown_masks)
-
-    guided = GUIDED if own.loss.lambda_guide > 0 else ()
-    claims = page.detector_claims(found, _deviations(masks), guided) + page.navigator_claims(seen, _deviations(stacked))
-    _write_tables(run, {detection.TASK: found, navigation.TASK: seen})
+    parts = [] if seen is None else [_explain_detector(run, settings, seen)]
+    parts += [] if flown is None else [_explain_navigator(run, settings, flown)]
+    claims = [claim for part in parts for claim in part.claims]
+    _write_tables(run, {part.task: part.evidence for part in parts})
     write_text(run.root / "claims.json", json.dumps([one.plain() for one in claims], indent=2) + "\n")
-    write_text(run.root / "captions.json", json.dumps(CAPTIONS, indent=2) + "\n")
-    metrics = (
-        figures_of(found, detection.TASK, higher_is_better=True)
-        | figures_of(seen, navigation.TASK, higher_is_better=False)
-        | selection_entries(own, split)
-        | terrain
-    )
-    metrics |= {f"mask_deviation/{block}": value for block, value in _deviations(masks).items()}
-    metrics |= {f"mask_deviation_stack/{block}": value for block, value in _deviations(stacked).items()}
-    metrics |= {
-        "detect/guided_gates": " ".join(guided),
-        "headline": page.headline(claims),
-        "pcc1_sign": PCC1_SIGN,
-        "frames": len(frames.images),
-        "pairs": len(pairs.images),
-        "scenes": len(set(frames.scene_ids)),
-        "pair_scenes": len(set(pairs.scene_ids)),
-        "detector": detector.as_posix(),
-        "navigator": navigator.as_posix(),
-    }
-    for part, mark in marks.items():
-        mark_files(run.root, PICTURES[part], mark)
-    joined = "; ".join(f"{part}: {mark}" for part, mark in marks.items() if mark)
+    captions = {name: CAPTIONS[name] for part in networks for name in PICTURES[part]}
+    write_text(run.root / "captions.json", json.dumps(captions, indent=2) + "\n")
+    for part in parts:
+        metrics |= part.metrics
+    metrics |= {"headline": page.headline(claims), "pcc1_sign": PCC1_SIGN}
+    for name, mark in marks.items():
+        mark_files(run.root, PICTURES[name], mark)
+    joined = "; ".join(f"{name}: {mark}" for name, mark in marks.items() if mark)
     mark_files(run.root, [f"{name}.parquet" for name in TABLES], joined)
     console.print(page.headline(claims), markup=False, soft_wrap=True)
     write_metrics(run.root, metrics)
     return run
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What an explain run found on one network."""
+
+    task: str
+    """detect or navigate."""
+    evidence: Evidence
+    """All tables."""
+    claims: list[Claim]
+    """Statements with verdicts."""
+    metrics: Metrics
+    """Entries of metrics.json."""
+
+
+def _explain_detector(run: RunFolder, settings: ExplainConfig, seen: ExplainedDetector) -> _Part:
+    where = seen.checkpoint
+    found, masks = detection.explain_detector(settings, seen.detector, seen.frames, seen.known_frames, where)
+    along = detector_masks(seen.detector.network, seen.descent.images, where)
+    draw_detector(run.root, settings, seen.frames, masks, found, seen.descent, along)
+    save_masks(run.root / "masks_detect.npz", seen.descent.frame_ids, along)
+    deviations, guided = _deviations(masks), GUIDED if seen.config.loss.lambda_guide > 0 else ()
+    metrics = figures_of(found, detection.TASK, higher_is_better=True) | selection_entries(seen.config, seen.split)
+    metrics |= {f"mask_deviation/{block}": value for block, value in deviations.items()}
+    metrics |= {"detect/guided_gates": " ".join(guided), "detector": where.as_posix()}
+    metrics |= {"frames": len(seen.frames.images), "scenes": len(set(seen.frames.scene_ids))}
+    return _Part(detection.TASK, found, page.detector_claims(found, deviations, guided), metrics)
+
+
+def _explain_navigator(run: RunFolder, settings: ExplainConfig, flown: ExplainedNavigator) -> _Part:
+    where, network, pairs = flown.checkpoint, flown.network, flown.pairs
+    found, masks = navigation.explain_navigator(settings, network, flown.architecture, pairs, flown.known_pairs, where)
+    along = navigator_masks(network, flown.flight.images, flown.architecture["size_px"], where)
+    draw_navigator(run.root, settings, pairs, masks, found, flown.flight, along)
+    deviations = _deviations(masks)
+    metrics = figures_of(found, navigation.TASK, higher_is_better=False) | {"navigator": where.as_posix()}
+    metrics |= {f"mask_deviation_stack/{block}": value for block, value in deviations.items()}
+    metrics |= {"pairs": len(pairs.images), "pair_scenes": len(set(pairs.scene_ids))}
+    return _Part(navigation.TASK, found, page.navigator_claims(found, deviations), metrics)
 
 
 def _deviations(masks: Masks) -> dict[str, float]:
