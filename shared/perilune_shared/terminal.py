@@ -17,7 +17,7 @@ from rich.text import Text
 
 console = Console(stderr=True)
 """Console for messages; text that it prints appears above a running progress bar."""
-_LOG_INTERVAL_S = 60.0
+_LOG_INTERVAL_S, _LOG_WIDTH = 60.0, 120
 
 
 class _Rate(ProgressColumn):
@@ -57,7 +57,7 @@ class _LoggedProgress(Progress):
             if self.console.is_terminal or self.finished or now_s - self._printed_s < _LOG_INTERVAL_S:
                 return
             self._printed_s = now_s
-            self.console.print(self.get_renderable())
+            self.console.print(self.get_renderable(), width=_LOG_WIDTH)
 
 
 def progress_bar(clock: Callable[[], float] = time.monotonic) -> Progress:
