@@ -17,7 +17,9 @@ from rich.text import Text
 
 console = Console(stderr=True)
 """Console for messages; text that it prints appears above a running progress bar."""
-_LOG_INTERVAL_S, _LOG_WIDTH = 60.0, 120
+_LOG_INTERVAL_S = 60.0
+_LOG_WIDTH = 120
+"""Characters of a line of progress in a file."""
 
 
 class _Rate(ProgressColumn):

@@ -60,7 +60,7 @@ def terrain_marks(
 
 @dataclass(frozen=True)
 class ExplainedDetector:
-    """A detector and the frames that it is explained on."""
+    """A detector and its frames."""
 
     checkpoint: Path
     """Its weights."""
@@ -80,7 +80,7 @@ class ExplainedDetector:
 
 @dataclass(frozen=True)
 class ExplainedNavigator:
-    """A stack navigator and the pairs of frames that it is explained on."""
+    """A stack navigator and its pairs of frames."""
 
     checkpoint: Path
     """Its weights."""
