@@ -1,6 +1,8 @@
 """Time of non-maximum suppression: OpenCV frame by frame against a whole batch on the device.
 
-A frame has 8,000 candidates, about fifteen per crater. Both keep the same boxes. Writes runs/bench/suppress.json.
+A frame has 8,000 candidates, about fifteen per crater. Both keep the same boxes. A network that is hardly trained has
+more candidates, of which thousands are kept; `untrained` compares the limit on detections with keeping all.
+Writes runs/bench/suppress.json.
 """
 
 import statistics
@@ -10,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from benchmarks.figures import write_figures
+from perilune_train.detect.config import EvaluationSettings
 from perilune_train.detect.evaluate.boxes import suppress
 from perilune_train.detect.inference.suppression import suppress_batch
 
@@ -27,6 +31,18 @@ def candidates(rng: np.random.Generator) -> tuple[Tensor, Tensor]:
     half = side * np.exp(0.1 * rng.normal(size=(CANDIDATES, 2))) / 2
     boxes = torch.tensor(np.concatenate([centre - half, centre + half], axis=1), dtype=torch.float32)
     return boxes, torch.tensor(rng.uniform(0.01, 1, CANDIDATES), dtype=torch.float32)
+
+
+def untrained_candidates(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Boxes (K, 4) and scores (K,) of all predictors for one frame of 256 px: three anchors at strides 4, 8 and 16."""
+    boxes = []
+    for stride, anchors in ((4, (6, 9, 13)), (8, (18, 26, 36)), (16, (50, 70, 100))):
+        grid = np.stack(np.meshgrid(*[np.arange(0, 256, stride) + stride / 2] * 2), axis=-1).reshape(-1, 2)
+        for anchor in anchors:
+            centre = grid + stride / 3 * rng.normal(size=grid.shape)
+            half = anchor * np.exp(0.1 * rng.normal(size=(len(grid), 1))) / 2
+            boxes.append(np.concatenate([centre - half, centre + half], axis=1))
+    return np.concatenate(boxes), rng.uniform(0.01, 0.2, sum(map(len, boxes)))
 
 
 def median_s(call: Callable[[], object]) -> float:
@@ -60,6 +76,18 @@ def main() -> None:
         opencv_s, batch_s = median_s(by_frame), median_s(whole)
         result[f"frames_{n_frames}"] = {"opencv_s": opencv_s, "batch_s": batch_s, "ratio": batch_s / opencv_s}
         print(f"{n_frames} frames: OpenCV {opencv_s:.3f} s, batch on {device} {batch_s:.3f} s")
+    several_boxes, several_scores = untrained_candidates(np.random.default_rng(0))
+    limit = EvaluationSettings().max_detections
+    all_s = median_s(lambda: suppress(several_boxes, several_scores, THRESHOLD_IOU, len(several_boxes)))
+    limited_s = median_s(lambda: suppress(several_boxes, several_scores, THRESHOLD_IOU, limit))
+    result["untrained"] = {
+        "candidates": len(several_boxes),
+        "limit": limit,
+        "all_s": all_s,
+        "limited_s": limited_s,
+        "ratio": limited_s / all_s,
+    }
+    print(f"untrained, {len(several_boxes)} candidates: all {all_s:.3f} s, {limit} detections {limited_s:.3f} s")
     write_figures(Path("runs/bench/suppress.json"), result)
 
 

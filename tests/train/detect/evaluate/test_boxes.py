@@ -1,6 +1,8 @@
 """Overlap and suppression by hand."""
 
+import cv2
 import numpy as np
+import pytest
 
 from perilune_train.detect.evaluate.boxes import iou_matrix, suppress
 
@@ -36,3 +38,30 @@ def test_a_crowd_is_kept_whole():
     kept = suppress(boxes, scores, 0.5, 1000)
     assert len(np.unique(boxes[kept], axis=0)) == len(kept) == 400
     assert (np.diff(scores[kept]) <= 0).all()
+
+
+def undecided(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes and scores as of a network that is hardly trained: most of them are kept. Some scores are equal."""
+    rng = np.random.default_rng(count)
+    corner, side = rng.uniform(0, 256, (count, 2)), rng.lognormal(2.0, 0.5, (count, 1))
+    return np.concatenate([corner, corner + side], axis=1), rng.uniform(0.01, 0.2, count).round(2)
+
+
+@pytest.mark.parametrize("most", [1, 7, 100, 899, 900, 5000])
+def test_a_limit_keeps_the_first_of_all(most):
+    boxes, scores = undecided(1500)
+    every = suppress(boxes, scores, 0.45, 10**6)
+    assert 900 < len(every) < 1500
+    assert suppress(boxes, scores, 0.45, most).tolist() == every[:most].tolist()
+
+
+def test_boxes_below_the_limit_are_not_compared(monkeypatch):
+    compared, opencv = [], cv2.dnn.NMSBoxes
+
+    def counted(boxes, *rest):
+        compared.append(len(boxes))
+        return opencv(boxes, *rest)
+
+    monkeypatch.setattr(cv2.dnn, "NMSBoxes", counted)
+    assert len(suppress(*undecided(16000), 0.45, 200)) == 200
+    assert sum(compared) < 1000

@@ -24,12 +24,20 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
     """Non-maximum suppression (OpenCV's): indices of the kept boxes, best first, at most `max_count`.
 
     A box is removed if its IoU with a kept box of a higher score exceeds `threshold_iou`; equal scores keep their
-    order. All boxes are considered: several hundred craters with a dozen predictors each would exceed any usual limit
-    on candidates and cut the precision-recall curve short.
+    order. No limit on candidates cuts the result short: several hundred craters with a dozen predictors each would
+    exceed any usual one.
     """
     boxes, scores = np.asarray(boxes, np.float64).reshape(-1, 4), np.asarray(scores, np.float64)
     if not len(boxes):
         return np.empty(0, np.intp)
     corner_and_size = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
-    kept = cv2.dnn.NMSBoxes(corner_and_size, scores, 0.0, threshold_iou)  # type: ignore[arg-type]
-    return np.asarray(kept, np.intp).reshape(-1)[:max_count]
+    # OpenCV compares scores as float32. Its time grows with candidates times kept boxes, and the best `max_count` kept
+    # boxes depend on no lower score, so suppress only as many of the best candidates as give that number.
+    order = np.argsort(-scores.astype(np.float32), kind="stable")
+    considered = max(max_count, 1)
+    while True:
+        considered *= 2
+        best = order[:considered]
+        kept = cv2.dnn.NMSBoxes(corner_and_size[best], scores[best], 0.0, threshold_iou)  # type: ignore[arg-type]
+        if len(kept) >= max_count or considered >= len(order):
+            return best[np.asarray(kept, np.intp).reshape(-1)[:max_count]]
