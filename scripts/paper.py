@@ -324,7 +324,7 @@ def _hours(seconds: float) -> str:
 
 
 if __name__ == "__main__":
-    from perilune_shared.errors import run_command_line
+    from perilune_shared.command_line import run_command_line
 
     app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
     app.command()(main)

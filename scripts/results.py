@@ -18,7 +18,8 @@ from typing import Annotated, Any
 import typer
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from perilune_shared.errors import UserError, run_command_line
+from perilune_shared.command_line import run_command_line
+from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,7 +17,8 @@ from typing import Annotated
 import typer
 from model_card import Shipment, model_card
 
-from perilune_shared.errors import UserError, run_command_line
+from perilune_shared.command_line import run_command_line
+from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
 from perilune_train.navigate.covariance import FILE as COVARIANCE

@@ -27,8 +27,9 @@ from perilune_render.labels.drawing import write_sheet
 from perilune_render.labels.frame_labels import RimCircles, label_frame
 from perilune_render.streams import derived_seed, stream
 from perilune_render.terrain.scene import Scene, grow_scene
+from perilune_shared.command_line import run_command_line
 from perilune_shared.config import resolve
-from perilune_shared.errors import UserError, run_command_line
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera
 from perilune_shared.geometry.frames import Array, sun_direction
 from perilune_shared.terminal import progress_bar

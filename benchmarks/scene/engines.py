@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.figures import write_figures
 from perilune_render.config import DatasetConfig
 from perilune_render.dataset.shots import planned_shot
-from perilune_render.engines import n_cores, open_engine
+from perilune_render.engines import open_engine
 from perilune_render.flight.plan import make_plan
 from perilune_render.frame_source import Frame, FrameSource, Shot
 from perilune_render.imaging.radiance import Radiance
@@ -27,6 +27,7 @@ from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.scene import Scene
 from perilune_shared.config import resolve
 from perilune_shared.terminal import progress_bar
+from perilune_shared.threads import usable_cores
 
 ENGINES = ("cycles", "heightfield")
 WIDTHS = (256, 1024)
@@ -118,7 +119,7 @@ def speed(scene: Scene, config: DatasetConfig, shots: list[Shot], width_px: int,
     seconds: dict[str, list[float]] = {}
     for engine in ENGINES:
         one = config.model_copy(
-            update={"render": config.render.model_copy(update={"engine": engine, "threads": n_cores()})}
+            update={"render": config.render.model_copy(update={"engine": engine, "threads": usable_cores()})}
         )
         with open_engine(scene, one, camera, sun) as opened:
             source = FrameSource.of(opened, one, camera, RimCircles.of_scene(scene))

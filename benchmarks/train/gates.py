@@ -16,8 +16,9 @@ import typer
 from matplotlib.figure import Figure
 
 from benchmarks.figures import write_figures
+from perilune_shared.command_line import run_command_line
 from perilune_shared.dataset.manifest import Dataset, open_dataset
-from perilune_shared.errors import UserError, run_command_line
+from perilune_shared.errors import UserError
 from perilune_train.detect.finished_run import config_of_run
 from perilune_train.detect.inference.detector import open_detector
 from perilune_train.evaluation.pictures import save_figure

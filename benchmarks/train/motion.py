@@ -19,8 +19,8 @@ import typer
 from matplotlib.figure import Figure
 
 from benchmarks.figures import write_figures
+from perilune_shared.command_line import run_command_line
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.errors import run_command_line
 from perilune_shared.terminal import progress_bar
 from perilune_train.evaluation.markdown import table
 from perilune_train.evaluation.pictures import save_figure

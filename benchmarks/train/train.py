@@ -16,7 +16,6 @@ copies it.
 
 import copy
 import itertools
-import os
 import statistics
 import tempfile
 import time
@@ -29,9 +28,10 @@ from lightning.pytorch.callbacks import Callback
 from torch.utils.data import DataLoader
 
 from benchmarks.figures import write_figures
+from perilune_shared.command_line import run_command_line
 from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.errors import run_command_line
+from perilune_shared.threads import usable_cores
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input, training_loader
 from perilune_train.detect.data.split import DetectSplit, load_split
@@ -147,7 +147,7 @@ def main(
     gpu = device == "cuda"
     changes = {"width": width or (1.0 if gpu else config.width), "workers": config.workers}
     if gpu and not config.workers:
-        changes["workers"] = min(_WORKERS, max(1, (os.cpu_count() or 1) - 1))
+        changes["workers"] = min(_WORKERS, max(1, usable_cores() - 1))
     config = config.model_copy(update=changes)
     whole = load_split(open_dataset(dataset), "val", config.labels)
     steps = min(steps or (200 if gpu else 40), len(whole) // config.batch_size)

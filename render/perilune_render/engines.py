@@ -1,6 +1,5 @@
 """Open the engine that a configuration names: `cycles` (Blender), or `heightfield` (rays over the height field)."""
 
-import os
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
@@ -9,6 +8,7 @@ from perilune_render.frame_source import Engine
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
+from perilune_shared.threads import usable_cores
 
 if TYPE_CHECKING:
     from perilune_render.heightfield.surface import Surface
@@ -25,13 +25,8 @@ def open_engine(
     if config.render.engine == "heightfield":
         from perilune_render.heightfield.engine import HeightfieldEngine
 
-        return HeightfieldEngine(scene, config, camera, sun, config.render.threads or n_cores(), surface)
+        return HeightfieldEngine(scene, config, camera, sun, config.render.threads or usable_cores(), surface)
     # Importing Blender takes a second, and only this engine needs it.
     from perilune_render.blender.renderer import Renderer
 
     return Renderer(scene, config, camera, sun)
-
-
-def n_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from perilune_shared.threads import usable_cores
+
 _CHECKOUT = Path(__file__).resolve().parents[2]
 _MODEL, _BFLOAT16 = re.compile(r"^model name\s*:\s*(.+)$", re.MULTILINE), "avx512_bf16"
 
@@ -61,7 +63,12 @@ def _hardware() -> str:
     model = _MODEL.search(text)
     name = model.group(1).strip() if model else platform.processor() or platform.machine()
     bfloat16 = ["AVX512-BF16"] if _BFLOAT16 in text else []
-    return ", ".join([f"{os.cpu_count() or 1} cores {name}", *bfloat16, *_memory()])
+    return ", ".join([f"{_cores()} {name}", *bfloat16, *_memory()])
+
+
+def _cores() -> str:
+    every = os.cpu_count() or 1
+    return f"{every} cores" if usable_cores() == every else f"{usable_cores()} of {every} cores"
 
 
 def _memory() -> list[str]:

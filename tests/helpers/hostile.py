@@ -14,10 +14,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from perilune_shared.cli import main as cli
+from perilune_shared.command_line import run_command_line
 from perilune_shared.dataset.manifest import Dataset, open_dataset
 from perilune_shared.dataset.packed import SHARDS, packed_rows, shard_name
 from perilune_shared.dataset.schema import TABLES, complete
-from perilune_shared.errors import UserError, run_command_line
+from perilune_shared.errors import UserError
 from perilune_shared.validation.validate import validate
 from tests.helpers.drawn_dataset import seal
 

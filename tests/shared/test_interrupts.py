@@ -22,7 +22,7 @@ with interrupts_held():
 
 NATIVE = """
 import hashlib, sys
-from perilune_shared.errors import run_command_line
+from perilune_shared.command_line import run_command_line
 from perilune_shared.interrupts import ended_by_interrupt
 def command():
     with ended_by_interrupt(after_s=0.5, at_end=lambda: print("at end", flush=True)):
@@ -94,7 +94,7 @@ def test_ctrl_c_ends_a_command_that_is_in_native_code(ignored):
 
 LATE = """
 import signal, sys, time
-from perilune_shared.errors import run_command_line
+from perilune_shared.command_line import run_command_line
 class Slow:
     def __del__(self, sleep=time.sleep, write=sys.stdout.write, flush=sys.stdout.flush):
         write("ending\\n"), flush(), sleep(1.0)

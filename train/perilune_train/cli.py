@@ -4,9 +4,9 @@ from typing import Annotated
 
 import typer
 
+from perilune_shared.command_line import Verbose, run_command_line
 from perilune_shared.config import Section, resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
-from perilune_shared.errors import run_command_line
 from perilune_train.cli_options import ConfigFile, Preset, Settings
 from perilune_train.detect.cli.main import app as detect
 from perilune_train.detect.config import DetectConfig
@@ -26,6 +26,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+
+@app.callback()
+def program(verbose: Verbose = False) -> None:
+    pass
+
+
 app.add_typer(detect, name="detect")
 app.add_typer(navigate, name="navigate")
 app.command("explain")(explain)

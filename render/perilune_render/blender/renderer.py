@@ -27,6 +27,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array
 from perilune_shared.interrupts import interrupts_held
+from perilune_shared.threads import usable_cores
 
 _FAR_M = 1e9
 BAND_PX = 0.2
@@ -229,7 +230,7 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     render.use_file_extension = False
     # Blender itself would count the cores that it could use when it started, which is one.
     render.threads_mode = "FIXED"
-    render.threads = settings.threads or _n_cores()
+    render.threads = settings.threads or usable_cores()
     render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
     render.image_settings.color_depth = "32"
     render.image_settings.exr_codec = "NONE"
@@ -250,11 +251,6 @@ def configure(stage: bpy.types.Scene, camera: Camera, settings: RenderConfig, li
     layer.use_pass_z = True
     layer.use_pass_normal = True
     layer.use_pass_diffuse_direct = light.bounce or light.earthshine
-
-
-def _n_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _pixel_aspect(camera: Camera) -> tuple[float, float]:

@@ -28,9 +28,10 @@ from perilune_render.cli.spice import spice
 from perilune_render.cli.status import status
 from perilune_render.cli.survey import survey
 from perilune_render.config import DatasetConfig
+from perilune_shared.command_line import Verbose, run_command_line
 from perilune_shared.config import resolve, to_yaml
 from perilune_shared.config_page import annotated_yaml
-from perilune_shared.errors import EXIT_USER_ERROR, UserError, run_command_line
+from perilune_shared.errors import EXIT_USER_ERROR, UserError
 from perilune_shared.terminal import progress_bar
 
 app = typer.Typer(
@@ -39,6 +40,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+
+@app.callback()
+def program(verbose: Verbose = False) -> None:
+    pass
 
 
 @app.command()

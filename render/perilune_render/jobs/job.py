@@ -1,6 +1,5 @@
 """A job: a dataset to render, as plain data that every process of a run receives."""
 
-import os
 from dataclasses import dataclass, replace
 
 from perilune_render.config import DatasetConfig
@@ -9,6 +8,7 @@ from perilune_render.flight.plan import Plan, ScenePlan, TrajectoryPlan, make_pl
 from perilune_render.provenance.recipe import recipe_of
 from perilune_shared.dataset.metadata import DatasetInfo
 from perilune_shared.dataset.names import Kind
+from perilune_shared.threads import usable_cores
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Job:
         """
         if n_threads is None and (self.config.render.threads or n_workers <= 1):
             return self
-        n_threads = n_threads or max(len(os.sched_getaffinity(0)) // n_workers, 1)
+        n_threads = n_threads or max(usable_cores() // n_workers, 1)
         render = self.config.render.model_copy(update={"threads": n_threads})
         return replace(self, config=self.config.model_copy(update={"render": render}))
 

@@ -24,6 +24,7 @@ from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
 from perilune_shared.progress import say
 from perilune_shared.storage.store import Store, open_store
+from perilune_shared.threads import usable_cores
 
 WORKER = ("-m", "perilune_render.jobs.worker")
 """What Python runs in a worker process."""
@@ -212,7 +213,7 @@ def default_workers(job: Job, n_threads: int | None) -> int:
     It is limited by the trajectories and by free memory. On two cores, two processes of one thread rendered 1.28 times
     as many frames a second as one process of two (docs/notebook/2026-11-22-cores.md). More cores were not measured.
     """
-    n_cores = len(os.sched_getaffinity(0)) // (n_threads or job.config.render.threads or 1)
+    n_cores = usable_cores() // (n_threads or job.config.render.threads or 1)
     n_ground = graded_grid(job.config.terrain, job.plan.view).n_vertices
     n_vertices = min(n_ground, job.config.terrain.max_vertices)
     rendering = _VERTEX_BYTES * n_vertices + _GROUND_BYTES * (n_ground - n_vertices)

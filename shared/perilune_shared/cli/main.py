@@ -13,7 +13,8 @@ from rich.text import Text
 import perilune_shared as ps
 from perilune_shared.cli import edit, export
 from perilune_shared.cli.edit import DatasetArgument
-from perilune_shared.errors import EXIT_USER_ERROR, one_line, run_command_line, shortened
+from perilune_shared.command_line import Verbose, run_command_line
+from perilune_shared.errors import EXIT_USER_ERROR, one_line, shortened
 from perilune_shared.terminal import progress_bar
 
 app = typer.Typer(
@@ -22,6 +23,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+
+@app.callback()
+def program(verbose: Verbose = False) -> None:
+    pass
 
 
 @app.command()

@@ -12,9 +12,9 @@ from PIL import Image
 from tests.helpers import in_process
 from tests.helpers.drawn_dataset import build_dataset
 
+from perilune_shared.command_line import run_command_line
 from perilune_shared.config import to_yaml
 from perilune_shared.dataset.manifest import open_dataset
-from perilune_shared.errors import run_command_line
 from perilune_train.detect.config import DetectConfig
 from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.report.command import report as report_of_command_line

@@ -16,6 +16,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.png import png_header
 from perilune_shared.terminal import progress_bar
+from perilune_shared.threads import usable_cores
 from perilune_train.data.shares import ALONE, Share
 
 _PORTION = 256
@@ -102,7 +103,7 @@ def load_images(dataset: Dataset, table: pd.DataFrame, split: str) -> NDArray[np
         images[i] = decode(frame[1], f"{dataset.store}/{paths[i]}", camera.height_px, camera.width_px, sizes[i])
 
     # OpenCV releases Python's global interpreter lock while it decodes.
-    with progress_bar() as progress, ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as threads:
+    with progress_bar() as progress, ThreadPoolExecutor(min(usable_cores(), 16)) as threads:
         task = progress.add_task(f"load {split}", total=len(table), unit="frames", note="")
         for portion in _portions(dataset.pngs(rows, split), _PORTION):
             for _ in threads.map(unpack, portion):

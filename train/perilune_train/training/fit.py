@@ -15,9 +15,11 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from perilune_shared.errors import UserError
 from perilune_shared.terminal import progress_bar
+from perilune_shared.threads import warn_if_crowded
 from perilune_train.config import Precision
 from perilune_train.data.lost import DataLost
 from perilune_train.data.shares import Share
+from perilune_train.training.fair_threads import FairThreads
 from perilune_train.training.runs import (
     RunFolder,
     check_tensors,
@@ -120,6 +122,22 @@ class KeepLast(Callback):
         self.saved = time.monotonic()
 
 
+class FewerThreadsIfCrowded(Callback):
+    """Adapt the number of threads on a CPU to other work on the machine (see `FairThreads`)."""
+
+    def __init__(self, enabled: bool):
+        self.threads = FairThreads(enabled)
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
+        self.threads.step()
+
+    def on_train_end(self, trainer, pl_module) -> None:
+        self.threads.restore()
+
+    def on_exception(self, trainer, pl_module, exception) -> None:
+        self.threads.restore()
+
+
 class Bar(Callback):
     """Progress bar: steps done, total steps, rate, time left, loss."""
 
@@ -209,6 +227,9 @@ def fit(
             raise UserError(resume_from, "processes", devices * num_nodes, expected)
     keep_last = KeepLast(run, checkpoint_minutes)
     device = choose_device(device)
+    # Several processes share the cores: Lightning gives each its part.
+    threads = FewerThreadsIfCrowded(device == "cpu" and devices * num_nodes == 1)
+    warn_if_crowded()
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -236,6 +257,7 @@ def fit(
                 LearningRateMonitor("step"),
                 KeepBest(run, monitor, mode),
                 keep_last,
+                threads,
             ],
         )
         if trainer.global_rank != share.process:

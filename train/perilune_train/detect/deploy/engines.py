@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from perilune_shared.errors import UserError
+from perilune_shared.threads import cores_in_affinity, usable_cores
 
 Array = NDArray[np.float32]
 Engine = Callable[[Array], tuple[Array, Array]]
@@ -46,10 +47,12 @@ def torch_engine(network: nn.Module, precision: EnginePrecision = "f32") -> Engi
 
 
 def onnxruntime_engine(path: Path, threads: int = 0) -> Engine:
-    """ONNX Runtime engine of an .onnx file; 0 threads means one per core."""
+    """ONNX Runtime engine of an .onnx file; 0 threads means one per core, or as many as a container's quota allows."""
     onnxruntime = package("onnxruntime")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = threads or _within_quota()
+    # A thread that spins keeps a core from other programs.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     with _readable(path):
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     return lambda images: tuple(session.run(["boxes", "scores"], {"images": images}))
@@ -78,7 +81,7 @@ def openvino_engine(
     if batch is not None:
         model.reshape({0: [batch, *(side.get_length() for side in list(model.input(0).partial_shape)[1:])]})
     settings = {"INFERENCE_PRECISION_HINT": precision, "PERFORMANCE_HINT": "LATENCY"}
-    if threads:
+    if threads := threads or _within_quota():
         settings["INFERENCE_NUM_THREADS"] = str(threads)
     request = core.compile_model(model, "CPU", settings).create_infer_request()
 
@@ -87,6 +90,11 @@ def openvino_engine(
         return found["boxes"].copy(), found["scores"].copy()
 
     return run
+
+
+def _within_quota() -> int:
+    """Threads for an engine that reads no container's quota; 0, its own choice, if the quota is no limit."""
+    return usable_cores() if usable_cores() < cores_in_affinity() else 0
 
 
 def has_bf16() -> bool:

@@ -38,6 +38,6 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
     while True:
         considered *= 2
         best = order[:considered]
-        kept = cv2.dnn.NMSBoxes(corner_and_size[best], scores[best], 0.0, threshold_iou)  # type: ignore[arg-type]
+        kept = cv2.dnn.NMSBoxes(corner_and_size[best], scores[best], 0.0, threshold_iou)
         if len(kept) >= max_count or considered >= len(order):
             return best[np.asarray(kept, np.intp).reshape(-1)[:max_count]]
