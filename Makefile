@@ -38,7 +38,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-stream bench-suppress bench-gates bench-engines bench-serve bench-infer bench-latency results clean
+.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-stream bench-suppress bench-gates bench-engines bench-serve bench-infer bench-latency bench-shared results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -270,6 +270,9 @@ bench-gates: detect-frames ## AP and variation of attention masks of detect runs
 
 bench-infer: setup ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer
+
+bench-shared: setup ## speed of training, detection, rendering and the filter beside other work, relative to the fair share; writes runs/bench/shared.json
+	@$(BIN)/python -m benchmarks.shared
 
 bench-latency: setup ## where the time of the detector goes, by groups of operations, and the processor's limit; writes runs/bench/latency.json
 	@$(BIN)/python -m benchmarks.train.latency
