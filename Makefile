@@ -1,7 +1,8 @@
 # perilune: datasets, networks and their explanation. `make help` lists the targets.
 SHELL := /bin/bash
 PYTHON ?= python3.11
-PRESET ?= small
+# `make demo` has a preset of its own.
+PRESET ?= $(if $(filter demo,$(MAKECMDGOALS)),demo,small)
 KIND ?= both
 NAME ?= $(PRESET)
 VENV := .venv
@@ -38,17 +39,17 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-stream bench-suppress bench-gates bench-engines bench-serve bench-infer bench-latency bench-shared results clean
+.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-stream bench-suppress bench-gates bench-engines bench-serve bench-infer bench-latency bench-shared results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
 	@echo
-	@echo 'PRESET=tiny|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port  RUN=folder  SCENES=number  ELEVATION=folder  DRAWS=number  SCENARIO=name  REPORT=demo|paper|benchmark'
+	@echo 'PRESET=tiny|demo|small|paper|large  CONFIG=file.yaml  OUT=folder  SET="a.b=c d.e=f"  DEM=file.tif  CATALOGUE=file.csv  NAC=folder  KIND=detect|nav  NAME=run  WORKERS=processes  THREADS=threads  EXECUTOR=local|ray  ADDRESS=host:port  RUN=folder  SCENES=number  ELEVATION=folder  DRAWS=number  SCENARIO=name  REPORT=demo|paper|benchmark'
 	@echo
 	@echo "SET takes settings as shell words; quote one that has spaces or quotes:"
 	@echo "  make dataset SET=\"dataset.seed=7 'dataset.detect.sun.elevation_deg={low: 5, high: 9}'\""
 
-setup: $(VENV)/.ready ## create the environment (.venv) with all packages
+setup: $(VENV)/.ready ## create the environment (.venv) with the three packages
 
 $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pyproject.toml train/pyproject.toml scripts/system-libraries
 	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON): not found: Blender's module needs Python 3.11 (sudo apt-get install -y python3.11 python3.11-venv)" >&2; exit 2; }
@@ -56,18 +57,25 @@ $(VENV)/.ready: constraints.txt pyproject.toml shared/pyproject.toml render/pypr
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV) (some minutes the first time)"
 	@$(BIN)/python -m pip install -q -c constraints.txt setuptools wheel torch
-	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[export,geo]" -r requirements-dev.txt
+	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e shared -e render -e "train[geo]"
 	@touch $@
 
-demo: setup ## run all steps: set-up, datasets, detection, navigation, explanation, report (PRESET=small)
-	@$(MAKE) --no-print-directory train-detect
-	@$(MAKE) --no-print-directory train-nav
-	@$(MAKE) --no-print-directory explain
-	@$(MAKE) --no-print-directory report
+setup-dev: $(VENV)/.ready-dev ## also install the tools of tests, checks, documentation and benchmarks
+
+$(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt
+	@scripts/system-libraries --browser
+	@echo "installing tools for development into $(VENV)"
+	@$(BIN)/python -m pip install -q -c constraints.txt --no-build-isolation -e "train[export,geo]" -r requirements-dev.txt
+	@touch $@
+
+demo: setup ## run all steps: set-up, frames, detection, navigation, explanation, report (PRESET=demo; tiny shows that all steps work)
+	@$(BIN)/python scripts/demo.py --preset $(PRESET) --name $(NAME) --data $(call quoted,$(DATA)) --runs $(call quoted,$(RUNS)) \
+	  -- $(if $(CONFIG),--config $(call quoted,$(CONFIG))) $(SETTINGS)
 	@echo
 	@echo "Datasets    $(DATA)/detect  $(DATA)/nav           pictures: overview.png"
 	@echo "Detection   $(RUNS)/detect/$(NAME)                metrics.json, *.png, detections.parquet"
 	@echo "Navigation  $(RUNS)/navigate/$(NAME)[-stack]      metrics.json, *.png, navigation.parquet"
+	@echo "Landing     $(RUNS)/navigate/$(NAME)-methods      methods.md, *.png: the filter and all other methods"
 	@echo "Explanation $(RUNS)/explain/$(NAME)               claims.json, metrics.json, *.png, *.parquet"
 	@echo "Report      $(RUNS)/report/$(NAME)                report.html (open it in a browser), summary.md"
 
@@ -189,14 +197,14 @@ closed-loop: setup ## fly a descent in closed loop: guidance, navigation filter 
 	@$(BIN)/python examples/closed_loop.py --out "$(RUNS)/closed-loop"
 
 JOBS ?= 2
-test: setup ## run all tests, in JOBS=2 processes
+test: setup-dev ## run all tests, in JOBS=2 processes
 	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 
 # Tracing slows every line of every library, on Python before 3.12.
-coverage: setup ## run all tests and print their line coverage, which has no target; takes 1.6 times as long
+coverage: setup-dev ## run all tests and print their line coverage, which has no target; takes 1.6 times as long
 	@PYTEST_ADDOPTS="--cov --cov-report=term" $(MAKE) --no-print-directory test
 
-lint: setup ## ruff (rules and format) and mypy
+lint: setup-dev ## ruff (rules and format) and mypy
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy shared/perilune_shared render/perilune_render train/perilune_train benchmarks examples
@@ -204,77 +212,77 @@ lint: setup ## ruff (rules and format) and mypy
 docs: docs-build ## build and serve the documentation (http://127.0.0.1:8000)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs serve
 
-docs-build: setup ## build the documentation into site/; a broken link or name is an error
+docs-build: setup-dev ## build the documentation into site/; a broken link or name is an error
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-bench-render: setup ## time of a frame, compared with a bare Blender loop; writes runs/bench/render.json
+bench-render: setup-dev ## time of a frame, compared with a bare Blender loop; writes runs/bench/render.json
 	@$(BIN)/python -m benchmarks.dataset.render
 
-bench-kill: setup ## renderings disturbed at random moments (SIGKILL, Ctrl-C, full disk, lost nodes and stores), resumed and compared; writes runs/bench/kill.json
+bench-kill: setup-dev ## renderings disturbed at random moments (SIGKILL, Ctrl-C, full disk, lost nodes and stores), resumed and compared; writes runs/bench/kill.json
 	@$(BIN)/python -m benchmarks.kill
 
-bench-scale: setup ## frames per second by executor, number of processes and threads; writes runs/bench/scale.json
+bench-scale: setup-dev ## frames per second by executor, number of processes and threads; writes runs/bench/scale.json
 	@$(BIN)/python -m benchmarks.dataset.scale
 
-bench-requests: setup ## requests of a frame, trajectory, scene and dataset in an S3 store; writes runs/bench/requests.json
+bench-requests: setup-dev ## requests of a frame, trajectory, scene and dataset in an S3 store; writes runs/bench/requests.json
 	@$(BIN)/python -m benchmarks.dataset.requests
 
-bench-scaling: setup ## core hours and bytes of up to 100 million frames, estimated; writes runs/bench/scaling.json
+bench-scaling: setup-dev ## core hours and bytes of up to 100 million frames, estimated; writes runs/bench/scaling.json
 	@$(BIN)/python -m benchmarks.dataset.scaling
 
 compare-nac: setup ## compare rendered frames with real NAC crops (NAC=folder); writes runs/nac/
 	@$(BIN)/python -m benchmarks.nac.compare "$(NAC)" $(COMMON) --out "$(RUNS)/nac"
 
-bench-terrain: setup ## time and memory of generating terrain on one core; writes runs/bench/terrain.json
+bench-terrain: setup-dev ## time and memory of generating terrain on one core; writes runs/bench/terrain.json
 	@$(BIN)/python -m benchmarks.scene.terrain
 
-bench-megapixel: setup ## memory and time of a descent in 1024 x 1024 pixels, and KLT residuals on changes of level; writes runs/bench/megapixel.json
+bench-megapixel: setup-dev ## memory and time of a descent in 1024 x 1024 pixels, and KLT residuals on changes of level; writes runs/bench/megapixel.json
 	@$(BIN)/python -m benchmarks.scene.megapixel
 
-bench-photometry: setup ## rendered radiance, compared with the formulas; writes runs/bench/photometry.json
+bench-photometry: setup-dev ## rendered radiance, compared with the formulas; writes runs/bench/photometry.json
 	@$(BIN)/python -m benchmarks.scene.photometry
 
-bench-manifest: setup ## time and memory of reading 100,000 frames and 5 million labels; writes runs/bench/manifest.json
+bench-manifest: setup-dev ## time and memory of reading 100,000 frames and 5 million labels; writes runs/bench/manifest.json
 	@$(BIN)/python -m benchmarks.dataset.manifest
 
-bench-plan: setup ## time and memory of planning 10 million frames; writes runs/bench/plan.json
+bench-plan: setup-dev ## time and memory of planning 10 million frames; writes runs/bench/plan.json
 	@$(BIN)/python -m benchmarks.dataset.plan
 
-bench-memory: setup ## resident memory of a process that renders 5000 frames; writes runs/bench/memory.json
+bench-memory: setup-dev ## resident memory of a process that renders 5000 frames; writes runs/bench/memory.json
 	@$(BIN)/python -m benchmarks.dataset.memory
 
-bench-develop: setup ## frames developed per second on one core; writes runs/bench/develop.json
+bench-develop: setup-dev ## frames developed per second on one core; writes runs/bench/develop.json
 	@$(BIN)/python -m benchmarks.dataset.develop
 
-bench-regenerate: setup ## number of frames that are identical when rendered again from the manifest; writes runs/bench/regenerate.json
+bench-regenerate: setup-dev ## number of frames that are identical when rendered again from the manifest; writes runs/bench/regenerate.json
 	@$(BIN)/python -m benchmarks.dataset.regenerate
 
-bench-labels: setup ## label ellipses, compared with rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
+bench-labels: setup-dev ## label ellipses, compared with rendered rings; writes runs/bench/labels.json and docs/pictures/labels_histogram.png
 	@$(BIN)/python -m benchmarks.scene.labels --picture docs/pictures/labels_histogram.png
 
-bench-truth: setup ## depth and normals of EXRs, compared with cast rays; writes runs/bench/truth.json
+bench-truth: setup-dev ## depth and normals of EXRs, compared with cast rays; writes runs/bench/truth.json
 	@$(BIN)/python -m benchmarks.scene.truth
 
-bench-engines: setup ## frames of both engines: speed, and agreement of radiance, depth and labels; writes runs/bench/engines.json
+bench-engines: setup-dev ## frames of both engines: speed, and agreement of radiance, depth and labels; writes runs/bench/engines.json
 	@$(BIN)/python -m benchmarks.scene.engines
 
-bench-serve: setup ## frames per second of the image server, and its memory over 20,000 frames; writes runs/bench/serve.json
+bench-serve: setup-dev ## frames per second of the image server, and its memory over 20,000 frames; writes runs/bench/serve.json
 	@$(BIN)/python -m benchmarks.scene.serve
 
-bench-contrast: setup ## AUC of contrast for the craters that the detector finds; writes runs/bench/contrast.json
+bench-contrast: setup-dev ## AUC of contrast for the craters that the detector finds; writes runs/bench/contrast.json
 	@$(BIN)/python -m benchmarks.train.contrast "$(DATA)/detect" "$(RUNS)/detect/$(NAME)"
 
 GATES ?= "$(RUNS)/detect/$(NAME)"
 bench-gates: detect-frames ## AP and variation of attention masks of detect runs on the validation split (GATES="runs/detect/a runs/detect/b"); writes runs/bench/gates.json
 	@$(BIN)/python -m benchmarks.train.gates "$(DATA)/detect" $(GATES)
 
-bench-infer: setup ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
+bench-infer: setup-dev ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer
 
-bench-shared: setup ## speed of training, detection, rendering and the filter beside other work, relative to the fair share; writes runs/bench/shared.json
+bench-shared: setup-dev ## speed of training, detection, rendering and the filter beside other work, relative to the fair share; writes runs/bench/shared.json
 	@$(BIN)/python -m benchmarks.shared
 
-bench-latency: setup ## where the time of the detector goes, by groups of operations, and the processor's limit; writes runs/bench/latency.json
+bench-latency: setup-dev ## where the time of the detector goes, by groups of operations, and the processor's limit; writes runs/bench/latency.json
 	@$(BIN)/python -m benchmarks.train.latency
 
 bench-train: detect-frames ## training speed, compared with training from memory and with a bare loop; writes runs/bench/train.json
@@ -283,19 +291,19 @@ bench-train: detect-frames ## training speed, compared with training from memory
 bench-transfer: detect-frames ## compare four ways to start from a frozen backbone; writes runs/bench/transfer.json
 	@$(BIN)/python -m benchmarks.train.transfer --dataset "$(DATA)/detect"
 
-bench-landing: setup ## all methods of navigation on the validation descents of shipped-nav; writes runs/bench/landing
+bench-landing: setup-dev ## all methods of navigation on the validation descents of shipped-nav; writes runs/bench/landing
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
 	@$(call surveyed,data/shipped/nav,val,data/shipped/survey,runs/bench/landing-map)
 	@$(BIN)/perilune-train navigate methods --dataset data/shipped/nav --split val --allow-overlap --map runs/bench/landing-map --out runs/bench/landing
 
-bench-motion: setup ## relative motion under noise, blur and a wrong prior, on the validation descents of shipped-nav; writes runs/bench/motion.json
+bench-motion: setup-dev ## relative motion under noise, blur and a wrong prior, on the validation descents of shipped-nav; writes runs/bench/motion.json
 	@test -e data/shipped/nav/dataset.json || $(BIN)/perilune-render dataset --manifest data_manifests/shipped-nav --out data/shipped/nav
 	@$(BIN)/python -m benchmarks.train.motion data/shipped/nav
 
-bench-stream: setup ## navigation trained on rendered sequences against a dataset alone, at equal processor time; writes runs/bench/stream.json
+bench-stream: setup-dev ## navigation trained on rendered sequences against a dataset alone, at equal processor time; writes runs/bench/stream.json
 	@$(BIN)/python -m benchmarks.train.stream
 
-bench-suppress: setup ## time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
+bench-suppress: setup-dev ## time of suppression of a batch, compared with OpenCV's frame by frame; writes runs/bench/suppress.json
 	@$(BIN)/python -m benchmarks.train.suppress
 
 # With RECORD=files, first copy these JSON files of runs or benchmarks into results/.

@@ -17,7 +17,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.yaml_text import parse_yaml, to_yaml_text
 
 SECTIONS = ("dataset", "detect", "navigate", "explain")
-PRESETS = ("tiny", "small", "paper", "large")
+PRESETS = ("tiny", "demo", "small", "paper", "large")
 _LARGEST_FILE_BYTES = 100_000
 
 

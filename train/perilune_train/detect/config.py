@@ -141,9 +141,10 @@ class DetectConfig(Section):
     """Number of first epochs in which the backbone is frozen except its attention gates. Used only with `init_from`:
     freezing random weights does not help, so without it training starts unfrozen."""
     init_from: str | None = None
-    """Weights to start from. best.ckpt of a detect run of equal width and in_channels: all weights if the strides are
-    equal, else the backbone. Or a Darknet file: darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads
-    too); Darknet files need width 1 and in_channels 3."""
+    """Weights to start from. best.ckpt of a detect run of equal width and in_channels, or crater-detector (the
+    installed detector, width 0.40625): all weights if the strides are equal, else the backbone. Or a Darknet file:
+    darknet53.conv.74 (the backbone) or yolov3.weights (neck and heads too); Darknet files need width 1 and
+    in_channels 3."""
     init_layers: Literal["all", "from_second"] = "all"
     """Layers that `init_from` gives: all, or all but the first convolution (the paper)."""
     plain_gates_before_frozen_layers: bool = False

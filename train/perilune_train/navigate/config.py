@@ -75,6 +75,9 @@ class NavigateConfig(Section):
     detector: Path | None = None
     """best.ckpt of the detector whose backbone initialises the stack network. None: the default run, if there is
     one."""
+    init_from: str | None = None
+    """Weights from which warp starts: best.ckpt of a warp run of equal size_px, width, attention and hidden, or
+    lander-navigator (the installed navigator). None: random weights."""
     precision: Precision = "auto"
     """Arithmetic: auto (bfloat16 if the hardware supports it), bf16 or float32."""
     device: Device = "auto"

@@ -32,9 +32,13 @@ class Detected:
     """Detections at or above the run's threshold, one entry for each frame."""
 
 
-def read_detections(run: Path, dataset: Address) -> Detected:
-    """Read a run's detections. Raises UserError if they are missing, damaged or of other frames."""
-    split = load_split(open_single(dataset), "test", config_of_run(run).labels)
+def read_detections(run: Path, dataset: Address, trained: Path | None = None) -> Detected:
+    """Read a run's detections. Raises UserError if they are missing, damaged or of other frames.
+
+    `trained` is the folder of the network's run, by default `run`; it has the settings and the threshold.
+    """
+    trained = trained or run
+    split = load_split(open_single(dataset), "test", config_of_run(trained).labels)
     path = run / "detections.parquet"
     if not path.is_file():
         raise UserError(path, "detections", "no such file", "the detections of a finished run")
@@ -48,7 +52,7 @@ def read_detections(run: Path, dataset: Address) -> Detected:
         unusable = table[name][~np.isfinite(table[name])]
         if len(unusable):
             raise UserError(path, name, unusable.iloc[0], "finite numbers")
-    table = table[table["score"] >= chosen_threshold(run)]
+    table = table[table["score"] >= chosen_threshold(trained)]
     of_frame = {str(name): own for name, own in table.groupby("frame_id")}
     names = split.frames.table["frame_id"].tolist()
     unknown = set(of_frame) - set(names)

@@ -12,7 +12,7 @@ from perilune_train.evaluation.spread import MIN_UNITS, read_spread
 from perilune_train.report.content import Figure, FramePicture, Section, Table
 from perilune_train.report.frames import LabelledFrames
 from perilune_train.report.pictures import COLOURS, DASHES, drawing, label_axes, picture_of, plain, svg_of
-from perilune_train.report.sources import Run, sources_of
+from perilune_train.report.sources import INSTALLED, Run, sources_of
 
 _ROWS = {
     "ap50_paper": "AP",
@@ -85,7 +85,11 @@ def _section(
         if isinstance(units, int) and units >= MIN_UNITS
         else f"the value of each {unit or 'unit'}, since they are too few for an interval"
     )
-    lead = (*(headline(run, prefix) for run in runs), f"In brackets: {spread}. AP is the paper's definition, IoU 0.5.")
+    lead = (
+        *(headline(run, prefix) for run in runs),
+        *_starts(runs),
+        f"In brackets: {spread}. AP is the paper's definition, IoU 0.5.",
+    )
     rows = tuple(
         (text, *(_value(run, prefix + name, spread=True) for run in runs))
         for name, text in _ROWS.items()
@@ -93,6 +97,22 @@ def _section(
     )
     table = Table("Figures of detection", ("figure", *(run.name for run in runs)), rows, sources_of(runs))
     return Section(key, title, lead, (table,), tuple([*_curves(runs, prefix), *_bins(runs, prefix)]), pictures)
+
+
+def _starts(runs: Sequence[Run]) -> list[str]:
+    """A line for each run that did not start from random weights, and for an evaluation of the installed detector."""
+    lines = []
+    for run in runs:
+        start = run.metrics.get("train/start", "random weights")
+        if start != "random weights":
+            lines.append(
+                f"{run.name} started from {start}; epochs of training on this dataset: {run.metrics['train/epochs']}."
+            )
+        elif run.name.endswith(INSTALLED):
+            lines.append(
+                f"{run.name} is the installed detector, which was not trained on this dataset. The frames show it."
+            )
+    return lines
 
 
 def _value(run: Run, key: str, *, spread: bool = False) -> str:

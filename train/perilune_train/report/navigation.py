@@ -56,7 +56,7 @@ def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
     return Section(
         "navigation",
         "Navigation",
-        tuple(headline(run) for run in runs),
+        (*(headline(run) for run in runs), *_starts(runs)),
         (_table(runs),),
         tuple(figures),
     )
@@ -88,6 +88,22 @@ def methods_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
         best = absolute.iloc[0]
         lead = (f"Lowest error of position over ground: {best['method']}, {number(best['position_rmse_m'])} m RMSE.",)
     return Section("methods", "Methods of navigation", lead, (table,), tuple(figures))
+
+
+def _starts(runs: Sequence[Run]) -> list[str]:
+    """A line for each run that did not start from random weights."""
+    starts = {run.name: str(run.metrics.get("network/backbone", "from scratch")) for run in runs}
+    return [f"{name} started {start}." for name, start in starts.items() if not start.startswith("from scratch")]
+
+
+def landing_of(folder: Path) -> str | None:
+    """The filter's errors in one line, from the folder of `make navigate`; None if the filter was not flown."""
+    rows = _read(folder / "navigation.parquet", None)
+    own = rows[rows["method"] == "filter"] if "method" in rows else rows.iloc[:0]
+    if not len(own):
+        return None
+    over, end = (number(own[key].iloc[0]) for key in ("position_rmse_m", "position_end_rmse_m"))
+    return f"landing (installed detector, filter): position RMSE {over} m over the descents, {end} m at their end"
 
 
 def scores_section(scores: Sequence[Run]) -> Section:

@@ -25,6 +25,7 @@ from perilune_train.report.content import Provenance, Report, Section, Viewer
 from perilune_train.report.dataset import dataset_section
 from perilune_train.report.frames import MASKS_FILE, LabelledFrames, labelled_frames, viewer_of
 from perilune_train.report.sources import (
+    INSTALLED,
     SCORE_FILE,
     Folders,
     Kind,
@@ -35,9 +36,14 @@ from perilune_train.report.sources import (
     read_run,
 )
 from perilune_train.report.summary import summary_of
+from perilune_train.shipped.models import shipped_run
 
 PAGE, SUMMARY = "report.html", "summary.md"
 _TITLES: dict[Kind, str] = {"demo": "Demo", "paper": "The paper's experiment", "benchmark": "Locked benchmark"}
+_TRIAL = (
+    "The preset tiny only shows that all steps work: its networks train for seconds, find almost nothing, and are no "
+    "measure of the method. The frames show the installed detector."
+)
 _VERSIONS = ("perilune-train", "numpy", "pandas", "pyarrow", "matplotlib", "jinja2", "torch", "lightning")
 
 
@@ -84,7 +90,8 @@ def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
             detect = opened.detect[-1] if opened.detect else None
             found = None
             if detect is not None:
-                read = read_detections(detect.folder, str(folder))
+                installed = detect.name.endswith(INSTALLED)
+                read = read_detections(detect.folder, str(folder), shipped_run("detect") if installed else None)
                 split, found = read.split, read.found
             else:
                 split = load_split(own, "test", LabelSettings())
@@ -97,7 +104,7 @@ def gather(kind: Kind, name: str, dataset: Path, runs: Path) -> Report:
     viewer = _viewer(frames, opened)
     return Report(
         f"{_TITLES[kind]}: {name}",
-        tuple(_headlines(opened)),
+        tuple(_headlines(opened, folders)),
         tuple(sections),
         viewer,
         _provenance(sections, viewer),
@@ -165,10 +172,14 @@ def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
     )
 
 
-def _headlines(opened: _Opened) -> list[str]:
-    """One line for each run; what the gates show is first."""
-    lines = [f"{run.name}: {found}" for run in opened.explain if (found := explanation.headline_of(run))]
-    lines += [detection.headline(run) for run in opened.detect]
+def _headlines(opened: _Opened, folders: Folders) -> list[str]:
+    """What `tiny` is for, the landing, then a line for each run, those of explanation first."""
+    lines = [_TRIAL] if any(one.info.name == "tiny" for one in opened.datasets.values()) else []
+    for folder in folders.methods:
+        if (folder / "navigation.parquet").is_file() and (landing := navigation.landing_of(folder)):
+            lines.append(landing)
+    lines += [f"{run.name}: {found}" for run in opened.explain if (found := explanation.headline_of(run))]
+    lines += [detection.headline(run) for run in reversed(opened.detect)]
     lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
     return lines + [navigation.headline(run) for run in opened.navigate]
 

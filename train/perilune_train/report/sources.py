@@ -17,6 +17,8 @@ from perilune_train.report.content import Provenance
 
 Kind = Literal["demo", "paper", "benchmark"]
 SCORE_FILE = "benchmark.json"
+INSTALLED = "-installed"
+"""End of the name of an evaluation of the installed detector, which has no settings and no threshold of its own."""
 LARGEST_JSON_BYTES = 16 * 2**20
 """Largest JSON file that is read, bytes."""
 
@@ -58,16 +60,16 @@ class Folders:
 def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:
     """The folders of a report by its kind.
 
-    demo: `dataset` has detect and nav, and runs are <runs>/<task>/<name>. paper: the same with the networks' names,
-    below the folder of the experiment. benchmark: `dataset` has the benchmark's datasets; all scores below
-    <runs>/benchmark are shown.
+    demo: `dataset` has detect and nav, and runs are <runs>/<task>/<name>; <runs>/detect/<name>-installed has an
+    evaluation of the installed detector. paper: the same with the networks' names, below the folder of the experiment.
+    benchmark: `dataset` has the benchmark's datasets; all scores below <runs>/benchmark are shown.
     """
     both = (dataset / "detect", dataset / "nav")
     if kind == "demo":
         navigate = runs / "navigate"
         return Folders(
             both,
-            (runs / "detect" / name,),
+            (runs / "detect" / name, runs / "detect" / f"{name}{INSTALLED}"),
             (navigate / name, navigate / f"{name}-stack"),
             (navigate / f"{name}-methods",),
             (runs / "explain" / name, runs / "explain" / f"{name}-causal"),

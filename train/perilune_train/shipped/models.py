@@ -48,6 +48,13 @@ def shipped_models() -> list[ShippedModel]:
     return [ShippedModel(n, t, _FOLDER / n) for n, t in _TASKS.items() if (_FOLDER / n / WEIGHTS).is_file()]
 
 
+def weights_file(given: str | Path) -> Path:
+    """The file of weights that a setting names: a path, or the name of an installed network (`crater-detector`)."""
+    installed = {model.name: model.folder / WEIGHTS for model in shipped_models()}
+    path = Path(given)
+    return path if path.exists() else installed.get(str(given), path)
+
+
 def shipped_run(task: Task) -> Path:
     """Folder of the installed network of a task. Raises UserError if none is installed."""
     found = [model.folder for model in shipped_models() if model.task == task]

@@ -39,6 +39,7 @@ from perilune_train.detect.train.transfer import inherited_terrain, start_from
 from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, training_provenance
+from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.fit import fit, own_share
@@ -84,7 +85,7 @@ def run_detect(
     sizes = train.label_sizes_px
     network = build_network(config, sizes, dataset.store)
     if config.init_from is not None and not resume:
-        start_from(network, Path(config.init_from), config)
+        start_from(network, weights_file(config.init_from), config)
     teacher = None if config.teacher is None else load_teacher(Path(config.teacher), config)
     if teacher is not None:
         network.anchors.copy_(teacher.network.anchors)
@@ -123,6 +124,7 @@ def run_detect(
     metrics: Metrics = {
         "train/seconds": round(seconds, 1),
         "train/epochs": config.epochs,
+        "train/start": config.init_from or "random weights",
         "train/images_per_s": round(task.images_seen / seconds, 2),
         "anchors/best_possible_recall": best_possible_recall(sizes, anchors, config.anchor_ratio),
         "anchors/mean_best_iou": mean_best_iou(sizes, anchors),

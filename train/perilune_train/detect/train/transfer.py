@@ -21,6 +21,7 @@ from perilune_train.models.darknet_weights import (
     read_darknet,
 )
 from perilune_train.models.yolo import YOLOv3
+from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
 
 _GREY_MEAN, _GREY_DEVIATION = 0.45, 0.25
@@ -106,7 +107,7 @@ def inherited_terrain(config: DetectConfig, last: Path | None) -> list[Provenanc
     if last is not None:
         content = runs.read_saved(last, "last state", {"state_dict"}, "the state of an interrupted run")
         return [read_provenance(content, last)]
-    given = [Path(path) for path in (config.init_from, config.teacher) if path is not None]
+    given = [weights_file(path) for path in (config.init_from, config.teacher) if path is not None]
     return [read_provenance(runs.load_weights(path), path) for path in given if not is_darknet(path)]
 
 

@@ -3,6 +3,7 @@
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import lightning
 from torch import Tensor
@@ -24,8 +25,9 @@ from perilune_train.navigate.data.stream import Stream
 from perilune_train.navigate.data.trajectories import Trajectory, load_trajectories
 from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.report import write_evaluation
-from perilune_train.navigate.network import Fusion, load_navigator, predict, predict_by_pairs
+from perilune_train.navigate.network import Fusion, Scales, load_navigator, predict, predict_by_pairs
 from perilune_train.navigate.train.task import NavigationTask
+from perilune_train.shipped.models import weights_file
 from perilune_train.training.begin import hashes_of, start_run, state_of
 from perilune_train.training.fit import fit, own_share
 from perilune_train.training.runs import (
@@ -33,6 +35,7 @@ from perilune_train.training.runs import (
     check_architecture,
     choose_device,
     is_first_process,
+    load_state,
     load_weights,
 )
 
@@ -72,9 +75,11 @@ def navigate_run(
         return list(folders.values())
     opened = open_single(dataset_address)
     own = training_provenance(opened)
-    terrain = {"warp": own, "stack": own.joined(inherited)}
+    start = _start_of_warp(settings) if "warp" in fusions else None
+    of_start = [] if start is None else [read_provenance(start, weights_file(str(settings.init_from)))]
+    terrain = {"warp": own.joined(of_start), "stack": own.joined(inherited)}
     # One check for both, because the table of the warp run includes the metrics of stack.
-    terrain_check = check_terrain(terrain["stack"], opened, "test", allow_overlap)
+    terrain_check = check_terrain(terrain["stack"].joined(of_start), opened, "test", allow_overlap)
     share = own_share(1, 1)
     stream = Stream(settings.stream, opened) if settings.stream is not None else None
     trajectories = load_trajectories(opened, share)
@@ -83,9 +88,14 @@ def navigate_run(
     for fusion, run in folders.items():
         if states[fusion] != "finished":
             start_run(run, "navigate", settings, inputs[fusion], states[fusion])
-            start, resume = backbone if fusion == "stack" else None, states[fusion] == "resume"
-            given = start, resume, terrain[fusion], share, stream
-            seconds[fusion] = _train(run, settings, fusion, trajectories, *given)
+            resume = states[fusion] == "resume"
+            if fusion == "stack":
+                lightning.seed_everything(settings.seed, verbose=False)
+                task = NavigationTask(settings, fusion, trajectories, backbone, share)
+            else:
+                task = _warp_task(settings, trajectories, share, stream, start)
+            task.provenance = terrain[fusion]
+            seconds[fusion] = _train(run, task, resume)
     if not is_first_process():
         return list(folders.values())
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
@@ -112,7 +122,7 @@ def navigate_run(
             "test/ms_per_single_pair": round(1e3 * predict_by_pairs(network, architecture, test[0])[1], 2),
             "dataset/name": opened.info.name,
             "network/parameters": sum(p.numel() for p in network.parameters()),
-            "network/backbone": source if fusion == "stack" else "from scratch",
+            "network/backbone": source if fusion == "stack" else f"from {settings.init_from or 'scratch'}",
             "dataset/protocol": protocol_of(opened.info),
             **terrain_check.metrics(),
         }
@@ -120,27 +130,42 @@ def navigate_run(
     return list(folders.values())
 
 
-def _train(
-    run: RunFolder,
+def _start_of_warp(settings: NavigateConfig) -> dict[str, Any] | None:
+    """Content of the checkpoint `navigate.init_from`. Raises UserError if its network has another architecture."""
+    if settings.init_from is None:
+        return None
+    path, own = weights_file(settings.init_from), settings.warp
+    content = load_weights(path)
+    expected = {"fusion": "warp", **{key: getattr(own, key) for key in ("size_px", "width", "attention", "hidden")}}
+    check_architecture(path, content["architecture"], expected)
+    return content
+
+
+def _warp_task(
     settings: NavigateConfig,
-    fusion: Fusion,
     trajectories: list[Trajectory],
-    backbone: dict[str, Tensor] | None,
-    resume: bool,
-    terrain: Provenance,
     share: Share,
     stream: Stream | None,
-) -> float:
-    """Train one network; returns the training time in seconds."""
+    start: dict[str, Any] | None,
+) -> NavigationTask:
+    """Training of warp from random weights, or from the content of a checkpoint."""
     lightning.seed_everything(settings.seed, verbose=False)
-    task = NavigationTask(settings, fusion, trajectories, backbone, share, stream)
-    task.provenance = terrain
-    own = task.own
+    if start is None:
+        return NavigationTask(settings, "warp", trajectories, None, share, stream)
+    scales = Scales(**start["architecture"]["scales"])
+    task = NavigationTask(settings, "warp", trajectories, None, share, stream, scales)
+    load_state(task.network, start["state_dict"], weights_file(str(settings.init_from)))
+    return task
+
+
+def _train(run: RunFolder, task: NavigationTask, resume: bool) -> float:
+    """Train one network; returns the training time in seconds."""
+    settings, own = task.settings, task.own
     with closing(task):
         return fit(
             run,
             task,
-            label=f"train {fusion}",
+            label=f"train {task.fusion}",
             epochs=own.coarse_epochs + own.fine_epochs,
             monitor="val/position_rmse_vector_m",
             mode="min",

@@ -65,11 +65,13 @@ class NavigationTask(lightning.LightningModule):
         pretrained: dict[str, Tensor] | None = None,
         share: Share = ALONE,
         stream: Stream | None = None,
+        scales: Scales | None = None,
     ):
         super().__init__()
         self.settings, self.fusion, self.stream = settings, fusion, stream
         self.own: FusionConfig = getattr(settings, fusion)
-        self.scales = Scales.measured([one for one in trajectories if one.split == "train"], fusion)
+        # Initial weights predict motions on the scales of their own training.
+        self.scales = scales or Scales.measured([one for one in trajectories if one.split == "train"], fusion)
         self.architecture = {
             "fusion": fusion,
             "size_px": self.own.size_px,

@@ -1,0 +1,151 @@
+"""All steps of `make demo`: frames, detection, navigation, explanation, report.
+
+Navigation frames are rendered beside the training of the detector; their progress is in <data>/nav.log. Run the same
+command again to resume. Ctrl-C stops both sides, and both keep what is finished.
+
+    python scripts/demo.py --preset demo --name demo --data data/demo --runs runs -- --set dataset.seed=7
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perilune_shared.command_line import run_command_line
+from perilune_shared.errors import EXIT_INTERRUPTED, UserError
+from perilune_shared.threads import usable_cores
+
+BIN = Path(sys.executable).parent
+
+
+@dataclass(frozen=True, slots=True)
+class Demo:
+    """Folders and settings of one demo."""
+
+    name: str
+    """Name of the runs."""
+    data: Path
+    """Folder of the datasets."""
+    runs: Path
+    """Folder of the runs."""
+    settings: tuple[str, ...]
+    """Options of all commands: preset, configuration file, single settings."""
+
+    def render(self, kind: str, *options: str) -> list[str]:
+        """Command that renders a dataset."""
+        return ["perilune-render", "dataset", *self.settings, "--kind", kind, "--out", str(self.data), *options]
+
+    def train(self, *words: str, dataset: Path) -> list[str]:
+        """Command that trains on a dataset, or explains."""
+        place = ["--out", str(self.runs), "--name", self.name, "--dataset", str(dataset)]
+        return ["perilune-train", *words, *self.settings, *place]
+
+    def rendered(self, kind: str) -> bool:
+        """Whether a dataset is complete; an interrupted one has a dataset.json too."""
+        path = self.data / kind / "dataset.json"
+        return path.is_file() and json.loads(path.read_text(encoding="utf-8")).get("complete") is True
+
+
+class Processes:
+    """Commands of the demo. Each has a process group of its own, so that Ctrl-C reaches it once, through this class."""
+
+    def __init__(self) -> None:
+        self._running: list[subprocess.Popen] = []
+        self._begun_s = time.monotonic()
+
+    def run(self, title: str, command: list[str]) -> None:
+        """Run a command to its end, and end this program with its exit code if it fails."""
+        self.end(self.start(title, command))
+
+    def start(self, title: str, command: list[str], log: Path | None = None) -> subprocess.Popen:
+        """Start a command; `log` takes what it prints."""
+        minutes = (time.monotonic() - self._begun_s) / 60
+        print(f"{title}, after {minutes:.1f} minutes" + (f"; progress in {log}" if log else ""), flush=True)
+        program = [str(BIN / command[0]), *command[1:]]
+        if log is None:
+            process = subprocess.Popen(program, process_group=0)
+        else:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            with log.open("w", encoding="utf-8") as file:
+                process = subprocess.Popen(program, process_group=0, stdout=file, stderr=subprocess.STDOUT)
+        self._running.append(process)
+        return process
+
+    def end(self, process: subprocess.Popen, log: Path | None = None) -> None:
+        """Wait for a command. If it fails, stop the others and end this program with its exit code."""
+        code = process.wait()
+        self._running.remove(process)
+        if code:
+            if log is not None:
+                print("\n".join(log.read_text(encoding="utf-8").splitlines()[-3:]), file=sys.stderr)
+            self.stop()
+            raise SystemExit(code)
+
+    def stop(self) -> None:
+        """Interrupt all commands and wait for them."""
+        for process in self._running:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        for process in self._running:
+            process.wait()
+
+
+def run_steps(demo: Demo, processes: Processes) -> None:
+    """Run the steps that are not finished."""
+    if not demo.rendered("detect"):
+        processes.run("render detection frames", demo.render("detect"))
+    log = demo.data / "nav.log"
+    beside = None
+    if not demo.rendered("nav"):
+        # Half the cores render, the others train.
+        options = ("--workers", str(max(1, usable_cores() // 2)))
+        beside = processes.start("render navigation frames in the background", demo.render("nav", *options), log)
+    processes.run("train the detector", demo.train("detect", "train", dataset=demo.data / "detect"))
+    installed = demo.runs / "detect" / f"{demo.name}-installed"
+    if not (installed / "metrics.json").is_file():
+        place = ["--dataset", str(demo.data / "detect"), "--out", str(installed)]
+        processes.run("evaluate the installed detector", ["perilune-train", "detect", "evaluate", *place])
+    if beside is not None:
+        processes.end(beside, log)
+    processes.run("train the navigators", demo.train("navigate", "train", dataset=demo.data / "nav"))
+    methods = demo.runs / "navigate" / f"{demo.name}-methods"
+    if not (methods / "methods.md").is_file():
+        place = ["--dataset", str(demo.data / "nav"), "--out", str(methods)]
+        processes.run("land with the filter", ["perilune-train", "navigate", "methods", *place])
+    processes.run("explain", demo.train("explain", dataset=demo.data))
+    report = demo.runs / "report" / demo.name
+    place = ["--name", demo.name, "--dataset", str(demo.data), "--runs", str(demo.runs), "--out", str(report)]
+    processes.run("report", ["perilune-train", "report", *place])
+
+
+def main(
+    settings: Annotated[list[str] | None, typer.Argument(help="Options of all commands, after --.")] = None,
+    preset: str = "demo",
+    name: str = "demo",
+    data: Path = Path("data/demo"),
+    runs: Path = Path("runs"),
+) -> None:
+    """Run all steps of the demo."""
+    for folder in (data, runs):
+        if folder.exists() and not folder.is_dir():
+            raise UserError(folder, "folder", "a file", "a folder, or nothing")
+    demo = Demo(name, data, runs, ("--preset", preset, *(settings or ())))
+    processes = Processes()
+    try:
+        run_steps(demo, processes)
+    except KeyboardInterrupt:
+        processes.stop()
+        # The command in the foreground has printed how to resume; `run_command_line` would print it again.
+        sys.stdout.flush()
+        os._exit(EXIT_INTERRUPTED)
+
+
+if __name__ == "__main__":
+    run_command_line(lambda: typer.run(main))
