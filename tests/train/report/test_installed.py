@@ -1,0 +1,75 @@
+"""The installed detector and the filter's landing beside networks that were just trained."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from tests.train.report.conftest import make_data, make_runs
+
+from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.report.page import gather
+
+
+@pytest.fixture
+def shown(tmp_path) -> tuple[Path, Path]:
+    """Data and runs of a demo with an evaluation of the installed detector and flights of the filter."""
+    data = make_data(tmp_path / "data")
+    runs = make_runs(tmp_path / "runs", data)
+    trained, installed = runs / "detect" / "demo", runs / "detect" / "demo-installed"
+    installed.mkdir()
+    # Only true detections: half of those of the trained network, which are below its threshold there.
+    found = pd.read_parquet(trained / "detections.parquet")
+    found[found["score"] == 0.9].to_parquet(installed / "detections.parquet")
+    write_metrics(installed, {f"test/{key}": 0.9 for key in ("ap50_paper", "precision", "recall", "f1")})
+    methods = runs / "navigate" / "demo-methods"
+    methods.mkdir()
+    rows = pd.DataFrame({"method": ["klt", "filter"], "kind": ["relative", "absolute"], "n_frames": [4.0, 4.0]})
+    rows = rows.assign(position_rmse_m=[3.0, 1.25], attitude_rmse_deg=0.1, position_end_rmse_m=[9.0, 0.5])
+    rows.to_parquet(methods / "navigation.parquet")
+    return data, runs
+
+
+def test_the_frames_are_those_of_the_installed_detector(shown):
+    report = gather("demo", "demo", *shown)
+    assert report.viewer is not None
+    kinds = {mark.kind for frame in report.viewer.frames for mark in frame.detections}
+    assert kinds == {"matched"}
+    assert any("demo-installed: AP 0.900" in line for line in report.summary)
+    section = next(section for section in report.sections if section.key == "detection")
+    assert any("is the installed detector" in line for line in section.lead)
+
+
+def test_without_the_installed_detector_the_frames_are_those_of_the_run(shown):
+    data, runs = shown
+    shutil.rmtree(runs / "detect" / "demo-installed")
+    report = gather("demo", "demo", data, runs)
+    assert report.viewer is not None
+    assert {mark.kind for frame in report.viewer.frames for mark in frame.detections} == {"matched", "false"}
+    assert "detect run demo-installed: no finished run" in report.missing
+
+
+def test_the_landing_is_a_headline(shown):
+    lines = gather("demo", "demo", *shown).summary
+    assert any("position RMSE 1.25 m over the descents, 0.5 m at their end" in line for line in lines)
+
+
+def test_tiny_says_what_it_is_for(shown):
+    data, runs = shown
+    assert not any("only shows that all steps work" in line for line in gather("demo", "demo", data, runs).summary)
+    for kind in ("detect", "nav"):
+        path = data / kind / "dataset.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"name": "tiny"}))
+    assert gather("demo", "demo", data, runs).summary[0].startswith("The preset tiny only shows that all steps work")
+
+
+def test_the_report_names_the_start_of_a_training(shown):
+    data, runs = shown
+    path = runs / "detect" / "demo" / "metrics.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"train/start": "crater-detector", "train/epochs": 1}))
+    path = runs / "navigate" / "demo-stack" / "metrics.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"network/backbone": "from lander-navigator"}))
+    leads = [line for section in gather("demo", "demo", data, runs).sections for line in section.lead]
+    assert "demo started from crater-detector; epochs of training on this dataset: 1." in leads
+    assert "demo-stack started from lander-navigator." in leads
