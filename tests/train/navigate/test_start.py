@@ -10,13 +10,8 @@ from perilune_train.navigate.train.run import navigate_run
 from perilune_train.shipped.models import weights_file
 from perilune_train.training.runs import load_weights
 
-QUICK = (
-    "navigate.fusion=warp",
-    "navigate.warp.fine_epochs=1",
-    "navigate.warp.learning_rate=1e-9",
-    "navigate.device=cpu",
-)
-DEMO = ("navigate.precision=float32", "navigate.warp.sequence_pairs=2")
+QUICK = ("navigate.fusion=warp", "navigate.warp.fine_epochs=1", "navigate.warp.sequence_pairs=2")
+SAME = ("navigate.warp.learning_rate=1e-9", "navigate.precision=float32", "navigate.device=cpu")
 
 
 def settings(preset: str, *changes: str) -> NavigateConfig:
