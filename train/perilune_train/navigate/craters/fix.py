@@ -127,11 +127,10 @@ def _assigned(own: NDArray[np.integer], other: NDArray[np.integer], cost: Array)
     rivals = allowed[~alone]
     rows, row = _numbered(own[~alone])
     columns, column = _numbered(other[~alone])
-    pair = np.full((rows, columns), -1)
-    pair[row, column] = rivals
-    costs = np.where(pair >= 0, cost[pair], _FORBIDDEN)
-    chosen = pair[linear_sum_assignment(costs)]
-    matched = np.concatenate([allowed[alone], chosen[chosen >= 0]])
+    costs, pair = np.full((rows, columns), _FORBIDDEN), np.zeros((rows, columns), int)
+    costs[row, column], pair[row, column] = cost[rivals], rivals
+    chosen = linear_sum_assignment(costs)
+    matched = np.concatenate([allowed[alone], pair[chosen][costs[chosen] < _FORBIDDEN]])
     return np.sort(matched)
 
 

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.linalg.blas import dtrsm
 from scipy.stats import chi2
 
 from perilune_shared.geometry.frames import Array
@@ -50,9 +51,9 @@ def updated(state: State, innovation: Array, by_error: Array, noise: Array) -> U
 def updated_by(state: State, innovation: Array, crossed: Array, spread: Array, gated: bool = True) -> Update:
     """Update by a measurement: innovation (n,), its covariance with the error state (n, N), its own (n, n)."""
     root = np.linalg.cholesky(spread)
-    # One solution for both: in its units the parts of the innovation are independent and of deviation 1.
-    scaled = solve_triangular(root, np.column_stack([crossed, innovation]), lower=True, check_finite=False)
-    crossed, innovation = scaled[:, :-1], scaled[:, -1]
+    # In units in which the parts of the innovation are independent and of deviation 1. The transposes need no copies.
+    innovation = solve_triangular(root, innovation, lower=True, check_finite=False)
+    crossed = dtrsm(1.0, root.T, crossed.T, side=1).T
     squared = float(innovation @ innovation)
     if gated and squared > gate(len(innovation)):
         return Update(state, squared, len(innovation), False)
