@@ -137,7 +137,7 @@ def filtering() -> Step:
     from perilune_shared.geometry.inertial_grades import GRADES
     from perilune_train.navigate.craters.catalogue import Catalogue
     from perilune_train.navigate.filter.lander import Lander, Surroundings
-    from perilune_train.navigate.filter.propagate import Increment, InertialNoise, start_sigmas
+    from perilune_train.navigate.filter.propagate import Increments, InertialNoise, start_sigmas
     from perilune_train.navigate.filter.state import State
 
     rng, grade = np.random.default_rng(0), GRADES["tactical"]
@@ -151,7 +151,7 @@ def filtering() -> Step:
     def step() -> None:
         for _ in range(50):
             tick = next(ticks)
-            lander.inertial(Increment(0.02 * tick, 0.02, np.zeros(3), np.asarray(hover)))
+            lander.inertial(Increments.single(0.02 * tick, 0.02, np.zeros(3), np.asarray(hover)))
             if tick % 5 == 0:
                 lander.range(float(lander.state.position_m[2]))
 

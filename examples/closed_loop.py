@@ -39,7 +39,7 @@ from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.navigate.craters.catalogue import Catalogue, CatalogueErrors, with_errors
 from perilune_train.navigate.craters.sightings import Sightings
 from perilune_train.navigate.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
-from perilune_train.navigate.filter.propagate import Increment, InertialNoise, start_sigmas
+from perilune_train.navigate.filter.propagate import Increments, InertialNoise, start_sigmas
 from perilune_train.navigate.filter.state import State
 from perilune_train.shipped.models import shipped_run
 from perilune_train.training.runs import RunFolder
@@ -188,7 +188,7 @@ def fly(scene: SceneClient, lander: Lander, eye: Eye | None, seed: int) -> Fligh
             before, after = sway(time_s), sway(time_s + STEP_S)
             rate = rotation_vectors(before.T @ after) / STEP_S + gyro[step]
             sensed = sway(time_s + STEP_S / 2).T @ thrust + force[step]
-            lander.inertial(Increment(time_s + STEP_S, STEP_S, rate, sensed))
+            lander.inertial(Increments.single(time_s + STEP_S, STEP_S, rate, sensed))
             acceleration = thrust + gravity_mps2(position[2])
             position = position + velocity * STEP_S + acceleration * STEP_S**2 / 2
             velocity = velocity + acceleration * STEP_S

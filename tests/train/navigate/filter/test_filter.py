@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.train.navigate.craters.crater_world import CAMERA, nearby, sighted, world
+from tests.train.navigate.filter import plain_filter
 
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY as MOUNTING
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, rotation_vectors
@@ -13,9 +14,10 @@ from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GR
 from perilune_train.navigate.craters.fix import refine
 from perilune_train.navigate.craters.projection import Pose, projected
 from perilune_train.navigate.filter import measurements
-from perilune_train.navigate.filter.propagate import Increment, InertialNoise, propagated
+from perilune_train.navigate.filter.propagate import Increments, InertialNoise
 from perilune_train.navigate.filter.state import N_ERRORS, State
-from perilune_train.navigate.filter.update import updated
+from perilune_train.navigate.filter.stretch import Stretch
+from perilune_train.navigate.filter.update import updated, updated_by
 
 NOISE = InertialNoise.of(GRADES["tactical"])
 QUIET = InertialNoise(0.0, 0.0, 0.0, 0.0)
@@ -41,6 +43,13 @@ def some_state(rng):
     )
 
 
+def propagated(state, measured, noise, relief_m):
+    """The state after inertial measurements."""
+    stretch = Stretch([state], noise, relief_m)
+    stretch.inertial(measured)
+    return stretch.states()[0]
+
+
 def difference(one, other):
     """The error (31,) that leads from a state to another."""
     return np.concatenate(
@@ -62,7 +71,8 @@ def difference(one, other):
 def test_propagation_of_errors_is_the_derivative():
     state = some_state(np.random.default_rng(0))
     rate, force = np.array([0.02, -0.03, 0.05]), np.array([0.3, -0.2, 1.7])
-    measured = [Increment(3.01, 0.01, rate, force), Increment(3.03, 0.02, -rate, 0.5 * force)]
+    rates, forces = np.array([rate, -rate]), np.array([force, 0.5 * force])
+    measured = Increments(np.array([3.01, 3.03]), np.array([0.01, 0.02]), rates, forces)
     ends = propagated(state, measured, QUIET, 0.0)
     for k in range(N_ERRORS + 4):
         column = np.zeros(N_ERRORS + 4)
@@ -77,13 +87,11 @@ def test_propagation_of_errors_is_the_derivative():
 
 def test_several_measurements_at_once_are_the_same_as_one_after_the_other():
     state, rng = some_state(np.random.default_rng(0)), np.random.default_rng(1)
-    measured = [
-        Increment(3 + 0.01 * k, 0.01, 0.05 * rng.normal(size=3), [0, 0, 1.6] + 0.3 * rng.normal(size=3))
-        for k in range(1, 31)
-    ]
+    rates, forces = 0.05 * rng.normal(size=(30, 3)), [0, 0, 1.6] + 0.3 * rng.normal(size=(30, 3))
+    measured = Increments(3 + 0.01 * np.arange(1, 31), np.full(30, 0.01), rates, forces)
     single = state
-    for one in measured:
-        single = propagated(single, [one], NOISE, 5.0)
+    for k in range(30):
+        single = propagated(single, measured.part(slice(k, k + 1)), NOISE, 5.0)
     together = propagated(state, measured, NOISE, 5.0)
     np.testing.assert_allclose(difference(single, together), 0, atol=1e-9)
     np.testing.assert_allclose(together.ground_m, single.ground_m, rtol=1e-9)
@@ -94,7 +102,7 @@ def fields(state):
     return {name: getattr(state, name) for name in State.__slots__}
 
 
-@pytest.mark.parametrize("kind", ["range", "pose", "motion"])
+@pytest.mark.parametrize("kind", ["pose", "motion"])
 def test_measurements_have_the_derivatives_of_their_innovations(kind, monkeypatch):
     state = some_state(np.random.default_rng(1))
     caught = {}
@@ -106,11 +114,9 @@ def test_measurements_have_the_derivatives_of_their_innovations(kind, monkeypatc
     monkeypatch.setattr(measurements, "updated", catch)
 
     def measure(of):
-        if kind == "range":
-            measurements.range_update(of, 880.0, 4.0, 2.0)
-        elif kind == "pose":
-            pose = MOUNTING @ of_true.rotation_site_from_body.T
-            measurements.pose_update(of, np.array([32.0, -41, 903]), pose, np.eye(6), MOUNTING)
+        if kind == "pose":
+            pose = Pose(np.array([32.0, -41, 903]), MOUNTING @ of_true.rotation_site_from_body.T)
+            measurements.pose_update(of, pose, np.eye(6), MOUNTING)
         else:
             rotations = of_true.last_rotation_site_from_body, of_true.rotation_site_from_body
             first, second = (MOUNTING @ rotation.T for rotation in rotations)
@@ -167,7 +173,7 @@ def fly(seed, with_motion):
         force = force + np.sqrt(NOISE.force_bias) * root * rng.normal(size=3)
         seen_rate = rate + gyro + np.sqrt(NOISE.turn) / root * rng.normal(size=3)
         seen_force = thrust + force + np.sqrt(NOISE.velocity) / root * rng.normal(size=3)
-        state = propagated(state, [Increment(k * step, step, seen_rate, seen_force)], NOISE, 0.0)
+        state = propagated(state, Increments.single(k * step, step, seen_rate, seen_force), NOISE, 0.0)
         if k % 50:
             continue
         camera = MOUNTING @ turn.T
@@ -184,11 +190,12 @@ def fly(seed, with_motion):
             noise = np.diag([3.0] * 3 + [1e-3] * 3) ** 2
             error = np.sqrt(np.diag(noise)) * rng.normal(size=6)
             pose = matrix_from_rotation_vector(error[3:]) @ camera
-            done = measurements.pose_update(state, position + error[:3], pose, noise, MOUNTING)
+            done = measurements.pose_update(state, Pose(position + error[:3], pose), noise, MOUNTING)
             innovations.append(done.innovation_squared)
             state = done.state
-        done = measurements.range_update(state, position[2] / turn[2, 2] + 2 * rng.normal(), 0.0, 2.0)
-        state = done.state
+        stretch = Stretch([state], NOISE, 0.0)
+        stretch.range(position[2] / turn[2, 2] + 2 * rng.normal(), np.zeros(1), 2.0)
+        (state,) = stretch.states()
         state, last = state.with_frame(), (position, turn)
         error = state.pose_error(position, turn)
         own = [*range(3), *range(6, 9)]
@@ -207,17 +214,21 @@ def test_errors_have_the_stated_size(with_motion):
 def test_heights_of_the_catalogue_are_noise_where_they_are_seen(monkeypatch):
     rng, caught = np.random.default_rng(2), {}
 
-    def catch(state, innovation, by_error, noise, gate):
-        caught["noise"] = noise
-        return updated(state, innovation, by_error, noise, gate)
+    def catch(state, innovation, crossed, spread, gated):
+        caught["spread"] = spread
+        return updated_by(state, innovation, crossed, spread, gated)
 
-    monkeypatch.setattr(measurements, "updated", catch)
+    monkeypatch.setattr(measurements, "updated_by", catch)
     catalogue = replace(world(), position_sigma_m=3.0)
     true = Pose(np.array([20.0, -30, 700]), MOUNTING)
     seen = sighted(catalogue, true, rng, false_share=0.0)
     fix = refine(seen, catalogue, CAMERA, nearby(true, np.zeros(3), np.zeros(3)), true)
-    state = State.starting(fix.pose.position_m, np.zeros(3), np.eye(3), np.ones(15), 5.0)
-    measurements.craters_update(state, fix, seen, catalogue, CAMERA, MOUNTING)
+    state = State.starting(fix.pose.position_m, np.zeros(3), np.eye(3), np.zeros(15), 5.0)
+    # Without uncertainty of the state, the spread is the noise.
+    n_used = int((fix.weight > 0.1).sum())
+    known = replace(state, covariance=np.zeros((N_ERRORS + 2 * n_used,) * 2), offsets_m=np.zeros((n_used, 2)))
+    known = replace(known, craters=fix.crater[fix.weight > 0.1])
+    measurements.craters_update(known, fix, seen, catalogue, CAMERA, MOUNTING)
     higher = replace(catalogue, centre_m=catalogue.centre_m + np.array([0, 0, 3.0]))
     used = fix.weight > 0.1
     shift = np.zeros((used.sum(), 2))
@@ -228,6 +239,42 @@ def test_heights_of_the_catalogue_are_noise_where_they_are_seen(monkeypatch):
         shift[k] = (after.centre_px - before.centre_px)[0]
     assert np.abs(shift).max() > 0.4, "some craters are far from the middle"
     for k, (weight, own) in enumerate(zip(fix.weight[used], fix.sighting[used], strict=True)):
-        block = caught["noise"][2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
+        block = caught["spread"][2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
         expected = seen.noise_px[own] ** 2 / weight * np.eye(2) + np.outer(shift[k], shift[k])
         np.testing.assert_allclose(block, expected, rtol=0.02, atol=1e-3)
+
+
+def test_craters_update_as_the_whole_filter(monkeypatch):
+    """The blocks of the derivative give the update of the whole derivative."""
+    rng, caught = np.random.default_rng(3), {}
+
+    def catch(state, innovation, crossed, spread, gated):
+        caught.update(state=state, innovation=innovation, crossed=crossed, spread=spread)
+        return updated_by(state, innovation, crossed, spread, gated)
+
+    def catch_blocks(state, crater, by_error, by_offset):
+        caught.update(crater=crater, by_error=by_error, by_offset=by_offset)
+        return crossed_by(state, crater, by_error, by_offset)
+
+    crossed_by = measurements._crossed
+    monkeypatch.setattr(measurements, "updated_by", catch)
+    monkeypatch.setattr(measurements, "_crossed", catch_blocks)
+    catalogue = replace(world(), position_sigma_m=1.0)
+    true = Pose(np.array([20.0, -30, 700]), MOUNTING)
+    state = State.starting(true.position_m + np.array([3.0, 2, 1]), np.zeros(3), np.eye(3), np.ones(15), 5.0)
+    for _ in range(2):
+        seen = sighted(catalogue, true, rng)
+        fix = refine(seen, catalogue, CAMERA, nearby(true, np.zeros(3), np.zeros(3)), true)
+        after = measurements.craters_update(state, fix, seen, catalogue, CAMERA, MOUNTING).state
+        before, n = caught["state"], len(caught["crater"])
+        by_error = np.zeros((n, 2, len(before.covariance)))
+        by_error[:, :, [*range(3), *range(6, 9), *range(21, 26)]] = caught["by_error"]
+        for k, crater in enumerate(caught["crater"]):
+            by_error[k, :, N_ERRORS + 2 * crater : N_ERRORS + 2 * crater + 2] = caught["by_offset"][k]
+        by_error = by_error.reshape(2 * n, -1)
+        np.testing.assert_allclose(caught["crossed"], by_error @ before.covariance, rtol=1e-9, atol=1e-9)
+        noise = caught["spread"] - by_error @ before.covariance @ by_error.T
+        expected = plain_filter.updated(before, caught["innovation"], by_error, noise, gated=False)
+        np.testing.assert_allclose(after.covariance, expected.covariance, atol=1e-8)
+        np.testing.assert_allclose(difference(after, expected), 0, atol=1e-8)
+        state = after

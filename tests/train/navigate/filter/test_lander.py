@@ -12,8 +12,9 @@ from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S, STANDARD_GR
 from perilune_train.navigate.craters.catalogue import CatalogueErrors, with_errors
 from perilune_train.navigate.craters.projection import Pose
 from perilune_train.navigate.craters.sightings import STATIC_SHARE, Sightings
+from perilune_train.navigate.filter.flight import Instruments, fly, fly_together, together
 from perilune_train.navigate.filter.lander import Lander, Surroundings
-from perilune_train.navigate.filter.propagate import Increment, InertialNoise
+from perilune_train.navigate.filter.propagate import Increments, InertialNoise
 from perilune_train.navigate.filter.state import N_ERRORS, State
 
 GRADE = GRADES["tactical"]
@@ -56,7 +57,7 @@ def flown(craft, rng, biases, see=lambda k, seen: seen, seconds=30, feel=lambda 
         rate, lift = gyro + noise[0] * rng.normal(size=3), force + noise[1] * rng.normal(size=3)
         if feel(k * STEP_S):
             lift = lift - gravity_mps2(position[2])
-            craft.inertial(Increment((k + 1) * STEP_S, STEP_S, rate, lift))
+            craft.inertial(Increments.single((k + 1) * STEP_S, STEP_S, rate, lift))
             craft.range(position[2] - ground_m(position) + 2 * rng.normal())
     return np.array(errors), np.array(squared), status
 
@@ -180,8 +181,8 @@ def test_senseless_measurements_change_nothing(value):
     before = craft.state
     assert not craft.range(value)
     assert not craft.range(-3.0)
-    craft.inertial(Increment(0.05, 0.05, np.full(3, value), np.zeros(3)))
-    craft.inertial(Increment(-1.0, 0.05, np.zeros(3), np.zeros(3)))
+    craft.inertial(Increments.single(0.05, 0.05, np.full(3, value), np.zeros(3)))
+    craft.inertial(Increments.single(-1.0, 0.05, np.zeros(3), np.zeros(3)))
     assert craft.state is before
 
 
@@ -209,3 +210,39 @@ def test_the_smoother_keeps_all_frames_and_ends_where_the_filter_ends():
         filtered.append(errors)
     assert np.sqrt(np.mean(np.square(smoothed))) < 0.7 * np.sqrt(np.mean(np.square(filtered)))
     assert 2.5 < np.mean(squared) < 9
+
+
+def test_flights_together_are_those_one_by_one():
+    """Measurements of three flights at the same times, with a gap, a missed range and a missing measurement."""
+    time_s, rng = 0.05 * np.arange(1, 101), np.random.default_rng(0)
+    time_s = time_s[(time_s < 2.02) | (time_s > 2.53)]
+    rate, force = 0.01 * rng.normal(size=(3, len(time_s), 3)), 0.02 * rng.normal(size=(3, len(time_s), 3))
+    rate[:, 7] = np.nan
+    force[..., 2] += 1.62
+    frames, ranges = np.arange(5.0), np.arange(0.1, 5, 0.2)
+    range_m = 1400 - 35 * ranges + rng.normal(size=len(ranges))
+    range_m[3] = np.nan
+    inertial = Increments(time_s, np.full(len(time_s), 0.05), rate, force)
+    alone = [
+        Instruments(dataclasses.replace(inertial, angular_rate_radps=one, specific_force_mps2=other), ranges, range_m)
+        for one, other in zip(rate, force, strict=True)
+    ]
+    seen = [
+        [
+            sighted(WORLD, Pose(POSITION_M + t * VELOCITY_MPS, MOUNTING), np.random.default_rng(int(10 * t) + k))
+            for t in frames
+        ]
+        for k in range(3)
+    ]
+    flown = [list(fly(lander(k)[0], alone[k], frames, seen[k])) for k in range(3)]
+    crafts = [lander(k)[0] for k in range(3)]
+    found = list(fly_together(crafts, together(alone), frames, zip(*seen, strict=True)))
+    assert len(found) == len(frames)
+    for number, estimates in enumerate(found):
+        for k, estimate in enumerate(estimates):
+            expected = flown[k][number]
+            assert (estimate.status, estimate.frame) == (expected.status, number)
+            np.testing.assert_allclose(estimate.state.position_m, expected.state.position_m, atol=1e-7)
+            np.testing.assert_allclose(estimate.state.covariance, expected.state.covariance, rtol=1e-5, atol=1e-9)
+    assert "tracking" in {one.status for one in found[-1]}
+    assert all(craft.state.time_s == ranges[-1] for craft in crafts)

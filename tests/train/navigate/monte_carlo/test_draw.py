@@ -6,14 +6,14 @@ from tests.train.navigate.methods.test_fixes import descent
 
 from perilune_shared.geometry.inertial_grades import GRADES, HOUR_S
 from perilune_train.navigate.filter.flight import Instruments
-from perilune_train.navigate.filter.propagate import Increment
+from perilune_train.navigate.filter.propagate import Increments
 from perilune_train.navigate.methods.flights import default_sigmas
 from perilune_train.navigate.monte_carlo.draw import drawn
 from perilune_train.navigate.monte_carlo.scenario import SCENARIOS
 
 SIGMAS = default_sigmas("tactical", 0.5)
 STILL = Instruments(
-    [Increment(0.01 * k, 0.01, np.zeros(3), np.array([0, 0, 1.62])) for k in range(1, 3001)],
+    Increments(0.01 * np.arange(1, 3001), np.full(3000, 0.01), np.zeros((3000, 3)), np.tile([0, 0, 1.62], (3000, 1))),
     np.arange(300) / 10,
     np.full(300, 800.0),
 )
@@ -29,8 +29,8 @@ def test_a_seed_gives_a_draw_and_another_seed_another(scenario):
     (_, first), (_, again), (_, other) = draw(scenario), draw(scenario), draw(scenario, seed=1)
     np.testing.assert_array_equal(first.off, again.off)
     assert not np.isclose(first.off, other.off).any()
-    for one, two in zip(first.instruments.inertial, again.instruments.inertial, strict=True):
-        np.testing.assert_array_equal(one.angular_rate_radps, two.angular_rate_radps)
+    one, two = first.instruments.inertial, again.instruments.inertial
+    np.testing.assert_array_equal(one.angular_rate_radps, two.angular_rate_radps)
     assert [len(one) for one in first.descent.sightings] == [len(one) for one in again.descent.sightings]
 
 
@@ -39,8 +39,8 @@ def test_inertial_errors_and_starts_have_the_stated_size():
     for seed in range(200):
         _, one = draw(seed=seed, n=2)
         offs.append(one.off)
-        turns.append(np.mean([own.angular_rate_radps for own in one.instruments.inertial], axis=0))
-        pushes.append(np.mean([own.specific_force_mps2 for own in one.instruments.inertial], axis=0) - [0, 0, 1.62])
+        turns.append(one.instruments.inertial.angular_rate_radps.mean(axis=0))
+        pushes.append(one.instruments.inertial.specific_force_mps2.mean(axis=0) - [0, 0, 1.62])
     np.testing.assert_allclose(np.std(offs, axis=0), SIGMAS[:9], rtol=0.2)
     # Means over 30 s: bias and integrated noise; the walk of the bias is below a tenth of it.
     unit, seconds = GRADES["tactical"], 30.0

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,7 @@ class Catalogue:
     def ground_m(self, position_m: Array, count: int) -> float:
         """Median height of the `count` craters nearest to a position, over ground: (2,) or (3,), O_L."""
         _, nearest = self._tree.query(position_m[:2], min(count, len(self)))
-        return float(np.median(self.centre_m[nearest, 2]))
+        return median(self.centre_m[np.atleast_1d(nearest), 2].tolist())
 
     @cached_property
     def _tree(self) -> KDTree:

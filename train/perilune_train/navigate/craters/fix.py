@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import KDTree
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
@@ -65,22 +64,35 @@ class Fix:
 
 def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: PosePrior, start: Pose) -> Fix | None:
     """The pose that fits best, from a start within a few pixels; None if too few sightings can be matched."""
+    if not len(sightings):
+        return None
     precision = np.linalg.inv(prior.covariance)
-    pose = start
-    least_px = _LEAST_SIZE * float(sightings.radius_px.min()) if len(sightings) else 1.0
+    pose, noise_px = start, np.hypot(sightings.noise_px, sightings.static_px)
+    size_sigma = float(np.hypot(sightings.size_sigma, catalogue.radius_sigma_share))
+    least_px = _LEAST_SIZE * float(sightings.radius_px.min())
     places = in_view(catalogue, camera, start, _FARTHEST_PX, _SMALLER * least_px)
     catalogue = catalogue.part(places)
     for gate_px in _GATES_PX:
         seen = projected(catalogue, camera, pose, 3 * gate_px, least_px)
-        own, other = _matches(sightings, seen, catalogue, camera, gate_px)
-        if len(own) < _LEAST_MATCHES:
+        placed_px = camera.fx_px / seen.depth_m * catalogue.position_sigma_m
+        own_px = np.hypot(noise_px, gate_px)
+        reach_px = _GATE_SIGMAS * np.sqrt(2 * (own_px**2 + np.max(placed_px, initial=0.0) ** 2))
+        own, other = _near(sightings, seen, reach_px)
+        error = _errors(sightings, seen, own, other)
+        cost = (error[:, :2] ** 2).sum(axis=1) / (own_px[own] ** 2 + placed_px[other] ** 2) / 2
+        cost += error[:, 2] ** 2 / (size_sigma**2 + (gate_px / 60) ** 2)
+        matched = _assigned(own, other, cost)
+        if len(matched) < _LEAST_MATCHES:
             return None
-        error, sigma = _errors(sightings, seen, catalogue, camera, own, other)
-        distance = np.linalg.norm(error[:, :2] / np.hypot(sigma[:, :2], gate_px), axis=1) / np.sqrt(2)
+        own, other, error = own[matched], other[matched], error[matched]
+        centre_sigma = np.hypot(noise_px[own], placed_px[other])
+        sigma = np.column_stack([centre_sigma, centre_sigma, np.full(len(own), size_sigma)])
+        distance = np.sqrt((error[:, :2] ** 2).sum(axis=1) / (centre_sigma**2 + gate_px**2) / 2)
         weight = np.clip(1 - (distance / _TUKEY) ** 2, 0, None) ** 2
-        jacobian = seen.jacobian[other] / sigma[:, :, None]
-        normal = np.einsum("n,nij,nik->jk", weight, jacobian, jacobian) + precision
-        gradient = np.einsum("n,nij,ni->j", weight, jacobian, error / sigma) - precision @ _offset(pose, prior.pose)
+        jacobian = (seen.jacobian(other) / sigma[:, :, None]).reshape(-1, 6)
+        weighted = np.repeat(weight, 3)[:, None] * jacobian
+        normal = weighted.T @ jacobian + precision
+        gradient = (error / sigma).ravel() @ weighted - precision @ _offset(pose, prior.pose)
         pose = pose.changed(np.linalg.solve(normal, gradient))
     if len(own) < _LEAST_SHARE * len(sightings):
         return None
@@ -92,52 +104,48 @@ def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
     return Fix(pose, covariance, own, places[seen.index[other]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2))))
 
 
-def _matches(
-    sightings: Sightings, seen: Projected, catalogue: Catalogue, camera: Camera, gate_px: float
-) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
-    """One-to-one matches within the gate: places in `sightings` and in `seen` (K,)."""
-    mapped = camera.fx_px / seen.depth_m * catalogue.position_sigma_m
-    own_variance = sightings.noise_px**2 + sightings.static_px**2 + gate_px**2
-    own, other = _near(sightings, seen, own_variance + np.max(mapped, initial=0.0) ** 2)
-    across = sightings.centre_px[own] - seen.centre_px[other]
-    variance = own_variance[own] + mapped[other] ** 2
-    ratio = np.log(sightings.radius_px[own] / seen.radius_px[other])
-    size_variance = sightings.size_sigma**2 + catalogue.radius_sigma_share**2 + (gate_px / 60) ** 2
-    cost = (across**2).sum(axis=1) / variance / 2 + ratio**2 / size_variance
-    allowed = cost < _GATE_SIGMAS**2
-    if not allowed.any():
-        return np.zeros(0, int), np.zeros(0, int)
-    costs = np.full((len(sightings), len(seen.index)), _FORBIDDEN)
-    costs[own[allowed], other[allowed]] = cost[allowed]
-    own, other = linear_sum_assignment(costs)
-    kept = costs[own, other] < _FORBIDDEN
-    return own[kept], other[kept]
+def _near(sightings: Sightings, seen: Projected, reach_px: Array) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+    """All pairs that are at most `reach_px` (M,) apart along each axis: places in `sightings` and in `seen` (K,)."""
+    order = np.argsort(seen.centre_px[:, 0])
+    x, y = seen.centre_px[order].T
+    first = np.searchsorted(x, sightings.centre_px[:, 0] - reach_px)
+    count = np.searchsorted(x, sightings.centre_px[:, 0] + reach_px, side="right") - first
+    own = np.repeat(np.arange(len(sightings)), count)
+    other = np.arange(len(own)) + np.repeat(first - np.cumsum(count) + count, count)
+    near = np.abs(sightings.centre_px[own, 1] - y[other]) <= reach_px[own]
+    return own[near], order[other[near]]
 
 
-def _near(sightings: Sightings, seen: Projected, variance: Array) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
-    """Pairs that are near enough for the gate (K,), by the largest variance (M,) that a pair of a sighting can have."""
-    if not len(seen.index) or not len(sightings):
-        return np.zeros(0, int), np.zeros(0, int)
-    near = KDTree(seen.centre_px).query_ball_point(sightings.centre_px, _GATE_SIGMAS * np.sqrt(2 * variance))
-    counts = [len(one) for one in near]
-    return np.repeat(np.arange(len(near)), counts), np.concatenate(near).astype(int)
+def _assigned(own: NDArray[np.integer], other: NDArray[np.integer], cost: Array) -> NDArray[np.integer]:
+    """The pairs of the one-to-one assignment of most pairs within the gate and of least cost, by increasing `own`."""
+    allowed = np.flatnonzero(cost < _GATE_SIGMAS**2)
+    if not len(allowed):
+        return allowed
+    # Pairs without a rival belong to every such assignment; without them the rest is small.
+    own, other = own[allowed], other[allowed]
+    alone = (np.bincount(own)[own] == 1) & (np.bincount(other)[other] == 1)
+    rivals = allowed[~alone]
+    rows, row = _numbered(own[~alone])
+    columns, column = _numbered(other[~alone])
+    costs, pair = np.full((rows, columns), _FORBIDDEN), np.zeros((rows, columns), int)
+    costs[row, column], pair[row, column] = cost[rivals], rivals
+    chosen = linear_sum_assignment(costs)
+    matched = np.concatenate([allowed[alone], pair[chosen][costs[chosen] < _FORBIDDEN]])
+    return np.sort(matched)
 
 
-def _errors(
-    sightings: Sightings,
-    seen: Projected,
-    catalogue: Catalogue,
-    camera: Camera,
-    own: NDArray[np.integer],
-    other: NDArray[np.integer],
-) -> tuple[Array, Array]:
-    """Differences of centre and logarithm of radius (K, 3), sighting less projection, and their deviations (K, 3)."""
-    ratio = np.log(sightings.radius_px[own] / seen.radius_px[other])
-    error = np.column_stack([sightings.centre_px[own] - seen.centre_px[other], ratio])
-    placed = camera.fx_px / seen.depth_m[other] * catalogue.position_sigma_m
-    centre = np.sqrt(sightings.noise_px[own] ** 2 + sightings.static_px[own] ** 2 + placed**2)
-    size = np.hypot(sightings.size_sigma, catalogue.radius_sigma_share)
-    return error, np.column_stack([centre, centre, np.full(len(own), size)])
+def _numbered(places: NDArray[np.integer]) -> tuple[int, NDArray[np.integer]]:
+    """The number of different places, and the places numbered without gaps."""
+    different = np.flatnonzero(np.bincount(places))
+    return len(different), np.searchsorted(different, places)
+
+
+def _errors(sightings: Sightings, seen: Projected, own: NDArray[np.integer], other: NDArray[np.integer]) -> Array:
+    """Differences of centre and logarithm of radius (K, 3), sighting less projection."""
+    error = np.empty((len(own), 3))
+    error[:, :2] = sightings.centre_px[own] - seen.centre_px[other]
+    error[:, 2] = np.log(sightings.radius_px[own] / seen.radius_px[other])
+    return error
 
 
 def _offset(pose: Pose, prior: Pose) -> Array:

@@ -1,7 +1,7 @@
 """One descent through the filter: measurements in the order of time, an estimate at every frame."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,9 +10,10 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_train.navigate.craters.locate import Located
 from perilune_train.navigate.craters.sightings import Sightings
-from perilune_train.navigate.filter.lander import Lander, Status
-from perilune_train.navigate.filter.propagate import Increment
+from perilune_train.navigate.filter.lander import Lander, Status, range_update
+from perilune_train.navigate.filter.propagate import Increments
 from perilune_train.navigate.filter.state import State
+from perilune_train.navigate.filter.stretch import Stretch
 
 _SAME_S = 1e-9
 
@@ -21,8 +22,8 @@ _SAME_S = 1e-9
 class Instruments:
     """Measurements of one descent besides its frames."""
 
-    inertial: list[Increment]
-    """Of the inertial unit, in the order of time."""
+    inertial: Increments
+    """Of the inertial unit."""
     range_time_s: Array
     """Times of the ranges (n,), seconds since the first frame."""
     range_m: Array
@@ -35,13 +36,21 @@ class Instruments:
         rows = dataset.table("inertial", columns, *ids).to_pandas()
         rows = rows[rows["grade"] == grade].sort_values("time_s")
         ranges = dataset.table("ranges", ["time_s", "range_m"], *ids).to_pandas().sort_values("time_s")
-        inertial = [
-            Increment(
-                row.time_s, row.interval_s, np.asarray(row.angular_rate_radps), np.asarray(row.specific_force_mps2)
-            )
-            for row in rows.itertuples()
-        ]
+        rate, force = (
+            np.array(rows[name].to_list(), np.float64).reshape(-1, 3)
+            for name in ("angular_rate_radps", "specific_force_mps2")
+        )
+        time_s, interval_s = (rows[name].to_numpy(np.float64) for name in ("time_s", "interval_s"))
+        inertial = Increments(time_s, interval_s, rate, force)
         return cls(inertial, ranges["time_s"].to_numpy(np.float64), ranges["range_m"].to_numpy(np.float64))
+
+
+def together(flights: Sequence[Instruments]) -> Instruments:
+    """Instruments of F flights, whose measurements have the times and the ranges of the first."""
+    inertial = [one.inertial for one in flights]
+    rate = np.stack([one.angular_rate_radps for one in inertial])
+    force = np.stack([one.specific_force_mps2 for one in inertial])
+    return replace(flights[0], inertial=replace(inertial[0], angular_rate_radps=rate, specific_force_mps2=force))
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,22 +73,44 @@ def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Ite
     `seen` has the sightings of the frames at increasing times (n,); an iterator is advanced by one at each frame.
     Inertial measurements that are not finite are missing ones; what was measured before the lander's state is ignored.
     """
+    for (estimate,) in fly_together([lander], instruments, frame_time_s, ((own,) for own in seen)):
+        yield estimate
+
+
+def fly_together(
+    landers: Sequence[Lander], instruments: Instruments, frame_time_s: Array, seen: Iterable[Sequence[Sightings]]
+) -> Iterator[list[Estimate]]:
+    """Run the filters of F flights over descents with measurements at the same times: as `fly`, but several times as
+    fast. `seen` has the sightings of all flights, frame by frame; inertial noise, range and relief are those of the
+    first lander."""
     times = np.concatenate([instruments.range_time_s, frame_time_s])
     is_frame = np.concatenate([np.zeros(len(instruments.range_time_s), bool), np.ones(len(frame_time_s), bool)])
     place = np.concatenate([np.arange(len(instruments.range_time_s)), np.arange(len(frame_time_s))])
     # At the same time, the range is first.
     order = np.lexsort([is_frame, times])
-    sightings = iter(seen)
-    waiting = (measured for measured in instruments.inertial if measured.is_finite)
-    following = next(waiting, None)
-    for k in order[times[order] >= lander.state.time_s - _SAME_S]:
-        while following is not None and following.time_s <= times[k] + _SAME_S:
-            lander.inertial(following)
-            following = next(waiting, None)
-        if times[k] > lander.state.time_s + _SAME_S:
-            lander.until(times[k], following) if following is not None else lander.coast(times[k])
+    sightings, surroundings = iter(seen), [one.surroundings for one in landers]
+    measured, done = instruments.inertial.measured(), 0
+    stretch = _stretch(landers)
+    for k in order[times[order] >= stretch.time_s - _SAME_S]:
+        end = int(np.searchsorted(measured.time_s, times[k] + _SAME_S, side="right"))
+        stretch.inertial(measured.part(slice(done, end)))
+        done = end
+        if times[k] > stretch.time_s + _SAME_S:
+            following = measured.part(slice(done, done + 1))
+            stretch.inertial(following.until(times[k])) if len(following) else stretch.coast(times[k])
         if is_frame[k]:
-            located = lander.sightings(next(sightings))
-            yield Estimate(int(place[k]), lander.state, lander.status, located)
+            estimates, own = [], next(sightings)
+            for lander, state, frame in zip(landers, stretch.states(), own, strict=True):
+                lander.state = state
+                located = lander.sightings(frame)
+                estimates.append(Estimate(int(place[k]), lander.state, lander.status, located))
+            yield estimates
+            stretch = _stretch(landers)
         else:
-            lander.range(float(instruments.range_m[place[k]]))
+            range_update(stretch, float(instruments.range_m[place[k]]), surroundings)
+    for lander, state in zip(landers, stretch.states(), strict=True):
+        lander.state = state
+
+
+def _stretch(landers: Sequence[Lander]) -> Stretch:
+    return Stretch([one.state for one in landers], landers[0].noise, landers[0].surroundings.relief_m)

@@ -1,9 +1,11 @@
 """The filter in flight: one call for each measurement, in the order of time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
@@ -12,9 +14,10 @@ from perilune_train.navigate.craters.fix import Fix, PosePrior
 from perilune_train.navigate.craters.locate import Located, locate
 from perilune_train.navigate.craters.projection import Pose
 from perilune_train.navigate.craters.sightings import Sightings
-from perilune_train.navigate.filter.measurements import craters_update, pose_update, range_update
-from perilune_train.navigate.filter.propagate import Increment, InertialNoise, propagated
+from perilune_train.navigate.filter.measurements import craters_update, pose_fits
+from perilune_train.navigate.filter.propagate import Increments, InertialNoise
 from perilune_train.navigate.filter.state import ATTITUDE, POSITION, VELOCITY, State
+from perilune_train.navigate.filter.stretch import Stretch
 from perilune_train.navigate.filter.update import passes_gate
 
 Status = Literal["tracking", "coasting", "lost"]
@@ -25,12 +28,8 @@ RANGE_SIGMA_M, RELIEF_M = 1.0, 10.0
 _LOST_S = 15.0
 _UNKNOWN_VELOCITY_MPS = 5.0
 """Standard deviation of the velocity, on each axis, where a fix contradicts the state."""
-"""Fixes in a row that the gate refuses, after which the filter starts again from a fix."""
-_GAP_S = 0.05
 _NEAREST = 10
 """Craters whose median height is that of the ground below, but for an error of the state."""
-_UNKNOWN_MPS2, _UNKNOWN_RADPS = 2.0, 0.05
-"""Standard deviations of the motion while inertial measurements are missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +46,15 @@ class Surroundings:
     """Standard deviation of a range."""
     relief_m: float
     """Standard deviation of the ground's height about that of the nearest craters."""
+
+
+def range_update(stretch: Stretch, range_m: float, surroundings: Sequence[Surroundings]) -> NDArray[np.bool_]:
+    """Update flights by the same range at the present time; whether it was accepted (F,). None if it is no length."""
+    if not (np.isfinite(range_m) and range_m > 0):
+        return np.zeros(len(surroundings), bool)
+    places = zip(stretch.position_m, surroundings, strict=True)
+    ground_m = np.array([around.catalogue.ground_m(position, _NEAREST) for position, around in places])
+    return stretch.range(range_m, ground_m, surroundings[0].range_sigma_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +82,18 @@ class Lander:
     """
 
     def __init__(self, state: State, noise: InertialNoise, around: Surroundings, keep_poses: bool = False):
-        self._state, self.status = state, "coasting"
+        self.status = "coasting"
         self._keep_poses = keep_poses
-        self._noise, self._around = noise, around
-        self._pending: list[Increment] = []
+        self.noise, self._around = noise, around
         self._contradiction: _Contradiction | None = None
-        self._matched_s = self._time_s = state.time_s
+        self._matched_s = state.time_s
+        self._state, self._since = state, None
 
     status: Status
+    noise: InertialNoise
+    """Of the inertial unit."""
+    _since: Stretch | None
+    """What came after `_state`."""
 
     @property
     def surroundings(self) -> Surroundings:
@@ -91,41 +103,37 @@ class Lander:
     @property
     def state(self) -> State:
         """The state at the present time."""
-        if self._pending:
-            self._state = propagated(self._state, self._pending, self._noise, self._around.relief_m)
-            self._pending = []
+        if self._since is not None:
+            (self.state,) = self._since.states()
         return self._state
 
-    def inertial(self, measured: Increment) -> None:
-        """Propagate to the end of an inertial measurement; one that is older, or not finite, is ignored."""
-        self.until(measured.time_s, measured)
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state, self._since = state, None
 
-    def until(self, time_s: float, measured: Increment) -> None:
-        """Propagate to a time within an inertial measurement."""
-        if not measured.is_finite:
-            return
-        start_s = min(measured.time_s - measured.interval_s, time_s)
-        if start_s > self._time_s + _GAP_S:
-            self.coast(start_s)
-        step_s = time_s - self._time_s
-        if step_s > 0:
-            self._pending.append(replace(measured, time_s=time_s, interval_s=step_s))
-            self._time_s = time_s
+    @property
+    def _stretch(self) -> Stretch:
+        if self._since is None:
+            self._since = Stretch([self._state], self.noise, self._around.relief_m)
+        return self._since
+
+    def inertial(self, measured: Increments) -> None:
+        """Propagate to the end of inertial measurements; those that are older, or not finite, are ignored."""
+        self._stretch.inertial(measured)
+
+    def coast(self, until_s: float) -> None:
+        """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""
+        self._stretch.coast(until_s)
 
     def range(self, range_m: float) -> bool:
         """Update by a range at the present time; whether it was accepted. One that is no length is not."""
-        if not (np.isfinite(range_m) and range_m > 0):
-            return False
-        ground_m = self._around.catalogue.ground_m(self.state.position_m, _NEAREST)
-        done = range_update(self.state, range_m, ground_m, self._around.range_sigma_m)
-        self._state = done.state
-        return done.accepted
+        return bool(range_update(self._stretch, range_m, [self._around])[0])
 
     def sightings(self, seen: Sightings) -> Located | None:
         """Update by the craters of a frame at the present time; the fix, if one was accepted."""
         found = self._matched(seen)
         if self._keep_poses:
-            self._state = self.state.keeping_pose()
+            self.state = self.state.keeping_pose()
         return found
 
     def _matched(self, seen: Sightings) -> Located | None:
@@ -134,16 +142,14 @@ class Lander:
             self._unmatched()
             return None
         fix, mounting = found.fix, self._around.rotation_camera_from_body
-        pose = fix.pose.position_m, fix.pose.rotation_camera_from_site
-        done = pose_update(self.state, *pose, fix.covariance, mounting)
-        if not done.accepted:
+        if not pose_fits(self.state, fix.pose, fix.covariance, mounting):
             if not self._replaces(fix):
                 self._unmatched()
                 return None
             self._restart(found)
         else:
             around = self._around
-            self._state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
+            self.state = craters_update(self.state, fix, seen, around.catalogue, around.camera, mounting).state
         self._contradiction, self._matched_s, self.status = None, self.state.time_s, "tracking"
         return found
 
@@ -182,25 +188,12 @@ class Lander:
         own = body @ fix.covariance @ body.T
         covariance[POSITION, POSITION], covariance[ATTITUDE, ATTITUDE] = own[:3, :3], own[3:, 3:]
         covariance[POSITION, ATTITUDE], covariance[ATTITUDE, POSITION] = own[:3, 3:], own[3:, :3]
-        self._state = replace(
+        self.state = replace(
             state,
             position_m=fix.pose.position_m,
             rotation_site_from_body=fix.pose.rotation_camera_from_site.T @ mounting,
             covariance=covariance,
         )
-
-    def coast(self, until_s: float) -> None:
-        """Go on without inertial measurements: constant velocity and attitude, with the uncertainty of both."""
-        gap_s, state = until_s - self.state.time_s, self.state
-        position = state.position_m + state.velocity_mps * gap_s
-        change = np.eye(len(state.covariance))
-        change[POSITION, VELOCITY] = gap_s * np.eye(3)
-        covariance = change @ state.covariance @ change.T
-        covariance[VELOCITY, VELOCITY] += np.eye(3) * (_UNKNOWN_MPS2 * gap_s) ** 2
-        covariance[POSITION, POSITION] += np.eye(3) * (_UNKNOWN_MPS2 * gap_s**2 / 2) ** 2
-        covariance[ATTITUDE, ATTITUDE] += np.eye(3) * (_UNKNOWN_RADPS * gap_s) ** 2
-        self._state = replace(state, time_s=until_s, position_m=position, covariance=covariance)
-        self._time_s = until_s
 
     def _expected(self) -> PosePrior:
         """The camera's expected pose, with its covariance as of a step of `Pose`."""

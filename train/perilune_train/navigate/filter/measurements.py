@@ -1,18 +1,17 @@
-"""Ranges, poses from craters, and relative motions as measurements of the state."""
+"""Poses from craters, craters, and relative motions as measurements of the state."""
 
 import numpy as np
-from scipy.linalg import block_diag
+from numpy.typing import NDArray
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.craters.fix import Fix
-from perilune_train.navigate.craters.projection import in_view, projected
+from perilune_train.navigate.craters.projection import Pose, in_view, projected
 from perilune_train.navigate.craters.sightings import STATIC_SHARE, Sightings
 from perilune_train.navigate.filter.state import (
     ATTITUDE,
     COMMON,
-    GROUND,
     LAST_ATTITUDE,
     LAST_POSITION,
     N_ERRORS,
@@ -20,43 +19,38 @@ from perilune_train.navigate.filter.state import (
     State,
     common_pattern,
 )
-from perilune_train.navigate.filter.update import Update, updated
+from perilune_train.navigate.filter.update import Update, passes_gate, updated, updated_by
 
 _LEAST_WEIGHT = 0.1
 """Matches with a smaller weight in a fix are not used."""
+_ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON]
+"""Parts of the error state that displace every sighting."""
 
 
-def range_update(state: State, range_m: float, ground_m: float, sigma_m: float) -> Update:
-    """Update by the distance to the ground along -Z_B.
-
-    `ground_m` is the height of the ground as the nearest craters have it, `sigma_m` the deviation of the instrument.
-    """
-    rotation, height_m = state.rotation_site_from_body, state.position_m[2] - ground_m - state.ground_m
-    cosine = rotation[2, 2]
-    by_error = np.zeros((1, N_ERRORS))
-    by_error[0, 2], by_error[0, GROUND] = 1 / cosine, -1 / cosine
-    by_error[0, ATTITUDE] = -height_m / cosine**2 * np.array([-rotation[2, 1], rotation[2, 0], 0])
-    return updated(state, np.array([range_m - height_m / cosine]), by_error, np.array([[sigma_m**2]]))
-
-
-def pose_update(
-    state: State,
-    position_m: Array,
-    rotation_camera_from_site: Array,
-    covariance: Array,
-    rotation_camera_from_body: Array,
-) -> Update:
-    """Update by a pose of the camera.
+def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
+    """Whether a pose of the camera passes the gate.
 
     `covariance` (6, 6) is that of the shift, O_L, metres, and of the turn from the left, O_C, radians.
     """
+    innovation, by_error = _pose_innovation(state, pose, rotation_camera_from_body)
+    spread = by_error @ state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T + covariance
+    return passes_gate(innovation, spread)
+
+
+def pose_update(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> Update:
+    """Update by a pose of the camera, with a covariance as of `pose_fits`."""
+    return updated(state, *_pose_innovation(state, pose, rotation_camera_from_body), covariance)
+
+
+def _pose_innovation(state: State, pose: Pose, rotation_camera_from_body: Array) -> tuple[Array, Array]:
+    """Shift and turn (6,) from the expected pose, and their derivative (6, 27)."""
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
-    turn = rotation_vectors(rotation_camera_from_site @ expected.T)
+    turn = rotation_vectors(pose.rotation_camera_from_site @ expected.T)
     by_error = np.zeros((6, N_ERRORS))
     by_error[:3, POSITION] = np.eye(3)
     # R_camera_from_site = C R^T, and R exp(e) in the place of R turns it by -C e from the left.
     by_error[3:, ATTITUDE] = -rotation_camera_from_body
-    return updated(state, np.concatenate([position_m - state.position_m, turn]), by_error, covariance)
+    return np.concatenate([pose.position_m - state.position_m, turn]), by_error
 
 
 def motion_update(
@@ -109,7 +103,7 @@ def craters_update(
     known = np.concatenate([crater, unmatched])
     state = state.with_craters(known, np.hypot(catalogue.position_sigma_m, STATIC_SHARE * catalogue.radius_m[known]))
     seen = projected(catalogue.part(crater), camera, fix.pose, margin_px=np.inf, least_radius_px=0.0)
-    by_pose = seen.jacobian[:, :2]
+    by_pose = seen.jacobian()[:, :2]
     expected = rotation_camera_from_body @ state.rotation_site_from_body.T
     turn = rotation_vectors(expected @ fix.pose.rotation_camera_from_site.T)
     from_fix = np.concatenate([state.position_m - fix.pose.position_m, turn])
@@ -122,17 +116,29 @@ def craters_update(
         + np.einsum("nij,nj->ni", by_offset, state.offsets_m[seen.index])
         + pattern @ state.common_px
     )
-    n = len(seen.index)
-    by_error = np.zeros((n, 2, N_ERRORS + 2 * len(known)))
-    by_error[:, :, POSITION] = by_pose[:, :, :3]
-    by_error[:, :, ATTITUDE] = by_pose[:, :, 3:] @ -rotation_camera_from_body
-    by_error[:, :, COMMON] = pattern
-    for axis in (0, 1):
-        by_error[np.arange(n), :, N_ERRORS + 2 * seen.index + axis] = by_offset[:, :, axis]
+    by_error = np.concatenate([by_pose[:, :, :3], by_pose[:, :, 3:] @ -rotation_camera_from_body, pattern], axis=2)
     innovation = (sightings.centre_px[own[seen.index]] - predicted).ravel()
     variance = sightings.noise_px[own[seen.index]] ** 2 / weight[seen.index]
     # Errors of heights in the catalogue shift craters in the image, away from its middle. As parts of the state they
     # gave the same errors and normalised errors, for a state that is half as large again.
     by_height = catalogue.position_sigma_m * by_pose[:, :, 2]
     noise = variance[:, None, None] * np.eye(2) + by_height[:, :, None] * by_height[:, None, :]
-    return updated(state, innovation, by_error.reshape(2 * n, -1), block_diag(*noise), gate=False)
+    crossed, spread = _crossed(state, seen.index, by_error, by_offset)
+    number = np.arange(len(noise))
+    spread.reshape(len(noise), 2, len(noise), 2)[number, :, number] += noise
+    return updated_by(state, innovation, crossed, spread, gated=False)
+
+
+def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offset: Array) -> tuple[Array, Array]:
+    """Covariance of N sightings with the error state (2 N, M) and with one another (2 N, 2 N), without their noise.
+
+    `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are their derivatives by the errors `_ALL_SEE` and by the offsets of
+    their craters, whose places in the state are `crater` (N,). The other derivatives are zero.
+    """
+    places = N_ERRORS + 2 * crater[:, None] + [0, 1]
+    by_error = by_error.reshape(-1, len(_ALL_SEE))
+    crossed = by_offset @ state.covariance[places]
+    crossed = by_error @ state.covariance[_ALL_SEE] + crossed.reshape(2 * len(crater), -1)
+    # The derivative by a crater's offset has two columns.
+    own = by_offset[:, None] @ crossed[:, places].transpose(1, 2, 0).reshape(len(crater), 1, 2, -1)
+    return crossed, by_error @ crossed[:, _ALL_SEE].T + own.reshape(2 * len(crater), -1)

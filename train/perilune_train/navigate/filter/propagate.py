@@ -1,46 +1,61 @@
 """Propagation of the state by inertial measurements (strapdown integration, e.g. Sola 2017, arXiv 1711.02508)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
+from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.gravity import gravity_mps2
 from perilune_shared.geometry.inertial_grades import HOUR_S, STANDARD_GRAVITY_MPS2, InertialErrors
 from perilune_train.navigate.filter.state import (
     ATTITUDE,
     FORCE_BIAS,
-    GROUND,
-    GYRO_BIAS,
     POSITION,
     VELOCITY,
-    State,
+    cross_matrices,
+    rotation_matrices,
 )
 
-_GROUND_S = 10.0
-"""Time in which the ground below a lander becomes another, at 10 to 30 m/s over ground."""
-_CHANGED = 15
-"""Parts of the error state that change between measurements: all but the last frame's pose and the offsets."""
+_INERTIAL = 15
+"""Parts of the error state that inertial measurements change: the first."""
 
 
 @dataclass(frozen=True, slots=True)
-class Increment:
-    """One measurement of an inertial unit: means over an interval."""
+class Increments:
+    """N measurements of an inertial unit, means over intervals, in the order of time; of one flight or of F."""
 
-    time_s: float
-    """End of the interval, seconds since the first frame."""
-    interval_s: float
-    """Length of the interval, seconds."""
+    time_s: Array
+    """Ends of the intervals (N,), seconds since the first frame."""
+    interval_s: Array
+    """Lengths of the intervals (N,), seconds."""
     angular_rate_radps: Array
-    """Mean angular rate (3,), O_B."""
+    """Mean angular rates (N, 3) or (F, N, 3), O_B; NaN where they are missing."""
     specific_force_mps2: Array
-    """Mean specific force (3,), O_B."""
+    """Mean specific forces, as the rates, O_B."""
 
-    @property
-    def is_finite(self) -> bool:
-        """Whether all of it was measured."""
-        return bool(np.isfinite(self.angular_rate_radps).all() and np.isfinite(self.specific_force_mps2).all())
+    @classmethod
+    def single(cls, time_s: float, interval_s: float, rate_radps: Array, force_mps2: Array) -> "Increments":
+        """One measurement: end and length of its interval, rate (3,) and force (3,)."""
+        return cls(np.array([time_s]), np.array([interval_s]), np.array([rate_radps]), np.array([force_mps2]))
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def part(self, chosen: slice | Array) -> "Increments":
+        """Some of the measurements."""
+        rate, force = self.angular_rate_radps[..., chosen, :], self.specific_force_mps2[..., chosen, :]
+        return Increments(self.time_s[chosen], self.interval_s[chosen], rate, force)
+
+    def measured(self) -> "Increments":
+        """Those that are finite, in all flights."""
+        finite = np.isfinite(self.angular_rate_radps) & np.isfinite(self.specific_force_mps2)
+        finite = finite.all(axis=(*range(finite.ndim - 2), -1))
+        return self if finite.all() else self.part(finite)
+
+    def until(self, time_s: float) -> "Increments":
+        """A single measurement up to a time within its interval."""
+        interval_s = np.maximum(time_s - (self.time_s - self.interval_s), 0.0)
+        return Increments(np.array([time_s]), interval_s, self.angular_rate_radps, self.specific_force_mps2)
 
 
 def start_sigmas(position_m: float, velocity_mps: float, attitude_deg: float, unit: InertialErrors) -> Array:
@@ -75,54 +90,76 @@ class InertialNoise:
         )
 
 
-def propagated(state: State, measured: Sequence[Increment], noise: InertialNoise, relief_m: float) -> State:
-    """The state after consecutive inertial measurements, each over its interval.
+@dataclass(frozen=True, slots=True)
+class Moving:
+    """What moves, of F flights."""
 
-    The ground's height below changes as a Gauss-Markov process of deviation `relief_m`.
+    position_m: Array
+    """Positions (F, 3), O_L."""
+    velocity_mps: Array
+    """Velocities (F, 3), O_L."""
+    rotation_site_from_body: Array
+    """Attitudes (F, 3, 3)."""
+    gyro_bias_radps: Array
+    """Biases of the gyroscopes (F, 3), O_B."""
+    force_bias_mps2: Array
+    """Biases of the accelerometers (F, 3), O_B."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Motions of F flights over the same time, and what they do to the first 15 parts of the error state."""
+
+    end: Moving
+    """What moves, at the end."""
+    change: Array
+    """Derivative (F, 15, 15) of the errors at the end by those at the start."""
+    added: Array
+    """Covariance (F, 15, 15) that the noise of the inertial unit adds."""
+
+
+def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Motion:
+    """The motions by consecutive inertial measurements, each over its interval."""
+    position, velocity, rotation = start.position_m, start.velocity_mps, start.rotation_site_from_body
+    n, step_s = len(measured), measured.interval_s
+    # Time is the first axis.
+    rate = np.moveaxis(measured.angular_rate_radps - start.gyro_bias_radps[:, None], 1, 0)
+    force = np.moveaxis(measured.specific_force_mps2 - start.force_bias_mps2[:, None], 1, 0)
+    half = rotation_matrices(rate * (step_s / 2)[:, None, None])
+    middle = np.empty_like(half)
+    for k in range(n):
+        middle[k] = rotation @ half[k]
+        rotation = middle[k] @ half[k]
+        acceleration = (middle[k] @ force[k][..., None])[..., 0] + gravity_mps2(position[:, 2])
+        position = position + velocity * step_s[k] + acceleration * (step_s[k] ** 2 / 2)
+        velocity = velocity + acceleration * step_s[k]
+    changes = _changes(middle, half, force, step_s)
+    # From each measurement to the end, the last first.
+    onward = np.empty((len(position), _INERTIAL, n, _INERTIAL))
+    change = np.eye(_INERTIAL)
+    for k in reversed(range(n)):
+        onward[:, :, k] = change
+        change = change @ changes[k]
+    per_s = np.repeat([0.0, noise.velocity, noise.turn, noise.gyro_bias, noise.force_bias], 3)
+    onward = (onward * np.sqrt(per_s * step_s[:, None])).reshape(len(position), _INERTIAL, -1)
+    end = replace(start, position_m=position, velocity_mps=velocity, rotation_site_from_body=rotation)
+    return Motion(end, change, onward @ np.swapaxes(onward, 1, 2))
+
+
+def _changes(middle: Array, half: Array, force: Array, step_s: Array) -> Array:
+    """Derivatives (N, F, 15, 15) of the errors after each step by those before: that of the attitude turns the force,
+    and those of the biases add up.
+
+    `middle` and `half` (N, F, 3, 3) are the attitudes in the middle of the steps and the turns up to there.
     """
-    position, velocity, rotation = state.position_m, state.velocity_mps, state.rotation_site_from_body
-    added = np.repeat([0.0, noise.velocity, noise.turn, noise.gyro_bias, noise.force_bias], 3)
-    change, variance = np.eye(_CHANGED), np.zeros((_CHANGED, _CHANGED))
-    for one in measured:
-        step = one.interval_s
-        rate = one.angular_rate_radps - state.gyro_bias_radps
-        force = one.specific_force_mps2 - state.force_bias_mps2
-        half = matrix_from_rotation_vector(rate * (step / 2))
-        middle = rotation @ half
-        acceleration = middle @ force + gravity_mps2(position[2])
-        own = _change(middle, half @ half, force, step)
-        change, variance = own @ change, own @ variance @ own.T
-        variance[np.diag_indices(_CHANGED)] += added * step
-        position = position + velocity * step + acceleration * (step**2 / 2)
-        velocity = velocity + acceleration * step
-        rotation = middle @ half
-    covariance, kept = state.covariance.copy(), np.exp(-sum(one.interval_s for one in measured) / _GROUND_S)
-    covariance[GROUND] *= kept
-    covariance[:, GROUND] *= kept
-    covariance[GROUND, GROUND] += relief_m**2 * (1 - kept**2)
-    own = change @ covariance[:_CHANGED]
-    covariance[:_CHANGED], covariance[:, :_CHANGED] = own, own.T
-    covariance[:_CHANGED, :_CHANGED] = own[:, :_CHANGED] @ change.T + variance
-    return replace(
-        state,
-        time_s=measured[-1].time_s,
-        position_m=position,
-        velocity_mps=velocity,
-        rotation_site_from_body=rotation,
-        ground_m=float(kept * state.ground_m),
-        covariance=covariance,
-    )
-
-
-def _change(middle: Array, turn: Array, force: Array, step: float) -> Array:
-    """Derivative (15, 15) of the errors after a step by those before: that of the attitude turns the force, and those
-    of the biases add up."""
-    x, y, z = force
-    by_turn = middle @ np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]])
-    change = np.eye(_CHANGED)
-    change[[0, 1, 2], [3, 4, 5]], change[[6, 7, 8], [9, 10, 11]] = step, -step
-    change[POSITION, ATTITUDE], change[VELOCITY, ATTITUDE] = by_turn * (step**2 / 2), by_turn * step
-    change[POSITION, GYRO_BIAS], change[VELOCITY, GYRO_BIAS] = by_turn * (-(step**3) / 4), by_turn * (-(step**2) / 2)
-    change[POSITION, FORCE_BIAS], change[VELOCITY, FORCE_BIAS] = middle * (-(step**2) / 2), middle * -step
-    change[ATTITUDE, ATTITUDE] = turn.T
+    step = step_s[:, None, None, None]
+    by_turn = -middle @ cross_matrices(force)
+    change = np.zeros((*force.shape[:2], _INERTIAL, _INERTIAL))
+    change[:] = np.eye(_INERTIAL)
+    change[..., [0, 1, 2], [3, 4, 5]], change[..., [6, 7, 8], [9, 10, 11]] = step[..., 0], -step[..., 0]
+    by_velocity = np.concatenate([by_turn * step, by_turn * (-(step**2) / 2), middle * -step], axis=-1)
+    change[..., VELOCITY, ATTITUDE.start : FORCE_BIAS.stop] = by_velocity
+    change[..., POSITION, ATTITUDE.start : FORCE_BIAS.stop] = by_velocity * (step / 2)
+    turn = half @ half
+    change[..., ATTITUDE, ATTITUDE] = np.swapaxes(turn, -1, -2)
     return change

@@ -81,7 +81,7 @@ class State:
         return state.with_frame()
 
     def corrected(self, error: Array, covariance: Array) -> "State":
-        """The state with an estimated error (27 + 2 n + 6 m,) removed, and its new covariance."""
+        """The state with an estimated error (27 + 2 n + 6 m,) removed, and its new covariance, which is symmetric."""
         end = N_ERRORS + 2 * len(self.craters)
         past = error[end:].reshape(-1, 6)
         return State(
@@ -97,9 +97,9 @@ class State:
             self.ground_m + float(error[GROUND][0]),
             self.craters,
             self.offsets_m + error[N_ERRORS:end].reshape(-1, 2),
-            (covariance + covariance.T) / 2,
+            covariance,
             self.past_position_m + past[:, :3],
-            self.past_rotation_site_from_body @ _matrices(past[:, 3:]),
+            self.past_rotation_site_from_body @ rotation_matrices(past[:, 3:]),
         )
 
     def with_frame(self) -> "State":
@@ -130,21 +130,17 @@ class State:
         """The state with the offsets of these craters alone (n,), which have a deviation (n,) where they are new."""
         place = {int(crater): k for k, crater in enumerate(self.craters)}
         before = np.array([place.get(int(crater), -1) for crater in craters], int)
-        known, n_past = np.flatnonzero(before >= 0), 6 * len(self.past_position_m)
-        old, new = (
-            np.concatenate(
-                [
-                    np.arange(N_ERRORS),
-                    (N_ERRORS + 2 * places[:, None] + [0, 1]).ravel(),
-                    N_ERRORS + 2 * count + np.arange(n_past),
-                ]
-            )
-            for places, count in ((before[known], len(self.craters)), (known, len(craters)))
-        )
-        covariance = np.diag(np.concatenate([np.zeros(N_ERRORS), np.repeat(sigma_m**2, 2), np.zeros(n_past)]))
-        covariance[np.ix_(new, new)] = self.covariance[np.ix_(old, old)]
+        new = np.flatnonzero(before < 0)
+        # Of new craters the rows of the first crater are taken, or of another part, and replaced.
+        old = N_ERRORS + 2 * np.maximum(before, 0)[:, None] + [0, 1] if len(place) else np.zeros((len(craters), 2), int)
+        past = N_ERRORS + 2 * len(self.craters) + np.arange(6 * len(self.past_position_m))
+        source = np.concatenate([np.arange(N_ERRORS), old.ravel(), past])
+        covariance = self.covariance.take(source, axis=0).take(source, axis=1)
+        rows = (N_ERRORS + 2 * new[:, None] + [0, 1]).ravel()
+        covariance[rows], covariance[:, rows] = 0, 0
+        covariance[rows, rows] = np.repeat(sigma_m[new] ** 2, 2)
         offsets = np.zeros((len(craters), 2))
-        offsets[known] = self.offsets_m[before[known]]
+        offsets[before >= 0] = self.offsets_m[before[before >= 0]]
         return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
 
     def past_pose_error(self, number: int, position_m: Array, rotation_site_from_body: Array) -> tuple[Array, Array]:
@@ -160,9 +156,22 @@ class State:
         return np.concatenate([position_m - self.position_m, turn])
 
 
-def _matrices(turns_rad: Array) -> Array:
-    """Matrices (m, 3, 3) of rotation vectors (m, 3)."""
-    return np.array([matrix_from_rotation_vector(turn) for turn in turns_rad]).reshape(-1, 3, 3)
+_CROSS = np.zeros((3, 9))
+_CROSS[[0, 0, 1, 1, 2, 2], [5, 7, 2, 6, 1, 3]] = -1, 1, 1, -1, -1, 1
+"""Parts of the matrix of a cross product, row by row, of each axis."""
+
+
+def cross_matrices(vectors: Array) -> Array:
+    """Matrices (..., 3, 3) whose products with u are the cross products v x u, of vectors v (..., 3)."""
+    return (vectors @ _CROSS).reshape(*vectors.shape, 3)
+
+
+def rotation_matrices(turns_rad: Array) -> Array:
+    """Matrices (..., 3, 3) of rotation vectors (..., 3): `matrix_from_rotation_vector` of many."""
+    angle = np.sqrt((turns_rad**2).sum(axis=-1))[..., None]
+    cross = cross_matrices(turns_rad / np.where(angle > 0, angle, 1.0))
+    angle = angle[..., None]
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
 
 
 def common_pattern(ray: Array) -> Array:

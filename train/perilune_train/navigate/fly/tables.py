@@ -14,7 +14,7 @@ from perilune_shared.geometry.frames import Array
 from perilune_train.detect.images.read import picture_size
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.filter.flight import Instruments
-from perilune_train.navigate.filter.propagate import Increment
+from perilune_train.navigate.filter.propagate import Increments
 
 FRAMES_FILE = "frames.csv"
 FRAME_COLUMNS = ("file", "time_s")
@@ -81,7 +81,7 @@ def read_instruments(imu: Path, ranges: Path | None) -> Instruments:
         row = int(wrong.argmax())
         raise UserError(imu, f"interval_s: row {row}", interval_s[row], "above 0, at most 1 s")
     rates, forces = (np.column_stack([_values(table, name) for name in names]) for names in (RATES, FORCES))
-    inertial = [Increment(*row) for row in zip(end_s.tolist(), interval_s.tolist(), rates, forces, strict=True)]
+    inertial = Increments(end_s, interval_s, rates, forces)
     if ranges is None:
         return Instruments(inertial, np.zeros(0), np.zeros(0))
     lengths = _read_csv(ranges, RANGE_COLUMNS)

@@ -12,7 +12,7 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import GRADES, InertialGrade
 from perilune_shared.terminal import progress_bar
 from perilune_train.navigate.craters.catalogue import Catalogue
-from perilune_train.navigate.filter.flight import Instruments, fly
+from perilune_train.navigate.filter.flight import Estimate, Instruments, fly
 from perilune_train.navigate.filter.lander import RANGE_SIGMA_M, RELIEF_M, Lander, Surroundings
 from perilune_train.navigate.filter.propagate import InertialNoise, start_sigmas
 from perilune_train.navigate.filter.state import ATTITUDE, POSITION, State
@@ -81,23 +81,45 @@ def flight(
     `mounting` is rotation_camera_from_body (3, 3), `sigmas` states the errors of the start, `off` (9,) has its true
     errors: position, velocity, attitude.
     """
-    turned = descent.true[0].changed(np.concatenate([off[:3], mounting @ off[6:]]))
-    attitude = turned.rotation_camera_from_site.T @ mounting
-    start = State.starting(turned.position_m, descent.velocity_mps + off[3:6], attitude, sigmas, RELIEF_M)
-    around = Surroundings(descent.camera, mounting, catalogue, RANGE_SIGMA_M, RELIEF_M)
-    lander = Lander(start, InertialNoise.of(GRADES[grade]), around, keep_poses=smooth)
-    rows = []
-    for estimate in fly(lander, instruments, descent.time_s, descent.sightings):
-        position, rotation = _true(descent, estimate.frame, mounting)
-        covariance = estimate.state.covariance[np.ix_(_POSE, _POSE)]
-        rows.append(_row(position[2], estimate.status, estimate.state.pose_error(position, rotation), covariance))
+    lander = lander_of(descent, mounting, catalogue, grade, sigmas, off, smooth)
+    estimates = list(fly(lander, instruments, descent.time_s, descent.sightings))
+    rows = [row_of(descent, one, mounting) for one in estimates]
     if smooth:
         for number, row in enumerate(rows):
             position, rotation = _true(descent, number, mounting)
             error, covariance = lander.state.past_pose_error(number, position, rotation)
             rows[number] = _row(position[2], row["status"], error, covariance)
+    return table_of(descent, rows)
+
+
+def lander_of(
+    descent: SeenDescent,
+    mounting: Array,
+    catalogue: Catalogue,
+    grade: InertialGrade,
+    sigmas: Array,
+    off: Array,
+    smooth: bool = False,
+) -> Lander:
+    """The lander at the first frame; arguments as of `flight`."""
+    turned = descent.true[0].changed(np.concatenate([off[:3], mounting @ off[6:]]))
+    attitude = turned.rotation_camera_from_site.T @ mounting
+    start = State.starting(turned.position_m, descent.velocity_mps + off[3:6], attitude, sigmas, RELIEF_M)
+    around = Surroundings(descent.camera, mounting, catalogue, RANGE_SIGMA_M, RELIEF_M)
+    return Lander(start, InertialNoise.of(GRADES[grade]), around, keep_poses=smooth)
+
+
+def table_of(descent: SeenDescent, rows: list[dict[str, object]]) -> pd.DataFrame:
+    """The table of a flight from the rows of its frames."""
     own = {"scene_id": descent.ids[0], "trajectory_id": descent.ids[1]}
     return pd.DataFrame(rows).assign(**own, time_s=descent.time_s)
+
+
+def row_of(descent: SeenDescent, estimate: Estimate, mounting: Array) -> dict[str, object]:
+    """Errors of the filter at a frame."""
+    position, rotation = _true(descent, estimate.frame, mounting)
+    covariance = estimate.state.covariance[np.ix_(_POSE, _POSE)]
+    return _row(position[2], estimate.status, estimate.state.pose_error(position, rotation), covariance)
 
 
 _POSE = np.r_[POSITION, ATTITUDE]

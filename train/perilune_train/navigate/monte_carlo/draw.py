@@ -56,17 +56,10 @@ def drawn(
 
 
 def _measured(reference: Instruments, grade: InertialGrade, rng: np.random.Generator) -> Instruments:
-    interval = np.array([one.interval_s for one in reference.inertial])
-    gyro, accelerometer = drawn_errors(GRADES[grade], interval, rng)
-    inertial = [
-        replace(
-            one,
-            angular_rate_radps=one.angular_rate_radps + gyro[k],
-            specific_force_mps2=one.specific_force_mps2 + accelerometer[k],
-        )
-        for k, one in enumerate(reference.inertial)
-    ]
-    return replace(reference, inertial=inertial)
+    exact = reference.inertial
+    gyro, accelerometer = drawn_errors(GRADES[grade], exact.interval_s, rng)
+    rate, force = exact.angular_rate_radps + gyro, exact.specific_force_mps2 + accelerometer
+    return replace(reference, inertial=replace(exact, angular_rate_radps=rate, specific_force_mps2=force))
 
 
 def _none() -> Sightings:
