@@ -23,6 +23,8 @@ from perilune_shared.errors import EXIT_INTERRUPTED, UserError
 from perilune_shared.threads import usable_cores
 
 BIN = Path(sys.executable).parent
+DRAWS = 10
+"""Flights of the filter over each test descent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +117,10 @@ def run_steps(demo: Demo, processes: Processes) -> None:
     if beside is not None:
         processes.end(beside, log)
     processes.run("train the navigators", demo.train("navigate", "train", dataset=demo.data / "nav"))
-    methods = demo.runs / "navigate" / f"{demo.name}-methods"
-    if not (methods / "methods.md").is_file():
-        place = ["--dataset", str(demo.data / "nav"), "--out", str(methods)]
-        processes.run("land with the filter", ["perilune-train", "navigate", "methods", *place])
+    landing = demo.runs / "navigate" / f"{demo.name}-landing"
+    if not (landing / "monte_carlo.md").is_file():
+        place = ["--draws", str(DRAWS), "--dataset", str(demo.data / "nav"), "--out", str(landing)]
+        processes.run("land with the filter", ["perilune-train", "navigate", "monte-carlo", *place])
     processes.run("explain", demo.train("explain", dataset=demo.data))
     report = demo.runs / "report" / demo.name
     place = ["--name", demo.name, "--dataset", str(demo.data), "--runs", str(demo.runs), "--out", str(report)]

@@ -23,11 +23,13 @@ def shown(tmp_path) -> tuple[Path, Path]:
     found = pd.read_parquet(trained / "detections.parquet")
     found[found["score"] == 0.9].to_parquet(installed / "detections.parquet")
     write_metrics(installed, {f"test/{key}": 0.9 for key in ("ap50_paper", "precision", "recall", "f1")})
-    methods = runs / "navigate" / "demo-methods"
-    methods.mkdir()
-    rows = pd.DataFrame({"method": ["klt", "filter"], "kind": ["relative", "absolute"], "n_frames": [4.0, 4.0]})
-    rows = rows.assign(position_rmse_m=[3.0, 1.25], attitude_rmse_deg=0.1, position_end_rmse_m=[9.0, 0.5])
-    rows.to_parquet(methods / "navigation.parquet")
+    landing = runs / "navigate" / "demo-landing"
+    landing.mkdir()
+    rows = pd.DataFrame(
+        {"scene_id": "s004", "trajectory_id": "t004", "draw": 0, "time_s": [0.0, 1.0], "status": "tracking"}
+    )
+    rows = rows.assign(error_m=[1.0, 0.5], squared=[5.0, 6.0])
+    rows.to_parquet(landing / "draws.parquet")
     return data, runs
 
 
@@ -52,7 +54,7 @@ def test_without_the_installed_detector_the_frames_are_those_of_the_run(shown):
 
 def test_the_landing_is_a_headline(shown):
     lines = gather("demo", "demo", *shown).summary
-    assert any("position RMSE 1.25 m over the descents, 0.5 m at their end" in line for line in lines)
+    assert any("position RMSE 1.46 m over the descents, 0.5 m at their end" in line for line in lines)
 
 
 def test_tiny_says_what_it_is_for(shown):

@@ -11,6 +11,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_train.evaluation.markdown import number
 from perilune_train.evaluation.spread import read_spread
+from perilune_train.navigate.monte_carlo.summary import by_trajectory, run_summary
 from perilune_train.report.content import Figure, Provenance, Section, Table
 from perilune_train.report.pictures import COLOURS, DASHES, drawing, label_axes, logarithmic, picture_of, plain, svg_of
 from perilune_train.report.sources import Run, sources_of
@@ -30,6 +31,18 @@ _METHOD_PICTURES = {
     "flights.png": "Errors of the filter along each descent, within three standard deviations.",
     "matches_high.png": "First frame: detections matched (cyan) and not (red), catalogue at the pose (yellow).",
     "matches_low.png": "Last frame, likewise.",
+}
+LANDING_TABLE = "draws.parquet"
+_LANDING_ROWS = ("scene_id", "trajectory_id", "draw", "time_s", "status", "error_m", "turn_deg", "squared")
+_LANDING_COLUMNS = {
+    "position_rmse_m": "position RMSE (m)",
+    "position_end_rmse_m": "at the end (m)",
+    "attitude_rmse_deg": "attitude RMSE (deg)",
+    "in_band_share": "share in the 95 % band",
+}
+_LANDING_PICTURES = {
+    "errors.png": "Errors of position over all draws: 50, 95 and 100 %, and the median of three stated sigmas.",
+    "consistency.png": "Mean normalised error squared over the draws of a descent; 6 if the covariance is right.",
 }
 _METHOD_COLUMNS = {
     "kind": "kind",
@@ -96,14 +109,34 @@ def _starts(runs: Sequence[Run]) -> list[str]:
     return [f"{name} started {start}." for name, start in starts.items() if not start.startswith("from scratch")]
 
 
-def landing_of(folder: Path) -> str | None:
-    """The filter's errors in one line, from the folder of `make navigate`; None if the filter was not flown."""
-    rows = _read(folder / "navigation.parquet", None)
-    own = rows[rows["method"] == "filter"] if "method" in rows else rows.iloc[:0]
-    if not len(own):
-        return None
-    over, end = (number(own[key].iloc[0]) for key in ("position_rmse_m", "position_end_rmse_m"))
+def landing_section(folder: Path, sources: tuple[Provenance, ...]) -> Section:
+    """The filter with the installed detector over the test descents, from the folder of `navigate monte-carlo`."""
+    rows, columns = read_landing(folder), _LANDING_COLUMNS
+    cells = tuple(("/".join(ids), *(number(own[key]) for key in columns)) for ids, own in by_trajectory(rows).items())
+    table = Table("Descents, with all draws of each", ("descent", *columns.values()), cells, sources)
+    figures = [
+        Figure(picture_of(folder / name, caption), caption, sources, wide=True)
+        for name, caption in _LANDING_PICTURES.items()
+        if (folder / name).is_file()
+    ]
+    lead = (
+        landing_headline(rows),
+        "The filter uses the installed detector, a catalogue of the craters with errors, a tactical inertial unit and "
+        "an altimeter. Draws differ in the errors of the start, of the catalogue and of the inertial unit.",
+    )
+    return Section("landing", "Landing with the filter", lead, (table,), tuple(figures))
+
+
+def landing_headline(rows: pd.DataFrame) -> str:
+    """The filter's errors in one line, from its table of draws."""
+    own = run_summary(rows)
+    over, end = number(own["position_rmse_m"]), number(own["position_end_rmse_m"])
     return f"landing (installed detector, filter): position RMSE {over} m over the descents, {end} m at their end"
+
+
+def read_landing(folder: Path) -> pd.DataFrame:
+    """The table of draws. Raises UserError if it is damaged."""
+    return _read(folder / LANDING_TABLE, _LANDING_ROWS)
 
 
 def scores_section(scores: Sequence[Run]) -> Section:

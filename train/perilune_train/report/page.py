@@ -18,7 +18,7 @@ from perilune_shared.errors import UserError
 from perilune_shared.storage.files import sha256_of, write_text
 from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.split import DetectSplit, load_split
-from perilune_train.evaluation.metrics_file import METRICS_FILE, read_metrics
+from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.paper.detections import read_detections
 from perilune_train.report import detection, explanation, navigation
 from perilune_train.report.content import Provenance, Report, Section, Viewer
@@ -130,6 +130,8 @@ def _open(folders: Folders, root: Path) -> _Opened:
         runs[part] = [run for run in read.values() if run is not None]
         missing += [f"{part} run {path.name}: no finished run" for path, run in read.items() if run is None]
     scores = [read_run(path, root, SCORE_FILE) for path in folders.scores]
+    if folders.landing is not None and not (folders.landing / navigation.LANDING_TABLE).is_file():
+        missing.append(f"landing {folders.landing.name}")
     missing += [f"methods {path.name}" for path in folders.methods if not (path / "navigation.parquet").is_file()]
     return _Opened(datasets, **runs, scores=[one for one in scores if one is not None], missing=tuple(missing))
 
@@ -149,11 +151,14 @@ def _run_sections(folders: Folders, opened: _Opened, frames: LabelledFrames | No
     others = [one for one in opened.scores if one not in scored]
     if others:
         sections.append(navigation.scores_section(others))
+    if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
+        source = provenance_of(folders.landing, root, _metrics_of(folders.landing))
+        table = {navigation.LANDING_TABLE: sha256_of(folders.landing / navigation.LANDING_TABLE)}
+        source = replace(source, inputs=source.inputs | table)
+        sections.append(navigation.landing_section(folders.landing, (source,)))
     for folder in folders.methods:
         if (folder / "navigation.parquet").is_file():
-            # An older folder has no record of its own.
-            metrics = read_metrics(folder) if (folder / METRICS_FILE).is_file() else {}
-            source = provenance_of(folder, root, metrics)
+            source = provenance_of(folder, root, _metrics_of(folder))
             table = {"navigation.parquet": sha256_of(folder / "navigation.parquet")}
             source = replace(source, inputs=source.inputs | table)
             sections.append(navigation.methods_section(folder, (source,)))
@@ -161,6 +166,11 @@ def _run_sections(folders: Folders, opened: _Opened, frames: LabelledFrames | No
         title = "Explanation: rendered interventions" if run.name.endswith("-causal") else "Explanation"
         sections.append(explanation.explanation_section(run, f"explanation-{number}", title))
     return sections
+
+
+def _metrics_of(folder: Path) -> Metrics:
+    """Metrics of a folder; nothing if it is older than its record."""
+    return read_metrics(folder) if (folder / METRICS_FILE).is_file() else {}
 
 
 def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
@@ -175,9 +185,8 @@ def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
 def _headlines(opened: _Opened, folders: Folders) -> list[str]:
     """What `tiny` is for, the landing, then a line for each run, those of explanation first."""
     lines = [_TRIAL] if any(one.info.name == "tiny" for one in opened.datasets.values()) else []
-    for folder in folders.methods:
-        if (folder / "navigation.parquet").is_file() and (landing := navigation.landing_of(folder)):
-            lines.append(landing)
+    if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
+        lines.append(navigation.landing_headline(navigation.read_landing(folders.landing)))
     lines += [f"{run.name}: {found}" for run in opened.explain if (found := explanation.headline_of(run))]
     lines += [detection.headline(run) for run in reversed(opened.detect)]
     lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]

@@ -53,6 +53,8 @@ class Folders:
     """Runs of explanation, and of rendered interventions."""
     scores: tuple[Path, ...] = ()
     """Scores on the locked benchmark."""
+    landing: Path | None = None
+    """The filter over draws of the test descents."""
     page: Path | None = None
     """Folder with paper.json and pictures of the paper's experiment."""
 
@@ -73,6 +75,7 @@ def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:
             (navigate / name, navigate / f"{name}-stack"),
             (navigate / f"{name}-methods",),
             (runs / "explain" / name, runs / "explain" / f"{name}-causal"),
+            landing=navigate / f"{name}-landing",
         )
     if kind == "paper":
         return Folders(
@@ -82,7 +85,7 @@ def folders_of(kind: Kind, name: str, dataset: Path, runs: Path) -> Folders:
             (),
             (runs / "explain" / EXPLAINED, runs / "explain" / f"{EXPLAINED}-causal"),
             _scores(runs),
-            runs,
+            page=runs,
         )
     found = sorted(path.parent for path in dataset.glob(f"benchmark-*/{INFO_NAME}"))
     return Folders(tuple(found), (), (), (), (), _scores(runs))
