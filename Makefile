@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-serve bench-infer bench-latency bench-shared results clean
+.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-profile bench-serve bench-infer bench-latency bench-shared results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -250,6 +250,9 @@ bench-plan: setup-dev ## time and memory of planning 10 million frames; writes r
 
 bench-memory: setup-dev ## resident memory of a process that renders 5000 frames; writes runs/bench/memory.json
 	@$(BIN)/python -m benchmarks.dataset.memory
+
+bench-profile: setup-dev ## processor time of each step of a frame with the engine heightfield; writes runs/bench/profile_frames.json
+	@$(BIN)/python -m benchmarks.dataset.profile_frames
 
 bench-develop: setup-dev ## frames developed per second on one core; writes runs/bench/develop.json
 	@$(BIN)/python -m benchmarks.dataset.develop

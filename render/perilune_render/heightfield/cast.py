@@ -9,6 +9,7 @@ Ground is crossed where the ray's height over a triangle changes its sign, so no
 
 import numpy as np
 
+from perilune_render.heightfield.horizon import surely_lit
 from perilune_render.heightfield.surface import INLINED, WITHOUT_COUNTS, ring_vertex
 from perilune_render.provenance.kernels import njit
 
@@ -149,7 +150,7 @@ def _cross_sector(vertex, half_widths, n, side, ring, place, a0, da, d0, dd, oz,
 
 
 @njit(**INLINED)
-def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
+def _walk_inner(ground, rocks, horizon, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit in the inner square between t0 and t1; see `first_hit`."""
     n, coarsest = ground.n_half, ground.level[0, -1]
     cells = 2 * n
@@ -160,7 +161,7 @@ def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     i = min(max(int(p0 + t * dp), 0), cells - 1)
     j = min(max(int(q0 + t * dq), 0), cells - 1)
     level = min(_FIRST_LEVEL, coarsest)
-    best, best_rock, best_face = np.inf, -1, -1
+    best, best_rock, best_face, above = np.inf, -1, -1, False
     while t < t1:
         bi, bj = i >> level, j >> level
         tp = tq = np.inf
@@ -179,6 +180,7 @@ def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
             if min(oz + t * dz, oz + end * dz) <= top:
                 level -= 1
                 continue
+            above = True
         else:
             if ground.vertex[j * (cells + 1) + i, 3] < 0:
                 cell = j * cells + i
@@ -192,6 +194,8 @@ def _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
         if best <= end:
             break
         t = end
+        if horizon is not None and above and surely_lit(horizon, ox + t * dx, oy + t * dy, oz + t * dz):
+            return -np.inf, -1, -1, -1, -1, -1, -1
         if t >= t1:
             break
         if tp <= tq:
@@ -224,8 +228,20 @@ def _ring_at(half_widths, d, low, high):
     return low
 
 
+@njit(inline="always", **WITHOUT_COUNTS)
+def any_ring_at(ground, d, high):
+    """`_ring_at` among all rings, by a table."""
+    half_widths, table = ground.half_widths_m, ground.ring
+    ring = table[min(max(int((d - half_widths[0]) * ground.rings_per_m), 0), len(table) - 1)]
+    while ring < high and half_widths[ring + 1] <= d:
+        ring += 1
+    while ring > 0 and half_widths[ring] > d:
+        ring -= 1
+    return ring
+
+
 @njit(**INLINED)
-def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
+def _walk_sector(ground, rocks, horizon, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit in a sector between t0 and t1; see `first_hit`."""
     n, coarsest = ground.n_half, ground.level[1, -1]
     n_rings, places = len(ground.half_widths_m) - 1, 2 * n
@@ -241,10 +257,10 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     turning, per_d, per_n = da * d0 - a0 * dd, 1 / dd if dd != 0 else 0.0, 1 / n
     t, rises = t0, dz > 0
     d = d0 + t * dd
-    ring = _ring_at(half, d, 0, n_rings - 1)
+    ring = any_ring_at(ground, d, n_rings - 1)
     place = min(max(int(((a0 + t * da) / d + 1) * n), 0), places - 1)
     level = min(_FIRST_LEVEL, coarsest)
-    best, best_rock, best_face = np.inf, -1, -1
+    best, best_rock, best_face, above = np.inf, -1, -1, False
     while t < t1:
         br, bp = ring >> level, place >> level
         first_ring, last_ring = br << level, min((br + 1) << level, n_rings)
@@ -269,6 +285,7 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
             if min(oz + t * dz, oz + end * dz) <= top:
                 level -= 1
                 continue
+            above = True
         else:
             if ground.vertex[ring_vertex(ring, side * places + place, n), 3] < 0:
                 cell = 4 * n * n + (side * n_rings + ring) * places + place
@@ -284,6 +301,8 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
         if best <= end:
             break
         t = end
+        if horizon is not None and above and surely_lit(horizon, ox + t * dx, oy + t * dy, oz + t * dz):
+            return -np.inf, -1, -1, -1, -1, -1, -1
         if t >= t1:
             break
         if tr <= tp:
@@ -304,10 +323,12 @@ def _walk_sector(ground, rocks, side, ox, oy, oz, dx, dy, dz, t0, t1, skip):
 
 
 @njit(**INLINED)
-def first_hit(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
+def first_hit(ground, rocks, horizon, ox, oy, oz, dx, dy, dz, t0, t1, skip):
     """The first hit of the ray o + t d, relative to the grid's centre, with t0 < t < t1.
 
-    `skip` is the triangle (part, row, column, triangle) and the boulder that the ray starts on, -1 for none. Returns
+    `skip` is the triangle (part, row, column, triangle) and the boulder that the ray starts on, -1 for none. A ray to
+    the Sun's disc may have its `horizon`, others None: where the ray comes to a place that is surely lit, nothing is
+    ahead of it, and t is -inf. Returns
     t (inf for no hit), boulder and its face (-1 for the ground), and the cell: part (NO_PART, 0 for the inner square, 1
     to 4 for the sectors), row (y or ring), column (x or place), and triangle (-1 for a boulder).
     """
@@ -338,11 +359,13 @@ def first_hit(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1, skip):
             middle = 0.5 * (start + end)
             x, y = ox + middle * dx, oy + middle * dy
             if max(abs(x), abs(y)) <= half:
-                found = _walk_inner(ground, rocks, ox, oy, oz, dx, dy, dz, start, end, skip)
+                found = _walk_inner(ground, rocks, horizon, ox, oy, oz, dx, dy, dz, start, end, skip)
             elif abs(x) >= abs(y):
-                found = _walk_sector(ground, rocks, 1 if x > 0 else 3, ox, oy, oz, dx, dy, dz, start, end, skip)
+                side = 1 if x > 0 else 3
+                found = _walk_sector(ground, rocks, horizon, side, ox, oy, oz, dx, dy, dz, start, end, skip)
             else:
-                found = _walk_sector(ground, rocks, 2 if y > 0 else 0, ox, oy, oz, dx, dy, dz, start, end, skip)
+                side = 2 if y > 0 else 0
+                found = _walk_sector(ground, rocks, horizon, side, ox, oy, oz, dx, dy, dz, start, end, skip)
             if found[0] < np.inf:
                 return found
         start = end

@@ -61,11 +61,13 @@ class HeightfieldEngine:
         self._disc_rad = np.float32(np.radians(config.light.sun_angular_diameter_deg) / 2)
         self._far_m = scene.grid.farthest_m
         self.horizon, self._n_rays = NOWHERE, 0
-        self._threads = ThreadPoolExecutor(n_threads, "rays")
+        # One thread is the caller's: handing tiles over takes longer than that.
+        self._threads = ThreadPoolExecutor(n_threads, "rays") if n_threads > 1 else None
 
     def close(self) -> None:
-        """End the threads."""
-        self._threads.shutdown()
+        """End the threads, if there are any."""
+        if self._threads is not None:
+            self._threads.shutdown()
 
     def __enter__(self) -> "HeightfieldEngine":
         return self
@@ -132,7 +134,11 @@ class HeightfieldEngine:
         tile_rows = max(_RAYS_AT_ONCE // (_TILE_PX * self._samples), 1)
         columns = range(0, self.camera.width_px, _TILE_PX)
         firsts = [(row, column) for row in range(rows.start, rows.stop, tile_rows) for column in columns]
-        list(self._threads.map(cast, firsts))
+        if self._threads is not None:
+            list(self._threads.map(cast, firsts))
+            return
+        for each in firsts:
+            cast(each)
 
     def _disc(self, drawn: np.ndarray) -> np.ndarray:
         """Uniform places (..., 2) on the Sun's disc at unit distance, for uniform random numbers (..., 2)."""

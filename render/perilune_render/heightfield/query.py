@@ -44,7 +44,7 @@ def _hits(ground, rocks, origins, directions):
         ox, oy, oz = origins[k]
         dx, dy, dz = directions[k]
         t, rock, face, part, row, column, triangle = first_hit(
-            ground, rocks, ox, oy, oz, dx, dy, dz, 0.0, np.inf, (-1, -1, -1, -1, -1)
+            ground, rocks, None, ox, oy, oz, dx, dy, dz, 0.0, np.inf, (-1, -1, -1, -1, -1)
         )
         distance[k] = t
         if rock >= 0:

@@ -3,9 +3,10 @@
 import numpy as np
 
 from perilune_render.heightfield.beam import BLOCK_PX, begin_m
-from perilune_render.heightfield.cast import first_hit
+from perilune_render.heightfield.cast import any_ring_at, first_hit
 from perilune_render.heightfield.horizon import surely_lit
-from perilune_render.heightfield.surface import INLINED, WITHOUT_COUNTS, place_of, vertex
+from perilune_render.heightfield.prefetch import prefetch
+from perilune_render.heightfield.surface import INLINED, WITHOUT_COUNTS, place_of, ring_vertex, vertex
 from perilune_render.provenance.kernels import njit
 
 _LIFT = 1e-4
@@ -113,7 +114,10 @@ def rock_normal(rocks, k, face):
 
 @njit(**INLINED)
 def _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out):
-    """Cast the ray of one sample, which begins at the height `begin`, and its shadow ray; see `see`."""
+    """Cast the ray of one sample, which begins at the height `begin`, and its shadow ray; see `see`.
+
+    Returns the height of the hit, or `begin` if there is none.
+    """
     (origin, basis, sun, plane, far_m), (moved, disc), (depth, normal, angles) = view, drawn, out
     u, v = first[1] + j + 0.5 + moved[s, i, j, 0], first[0] + i + 0.5 + moved[s, i, j, 1]
     dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
@@ -121,10 +125,11 @@ def _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out):
     dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
     start = max((begin - origin[2]) / dz, 0.0) if begin < np.inf else 0.0
     t, rock, face, part, row, column, triangle = first_hit(
-        ground, rocks, origin[0], origin[1], origin[2], dx, dy, dz, start, far_m, (-1, -1, -1, -1, -1)
+        ground, rocks, None, origin[0], origin[1], origin[2], dx, dy, dz, start, far_m, (-1, -1, -1, -1, -1)
     )
     nx, ny, nz, albedo, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
+    hit_z = z if t < np.inf else begin
     if rock >= 0:
         nx, ny, nz = rock_normal(rocks, rock, face)
         albedo = 1.0
@@ -146,7 +151,7 @@ def _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out):
     angles[3, s, i, j] = albedo
     angles[4, s, i, j] = 0.0
     if cosine <= 0:
-        return
+        return hit_z
     skip = (-1, -1, -1, -1, rock)
     if rock < 0:
         skip = (part, row, column, triangle, -1)
@@ -158,9 +163,40 @@ def _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out):
             x, y, z = x + moves * mx, y + moves * my, z + moves * mz
         elif surely_lit(horizon, x, y, z):
             angles[4, s, i, j] = cosine
-            return
-    if first_hit(ground, rocks, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0] == np.inf:
+            return hit_z
+    if abs(first_hit(ground, rocks, horizon, x, y, z, lx, ly, lz, _LIFT, np.inf, skip)[0]) == np.inf:
         angles[4, s, i, j] = cosine
+    return hit_z
+
+
+@njit(**INLINED)
+def _read_ahead(ground, horizon, x, y):
+    """Begin to read what a ray needs that hits the ground near a place."""
+    n, half = ground.n_half, ground.half_widths_m
+    i = int((x * horizon.along_x + y * horizon.along_y + horizon.edge_m) * horizon.per_m)
+    j = int((y * horizon.along_x - x * horizon.along_y + horizon.edge_m) * horizon.per_m)
+    squares = horizon.clear_m.shape[0]
+    if 0 <= i < squares and 0 <= j < squares:
+        prefetch(horizon.clear_m, i * squares + j)
+    d = max(abs(x), abs(y))
+    if d < half[0]:
+        per_step = n / half[0]
+        column, row = int(x * per_step + n), int(y * per_step + n)
+        at = row * (2 * n + 1) + column
+        prefetch(ground.vertex, 4 * at)
+        prefetch(ground.vertex, 4 * (at + 2 * n + 1))
+        prefetch(ground.top_m, ground.level[0, 1] + (row >> 1) * n + (column >> 1))
+    elif d < half[-1]:
+        n_rings = len(half) - 1
+        ring = any_ring_at(ground, d, n_rings - 1)
+        if abs(x) >= abs(y):
+            side, along = (1, y) if x > 0 else (3, -y)
+        else:
+            side, along = (2, -x) if y > 0 else (0, x)
+        place = int((along / d + 1) * n)
+        prefetch(ground.vertex, 4 * ring_vertex(ring, side * 2 * n + place, n))
+        prefetch(ground.vertex, 4 * ring_vertex(ring + 1, side * 2 * n + place, n))
+        prefetch(ground.top_m, ground.level[1, 1] + (side * ((n_rings + 1) >> 1) + (ring >> 1)) * n + (place >> 1))
 
 
 @njit(**WITHOUT_COUNTS)
@@ -177,13 +213,25 @@ def see(ground, rocks, tops, horizon, origin, basis, sun, plane, far_m, first, m
     The samples of a pixel come one after another, since they read the same memory.
     """
     n_samples, height, width, _ = moved.shape
+    near_m = ground.highest_m
     view, drawn, out = (origin, basis, sun, plane, far_m), (moved, disc), (depth, normal, angles)
     for row in range(0, height, BLOCK_PX):
         for column in range(0, width, BLOCK_PX):
             last_row, last_column = min(row + BLOCK_PX, height), min(column + BLOCK_PX, width)
             u, v = first[1] + column, first[0] + row
             begin = begin_m(tops, ground, origin, basis, u, u + last_column - column, v, v + last_row - row)
+            if begin < np.inf:
+                # Close rays hit at similar heights, so the last hit says where memory will be read.
+                for i in range(row, last_row):
+                    for j in range(column, last_column):
+                        for s in range(n_samples):
+                            u, v = first[1] + j + 0.5 + moved[s, i, j, 0], first[0] + i + 0.5 + moved[s, i, j, 1]
+                            dx = u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]
+                            dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
+                            dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
+                            t = (near_m - origin[2]) / dz
+                            _read_ahead(ground, horizon, origin[0] + t * dx, origin[1] + t * dy)
             for i in range(row, last_row):
                 for j in range(column, last_column):
                     for s in range(n_samples):
-                        _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out)
+                        near_m = _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out)

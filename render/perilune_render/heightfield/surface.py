@@ -51,6 +51,10 @@ class Ground(NamedTuple):
     """Height below all ground, metres."""
     highest_m: float
     """Height above all ground and boulders, metres."""
+    ring: np.ndarray
+    """The ring at equal steps of the distance max(|x|, |y|) from that of the first ring (N,) int64."""
+    rings_per_m: float
+    """Elements of `ring` per metre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +76,7 @@ def surface_of(scene: Scene) -> Surface:
     height = np.ascontiguousarray(scene.height_m, np.float32)
     rocks, tops = rocks_of(scene)
     _raise_to_ground(height, n, *tops)
-    pyramids = [_pyramid(tops[0][None]), _pyramid(tops[1])]
+    pyramids = [_levels(tops[0][None]), _levels(tops[1])]
     starts = np.zeros((2, _MOST_LEVELS + 1), np.int64)
     for part, levels in enumerate(pyramids):
         before = 0 if part == 0 else sum(map(len, pyramids[0]))
@@ -81,21 +85,44 @@ def surface_of(scene: Scene) -> Surface:
     top = np.concatenate([level for levels in pyramids for level in levels])
     highest = max(float(part.max()) for part in tops if part.size)
     vertices = np.empty((len(height), 4), np.float32)
-    vertices[:, :2], vertices[:, 2], vertices[:, 3] = _vertex_normals(n, half, height), height, scene.albedo
+    vertices[:, 2], vertices[:, 3] = height, scene.albedo
+    _write_normals(n, half, height, vertices)
     _mark_rocks(vertices, n, rocks.cell_start, len(half) - 1)
-    ground = Ground(half, vertices, top, starts, n, float(height.min()) - _MARGIN_M, highest + _MARGIN_M)
+    bounds = float(height.min()) - _MARGIN_M, highest + _MARGIN_M
+    ground = Ground(half, vertices, top, starts, n, *bounds, *_ring_table(half))
     return Surface(ground, rocks, (grid.centre_x_m, grid.centre_y_m))
 
 
-def _pyramid(tops: np.ndarray) -> list[np.ndarray]:
+def _ring_table(half_widths: Array) -> tuple[np.ndarray, float]:
+    """`Ground.ring` and `Ground.rings_per_m`: four elements for each ring on average."""
+    n_rings = len(half_widths) - 1
+    width, count = half_widths[-1] - half_widths[0], 4 * max(n_rings, 1)
+    steps = half_widths[0] + width / count * np.arange(count)
+    ring = np.clip(np.searchsorted(half_widths, steps, side="right") - 1, 0, max(n_rings - 1, 0))
+    return ring, float(count / width) if n_rings else 0.0
+
+
+def _levels(tops: np.ndarray) -> list[np.ndarray]:
     """Levels from 1 of the largest values of `tops` (sides, rows, columns), each flat."""
     levels: list[np.ndarray] = []
     level = tops
     while not levels or (max(level.shape[1:]) > 1 and len(levels) < _MOST_LEVELS - 1):
-        padded = np.pad(level, ((0, 0), (0, level.shape[1] % 2), (0, level.shape[2] % 2)), constant_values=-np.inf)
-        level = padded.reshape(len(tops), padded.shape[1] // 2, 2, padded.shape[2] // 2, 2).max(axis=(2, 4))
+        level = _coarser(level)
         levels.append(level.ravel())
     return levels
+
+
+@njit()
+def _coarser(tops):
+    """The largest values of blocks of 2 x 2 of `tops` (sides, rows, columns); fewer at the end of an odd length."""
+    n_sides, n_rows, n_columns = tops.shape
+    found = np.full((n_sides, (n_rows + 1) // 2, (n_columns + 1) // 2), -np.inf, np.float32)
+    for side in range(n_sides):
+        for row in range(n_rows):
+            for column in range(n_columns):
+                top = found[side, row >> 1, column >> 1]
+                found[side, row >> 1, column >> 1] = max(top, tops[side, row, column])
+    return found
 
 
 @njit(inline="always")
@@ -174,8 +201,8 @@ def _add_face(part, row, column, n, half_widths, height, points, total):
 
 
 @njit()
-def _vertex_normals(n, half_widths, height):
-    """x and y of the unit vertex normals (V, 2) as Blender's: means of the faces' normals, weighted by the angles."""
+def _write_normals(n, half_widths, height, vertices):
+    """Write x and y of the unit vertex normals as Blender's: means of the faces' normals, weighted by the angles."""
     total, points = np.zeros((len(height), 3)), np.empty((4, 3))
     for j in range(2 * n):
         for i in range(2 * n):
@@ -186,8 +213,7 @@ def _vertex_normals(n, half_widths, height):
                 _add_face(side + 1, ring, t, n, half_widths, height, points, total)
     for k in range(len(height)):
         length = np.sqrt(total[k, 0] ** 2 + total[k, 1] ** 2 + total[k, 2] ** 2)
-        total[k] /= length
-    return total[:, :2]
+        vertices[k, 0], vertices[k, 1] = total[k, 0] / length, total[k, 1] / length
 
 
 @njit()

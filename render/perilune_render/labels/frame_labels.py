@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from perilune_render.imaging.radiance import Radiance
-from perilune_render.labels.pixels import contrasts, smallest_crater, sunlit_fractions
+from perilune_render.labels.pixels import centred_in, contrasts, smallest_crater, sunlit_fractions
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses, plane_basis, project_circles, rim_points
@@ -106,9 +106,12 @@ def label_frame(
     (`perilune_render.imaging.resampling.seen_by`). The contrast also depends on the sensor and is NaN here:
     `with_contrast` measures it.
     """
-    in_camera = camera_from_site(circles.centre_m, position_m, rotation_camera_from_site)
-    rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
-    candidate = np.flatnonzero(camera.inside(camera.project(in_camera)) & (rough > 0.5 * min_radius_px))
+    in_camera = _in_camera(circles.centre_m, position_m, rotation_camera_from_site)
+    if any(camera.distortion):
+        rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
+        candidate = np.flatnonzero(camera.inside(camera.project(in_camera)) & (rough > 0.5 * min_radius_px))
+    else:
+        candidate = np.flatnonzero(centred_in(camera, in_camera, circles.radius_m, 0.5 * min_radius_px))
     ellipses = project_circles(
         camera,
         in_camera[candidate],
@@ -129,6 +132,14 @@ def label_frame(
     lit = sunlit_fractions(ellipses, radiance.sunlit)
     n_above = int((radius > max_radius_px).sum())
     return Labels(circles.crater_id[rows], ellipses, visible, lit, np.full(len(rows), np.nan), n_above)
+
+
+def _in_camera(points_m: Array, position_m: Array, rotation_camera_from_site: Array) -> Array:
+    """`camera_from_site` for many points (N, 3): NumPy subtracts columns ten times as fast as rows of three numbers."""
+    offset = np.empty_like(points_m)
+    for k in range(3):
+        np.subtract(points_m[:, k], position_m[k], out=offset[:, k])
+    return offset @ rotation_camera_from_site.T
 
 
 def with_contrast(

@@ -13,6 +13,27 @@ REACH = 1.5
 _N_FITTED = 4
 
 
+def centred_in(camera: Camera, centre_m: Array, radius_m: Array, least_px: float) -> np.ndarray:
+    """Whether circles (N, 3), (N,) in O_C are centred in an image without distortion, and wider than a radius (N,).
+
+    The same as `Camera.project` and `Camera.inside`, to the bit, without arrays between the steps.
+    """
+    pinhole = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+    return _centred_in(centre_m, radius_m, pinhole, camera.width_px, camera.height_px, least_px)
+
+
+@njit()
+def _centred_in(centre, radius, pinhole, width, height, least):
+    fx, fy, cx, cy = pinhole
+    found = np.zeros(len(centre), np.bool_)
+    for k in range(len(centre)):
+        z = centre[k, 2]
+        if z > 0 and fx * radius[k] / max(z, 1e-9) > least:
+            u, v = fx * (centre[k, 0] / z) + cx, fy * (centre[k, 1] / z) + cy
+            found[k] = 0 <= u < width and 0 <= v < height
+    return found
+
+
 def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:
     """Share (N,) of lit pixels in `sunlit` (h, w) bool among those with their centre in each of N ellipses.
 

@@ -9,7 +9,7 @@ from perilune_render.config import LabelsConfig, SensorConfig
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import expected, expose
 from perilune_render.labels.frame_labels import RimCircles, Shown, crater_index, label_frame, with_contrast
-from perilune_render.labels.pixels import REACH, contrasts, sunlit_fractions
+from perilune_render.labels.pixels import REACH, centred_in, contrasts, sunlit_fractions
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
@@ -191,3 +191,16 @@ def test_the_instance_image_is_the_smallest_of_the_masks(hidden):
 
 def test_the_rule_of_visible_counts_the_pixels_in_which_contrast_is_measured():
     assert REACH == REACH_RADII
+
+
+def test_craters_centred_in_the_image_are_those_that_the_camera_projects_into_it():
+    rng = np.random.default_rng(3)
+    centre = rng.normal(0, 100, (5000, 3))
+    # On the image's left and upper edge, and outside its right and lower edge.
+    x, y = -CAMERA.cx_px / CAMERA.fx_px, -CAMERA.cy_px / CAMERA.fy_px
+    centre[:4] = [[x, 0, 1], [0, y, 1], [-x, 0, 1], [0, -y, 1]]
+    radius = np.concatenate([np.ones(4), rng.uniform(0, 20, 4996)])
+    expected_px = CAMERA.fx_px * radius / np.maximum(centre[:, 2], 1e-9)
+    expected_in = CAMERA.inside(CAMERA.project(centre)) & (expected_px > 4.0)
+    assert expected_in[:2].all() and not expected_in[2:4].any() and expected_in.sum() > 200
+    np.testing.assert_array_equal(centred_in(CAMERA, centre, radius, 4.0), expected_in)

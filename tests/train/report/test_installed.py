@@ -9,6 +9,7 @@ import pytest
 from tests.train.report.conftest import make_data, make_runs
 
 from perilune_train.evaluation.metrics_file import write_metrics
+from perilune_train.report.content import Report
 from perilune_train.report.page import gather
 
 
@@ -19,25 +20,27 @@ def shown(tmp_path) -> tuple[Path, Path]:
     runs = make_runs(tmp_path / "runs", data)
     trained, installed = runs / "detect" / "demo", runs / "detect" / "demo-installed"
     installed.mkdir()
-    # Only true detections: half of those of the trained network, which are below its threshold there.
+    # Without the false detections of the trained network.
     found = pd.read_parquet(trained / "detections.parquet")
     found[found["score"] == 0.9].to_parquet(installed / "detections.parquet")
     write_metrics(installed, {f"test/{key}": 0.9 for key in ("ap50_paper", "precision", "recall", "f1")})
     landing = runs / "navigate" / "demo-landing"
     landing.mkdir()
-    rows = pd.DataFrame(
-        {"scene_id": "s004", "trajectory_id": "t004", "draw": 0, "time_s": [0.0, 1.0], "status": "tracking"}
-    )
-    rows = rows.assign(error_m=[1.0, 0.5], squared=[5.0, 6.0])
+    rows = pd.DataFrame({"scene_id": "s004", "trajectory_id": "t004", "draw": 0, "time_s": [0.0, 1.0]})
+    rows = rows.assign(status="tracking", error_m=[2.0, 0.5], turn_deg=0.1, squared=[5.0, 6.0])
     rows.to_parquet(landing / "draws.parquet")
     return data, runs
 
 
+def scores_of(report: Report) -> set[float]:
+    """Scores of the detections on the frames of the viewer."""
+    assert report.viewer is not None
+    return {mark.shape[4] for frame in report.viewer.frames for mark in frame.detections}
+
+
 def test_the_frames_are_those_of_the_installed_detector(shown):
     report = gather("demo", "demo", *shown)
-    assert report.viewer is not None
-    kinds = {mark.kind for frame in report.viewer.frames for mark in frame.detections}
-    assert kinds == {"matched"}
+    assert scores_of(report) == {0.9}
     assert any("demo-installed: AP 0.900" in line for line in report.summary)
     section = next(section for section in report.sections if section.key == "detection")
     assert any("is the installed detector" in line for line in section.lead)
@@ -47,8 +50,7 @@ def test_without_the_installed_detector_the_frames_are_those_of_the_run(shown):
     data, runs = shown
     shutil.rmtree(runs / "detect" / "demo-installed")
     report = gather("demo", "demo", data, runs)
-    assert report.viewer is not None
-    assert {mark.kind for frame in report.viewer.frames for mark in frame.detections} == {"matched", "false"}
+    assert scores_of(report) == {0.8, 0.9}
     assert "detect run demo-installed: no finished run" in report.missing
 
 
