@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-Preset = Annotated[str, typer.Option(help="Preset with the values of all settings: tiny, small, paper or large.")]
+Preset = Annotated[str, typer.Option(help="Preset with the values of all settings: tiny, demo, small, paper or large.")]
 ConfigFile = Annotated[
     Path | None, typer.Option(help="YAML file whose section (detect, navigate or explain) overrides the preset.")
 ]

@@ -18,7 +18,7 @@ KindChoice = Literal[Kind, "both"]
 Preset = Annotated[
     str,
     typer.Option(
-        help="tiny (seconds, for tests), small (minutes), paper (the paper's protocol), large (343 terrains)."
+        help="tiny (seconds, for tests), demo and small (minutes), paper (the paper's protocol), large (343 terrains)."
     ),
 ]
 Config = Annotated[Path | None, typer.Option(help="YAML file whose section `dataset` overrides the preset.")]
