@@ -63,6 +63,7 @@ def test_the_benchmark_has_test_frames_under_low_and_high_suns(kind):
     assert min(altitude) < 220 and max(altitude) > 1480
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_frame_is_made_again(name, tmp_path):
     """The reference picture was rendered with the manifest; another kind of machine may differ in single pixels."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from tests.helpers.coco_reference import coco_evaluation
+from tests.train.detect.evaluate.coco_reference import coco_evaluation
 from typer.testing import CliRunner
 
 from perilune_shared.config import resolve
