@@ -33,7 +33,11 @@ def test_all_are_here():
     )
 
 
-@pytest.mark.parametrize("name", NAMES)
+LARGE = ("large-detect", "paper-detect")
+"""Manifests that take seconds to validate."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LARGE else []) for n in NAMES])
 def test_it_is_whole_and_named_in_the_readme(name):
     dataset = open_dataset(FOLDER / name)
     assert validate(dataset) == [] and dataset.info.images == "planned"

@@ -137,8 +137,10 @@ def test_developed_frames_are_made_again_with_the_first_camera_ground(quick, tmp
     assert (outcome.png, outcome.exr, outcome.state) == ("identical", None, "identical") and outcome.same_ground
 
 
-def test_verify_counts_what_is_the_same(tiny):
-    made = run("regenerate", "--manifest", tiny / "detect", "--verify", "--sample", "3")
+@pytest.mark.parametrize("made_by", ["quick", pytest.param("tiny", marks=pytest.mark.slow)])
+def test_verify_counts_what_is_the_same(request, made_by):
+    source = request.getfixturevalue(made_by) / "detect"
+    made = run("regenerate", "--manifest", source, "--verify", "--sample", "3")
     assert made.returncode == 0 and "3 frames: 3 identical" in made.stdout
 
 

@@ -65,9 +65,15 @@ def hashes(dataset):
     return dataset.table("frames", ["png_sha256"]).to_pandas()["png_sha256"].tolist()
 
 
+@pytest.fixture(params=["quick", pytest.param("tiny", marks=pytest.mark.slow)])
+def rendered(request):
+    """Datasets rendered by either engine."""
+    return request.getfixturevalue(request.param)
+
+
 @pytest.mark.parametrize("kind", ["detect", "nav"])
-def test_a_rendered_dataset_has_no_fault(tiny, kind):
-    assert validate(open_dataset(tiny / kind)) == []
+def test_a_rendered_dataset_has_no_fault(rendered, kind):
+    assert validate(open_dataset(rendered / kind)) == []
 
 
 def test_every_rendered_frame_counts_the_craters_that_are_too_large_for_a_label(quick):
@@ -75,8 +81,8 @@ def test_every_rendered_frame_counts_the_craters_that_are_too_large_for_a_label(
     assert counts["n_craters_above_max_radius"] == [0] * 24
 
 
-def test_frames_are_grey_lit_and_different(tiny):
-    dataset = open_dataset(tiny / "detect")
+def test_frames_are_grey_lit_and_different(rendered):
+    dataset = open_dataset(rendered / "detect")
     images = [
         cv2.imread(str(dataset.file(path)), cv2.IMREAD_UNCHANGED)
         for path in dataset.table("frames").to_pandas()["png_path"]
@@ -86,8 +92,8 @@ def test_frames_are_grey_lit_and_different(tiny):
     assert len({image.tobytes() for image in images}) == len(images) == 24
 
 
-def test_exr_holds_what_it_should(tiny):
-    dataset = open_dataset(tiny / "detect")
+def test_exr_holds_what_it_should(rendered):
+    dataset = open_dataset(rendered / "detect")
     frame = dataset.table("frames").to_pandas().iloc[3]
     exr = read_exr(dataset.file(frame.exr_path))
     assert set(exr) == set(CHANNELS) and all(c.dtype == np.float32 and c.shape == (128, 128) for c in exr.values())
