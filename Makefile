@@ -197,12 +197,13 @@ closed-loop: setup ## fly a descent in closed loop: guidance, navigation filter 
 	@$(BIN)/python examples/closed_loop.py --out "$(RUNS)/closed-loop"
 
 JOBS ?= 2
-test: setup-dev ## run all tests, in JOBS=2 processes
-	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --max-worker-restart=0
+# A test marked `slow` kills processes, starts Ray or a browser, or renders the shared manifests again.
+test: setup-dev ## run the tests, in JOBS=2 processes (SLOW=1 also runs those marked slow, as .ci/run does)
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --max-worker-restart=0 $(if $(SLOW),,-m "not slow")
 
 # Tracing slows every line of every library, on Python before 3.12.
-coverage: setup-dev ## run all tests and print their line coverage, which has no target; takes 1.6 times as long
-	@PYTEST_ADDOPTS="--cov --cov-report=term" $(MAKE) --no-print-directory test
+coverage: setup-dev ## run all tests, the slow ones too, and print their line coverage, which has no target; takes 1.6 times as long
+	@PYTEST_ADDOPTS="--cov --cov-report=term" $(MAKE) --no-print-directory test SLOW=1
 
 lint: setup-dev ## ruff (rules and format) and mypy
 	@$(BIN)/ruff check .

@@ -1,16 +1,16 @@
 """`config` prints every key with its meaning and default, as a file that can be given again."""
 
 import itertools
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
+from perilune_render.cli.main import main as render_main
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import Section, resolve
 from perilune_shared.config_page import annotated_yaml
 from perilune_train.cli import SECTIONS
+from perilune_train.cli import main as train_main
+from tests.helpers import in_process
 
 MODELS = [("dataset", DatasetConfig, "perilune_render"), *((name, m, "perilune_train") for name, m in SECTIONS.items())]
 CHANGES = {
@@ -49,17 +49,15 @@ def missing(model: type[Section]) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("program", "line"),
+    ("main", "line"),
     [
-        ("perilune-render", "    # Image width, pixels. Default: 256."),
-        ("perilune-train", "  # Factor on all channel counts; 1 is the paper's network. Default: 1.0."),
+        (render_main, "    # Image width, pixels. Default: 256."),
+        (train_main, "  # Factor on all channel counts; 1 is the paper's network. Default: 1.0."),
     ],
 )
-def test_command_line(program, line):
-    command = [str(Path(sys.executable).parent / program), "config", "--show", "--preset", "tiny"]
-    done = subprocess.run(command, capture_output=True, text=True)
+def test_command_line(main, line):
+    command = [main, "config", "--show", "--preset", "tiny"]
+    done = in_process.call(*command)
     assert done.returncode == 0 and line in done.stdout.split("\n")
-    wrong = subprocess.run(
-        [*command, "--set", "dataset.cameras=1", "--set", "detect.widht=1"], capture_output=True, text=True
-    )
+    wrong = in_process.call(*command, "--set", "dataset.cameras=1", "--set", "detect.widht=1")
     assert wrong.returncode == 2 and wrong.stdout == "" and len(wrong.stderr.strip().split("\n")) == 1

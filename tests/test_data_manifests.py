@@ -33,7 +33,11 @@ def test_all_are_here():
     )
 
 
-@pytest.mark.parametrize("name", NAMES)
+LARGE = ("large-detect", "paper-detect")
+"""Manifests that take seconds to validate."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LARGE else []) for n in NAMES])
 def test_it_is_whole_and_named_in_the_readme(name):
     dataset = open_dataset(FOLDER / name)
     assert validate(dataset) == [] and dataset.info.images == "planned"
@@ -63,6 +67,7 @@ def test_the_benchmark_has_test_frames_under_low_and_high_suns(kind):
     assert min(altitude) < 220 and max(altitude) > 1480
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_frame_is_made_again(name, tmp_path):
     """The reference picture was rendered with the manifest; another kind of machine may differ in single pixels."""

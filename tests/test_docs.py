@@ -89,10 +89,10 @@ def fault(line: str, *, complete: bool) -> str | None:
 
 
 @pytest.mark.parametrize(("page", "block"), BLOCKS)
-def test_example_runs(page, block, tiny, tmp_path, monkeypatch):
+def test_example_runs(page, block, quick, tmp_path, monkeypatch):
     """In a folder where `make dataset PRESET=tiny` was run."""
     (tmp_path / "data").mkdir()
-    (tmp_path / "data/tiny").symlink_to(tiny)
+    (tmp_path / "data/tiny").symlink_to(quick)
     monkeypatch.chdir(tmp_path)
     exec(compile(block.replace("data/small", "data/tiny"), page, "exec"), {})  # noqa: S102 - our own page
 
@@ -102,12 +102,12 @@ def test_there_are_examples():
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path, tiny, tmp_path):
+def test_notebook_runs(path, quick, tmp_path):
     """Beside a folder where `make dataset PRESET=tiny` was run; as saved, it has outputs without paths of a machine."""
     folder = tmp_path / path.parent.relative_to(TOP)
     folder.mkdir(parents=True)
     (tmp_path / "data").mkdir()
-    (tmp_path / "data/tiny").symlink_to(tiny)
+    (tmp_path / "data/tiny").symlink_to(quick)
     saved = nbformat.read(path, as_version=4)
     assert all(cell.outputs for cell in saved.cells if cell.cell_type == "code")
     assert not re.search(r"/(home|root|work|tmp|Users)/", nbformat.writes(saved))

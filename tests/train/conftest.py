@@ -1,11 +1,16 @@
-"""Small datasets and a trained run that the trainer's tests share."""
+"""Small datasets, trained runs and a map that the trainer's tests share."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from tests.helpers import in_process
 from tests.helpers.drawn_dataset import build_dataset
+
+from perilune_train.cli import main
+from perilune_train.navigate.config import NavigateConfig
+from perilune_train.navigate.train.run import navigate_run
 
 DRAWING = {
     "perilune_train.detect.evaluate.report": ("draw_bins", "draw_curves", "draw_frames"),
@@ -50,3 +55,23 @@ def dataset_nav(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six descents of 8 frames of 96 px over one terrain: 4 train, 1 val, 1 test."""
     splits = {"train": 4, "val": 1, "test": 1}
     return build_dataset(tmp_path_factory.mktemp("nav") / "nav", "nav", splits=splits, scenes=1)
+
+
+@pytest.fixture(scope="session")
+def navigated(dataset_nav: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the runs `a` and `a-stack`: both networks, trained for an epoch. Their own files stay."""
+    network = {"size_px": 64, "width": 0.125, "hidden": 16, "sequence_pairs": 4, "batch_sequences": 2}
+    network |= {"coarse_epochs": 0, "fine_epochs": 1, "learning_rate": 1e-2}
+    config = NavigateConfig(precision="float32", device="cpu", warp=network, stack=network)
+    folder = tmp_path_factory.mktemp("runs")
+    navigate_run(config, dataset_nav, folder, "a", None)
+    return folder / "navigate"
+
+
+@pytest.fixture(scope="session")
+def mapped(quick_survey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of a rendered survey. Read only."""
+    out = tmp_path_factory.mktemp("maps") / "map"
+    done = in_process.call(main, "navigate", "map", "--dataset", quick_survey, "--out", out)
+    assert done.returncode == 0, done.stderr
+    return out

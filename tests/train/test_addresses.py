@@ -90,6 +90,7 @@ def test_a_navigator_is_trained_on_a_dataset_at_an_address(bucket, tmp_path):
     assert "null" not in inputs
 
 
+@pytest.mark.slow
 def test_masks_are_explained_on_datasets_at_an_address(networks, bucket, few, dataset_nav, tmp_path):
     few_images = {
         "n_frames": 2,

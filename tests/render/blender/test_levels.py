@@ -19,6 +19,8 @@ from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import sun_direction
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera.from_field_of_view(160, 160, 50.0)
 SUN = sun_direction(90, 30)
 FLIGHT = {"azimuth_deg": {"low": 0.0, "high": 360.0}}

@@ -15,26 +15,24 @@ from perilune_shared.geometry.camera import camera_from_site
 from perilune_shared.geometry.frames import matrix_from_quaternion
 from perilune_shared.validation.validate import validate
 
-pytest.importorskip("bpy")
-
 
 def counterfactual(*arguments):
     return in_process.call(main, "counterfactual", *arguments)
 
 
 @pytest.fixture(scope="module")
-def made(tiny, tmp_path_factory) -> Path:
+def made(quick, tmp_path_factory) -> Path:
     """Three test frames of `tiny` without three of its craters."""
     out = tmp_path_factory.mktemp("counterfactual") / "without"
-    done = counterfactual(*command(tiny, out))
+    done = counterfactual(*command(quick, out))
     assert done.returncode == 0, done.stderr
     assert "3 craters removed" in done.stdout.replace("\n", " ")
     return out
 
 
-def command(tiny, out, n_craters=3):
+def command(quick, out, n_craters=3):
     numbers = ["--craters-per-scene", n_craters, "--frames-per-trajectory", 3]
-    return ["--manifest", tiny / "detect", "--out", out, *numbers, "--workers", 0]
+    return ["--manifest", quick / "detect", "--out", out, *numbers, "--workers", 0]
 
 
 def removed_craters(made: Path) -> pd.DataFrame:
@@ -49,8 +47,8 @@ def image(folder: Path, row) -> np.ndarray:
     return cv2.imread(str(folder / row["png_path"]), cv2.IMREAD_UNCHANGED).astype(int)
 
 
-def test_it_is_a_valid_dataset_of_the_same_frames(tiny, made):
-    before, after = open_dataset(tiny / "detect"), open_dataset(made)
+def test_it_is_a_valid_dataset_of_the_same_frames(quick, made):
+    before, after = open_dataset(quick / "detect"), open_dataset(made)
     assert validate(after) == []
     same = ("split", "time_s", "position_m", "rotation_wxyz", "velocity_mps", "sun_direction", "frame_index")
     old, new = frames(before), frames(after)
@@ -64,9 +62,9 @@ def test_it_is_a_valid_dataset_of_the_same_frames(tiny, made):
     assert recipe.config["counterfactual"]["removed"] == {str(table["seed"][0]): table["crater_id"].tolist()}
 
 
-def test_removed_craters_are_of_the_dataset_and_apart(tiny, made):
+def test_removed_craters_are_of_the_dataset_and_apart(quick, made):
     table = removed_craters(made)
-    craters = open_dataset(tiny / "detect").table("craters").to_pandas()
+    craters = open_dataset(quick / "detect").table("craters").to_pandas()
     rows = table.merge(craters, on=["scene_id", "crater_id"], validate="one_to_one")
     assert len(table) == len(rows) == 3
     assert np.array_equal(rows["x_m_x"], rows["x_m_y"]) and np.array_equal(rows["diameter_m_x"], rows["diameter_m_y"])
@@ -78,10 +76,10 @@ def test_removed_craters_are_of_the_dataset_and_apart(tiny, made):
             assert np.hypot(one.x_m - two.x_m, one.y_m - two.y_m) >= one.reach_m + two.reach_m
 
 
-def test_labels_lack_the_removed_craters_alone(tiny, made):
+def test_labels_lack_the_removed_craters_alone(quick, made):
     key = ["frame_id", "crater_id"]
     gone = set(removed_craters(made)["crater_id"])
-    before, after = (open_dataset(folder).table("labels").to_pandas() for folder in (tiny / "detect", made))
+    before, after = (open_dataset(folder).table("labels").to_pandas() for folder in (quick / "detect", made))
     before = before[before["frame_id"].isin(after["frame_id"])]
     assert gone & set(before["crater_id"]) and not gone & set(after["crater_id"])
     both = before.merge(after, on=key, how="outer", suffixes=("", "_after"), indicator=True)
@@ -92,14 +90,14 @@ def test_labels_lack_the_removed_craters_alone(tiny, made):
     assert (both["ellipse_cx_px"] == both["ellipse_cx_px_after"]).mean() > 0.8
 
 
-def test_images_change_at_the_removed_craters(tiny, made):
-    before, after = open_dataset(tiny / "detect"), open_dataset(made)
+def test_images_change_at_the_removed_craters(quick, made):
+    before, after = open_dataset(quick / "detect"), open_dataset(made)
     old, table, camera = frames(before), removed_craters(made), after.info.camera.intrinsics()
     z_m = before.table("craters").to_pandas().merge(table, on=["scene_id", "crater_id"])["z_m"].to_numpy()
     row_px, column_px = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
     changed_within = n_checked = 0
     for frame_id, row in frames(after).items():
-        change = np.abs(image(made, row) - image(tiny / "detect", old[frame_id]))
+        change = np.abs(image(made, row) - image(quick / "detect", old[frame_id]))
         centres = np.column_stack([table["x_m"], table["y_m"], z_m])
         in_camera = camera_from_site(centres, row["position_m"], matrix_from_quaternion(row["rotation_wxyz"]))
         radius_px = camera.fx_px * table["diameter_m"].to_numpy() / 2 / in_camera[:, 2]
@@ -108,7 +106,8 @@ def test_images_change_at_the_removed_craters(tiny, made):
         for (x, y), radius, reach_radii in zip(camera.project(in_camera), radius_px, reach, strict=True):
             distance = np.hypot(column_px - x, row_px - y)
             far &= distance > (reach_radii + 0.5) * radius + 2
-            if camera.inside(np.array([[x, y]]))[0] and radius > 2:
+            # A smaller crater has few vertices on the coarse ground of `quick`.
+            if camera.inside(np.array([[x, y]]))[0] and radius > 4:
                 changed_within += bool((change[distance < 1.5 * radius] > 5).any())
                 n_checked += 1
         # Beyond, only the automatic exposure may change.
@@ -116,19 +115,19 @@ def test_images_change_at_the_removed_craters(tiny, made):
     assert n_checked >= 1 and changed_within == n_checked
 
 
-def test_without_a_change_frames_are_byte_identical(tiny, tmp_path):
-    done = counterfactual(*command(tiny, tmp_path / "out", n_craters=0))
+def test_without_a_change_frames_are_byte_identical(quick, tmp_path):
+    done = counterfactual(*command(quick, tmp_path / "out", n_craters=0))
     assert done.returncode == 0, done.stderr
-    old, new = frames(open_dataset(tiny / "detect")), frames(open_dataset(tmp_path / "out"))
+    old, new = frames(open_dataset(quick / "detect")), frames(open_dataset(tmp_path / "out"))
     assert len(new) == 3
     assert all(row["png_sha256"] == old[frame_id]["png_sha256"] for frame_id, row in new.items())
     assert not len(removed_craters(tmp_path / "out"))
 
 
-def test_it_is_resumed_and_rendered_again_from_its_manifest(tiny, made, tmp_path):
-    again = counterfactual(*command(tiny, made))
+def test_it_is_resumed_and_rendered_again_from_its_manifest(quick, made, tmp_path):
+    again = counterfactual(*command(quick, made))
     assert again.returncode == 0, again.stderr
-    other = counterfactual(*command(tiny, made), "--seed", 7)
+    other = counterfactual(*command(quick, made), "--seed", 7)
     assert other.returncode == 2 and "counterfactual.removed" in other.stderr
     done = in_process.call(main, "dataset", "--manifest", made, "--out", tmp_path / "again", "--workers", 0)
     assert done.returncode == 0, done.stderr
@@ -137,11 +136,11 @@ def test_it_is_resumed_and_rendered_again_from_its_manifest(tiny, made, tmp_path
     assert verified.returncode == 0 and "1 identical" in verified.stdout
 
 
-def test_a_turned_sun_changes_the_light_alone(tiny, tmp_path):
+def test_a_turned_sun_changes_the_light_alone(quick, tmp_path):
     out = tmp_path / "sun"
-    done = counterfactual(*command(tiny, out, n_craters=0), "--sun-azimuth-offset-deg", 40)
+    done = counterfactual(*command(quick, out, n_craters=0), "--sun-azimuth-offset-deg", 40)
     assert done.returncode == 0, done.stderr
-    before, after = open_dataset(tiny / "detect"), open_dataset(out)
+    before, after = open_dataset(quick / "detect"), open_dataset(out)
     old, new = ({row["scene_id"]: row for row in one.table("scenes").to_pylist()} for one in (before, after))
     for scene_id, row in new.items():
         assert (row["sun_azimuth_deg"] - old[scene_id]["sun_azimuth_deg"]) % 360 == pytest.approx(40)
@@ -151,9 +150,9 @@ def test_a_turned_sun_changes_the_light_alone(tiny, tmp_path):
         assert row["png_sha256"] != frames(before)[frame_id]["png_sha256"]
 
 
-def test_as_many_craters_as_fit_are_removed(tiny, tmp_path):
+def test_as_many_craters_as_fit_are_removed(quick, tmp_path):
     numbers = ["--craters-per-scene", 500, "--frames-per-trajectory", 1]
-    done = counterfactual("--manifest", tiny / "detect", "--out", tmp_path / "out", *numbers, "--workers", 0)
+    done = counterfactual("--manifest", quick / "detect", "--out", tmp_path / "out", *numbers, "--workers", 0)
     assert done.returncode == 0, done.stderr
     n_removed = len(removed_craters(tmp_path / "out"))
     assert 3 < n_removed < 500
@@ -170,16 +169,16 @@ def test_as_many_craters_as_fit_are_removed(tiny, tmp_path):
         (["--out", "memory://bucket"], ["--out", "memory://bucket"]),
     ],
 )
-def test_options_that_cannot_be(tiny, tmp_path, arguments, words):
-    done = counterfactual("--manifest", tiny / "detect", "--out", tmp_path / "out", *arguments)
+def test_options_that_cannot_be(quick, tmp_path, arguments, words):
+    done = counterfactual("--manifest", quick / "detect", "--out", tmp_path / "out", *arguments)
     assert done.returncode == 2
     assert all(word in done.stderr for word in words), done.stderr
     assert "Traceback" not in done.stderr and not (tmp_path / "out").exists()
 
 
-def test_sources_that_cannot_be(tiny_survey, made, tmp_path):
+def test_sources_that_cannot_be(quick_survey, made, tmp_path):
     plan = Path(__file__).parents[3] / "data_manifests" / "small-detect"
-    for source, words in ((tiny_survey, "a survey"), (made, "a counterfactual"), (plan, "none, as in a plan")):
+    for source, words in ((quick_survey, "a survey"), (made, "a counterfactual"), (plan, "none, as in a plan")):
         done = counterfactual("--manifest", source, "--out", tmp_path / "out", "--workers", 0)
         assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
         assert words in done.stderr

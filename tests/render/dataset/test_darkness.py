@@ -16,6 +16,7 @@ DARK = [
     "--set=dataset.camera.width_px=32",
     "--set=dataset.camera.height_px=32",
     "--set=dataset.render.exr=false",
+    "--set=dataset.render.engine=heightfield",
     "--set=dataset.terrain.spacing_px=2.0",
     "--set=dataset.detect.sun.elevation_deg=0.05",
     "--set=dataset.detect.n_scenes=1",

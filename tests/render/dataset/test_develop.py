@@ -36,10 +36,10 @@ def develop(source, out, *arguments):
 
 
 @pytest.fixture(scope="module")
-def developed(tiny, tmp_path_factory):
+def developed(quick, tmp_path_factory):
     """The tiny detection dataset developed with its own settings, in a process that tells what it loaded. Read only."""
     out = tmp_path_factory.mktemp("developed") / "new"
-    arguments = ["develop", "--dataset", str(tiny / "detect"), "--out", str(out)]
+    arguments = ["develop", "--dataset", str(quick / "detect"), "--out", str(out)]
     program = (
         "import sys; from perilune_render.cli.main import app\n"
         f"app({arguments!r}, standalone_mode=False)\n"
@@ -60,9 +60,9 @@ def assert_labels_differ_in_contrast_alone(old, new):
     assert after.equals(before)
 
 
-def test_developed_alike_the_frames_are_the_same_bytes(tiny, developed):
+def test_developed_alike_the_frames_are_the_same_bytes(quick, developed):
     """What the renderer wrote in one go and what comes of its EXRs afterwards."""
-    old, new = open_dataset(tiny / "detect"), open_dataset(developed[0])
+    old, new = open_dataset(quick / "detect"), open_dataset(developed[0])
     assert validate(new) == []
     for table in SAME_TABLES:
         assert new.table(table).equals(old.table(table))
@@ -82,8 +82,8 @@ def test_developed_alike_the_frames_are_the_same_bytes(tiny, developed):
     assert not list(developed[0].rglob("*.exr"))
 
 
-def test_an_object_store_gets_the_same_bytes_and_its_frames_are_verified(tiny, developed, s3_bucket):
-    source, out = uploaded(tiny / "detect", f"{s3_bucket}/moon"), f"{s3_bucket}/developed"
+def test_an_object_store_gets_the_same_bytes_and_its_frames_are_verified(quick, developed, s3_bucket):
+    source, out = uploaded(quick / "detect", f"{s3_bucket}/moon"), f"{s3_bucket}/developed"
     done = develop(source, out)
     assert done.returncode == 0, done.stderr
     store, folder = open_store(out), open_store(developed[0])
@@ -94,39 +94,39 @@ def test_an_object_store_gets_the_same_bytes_and_its_frames_are_verified(tiny, d
     assert verified.returncode == 0 and "1 frames: 1 identical" in verified.stdout, verified.stderr
 
 
-def test_another_sensor_changes_the_pixels_and_of_the_labels_their_contrast(tiny, tmp_path):
+def test_another_sensor_changes_the_pixels_and_of_the_labels_their_contrast(quick, tmp_path):
     file = tmp_path / "sensor.yaml"
     file.write_text("dataset: {sensor: {bits: 12, read_noise_e: 100.0}}\n")
     changes = settings("sensor.psf_sigma_px=1.5", "sensor.black_level_share=0.05")
-    assert develop(tiny / "detect", tmp_path / "new", "--config", file, *changes).returncode == 0
+    assert develop(quick / "detect", tmp_path / "new", "--config", file, *changes).returncode == 0
     new = open_dataset(tmp_path / "new")
     assert validate(new) == []
     sensor = new.info.recipe().config["sensor"]
     assert (sensor["bits"], sensor["read_noise_e"], sensor["psf_sigma_px"]) == (12, 100.0, 1.5)
-    old = open_dataset(tiny / "detect")
+    old = open_dataset(quick / "detect")
     assert_labels_differ_in_contrast_alone(old, new)
-    for old, image in zip(images(tiny / "detect"), images(tmp_path / "new"), strict=True):
+    for old, image in zip(images(quick / "detect"), images(tmp_path / "new"), strict=True):
         # Twelve bits in the upper bits of sixteen.
         assert image.dtype == np.uint16 and (image & 0xF == 0).all() and len(np.unique(image)) > 300
         assert np.corrcoef(old.ravel(), image.ravel())[0, 1] > 0.8
         assert np.percentile(image, 99) / 65535 == pytest.approx(0.8, abs=0.05)
 
 
-def test_a_noisier_sensor_lowers_every_contrast(tiny, tmp_path):
-    assert develop(tiny / "detect", tmp_path / "new", *settings("sensor.read_noise_e=1500.0")).returncode == 0
-    old, new = open_dataset(tiny / "detect"), open_dataset(tmp_path / "new")
+def test_a_noisier_sensor_lowers_every_contrast(quick, tmp_path):
+    assert develop(quick / "detect", tmp_path / "new", *settings("sensor.read_noise_e=1500.0")).returncode == 0
+    old, new = open_dataset(quick / "detect"), open_dataset(tmp_path / "new")
     assert_labels_differ_in_contrast_alone(old, new)
     before, after = (d.table("labels")["contrast"].to_numpy() for d in (old, new))
     assert (np.abs(after) < np.abs(before)).all() and (after < 4).mean() > (before < 4).mean() + 0.1
 
 
-def test_another_camera_makes_new_labels_that_fit(tiny, tmp_path):
+def test_another_camera_makes_new_labels_that_fit(quick, tmp_path):
     lens = settings(
         "camera.width_px=96", "camera.height_px=80", "camera.focal_length_px=137.5", "camera.principal_x_px=45"
     )
     lens += settings("camera.distortion.k1=-0.12", "camera.distortion.p1=0.002")
-    assert develop(tiny / "detect", tmp_path / "new", *lens).returncode == 0
-    old, new = open_dataset(tiny / "detect"), open_dataset(tmp_path / "new")
+    assert develop(quick / "detect", tmp_path / "new", *lens).returncode == 0
+    old, new = open_dataset(quick / "detect"), open_dataset(tmp_path / "new")
     assert validate(new) == [] and new.info.camera.distortion == (-0.12, 0.0, 0.002, 0.0, 0.0)
     for table in SAME_TABLES:
         assert new.table(table).equals(old.table(table))
@@ -164,8 +164,8 @@ def test_another_camera_makes_new_labels_that_fit(tiny, tmp_path):
         (settings("sensor.black_level_share=0.4", "sensor.exposure_level=0.3"), ["exposure_level above"]),
     ],
 )
-def test_what_needs_a_new_rendering_is_refused(tiny, tmp_path, arguments, parts):
-    result = develop(tiny / "detect", tmp_path / "new", *arguments)
+def test_what_needs_a_new_rendering_is_refused(quick, tmp_path, arguments, parts):
+    result = develop(quick / "detect", tmp_path / "new", *arguments)
     assert result.returncode == 2 and len(result.stderr.strip().splitlines()) == 1
     assert all(part in result.stderr for part in parts) and not (tmp_path / "new").exists()
 
@@ -175,11 +175,11 @@ def test_a_dataset_without_exrs_is_refused(developed, tmp_path):
     assert again.returncode == 2 and "exr_path" in again.stderr and not (tmp_path / "again").exists()
 
 
-def test_a_damaged_exr_is_named_and_the_rest_goes_on_once_it_is_whole(tiny_detect, tmp_path):
-    exr = sorted(tiny_detect.rglob("*.exr"))[-1]
+def test_a_damaged_exr_is_named_and_the_rest_goes_on_once_it_is_whole(quick_detect, tmp_path):
+    exr = sorted(quick_detect.rglob("*.exr"))[-1]
     whole = exr.read_bytes()
     exr.write_bytes(whole[: len(whole) // 2])
-    broken = develop(tiny_detect, tmp_path / "new")
+    broken = develop(quick_detect, tmp_path / "new")
     assert broken.returncode == 2 and exr.name in broken.stderr and "Traceback" not in broken.stderr
     new = open_dataset(tmp_path / "new")
     finished = [name.replace(".", "/") for name in committed(new.store)]
@@ -187,13 +187,14 @@ def test_a_damaged_exr_is_named_and_the_rest_goes_on_once_it_is_whole(tiny_detec
     exr.write_bytes(whole)
     frames = [path for name in finished for path in (tmp_path / "new/frames" / name).glob("*.png")]
     done = {path: path.stat().st_mtime_ns for path in frames}
-    assert develop(tiny_detect, tmp_path / "new").returncode == 0
+    assert develop(quick_detect, tmp_path / "new").returncode == 0
     assert validate(open_dataset(tmp_path / "new")) == []
     assert done and all(path.stat().st_mtime_ns == stamp for path, stamp in done.items())
 
 
-def test_stopped_it_looks_incomplete_and_goes_on(tiny, tmp_path):
-    command = [RENDER, "develop", "--dataset", str(tiny / "nav"), "--out", str(tmp_path / "new")]
+@pytest.mark.slow
+def test_stopped_it_looks_incomplete_and_goes_on(quick, tmp_path):
+    command = [RENDER, "develop", "--dataset", str(quick / "nav"), "--out", str(tmp_path / "new")]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while not any(tmp_path.rglob("*.png")) and time.monotonic() < deadline:
@@ -201,9 +202,9 @@ def test_stopped_it_looks_incomplete_and_goes_on(tiny, tmp_path):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert not open_dataset(tmp_path / "new").info.complete
-    assert develop(tiny / "nav", tmp_path / "new").returncode == 0
+    assert develop(quick / "nav", tmp_path / "new").returncode == 0
     new = open_dataset(tmp_path / "new")
-    hashes = [d.table("frames")["png_sha256"].to_pylist() for d in (new, open_dataset(tiny / "nav"))]
+    hashes = [d.table("frames")["png_sha256"].to_pylist() for d in (new, open_dataset(quick / "nav"))]
     assert validate(new) == [] and hashes[0] == hashes[1]
 
 
@@ -254,10 +255,10 @@ def test_a_distorted_dataset_is_rendered_labelled_and_developed(tmp_path):
         assert alike > 0.97 and 1 - alike < 0.25 * (1 - apart)
 
 
-def test_a_source_that_is_not_complete_is_refused(tiny_detect, tmp_path):
-    path = tiny_detect / "dataset.json"
+def test_a_source_that_is_not_complete_is_refused(quick_detect, tmp_path):
+    path = quick_detect / "dataset.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "complete": False}))
-    result = develop(tiny_detect, tmp_path / "new")
+    result = develop(quick_detect, tmp_path / "new")
     assert result.returncode == 2 and "complete" in result.stderr and not (tmp_path / "new").exists()
-    shutil.rmtree(tiny_detect)
-    assert develop(tiny_detect, tmp_path / "new").returncode == 2
+    shutil.rmtree(quick_detect)
+    assert develop(quick_detect, tmp_path / "new").returncode == 2

@@ -18,6 +18,7 @@ SMALL = [
     "--set=dataset.camera.width_px=32",
     "--set=dataset.camera.height_px=32",
     "--set=dataset.render.exr=false",
+    "--set=dataset.render.engine=heightfield",
     "--set=dataset.terrain.spacing_px=4",
     "--set=dataset.detect.n_scenes=1",
     "--set=dataset.detect.n_frames=2",
@@ -64,8 +65,7 @@ def test_a_site_off_the_middle_is_in_the_recipe_and_its_frames_are_made_again(tm
         "--set=dataset.terrain.elevation.site_column_px=50",
         "--set=dataset.terrain.elevation.site_row_px=140.5",
     ]
-    settings.append("--set=dataset.render.engine=heightfield")
-    for name, more in (("middle", settings[2:]), ("site", settings)):
+    for name, more in (("middle", []), ("site", settings)):
         done = in_process.call(main, "dataset", "--workers", 0, *SMALL, *more, "--dem", dem, "--out", tmp_path / name)
         assert done.returncode == 0, done.stderr
     middle, site = (open_dataset(tmp_path / name / "detect") for name in ("middle", "site"))

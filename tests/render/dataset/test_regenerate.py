@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from rich.progress import Progress
 from tests.helpers import in_process
+from tests.helpers.rendered import QUICK
 
 from perilune_render.cli.main import main
 from perilune_render.dataset.regenerate import exr_outlier_share, png_outlier_share, regenerate, spread
@@ -44,9 +45,9 @@ def run(*arguments):
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory):
-    """The plan of the tiny detection dataset, by the command line."""
-    out = tmp_path_factory.mktemp("plan") / "tiny"
-    made = run("plan", "--preset", "tiny", "--kind", "detect", "--out", out)
+    """The plan of the detection dataset of `quick`, by the command line."""
+    out = tmp_path_factory.mktemp("plan") / "quick"
+    made = run("plan", "--preset", "tiny", "--kind", "detect", *QUICK, "--out", out)
     assert made.returncode == 0, made.stderr
     return out
 
@@ -64,8 +65,8 @@ def test_frames_on_levels_of_ground_are_the_same_bytes(tmp_path):
     assert [outcome.state for outcome in outcomes] == ["identical", "identical"]
 
 
-def test_after_merge_subset_and_split_the_bytes_are_the_same(tiny, tmp_path):
-    whole = open_dataset(tiny / "detect")
+def test_after_merge_subset_and_split_the_bytes_are_the_same(quick, tmp_path):
+    whole = open_dataset(quick / "detect")
     subset(whole, tmp_path / "a", ["frame_index < 3"], images="none")
     subset(whole, tmp_path / "b", ["frame_index > 5"], images="none")
     merge([open_dataset(tmp_path / name) for name in "ab"], tmp_path / "m")
@@ -79,11 +80,11 @@ def test_after_merge_subset_and_split_the_bytes_are_the_same(tiny, tmp_path):
     for frame_id in ids:
         for kind in ("png", "exr"):
             path = f"frames/{frame_id}.{kind}"
-            assert (tmp_path / "out" / path).read_bytes() == (tiny / "detect" / path).read_bytes()
+            assert (tmp_path / "out" / path).read_bytes() == (quick / "detect" / path).read_bytes()
 
 
-def test_a_plan_is_the_dataset_before_it_is_rendered(tiny, plan, tmp_path):
-    planned, rendered = open_dataset(plan), open_dataset(tiny / "detect")
+def test_a_plan_is_the_dataset_before_it_is_rendered(quick, plan, tmp_path):
+    planned, rendered = open_dataset(plan), open_dataset(quick / "detect")
     assert validate(planned) == [] and planned.info.images == "planned"
     found = {(each.place, each.column) for each in differences(planned, rendered)}
     hashes = {("frames", f"{kind}_{name}") for kind in ("png", "exr") for name in ("sha256", "bytes")}
@@ -97,19 +98,19 @@ def test_a_plan_is_the_dataset_before_it_is_rendered(tiny, plan, tmp_path):
     (outcome,) = again(plan, tmp_path, [frame_id])
     assert outcome.same_ground and outcome.state == "new"
     path = f"frames/{frame_id}.png"
-    assert (tmp_path / path).read_bytes() == (tiny / "detect" / path).read_bytes()
+    assert (tmp_path / path).read_bytes() == (quick / "detect" / path).read_bytes()
 
 
-def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
+def test_part_of_a_manifest_is_rendered_with_its_labels(quick, plan, tmp_path):
     """Names, splits and gaps are the manifest's; frames and labels are those of the whole dataset."""
     cut = ["frame_index % 3 == 1", "split != 'val'"]
-    subset(open_dataset(tiny / "detect"), tmp_path / "hashed", cut, images="plan")
+    subset(open_dataset(quick / "detect"), tmp_path / "hashed", cut, images="plan")
     split_dataset(open_dataset(tmp_path / "hashed"), tmp_path / "s", by="trajectory", val_share=0, test_share=0.5)
     made = run("dataset", "--workers", 0, "--manifest", tmp_path / "s", "--out", tmp_path / "out")
     assert made.returncode == 0, made.stderr
     n = len(open_dataset(tmp_path / "s").table("frames"))
     assert f"{n} of {n} frames are byte-identical to the manifest's; terrain hashes match" in made.stdout
-    new, old = open_dataset(tmp_path / "out"), open_dataset(tiny / "detect")
+    new, old = open_dataset(tmp_path / "out"), open_dataset(quick / "detect")
     assert validate(new) == [] and new.info.counts.scenes == 2
     ids = new.table("frames", ["frame_id"])["frame_id"]
     labels = old.table("labels").filter(pc.is_in(old.table("labels")["frame_id"], ids.combine_chunks()))
@@ -128,44 +129,46 @@ def test_part_of_a_manifest_is_rendered_with_its_labels(tiny, plan, tmp_path):
         assert refused.returncode == 2 and message in refused.stderr and not (tmp_path / "o").exists()
 
 
-def test_developed_frames_are_made_again_with_the_first_camera_ground(tiny, tmp_path):
+def test_developed_frames_are_made_again_with_the_first_camera_ground(quick, tmp_path):
     changes = ("--set", "dataset.camera.horizontal_fov_deg=44", "--set", "dataset.sensor.bits=12")
-    done = run("develop", "--dataset", tiny / "detect", "--out", tmp_path / "d", *changes)
+    done = run("develop", "--dataset", quick / "detect", "--out", tmp_path / "d", *changes)
     assert done.returncode == 0, done.stderr
     (outcome,) = again(tmp_path / "d", tmp_path / "out", ["scene-0002/trajectory-0000/000004"])
     assert (outcome.png, outcome.exr, outcome.state) == ("identical", None, "identical") and outcome.same_ground
 
 
-def test_verify_counts_what_is_the_same(tiny_detect):
-    made = run("regenerate", "--manifest", tiny_detect, "--verify", "--sample", "3")
+@pytest.mark.parametrize("made_by", ["quick", pytest.param("tiny", marks=pytest.mark.slow)])
+def test_verify_counts_what_is_the_same(request, made_by):
+    source = request.getfixturevalue(made_by) / "detect"
+    made = run("regenerate", "--manifest", source, "--verify", "--sample", "3")
     assert made.returncode == 0 and "3 frames: 3 identical" in made.stdout
 
 
-def test_a_frame_from_elsewhere_is_compared_and_reported(tiny_detect, tmp_path):
+def test_a_frame_from_elsewhere_is_compared_and_reported(quick_detect, tmp_path):
     """As another machine would have rendered it: a few grey levels off, or another picture."""
-    part = tiny_detect / "manifest/frames/all.parquet"
+    part = quick_detect / "manifest/frames/all.parquet"
     rows = pq.read_table(part).to_pandas()
     for row, shift in ((0, 1), (1, 40)):
-        path = tiny_detect / rows.at[row, "png_path"]
+        path = quick_detect / rows.at[row, "png_path"]
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         cv2.imwrite(str(path), np.where(image < 200, image + shift, image).astype(np.uint8))
         rows.at[row, "png_sha256"] = "0" * 64
     pq.write_table(complete("frames", pa.Table.from_pandas(rows, preserve_index=False)), part)
     ids = [f"scene-0000/trajectory-0000/00000{k}" for k in range(3)]
-    outcomes = again(tiny_detect, tmp_path / "out", ids)
+    outcomes = again(quick_detect, tmp_path / "out", ids)
     assert [o.png for o in outcomes] == ["within tolerance", "different", "identical"]
     result = run(
-        "regenerate", "--manifest", tiny_detect, "--out", tmp_path / "o", "--frames", ids[0], "--frames", ids[1]
+        "regenerate", "--manifest", quick_detect, "--out", tmp_path / "o", "--frames", ids[0], "--frames", ids[1]
     )
     assert result.returncode == 2 and "1 within tolerance" in result.stdout and "1 different" in result.stdout
 
 
-def test_another_ground_is_reported(tiny_detect):
-    part = tiny_detect / "manifest/scenes/all.parquet"
+def test_another_ground_is_reported(quick_detect):
+    part = quick_detect / "manifest/scenes/all.parquet"
     rows = pq.read_table(part).to_pandas()
     rows["content_sha256"] = "0" * 64
     pq.write_table(complete("scenes", pa.Table.from_pandas(rows, preserve_index=False)), part)
-    result = run("regenerate", "--manifest", tiny_detect, "--verify", "--frames", "scene-0001/trajectory-0000/000000")
+    result = run("regenerate", "--manifest", quick_detect, "--verify", "--frames", "scene-0001/trajectory-0000/000000")
     assert result.returncode == 2 and "1 identical" in result.stdout and "terrain hash mismatch" in result.stdout
 
 
@@ -178,8 +181,8 @@ def test_another_ground_is_reported(tiny_detect):
         ([], "--verify"),
     ],
 )
-def test_mistakes_are_reported_in_one_line(tiny, arguments, message):
-    made = run("regenerate", "--manifest", tiny / "detect", *arguments)
+def test_mistakes_are_reported_in_one_line(quick, arguments, message):
+    made = run("regenerate", "--manifest", quick / "detect", *arguments)
     assert made.returncode == 2 and message in made.stderr and len(made.stderr.strip().splitlines()) == 1
 
 
@@ -192,13 +195,13 @@ def changed_recipe(root, change):
     path.write_text(json.dumps(info))
 
 
-def test_a_recipe_opens_no_file_of_its_own_choice(tiny_detect):
-    changed_recipe(tiny_detect, lambda recipe: recipe["config"]["terrain"].update(dem="/etc/passwd"))
-    result = run("regenerate", "--manifest", tiny_detect, "--verify")
+def test_a_recipe_opens_no_file_of_its_own_choice(quick_detect):
+    changed_recipe(quick_detect, lambda recipe: recipe["config"]["terrain"].update(dem="/etc/passwd"))
+    result = run("regenerate", "--manifest", quick_detect, "--verify")
     assert result.returncode == 2 and "recipes" in result.stderr
-    info = open_dataset_with_right_key(tiny_detect)
+    info = open_dataset_with_right_key(quick_detect)
     with pytest.raises(UserError, match="--dem with a local copy"):
-        again(info, tiny_detect / "out", ["scene-0000/trajectory-0000/000000"])
+        again(info, quick_detect / "out", ["scene-0000/trajectory-0000/000000"])
 
 
 def open_dataset_with_right_key(root):
@@ -217,10 +220,10 @@ def open_dataset_with_right_key(root):
     return root
 
 
-def test_a_sample_is_spread_over_all_scenes(tiny):
-    ids = spread(open_dataset(tiny / "detect"), 3)
+def test_a_sample_is_spread_over_all_scenes(quick):
+    ids = spread(open_dataset(quick / "detect"), 3)
     assert len({frame_id.split("/")[0] for frame_id in ids}) == 3
-    assert len(spread(open_dataset(tiny / "detect"), 1000)) == 24
+    assert len(spread(open_dataset(quick / "detect"), 1000)) == 24
 
 
 def test_distances_by_hand():
@@ -245,6 +248,7 @@ def test_nothing_is_left_of_a_failed_plan(tmp_path):
     assert made.returncode == 2 and "--out" in made.stderr
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_plan_leaves_nothing(tmp_path):
     """At any moment, growing included, where code that Numba compiled must not be torn."""
     out = tmp_path / "p"

@@ -42,6 +42,9 @@ QUICK = [
 ]
 
 
+WITHOUT_BLENDER = ["--set", "dataset.render.engine=heightfield"]
+
+
 def run(*arguments):
     """In this process, where Blender is loaded once."""
     return in_process.call(main, *arguments)
@@ -62,18 +65,24 @@ def hashes(dataset):
     return dataset.table("frames", ["png_sha256"]).to_pandas()["png_sha256"].tolist()
 
 
+@pytest.fixture(params=["quick", pytest.param("tiny", marks=pytest.mark.slow)])
+def rendered(request):
+    """Datasets rendered by either engine."""
+    return request.getfixturevalue(request.param)
+
+
 @pytest.mark.parametrize("kind", ["detect", "nav"])
-def test_a_rendered_dataset_has_no_fault(tiny, kind):
-    assert validate(open_dataset(tiny / kind)) == []
+def test_a_rendered_dataset_has_no_fault(rendered, kind):
+    assert validate(open_dataset(rendered / kind)) == []
 
 
-def test_every_rendered_frame_counts_the_craters_that_are_too_large_for_a_label(tiny):
-    counts = open_dataset(tiny / "detect").table("frames", ["n_craters_above_max_radius"]).to_pydict()
+def test_every_rendered_frame_counts_the_craters_that_are_too_large_for_a_label(quick):
+    counts = open_dataset(quick / "detect").table("frames", ["n_craters_above_max_radius"]).to_pydict()
     assert counts["n_craters_above_max_radius"] == [0] * 24
 
 
-def test_frames_are_grey_lit_and_different(tiny):
-    dataset = open_dataset(tiny / "detect")
+def test_frames_are_grey_lit_and_different(rendered):
+    dataset = open_dataset(rendered / "detect")
     images = [
         cv2.imread(str(dataset.file(path)), cv2.IMREAD_UNCHANGED)
         for path in dataset.table("frames").to_pandas()["png_path"]
@@ -83,8 +92,8 @@ def test_frames_are_grey_lit_and_different(tiny):
     assert len({image.tobytes() for image in images}) == len(images) == 24
 
 
-def test_exr_holds_what_it_should(tiny):
-    dataset = open_dataset(tiny / "detect")
+def test_exr_holds_what_it_should(rendered):
+    dataset = open_dataset(rendered / "detect")
     frame = dataset.table("frames").to_pandas().iloc[3]
     exr = read_exr(dataset.file(frame.exr_path))
     assert set(exr) == set(CHANNELS) and all(c.dtype == np.float32 and c.shape == (128, 128) for c in exr.values())
@@ -96,14 +105,15 @@ def test_exr_holds_what_it_should(tiny):
     assert 0.005 < exr["R"].mean() < 0.2
 
 
-def test_the_camera_looks_down_at_the_site(tiny):
-    dataset = open_dataset(tiny / "nav")
+def test_the_camera_looks_down_at_the_site(quick):
+    dataset = open_dataset(quick / "nav")
     frames = dataset.table("frames").to_pandas()
     last = frames[frames["frame_index"] == 8].iloc[0]
     axis = matrix_from_quaternion(last.rotation_wxyz)[2]
     assert axis[2] < -0.999 and abs(last.position_m[2] - 200) < 40 and np.hypot(*last.position_m[:2]) < 40
 
 
+@pytest.mark.slow
 def test_stopped_and_resumed_is_the_same_dataset(tmp_path):
     command = [RENDER, "dataset", "--preset", "tiny", "--kind", "detect", *QUICK]
     assert run(*command[1:], *IN_PROCESS, "--out", tmp_path / "whole").returncode == 0
@@ -131,6 +141,7 @@ def test_stopped_and_resumed_is_the_same_dataset(tmp_path):
         assert whole.table(table).equals(again.table(table))
 
 
+@pytest.mark.slow
 def test_ctrl_c_is_answered_in_one_line(tmp_path):
     command = [RENDER, *DETECT, *QUICK, *ONE_WORKER, "--out", str(tmp_path)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
@@ -145,11 +156,12 @@ def test_ctrl_c_is_answered_in_one_line(tmp_path):
 
 
 def test_a_finished_dataset_is_reused_and_other_settings_are_refused(tmp_path):
-    assert run(*DETECT, *QUICK, *IN_PROCESS, "--out", tmp_path).returncode == 0
+    options = [*DETECT, *QUICK, *WITHOUT_BLENDER]
+    assert run(*options, *IN_PROCESS, "--out", tmp_path).returncode == 0
     stamp = (tmp_path / "detect/dataset.json").stat().st_mtime_ns
-    assert run(*DETECT, *QUICK, *IN_PROCESS, "--out", tmp_path).returncode == 0
+    assert run(*options, *IN_PROCESS, "--out", tmp_path).returncode == 0
     assert (tmp_path / "detect/dataset.json").stat().st_mtime_ns == stamp
-    other = run("dataset", "--preset", "tiny", "--kind", "detect", *QUICK, "--set", "dataset.seed=5", "--out", tmp_path)
+    other = run(*options, "--set", "dataset.seed=5", "--out", tmp_path)
     assert other.returncode == 2 and "seed" in other.stderr and len(other.stderr.strip().splitlines()) == 1
 
 
@@ -181,6 +193,7 @@ def test_a_folder_with_other_content_is_left_alone(tmp_path):
     assert [p.name for p in (tmp_path / "detect").iterdir()] == ["thesis.txt"]
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_what_was_finished(tmp_path):
     """A file size limit stands in for a full disk: the kernel refuses to write on, in mid-file."""
 
@@ -216,11 +229,11 @@ def test_preview_and_export(tmp_path):
     assert bad.returncode == 2 and ".glb" in bad.stderr
 
 
-def test_a_damaged_dataset_is_refused(tiny_detect):
-    info = json.loads((tiny_detect / "dataset.json").read_text())
-    (tiny_detect / "dataset.json").write_text(json.dumps({**info, "schema_version": "7"}))
+def test_a_damaged_dataset_is_refused(quick_detect):
+    info = json.loads((quick_detect / "dataset.json").read_text())
+    (quick_detect / "dataset.json").write_text(json.dumps({**info, "schema_version": "7"}))
     with pytest.raises(UserError, match="schema_version"):
-        open_dataset(tiny_detect)
-    shutil.rmtree(tiny_detect)
+        open_dataset(quick_detect)
+    shutil.rmtree(quick_detect)
     with pytest.raises(UserError, match=r"dataset\.json"):
-        open_dataset(tiny_detect)
+        open_dataset(quick_detect)

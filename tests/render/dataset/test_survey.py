@@ -10,15 +10,13 @@ from perilune_shared.geometry.camera import camera_from_site
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import matrix_from_quaternion
 
-pytest.importorskip("bpy")
-
 
 def survey(*arguments):
     return in_process.call(main, "survey", *arguments)
 
 
-def test_the_ground_is_that_of_the_descents_under_another_sun(tiny, tiny_survey):
-    descents, made = open_dataset(tiny / "nav"), open_dataset(tiny_survey)
+def test_the_ground_is_that_of_the_descents_under_another_sun(quick, quick_survey):
+    descents, made = open_dataset(quick / "nav"), open_dataset(quick_survey)
     columns = ["content_sha256", "extent_m", "seed"]
     assert made.table("scenes", columns) == descents.table("scenes", columns)
     before, after = (
@@ -29,8 +27,8 @@ def test_the_ground_is_that_of_the_descents_under_another_sun(tiny, tiny_survey)
     assert made.table("craters") == descents.table("craters")
 
 
-def test_both_images_show_the_site_from_either_side(tiny_survey):
-    made = open_dataset(tiny_survey)
+def test_both_images_show_the_site_from_either_side(quick_survey):
+    made = open_dataset(quick_survey)
     camera, frames = made.info.camera.intrinsics(), made.table("frames").sort_by("frame_id").to_pylist()
     assert len(frames) == 2
     sides = [np.sign(row["position_m"][0]) for row in frames]
@@ -45,8 +43,8 @@ def test_both_images_show_the_site_from_either_side(tiny_survey):
     assert np.degrees(np.arccos(axes[0] @ axes[1])) == pytest.approx(30.0)
 
 
-def test_labels_are_the_craters_as_the_camera_sees_them(tiny_survey):
-    made = open_dataset(tiny_survey)
+def test_labels_are_the_craters_as_the_camera_sees_them(quick_survey):
+    made = open_dataset(quick_survey)
     row = made.table("frames").sort_by("frame_id").to_pylist()[1]
     labels = made.table("labels").to_pandas()
     labels = labels[labels["frame_id"] == row["frame_id"]]
@@ -60,10 +58,10 @@ def test_labels_are_the_craters_as_the_camera_sees_them(tiny_survey):
     assert np.allclose(labels["ellipse_cy_px"], expected.cy_px, atol=1e-6)
 
 
-def test_a_survey_is_resumed_and_rendered_again_from_its_manifest(tiny, tiny_survey, tmp_path):
-    again = survey("--manifest", tiny / "nav", "--out", tiny_survey, "--pixel-m", 3, "--workers", 0)
+def test_a_survey_is_resumed_and_rendered_again_from_its_manifest(quick, quick_survey, tmp_path):
+    again = survey("--manifest", quick / "nav", "--out", quick_survey, "--pixel-m", 3, "--workers", 0)
     assert again.returncode == 0, again.stderr
-    done = in_process.call(main, "dataset", "--manifest", tiny_survey, "--out", tmp_path / "again", "--workers", 0)
+    done = in_process.call(main, "dataset", "--manifest", quick_survey, "--out", tmp_path / "again", "--workers", 0)
     assert done.returncode == 0, done.stderr
     assert "2 of 2 frames are byte-identical" in done.stdout
 
@@ -78,16 +76,16 @@ def test_a_survey_is_resumed_and_rendered_again_from_its_manifest(tiny, tiny_sur
         (["--convergence-deg", "nan"], ["convergence_deg", "nan"]),
     ],
 )
-def test_settings_that_cannot_be(tiny, tmp_path, arguments, words):
-    done = survey("--manifest", tiny / "nav", "--out", tmp_path / "out", *arguments)
+def test_settings_that_cannot_be(quick, tmp_path, arguments, words):
+    done = survey("--manifest", quick / "nav", "--out", tmp_path / "out", *arguments)
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert all(word in done.stderr for word in words), done.stderr
     assert not (tmp_path / "out").exists()
 
 
-def test_a_survey_of_a_survey_is_refused(tiny_survey, tmp_path):
-    done = survey("--manifest", tiny_survey, "--out", tmp_path / "out")
+def test_a_survey_of_a_survey_is_refused(quick_survey, tmp_path):
+    done = survey("--manifest", quick_survey, "--out", tmp_path / "out")
     assert done.returncode == 2
     assert "a survey" in done.stderr
     assert not (tmp_path / "out").exists()

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.validation.validate import validate
 
@@ -37,6 +39,7 @@ def test_plans_are_made_without_blender(tmp_path):
     assert {"generator", "numpy", "scipy", "numba"} <= set(versions) and not {"blender", "renderer"} & set(versions)
 
 
+@pytest.mark.slow
 def test_datasets_are_developed_without_blender(tiny, tmp_path):
     done = run("develop", "--dataset", tiny / "detect", "--out", tmp_path / "new")
     assert done.returncode == 0, done.stderr

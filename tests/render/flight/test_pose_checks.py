@@ -135,15 +135,15 @@ def test_an_impossible_configuration_ends_the_command_with_one_line(
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-def test_an_edited_pose_of_a_manifest_is_refused(tiny_detect, tmp_path, monkeypatch, capsys):
-    part = tiny_detect / "manifest" / "frames" / "all.parquet"
+def test_an_edited_pose_of_a_manifest_is_refused(quick_detect, tmp_path, monkeypatch, capsys):
+    part = quick_detect / "manifest" / "frames" / "all.parquet"
     rows = pq.read_table(part)
     positions = rows["position_m"].to_pylist()
     positions[3] = [positions[3][0], positions[3][1], -500.0]
     pq.write_table(with_column(rows, "position_m", positions), part)
     frame_id, out = "scene-0000/trajectory-0000/000003", tmp_path / "out"
     for command in (["dataset"], ["regenerate", "--frames", frame_id]):
-        argv = ["perilune-render", *command, "--manifest", str(tiny_detect), "--out", str(out)]
+        argv = ["perilune-render", *command, "--manifest", str(quick_detect), "--out", str(out)]
         line = refusal(argv, monkeypatch, capsys)
         assert f"frame {frame_id}: got a camera -" in line and "m above the ground, expected at least 1 m" in line
     assert not out.exists()

@@ -9,7 +9,10 @@ from perilune_render.jobs.job import Job
 from perilune_render.jobs.run import render_job
 from perilune_shared.config import resolve
 
+# What processes, shards and stores do to a rendering does not depend on its engine. test_other_processor.py and
+# test_render.py compare datasets that Blender rendered in several processes.
 QUICK = (
+    "dataset.render.engine=heightfield",
     "dataset.camera.width_px=32",
     "dataset.camera.height_px=32",
     "dataset.terrain.spacing_px=2.0",

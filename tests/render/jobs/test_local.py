@@ -37,6 +37,7 @@ def two_workers(job, out):
     return LocalWorkers(job, out, 2)
 
 
+@pytest.mark.slow
 def test_two_workers_one_killed_and_all_recycled_give_the_same_bytes(
     job, whole, files_of, tmp_path, monkeypatch, kill, capsys
 ):
@@ -48,6 +49,7 @@ def test_two_workers_one_killed_and_all_recycled_give_the_same_bytes(
     assert line == "warning: scene-0000/trajectory-0001: worker killed by SIGKILL; trying again (3 left)"
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_always_fails_is_named_and_all_others_are_rendered(job, whole, files_of, tmp_path, kill):
     kill(99)
     with pytest.raises(RenderingFailed) as failed:

@@ -40,6 +40,7 @@ class KillsOnce(Progress):
             self.killed = [os.kill(pid, signal.SIGKILL) for pid in processes_named("ray::_Renderer")] != []
 
 
+@pytest.mark.slow
 def test_ray_gives_the_same_bytes_on_s3_although_its_processes_are_killed(job, whole, s3_bucket, capsys):
     from perilune_render.jobs.ray_actors import RayActors
 
@@ -86,6 +87,7 @@ def test_ctrl_c_while_ray_starts_ends_it_when_it_has_started(job, monkeypatch, t
     assert done == ["started", "ended"]
 
 
+@pytest.mark.slow
 def test_a_process_that_is_lost_while_it_generates_the_first_scene_is_replaced(job, tmp_path):
     import ray
 
@@ -105,6 +107,7 @@ def test_a_process_that_is_lost_while_it_generates_the_first_scene_is_replaced(j
         assert actors.lost and [actor.scene_id for actor in actors._actors] == ["scene-0000"]
 
 
+@pytest.mark.slow
 def test_a_lost_node_is_replaced_by_one_that_joins(job, whole, files_of, tmp_path, capsys):
     from benchmarks.ray_cluster import LocalCluster
     from perilune_render.jobs.ray_actors import RayActors

@@ -25,6 +25,7 @@ def test_shards_share_out_every_trajectory_once():
         assert places == list(range(n_trajectories))
 
 
+@pytest.mark.slow
 def test_shards_in_random_order_and_at_the_same_time_give_the_same_bytes(options, whole, files_of, tmp_path):
     command, numbers = ["dataset", *options, "--out", str(tmp_path), "--workers", "0"], [1, 2, 3]
     random.shuffle(numbers)

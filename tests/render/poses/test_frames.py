@@ -12,8 +12,6 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.frames import sun_direction
 from perilune_shared.validation.validate import validate
 
-pytest.importorskip("bpy")
-
 DOWN = "0,1,0,0"
 """The quaternion of a camera that looks straight down."""
 NAMES = "time_s,x_m,y_m,z_m,qw,qx,qy,qz"
@@ -22,7 +20,7 @@ SCENE = {
         "name": "given",
         "seed": 5,
         "terrain": {"spacing_px": 1.0},
-        "render": {"samples": 1},
+        "render": {"samples": 1, "engine": "heightfield"},
         "scene": {"sun_azimuth_deg": 100, "sun_elevation_deg": 25},
     }
 }

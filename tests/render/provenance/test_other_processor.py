@@ -46,6 +46,7 @@ def rendered(out, workers, threads, environment):
     return {p.relative_to(out).as_posix(): p.read_bytes() for p in (out / "made").rglob("*") if p.is_file()}
 
 
+@pytest.mark.slow
 def test_a_dataset_has_the_same_bytes_on_another_processor_with_more_threads(tmp_path):
     one = rendered(tmp_path / "one", 0, 1, {})
     two = rendered(tmp_path / "two", 1, 2, OTHER_PROCESSOR)

@@ -126,8 +126,8 @@ def test_a_name_is_plain(name):
         preset("tiny", f"dataset.name={name!r}")
 
 
-def test_a_manifest_rendered_again_keeps_its_seeds(tiny):
-    manifest = open_dataset(tiny / "detect")
+def test_a_manifest_rendered_again_keeps_its_seeds(quick):
+    manifest = open_dataset(quick / "detect")
     recipe = manifest.info.recipe()
     renamed = recipe.model_copy(update={"config": {**recipe.config, "name": "other"}})
     info = manifest.info.model_copy(update={"recipes": recipes_of(renamed)})

@@ -32,8 +32,8 @@ HIGHLAND = Path(__file__).parents[3] / "configs" / "highland.yaml"
         ("tiny", "detect", 0, 8, None),
         ("tiny", "nav", 0, 9, None),
         ("tiny", "detect", 0, 8, HIGHLAND),
-        ("small", "detect", 5, 4, None),
-        ("small", "nav", 0, 3, None),
+        pytest.param("small", "detect", 5, 4, None, marks=pytest.mark.slow),
+        pytest.param("small", "nav", 0, 3, None, marks=pytest.mark.slow),
     ],
 )
 def test_no_facet_is_over_a_pixel_in_any_frame(preset, kind, place, n_frames, config_file):

@@ -22,7 +22,10 @@ from perilune_shared.validation.validate import validate
 
 OLD = Path(__file__).parents[1] / "old"
 CHAINS = int(os.environ.get("PERILUNE_CHAINS", "60"))
-"""Number of random chains, the same ones each time; 1000 take minutes and reach no line and no branch more than 200."""
+"""Number of random chains of the slow test, the same ones each time.
+
+1000 take minutes and reach no line and no branch more than 200.
+"""
 CONDITIONS = (
     "frame_index % 2 == 0",
     "split == 'train'",
@@ -122,10 +125,11 @@ def pool(tmp_path_factory):
     return Pool(tmp_path_factory.mktemp("chains"))
 
 
-def test_every_result_of_a_chain_is_consistent(pool):
+@pytest.mark.parametrize("n_chains", [15, pytest.param(CHAINS, marks=pytest.mark.slow)])
+def test_every_result_of_a_chain_is_consistent(pool, n_chains):
     chains = []
 
-    @settings(max_examples=CHAINS, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=n_chains, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
     @given(st.sampled_from([1, 2]), st.lists(STEPS, min_size=1, max_size=3))
     def run(start, steps):
         key, folder = ("drawn", start), pool.made["drawn", start]
@@ -137,4 +141,4 @@ def test_every_result_of_a_chain_is_consistent(pool):
 
     run()
     made = [folder for folder in pool.made.values() if folder is not None]
-    assert len(chains) >= CHAINS and len(made) > CHAINS / 5
+    assert len(chains) >= n_chains and len(made) > n_chains / 5

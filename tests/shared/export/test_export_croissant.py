@@ -3,17 +3,16 @@
 import io
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import mlcroissant
 import numpy as np
 import pytest
 from PIL import Image
+from tests.helpers import in_process
 from typer.testing import CliRunner
 
-from perilune_shared.cli.main import app
+from perilune_shared.cli.main import app, main
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.schema import OPTIONAL_TABLES, TABLES, stored
 from perilune_shared.editing.writer import new_dataset
@@ -112,6 +111,5 @@ def test_command_line(crowded, tmp_path):
     assert CliRunner().invoke(app, arguments("croissant")).exit_code == 0 and (root / "croissant.json").is_file()
     for wrong in (["coco"], ["croissant", "--split", "val"], ["yolo", "--split", "training"]):
         assert isinstance(CliRunner().invoke(app, arguments(*wrong)).exception, UserError)
-    manifest = str(Path(sys.executable).parent / "perilune-manifest")
-    taken = subprocess.run([manifest, *arguments("tum", "--out", root)], capture_output=True, text=True)
+    taken = in_process.call(main, *arguments("tum", "--out", root))
     assert taken.returncode == 2 and len(taken.stderr.strip().splitlines()) == 1, taken.stderr

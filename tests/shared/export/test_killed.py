@@ -78,7 +78,9 @@ def states(little, tmp_path_factory):
     return {"bare": bare, "full": full}
 
 
-@pytest.mark.parametrize("when", ["before", "within", "after"])
+@pytest.mark.parametrize(
+    "when", ["within", *(pytest.param(when, marks=pytest.mark.slow) for when in ("before", "after"))]
+)
 @pytest.mark.parametrize("state", ["bare", "full"])
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_killed_command_is_completed_by_the_next_one(name, state, when, states, tmp_path, monkeypatch):

@@ -75,10 +75,10 @@ def test_a_ridge_hides_craters_behind_it():
     assert mask.amodal.any() and not mask.visible.any()
 
 
-def test_masks_of_a_rendered_frame(tiny):
+def test_masks_of_a_rendered_frame(quick):
     from perilune_render.imaging.exr import read_exr
 
-    dataset = open_dataset(tiny / "detect")
+    dataset = open_dataset(quick / "detect")
     frame = dataset.table("frames").to_pandas().iloc[5]
     exr = read_exr(dataset.file(frame.exr_path))
     labels = dataset.table("labels").to_pandas()
@@ -114,11 +114,11 @@ def test_masks_of_a_rendered_frame(tiny):
     assert (owner == exr["crater"]).mean() > 0.9999 and (owner >= 0).any()
 
 
-def test_masks_with_distortion_use_the_requested_camera(tiny_detect):
+def test_masks_with_distortion_use_the_requested_camera(quick_detect):
     """Read a pinhole dataset as one of a distorted camera with a smaller view: same terrain, other pixels."""
     from perilune_render.imaging.exr import read_exr
 
-    dataset = open_dataset(tiny_detect)
+    dataset = open_dataset(quick_detect)
     pinhole = dataset.info.camera
     bent = pinhole.model_copy(update={"width_px": 64, "height_px": 64, "cx_px": 31.7, "cy_px": 32.0})
     bent = bent.model_copy(update={"distortion": (-0.3, 0.0, 0.0, 0.0, 0.0)})
@@ -149,8 +149,8 @@ def test_masks_with_distortion_use_the_requested_camera(tiny_detect):
     assert compared > 1000 and 0.9 * beside[0] < beside[1] > 0
 
 
-def test_unknown_frames_and_craters_are_refused(tiny):
-    dataset = open_dataset(tiny / "detect")
+def test_unknown_frames_and_craters_are_refused(quick):
+    dataset = open_dataset(quick / "detect")
     frame_id = dataset.table("frames", ["frame_id"])["frame_id"][0].as_py()
     with pytest.raises(UserError, match="frame_id: got nowhere"):
         frame_masks(dataset, "nowhere")

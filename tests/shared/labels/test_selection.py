@@ -42,8 +42,8 @@ def test_the_named_selections():
     ("width_px", "stated", "bound"),
     [(128, None, 50.0), (256, None, 50.0), (1024, None, 200.0), (1024, 50.0, 50.0), (1024, "much", 200.0)],
 )
-def test_the_label_bound_comes_from_the_recipe_or_the_image_width(tiny, width_px, stated, bound):
-    info = open_dataset(tiny / "detect").info
+def test_the_label_bound_comes_from_the_recipe_or_the_image_width(quick, width_px, stated, bound):
+    info = open_dataset(quick / "detect").info
     recipe = info.recipe().model_copy(update={"config": {"labels": {"max_radius_px": stated}}})
     camera = info.camera.model_copy(update={"width_px": width_px})
     assert label_bound_px(info.model_copy(update={"camera": camera, "recipes": {recipe.key: recipe}})) == bound
@@ -76,8 +76,8 @@ def test_the_contrast_of_large_craters_is_limited():
     assert selected(rows, Selection(min_contrast=5.0)).all()
 
 
-def test_labels_are_read_with_their_craters(tiny):
-    dataset = open_dataset(tiny / "detect")
+def test_labels_are_read_with_their_craters(quick):
+    dataset = open_dataset(quick / "detect")
     rows = read_labels(dataset, ["ellipse_a_px"])
     table = dataset.table("labels").to_pandas()
     for column in ("frame_id", "crater_id", "contrast", "ellipse_a_px"):

@@ -126,7 +126,11 @@ BOMBS = {
 }
 
 
-@pytest.mark.parametrize("name", BOMBS)
+QUICK = ("10^6 rows in 20 kB", "the same with a footer that hides it", "3 x 10^6 labels of one frame")
+"""One of each kind, since each takes a process of its own."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else [pytest.mark.slow]) for n in BOMBS])
 def test_bombs_are_refused_within_memory_and_time_limits(name, victim):
     damage, column = BOMBS[name]
     sealed(damage)(victim)

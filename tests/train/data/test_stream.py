@@ -81,7 +81,7 @@ def test_epochs_of_one_loader_follow_each_other(packed):
         assert len(loader) == 9 and list(loader) == epoch_of(packed, epoch)
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_stream_is_resumed_with_exactly_the_batches_that_were_left(packed, workers, monkeypatch):
     monkeypatch.setattr(streaming, "_GROUPS_PER_WINDOW", 2)
     options = {"process": 1, "processes": 2, "workers": workers, "batch_size": 3}

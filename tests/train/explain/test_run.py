@@ -155,18 +155,27 @@ def test_a_run_writes_values_tests_interventions_claims_and_pictures(
     assert {path: path.stat().st_mtime_ns for path in run.root.rglob("*")} == before
 
 
-def test_test_terrain_that_a_network_was_fitted_to_is_refused_or_marked(dataset_detect, dataset_nav, tmp_path):
+@pytest.fixture
+def overlapping(dataset_detect, dataset_nav, tmp_path):
+    """A detector that was fitted to other terrain, and a navigator that was fitted to test terrain."""
     detector, stack = _store(tmp_path / "networks")
-    store_record(detector, uses_of(dataset_detect, "test"))
-    with pytest.raises(UserError, match=r"s004 = elsewhere/s004 \(trained\).*--allow-overlap"):
-        _explain((detector, stack), dataset_detect, dataset_nav, tmp_path)
     store_record(detector, uses_of(dataset_detect, "train"))
     store_record(stack, uses_of(dataset_nav, "test"))
+    return detector, stack
+
+
+def test_test_terrain_that_a_network_was_fitted_to_is_refused(overlapping, dataset_detect, dataset_nav, tmp_path):
     with pytest.raises(UserError, match=r"s000 = elsewhere/s000 \(trained\).*--allow-overlap"):
-        _explain((detector, stack), dataset_detect, dataset_nav, tmp_path)
+        _explain(overlapping, dataset_detect, dataset_nav, tmp_path)
+    store_record(overlapping[0], uses_of(dataset_detect, "test"))
+    with pytest.raises(UserError, match=r"s004 = elsewhere/s004 \(trained\).*--allow-overlap"):
+        _explain(overlapping, dataset_detect, dataset_nav, tmp_path)
     assert not (tmp_path / "explain").exists()
-    # Each picture has the mark of its own network.
-    run = _explain((detector, stack), dataset_detect, dataset_nav, tmp_path, allow_overlap=True)
+
+
+@pytest.mark.slow
+def test_each_picture_has_the_mark_of_its_own_network(overlapping, dataset_detect, dataset_nav, tmp_path):
+    run = _explain(overlapping, dataset_detect, dataset_nav, tmp_path, allow_overlap=True)
     metrics = json.loads(run.metrics.read_text())
     assert (metrics["detector/terrain/status"], metrics["navigator/terrain/status"]) == ("disjoint", "overlap")
     assert "s000 = elsewhere/s000" in metrics["navigator/terrain/mark"]
@@ -176,6 +185,7 @@ def test_test_terrain_that_a_network_was_fitted_to_is_refused_or_marked(dataset_
     assert table_mark == f"navigator: {metrics['navigator/terrain/mark']}"
 
 
+@pytest.mark.slow
 def test_one_network_alone(checkpoints, dataset_detect, tmp_path):
     """No navigator and no navigation dataset are needed to explain a detector."""
     run = _explain((checkpoints[0], None), dataset_detect, "missing", tmp_path)

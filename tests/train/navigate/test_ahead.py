@@ -30,7 +30,10 @@ def test_items_come_in_order_and_at_most_so_many_are_made_ahead():
     make = Squares()
     ahead = Ahead(make, numbers, 2)
     assert [ahead.take(key) for key in (1, 2, 3)] == [1, 4, 9]
-    time.sleep(0.3)
+    deadline = time.monotonic() + 20
+    while len(make.made) < 6 and time.monotonic() < deadline:
+        time.sleep(0.001)
+    time.sleep(0.05)
     # Two wait, and the thread holds one more.
     assert make.made == [1, 2, 3, 4, 5, 6]
     assert make.begun == 1

@@ -9,26 +9,11 @@ from tests.helpers import in_process
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.subset import subset
 from perilune_train.cli import main
-from perilune_train.navigate.config import NavigateConfig
-from perilune_train.navigate.train.run import navigate_run
-
-_NETWORK = {
-    "size_px": 64,
-    "width": 0.125,
-    "hidden": 16,
-    "sequence_pairs": 4,
-    "batch_sequences": 2,
-    "coarse_epochs": 0,
-    "fine_epochs": 1,
-    "learning_rate": 1e-3,
-}
 
 
-@pytest.fixture(scope="module")
-def run(dataset_nav, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs")
-    settings = NavigateConfig(precision="float32", device="cpu", fusion="warp", warp=_NETWORK, stack=_NETWORK)
-    return navigate_run(settings, dataset_nav, folder, "a", None)[0].root
+@pytest.fixture
+def run(navigated):
+    return navigated / "a"
 
 
 @pytest.fixture(scope="module")

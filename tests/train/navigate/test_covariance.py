@@ -1,7 +1,9 @@
 """The covariance that a warp network states."""
 
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,6 @@ from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.cli import main
-from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.covariance import (
     FILE,
     NAMES,
@@ -25,7 +26,6 @@ from perilune_train.navigate.covariance import (
 from perilune_train.navigate.data.trajectories import load_split
 from perilune_train.navigate.evaluate.metrics import signed_errors
 from perilune_train.navigate.network import build
-from perilune_train.navigate.train.run import navigate_run
 
 ARCHITECTURE = {
     "fusion": "warp",
@@ -112,11 +112,8 @@ def test_damaged_files_get_one_line(tmp_path, text):
         read_numbers(tmp_path)
 
 
-def test_calibrate_writes_the_file_of_a_training(dataset_nav, tmp_path):
-    settings = {"size_px": 64, "width": 0.125, "hidden": 16, "sequence_pairs": 4, "batch_sequences": 2}
-    settings |= {"coarse_epochs": 0, "fine_epochs": 1, "learning_rate": 1e-3}
-    config = NavigateConfig(precision="float32", device="cpu", fusion="warp", warp=settings, stack=settings)
-    run = navigate_run(config, dataset_nav, tmp_path, "a", None)[0].root
+def test_calibrate_writes_the_file_of_a_training(navigated, dataset_nav, tmp_path):
+    run = Path(shutil.copytree(navigated / "a", tmp_path / "a"))
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     assert metrics["test/normalised_error_squared_mean"] > 0
     written = json.loads((run / FILE).read_text(encoding="utf-8"))

@@ -11,30 +11,13 @@ from tests.helpers import in_process
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.cli import main
-from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data.trajectories import load_trajectories
 from perilune_train.navigate.network import load_navigator, predict, predict_by_pairs
-from perilune_train.navigate.train.run import navigate_run
-
-_NETWORK = {
-    "size_px": 64,
-    "width": 0.125,
-    "hidden": 16,
-    "sequence_pairs": 4,
-    "batch_sequences": 2,
-    "coarse_epochs": 0,
-    "fine_epochs": 1,
-    "learning_rate": 1e-2,
-}
 
 
-@pytest.fixture(scope="module")
-def runs(dataset_nav, tmp_path_factory):
-    """Both networks, trained for an epoch."""
-    folder = tmp_path_factory.mktemp("runs")
-    settings = NavigateConfig(precision="float32", device="cpu", warp=_NETWORK, stack=_NETWORK)
-    navigate_run(settings, dataset_nav, folder, "a", None)
-    return folder / "navigate"
+@pytest.fixture
+def runs(navigated):
+    return navigated
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,8 @@ from perilune_shared.errors import UserError
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.train.run import navigate_run
 
+pytestmark = pytest.mark.slow
+
 _NETWORK = {
     "size_px": 64,
     "width": 0.125,

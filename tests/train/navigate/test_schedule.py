@@ -73,6 +73,7 @@ def test_stored_features_give_the_weights_of_whole_epochs(dataset_nav, tmp_path,
     assert torch.equal(first["network.backbone.stem.conv.weight"], start)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_a_kill_within_an_epoch_of_summed_gradients_changes_nothing(dataset_nav, tmp_path, monkeypatch):
     own = settings(coarse_epochs=0, fine_epochs=2, accumulate=2)

@@ -146,6 +146,7 @@ def leave_the_error(made):
     made.put(found)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_a_lost_server_ends_with_a_saved_state_that_resumes_to_the_same_weights(
     served, dataset_nav, tmp_path, monkeypatch, capsys

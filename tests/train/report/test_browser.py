@@ -25,6 +25,8 @@ if _path is None and not os.environ.get("CI"):
     pytest.skip("no Chromium: sudo apt-get install chromium", allow_module_level=True)
 needed("playwright")
 
+pytestmark = pytest.mark.slow
+
 YELLOW, ORANGE = (240, 228, 66), (230, 159, 0)
 
 

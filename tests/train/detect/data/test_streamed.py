@@ -59,7 +59,7 @@ def test_samples_are_those_of_frames_in_memory(few, packed):
 
 
 @pytest.mark.usefixtures("no_pictures")
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_run_stopped_within_an_epoch_is_resumed_with_the_frames_that_were_left(
     packed, tmp_path, workers, monkeypatch
 ):

@@ -219,7 +219,7 @@ def quantise_once():
     return quantise
 
 
-@pytest.mark.parametrize("most_loss", [-1.0, 1.0])
+@pytest.mark.parametrize("most_loss", [1.0, pytest.param(-1.0, marks=pytest.mark.slow)])
 def test_int8_is_evaluated_and_kept_only_if_better(
     run_folder, dataset_detect, tmp_path, monkeypatch, quantise_once, most_loss
 ):

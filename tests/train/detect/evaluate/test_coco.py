@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from tests.helpers.coco_reference import coco_evaluation
+from tests.train.detect.evaluate.coco_reference import coco_evaluation
 
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.evaluate.matching import COCO_IOUS, Detections, find_overlaps

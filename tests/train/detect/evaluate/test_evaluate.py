@@ -7,28 +7,23 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from tests.helpers.coco_reference import coco_evaluation
+from tests.train.detect.evaluate.coco_reference import coco_evaluation
 from typer.testing import CliRunner
 
-from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_train.cli import app
-from perilune_train.detect.config import DetectConfig, LabelSettings
+from perilune_train.detect.config import LabelSettings
 from perilune_train.detect.data.frame_facts import facts_of
 from perilune_train.detect.data.labels import FrameLabels
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.evaluate.matching import COCO_IOUS, Detections, find_overlaps
 from perilune_train.detect.evaluate.metrics import curve
-from perilune_train.detect.train.run import run_detect
-
-QUICK = ("detect.epochs=4", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
 
 
-@pytest.fixture(scope="module")
-def run(dataset_detect, tmp_path_factory) -> Path:
-    settings = resolve(DetectConfig, "detect", "perilune_train", "tiny", None, QUICK)
-    return run_detect(settings, dataset_detect, tmp_path_factory.mktemp("runs"), "a").root
+@pytest.fixture(scope="session")
+def run(finished) -> Path:
+    return finished.root
 
 
 def call(*arguments):

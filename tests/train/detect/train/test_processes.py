@@ -16,6 +16,8 @@ from perilune_train.cli import main
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.train.run import run_detect
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = ("detect.precision=float32", "detect.device=cpu", "detect.checkpoint_minutes=0")
 BATCHES = 6
 ALONE = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -6,6 +6,7 @@ import shutil
 import pyarrow.parquet as pq
 import pytest
 import torch
+from tests.train.detect.conftest import QUICK
 
 from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
@@ -22,16 +23,9 @@ from perilune_train.detect.train.task import DetectTask
 from perilune_train.detect.train.transfer import start_from
 from perilune_train.training import runs
 
-QUICK = ("detect.epochs=2", "detect.width=0.125", "detect.precision=float32", "detect.device=cpu")
-
 
 def settings(*more):
     return resolve(DetectConfig, "detect", "perilune_train", "tiny", None, (*QUICK, *more))
-
-
-@pytest.fixture(scope="module")
-def finished(dataset_detect, tmp_path_factory):
-    return run_detect(settings(), dataset_detect, tmp_path_factory.mktemp("runs"), "a")
 
 
 def test_a_run_leaves_all_its_files(finished):

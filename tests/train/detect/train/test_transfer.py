@@ -68,6 +68,7 @@ def test_normalised_frames_give_the_stem_what_grey_values_gave():
         torch.testing.assert_close(rescaled.state_dict()[key], value, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_published_size_is_written_again_byte_for_byte(coco, tmp_path):
     path, values = coco
     content = read_darknet(path, (62_001_757,))

@@ -56,6 +56,7 @@ def _run(rendered, detector, runs, **options):
     return causal_run(settings, rendered.factual, rendered.without, detector, "B_11", runs, "t", **options)
 
 
+@pytest.mark.slow
 def test_a_run_writes_effects_bins_claims_and_pictures(rendered, inputs, tmp_path):
     detector, stack, nav, without = inputs
     run = _run(rendered, detector, tmp_path, turned=rendered.factual, pose=(nav, without, stack))

@@ -110,9 +110,9 @@ def unpack(dataset, trajectory, out):
     return in_process.call(main, "navigate", "unpack", "--dataset", dataset, "--trajectory", trajectory, "--out", out)
 
 
-def test_a_dataset_unpacked_and_flown(tiny, tmp_path):
-    row = open_dataset(tiny / "nav").trajectories.iloc[-1]
-    unpacked = unpack(tiny / "nav", f"{row['scene_id']}/{row['trajectory_id']}", tmp_path / "descent")
+def test_a_dataset_unpacked_and_flown(quick, tmp_path):
+    row = open_dataset(quick / "nav").trajectories.iloc[-1]
+    unpacked = unpack(quick / "nav", f"{row['scene_id']}/{row['trajectory_id']}", tmp_path / "descent")
     assert unpacked.returncode == 0, unpacked.stderr
     table, _ = flown(tmp_path / "descent", tmp_path / "flight", catalogue="catalogue.parquet")
     assert len(table) == row["n_frames"]
@@ -123,8 +123,8 @@ def test_a_dataset_unpacked_and_flown(tiny, tmp_path):
     assert np.isfinite(table["error_attitude_deg"]).all()
 
 
-def test_a_trajectory_that_does_not_exist(tiny, tmp_path):
-    unpacked = unpack(tiny / "nav", "nowhere/none", tmp_path / "descent")
+def test_a_trajectory_that_does_not_exist(quick, tmp_path):
+    unpacked = unpack(quick / "nav", "nowhere/none", tmp_path / "descent")
     assert unpacked.returncode == 2
     assert "nowhere/none" in unpacked.stderr
     assert "one of its" in unpacked.stderr

@@ -1,24 +1,15 @@
-"""The command `navigate map` over a rendered survey, and the methods that use its catalogues."""
+"""The command `navigate map` over a rendered survey; tests/train/navigate/methods uses its catalogues."""
 
 import json
 import shutil
 
 import pandas as pd
-import pytest
 from tests.helpers import in_process
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.editing.pack import pack
 from perilune_shared.editing.subset import subset
 from perilune_train.cli import main
-
-
-@pytest.fixture(scope="module")
-def mapped(tiny_survey, tmp_path_factory):
-    out = tmp_path_factory.mktemp("maps") / "map"
-    done = in_process.call(main, "navigate", "map", "--dataset", tiny_survey, "--out", out)
-    assert done.returncode == 0, done.stderr
-    return out
 
 
 def test_a_catalogue_with_its_errors(mapped):
@@ -38,16 +29,7 @@ def test_a_catalogue_with_its_errors(mapped):
     assert stated["sun_elevation_deg"] == 30.0
 
 
-def test_methods_fly_over_a_map(mapped, tiny, tmp_path):
-    out = tmp_path / "methods"
-    done = in_process.call(main, "navigate", "methods", "--dataset", tiny / "nav", "--map", mapped, "--out", out)
-    assert done.returncode == 0, done.stderr
-    rows = pd.read_parquet(out / "navigation.parquet").set_index("method")
-    assert rows.loc["filter, map", "n_frames"] == rows.loc["filter", "n_frames"]
-    assert "`filter, map`" in (out / "methods.md").read_text(encoding="utf-8")
-
-
-def test_damaged_maps_get_one_line(mapped, tiny, tmp_path):
+def test_damaged_maps_get_one_line(mapped, quick, tmp_path):
     def damaged(name, text):
         folder = tmp_path / name
         shutil.copytree(mapped, folder)
@@ -67,7 +49,7 @@ def test_damaged_maps_get_one_line(mapped, tiny, tmp_path):
         (damaged("nan", json.dumps(good).replace('"position_sigma_m": ', '"position_sigma_m": -')), ["deviations"]),
     ):
         done = in_process.call(
-            main, "navigate", "methods", "--dataset", tiny / "nav", "--map", folder, "--out", tmp_path / "out"
+            main, "navigate", "methods", "--dataset", quick / "nav", "--map", folder, "--out", tmp_path / "out"
         )
         assert done.returncode == 2, folder
         assert len(done.stderr.strip().splitlines()) == 1, done.stderr
@@ -75,16 +57,16 @@ def test_damaged_maps_get_one_line(mapped, tiny, tmp_path):
         assert not (tmp_path / "out").exists()
 
 
-def test_frames_of_a_descent_make_no_map(tiny, tmp_path):
-    done = in_process.call(main, "navigate", "map", "--dataset", tiny / "nav", "--out", tmp_path / "out")
+def test_frames_of_a_descent_make_no_map(quick, tmp_path):
+    done = in_process.call(main, "navigate", "map", "--dataset", quick / "nav", "--out", tmp_path / "out")
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert "perilune-render survey" in done.stderr
     assert not (tmp_path / "out").exists()
 
 
-def test_a_survey_without_frames_and_a_packed_one(tiny_survey, mapped, tmp_path):
-    survey = open_dataset(tiny_survey)
+def test_a_survey_without_frames_and_a_packed_one(quick_survey, mapped, tmp_path):
+    survey = open_dataset(quick_survey)
     subset(survey, tmp_path / "absent", images="none")
     done = in_process.call(main, "navigate", "map", "--dataset", tmp_path / "absent", "--out", tmp_path / "out")
     assert done.returncode == 2

@@ -13,11 +13,11 @@ from perilune_train.cli import main
 
 
 @pytest.fixture(scope="module")
-def places(tiny, tmp_path_factory):
+def places(quick, tmp_path_factory):
     """The test descents of `tiny` as one part of a benchmark, and its manifest."""
     folder = tmp_path_factory.mktemp("landing")
     part = folder / "data" / "benchmark-nav-highland"
-    subset(open_dataset(tiny / "nav"), part, where=["split == 'test'"])
+    subset(open_dataset(quick / "nav"), part, where=["split == 'test'"])
     subset(open_dataset(part), folder / "manifests" / part.name, images="none")
     return folder / "data", folder / "manifests"
 

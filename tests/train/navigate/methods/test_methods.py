@@ -14,9 +14,9 @@ def methods(*arguments):
     return in_process.call(main, "navigate", "methods", *arguments)
 
 
-def test_a_page_with_every_method(tiny, tmp_path):
+def test_a_page_with_every_method(quick, mapped, tmp_path):
     out = tmp_path / "methods"
-    done = methods("--dataset", tiny / "nav", "--out", out)
+    done = methods("--dataset", quick / "nav", "--map", mapped, "--out", out)
     assert done.returncode == 0, done.stderr
     rows = pd.read_parquet(out / "navigation.parquet").set_index("method")
     expected = {
@@ -30,8 +30,10 @@ def test_a_page_with_every_method(tiny, tmp_path):
         "filter",
         "smoother",
         "filter, exact catalogue",
+        "filter, map",
     }
     assert expected <= set(rows.index)
+    assert rows.loc["filter, map", "n_frames"] == rows.loc["filter", "n_frames"]
     page = (out / "methods.md").read_text(encoding="utf-8")
     assert all(f"`{method}`" in page for method in rows.index)
     assert "terrain" not in page.split("##")[0]
@@ -44,8 +46,8 @@ def test_a_page_with_every_method(tiny, tmp_path):
         assert f"]({name})" in page
     record, inputs = (json.loads((out / name).read_text()) for name in ("metrics.json", "inputs.json"))
     assert record["split"] == "test" and "torch" in record["run/versions"] and record["run/commit"]
-    assert inputs["dataset"] == sha256_of(tiny / "nav/dataset.json") and set(inputs) > {"navigator", "detector"}
-    again = methods("--dataset", tiny / "nav", "--out", out)
+    assert inputs["dataset"] == sha256_of(quick / "nav/dataset.json") and set(inputs) > {"navigator", "detector"}
+    again = methods("--dataset", quick / "nav", "--out", out)
     assert again.returncode == 2
     assert len(again.stderr.strip().splitlines()) == 1
 

@@ -15,11 +15,11 @@ def monte_carlo(*arguments):
     return in_process.call(main, "navigate", "monte-carlo", *arguments)
 
 
-def test_a_page_and_the_same_draws_with_any_number_of_workers(tiny, tmp_path):
+def test_a_page_and_the_same_draws_with_any_number_of_workers(quick, tmp_path):
     tables = []
     for workers in (1, 2):
         out = tmp_path / f"workers-{workers}"
-        done = monte_carlo("--dataset", tiny / "nav", "--out", out, "--draws", 3, "--workers", workers)
+        done = monte_carlo("--dataset", quick / "nav", "--out", out, "--draws", 3, "--workers", workers)
         assert done.returncode == 0, done.stderr
         tables.append(pd.read_parquet(out / "draws.parquet"))
     pd.testing.assert_frame_equal(*tables)
@@ -32,7 +32,7 @@ def test_a_page_and_the_same_draws_with_any_number_of_workers(tiny, tmp_path):
     for name in ("errors.png", "consistency.png"):
         assert (out / name).stat().st_size > 10_000
         assert f"]({name})" in page
-    again = monte_carlo("--dataset", tiny / "nav", "--out", out)
+    again = monte_carlo("--dataset", quick / "nav", "--out", out)
     assert again.returncode == 2
     assert len(again.stderr.strip().splitlines()) == 1
 
@@ -53,8 +53,8 @@ def test_mistakes_get_one_line(tmp_path, arguments, words):
     assert not (tmp_path / "out").exists()
 
 
-def test_descents_without_inertial_measurements_are_refused(tiny, tmp_path):
-    bare = shutil.copytree(tiny / "nav", tmp_path / "nav")
+def test_descents_without_inertial_measurements_are_refused(quick, tmp_path):
+    bare = shutil.copytree(quick / "nav", tmp_path / "nav")
     for part in (bare / "manifest" / "inertial").glob("*.parquet"):
         table = pq.read_table(part)
         pq.write_table(table.filter(pc.equal(table["grade"], "tactical")), part)
