@@ -156,12 +156,13 @@ def test_the_summary_has_the_figures(report):
 
 
 def test_the_headline_of_the_explanation_is_first(report, page):
-    assert report.summary[0] == f"demo: {HEADLINE}"
+    # After the line that says what the preset `tiny` is for.
+    assert report.summary[1] == f"demo: {HEADLINE}"
     (section,) = (one for one in report.sections if one.title == "Explanation")
     assert section.lead[0] == HEADLINE and section.lead[1].startswith("Claims: ")
     lines = summary_of(report).splitlines()
-    assert lines[2].replace("\\", "") == f"- demo: {HEADLINE}"
-    assert re.search(r"<h1>.*?<li>(.*?)</li>", page.read_text(), re.S)[1] == f"demo: {HEADLINE}"
+    assert lines[3].replace("\\", "") == f"- demo: {HEADLINE}"
+    assert re.search(r"<h1>.*?<li>.*?<li>(.*?)</li>", page.read_text(), re.S)[1] == f"demo: {HEADLINE}"
 
 
 @pytest.mark.parametrize("headline", [None, "", 3])
@@ -170,7 +171,7 @@ def test_a_run_without_a_headline_shows_its_claims(report_data, report_runs, tmp
     write_metrics(runs / "explain/demo", {} if headline is None else {"headline": headline})
     report = gather("demo", "demo", report_data, runs)
     (section,) = (one for one in report.sections if one.title == "Explanation")
-    assert section.lead == ("Claims: 1; holds: 1.",) and report.summary[0].startswith("demo: AP")
+    assert section.lead == ("Claims: 1; holds: 1.",) and report.summary[1].startswith("demo: AP")
 
 
 def test_hostile_names_stay_texts(hostile_page):

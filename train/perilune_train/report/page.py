@@ -40,9 +40,10 @@ from perilune_train.shipped.models import shipped_run
 
 PAGE, SUMMARY = "report.html", "summary.md"
 _TITLES: dict[Kind, str] = {"demo": "Demo", "paper": "The paper's experiment", "benchmark": "Locked benchmark"}
+_TRIAL_PRESET = "tiny"
 _TRIAL = (
-    "The preset tiny only shows that all steps work: its networks train for seconds, find almost nothing, and are no "
-    "measure of the method. The frames show the installed detector."
+    f"The preset {_TRIAL_PRESET} only shows that all steps work: its networks train for seconds, find almost nothing, and "
+    "are no measure of the method."
 )
 _VERSIONS = ("perilune-train", "numpy", "pandas", "pyarrow", "matplotlib", "jinja2", "torch", "lightning")
 
@@ -183,11 +184,14 @@ def _viewer(frames: LabelledFrames | None, opened: _Opened) -> Viewer | None:
 
 
 def _headlines(opened: _Opened, folders: Folders) -> list[str]:
-    """What `tiny` is for, the landing, then a line for each run, those of explanation first."""
-    lines = [_TRIAL] if any(one.info.name == "tiny" for one in opened.datasets.values()) else []
+    """What `tiny` is for, then a line for each run: what the gates show, the landing, the networks."""
+    recipes = [recipe for one in opened.datasets.values() for recipe in one.info.recipes.values()]
+    lines = [_TRIAL] if any(recipe.preset == _TRIAL_PRESET for recipe in recipes) else []
+    if lines and opened.detect and opened.detect[-1].name.endswith(INSTALLED):
+        lines[0] += " The frames show the installed detector."
+    lines += [f"{run.name}: {found}" for run in opened.explain if (found := explanation.headline_of(run))]
     if folders.landing is not None and (folders.landing / navigation.LANDING_TABLE).is_file():
         lines.append(navigation.landing_headline(navigation.read_landing(folders.landing)))
-    lines += [f"{run.name}: {found}" for run in opened.explain if (found := explanation.headline_of(run))]
     lines += [detection.headline(run) for run in reversed(opened.detect)]
     lines += [detection.headline(one, "visible/") for one in opened.scores if "visible/ap50_paper" in one.metrics]
     return lines + [navigation.headline(run) for run in opened.navigate]
