@@ -42,8 +42,8 @@ PAGE, SUMMARY = "report.html", "summary.md"
 _TITLES: dict[Kind, str] = {"demo": "Demo", "paper": "The paper's experiment", "benchmark": "Locked benchmark"}
 _TRIAL_PRESET = "tiny"
 _TRIAL = (
-    f"The preset {_TRIAL_PRESET} only shows that all steps work: its networks train for seconds, find almost nothing, and "
-    "are no measure of the method."
+    f"The preset {_TRIAL_PRESET} only shows that all steps work: its networks train for seconds, find almost nothing, "
+    "and are no measure of the method."
 )
 _VERSIONS = ("perilune-train", "numpy", "pandas", "pyarrow", "matplotlib", "jinja2", "torch", "lightning")
 
