@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,9 +20,12 @@ import typer
 
 from perilune_shared.command_line import run_command_line
 from perilune_shared.errors import EXIT_INTERRUPTED, UserError
+from perilune_shared.run_record import run_record
+from perilune_shared.storage.files import write_text
 from perilune_shared.threads import usable_cores
 
 BIN = Path(sys.executable).parent
+FIRST_STEP = "render detection frames"
 DRAWS = 10
 """Flights of the filter over each test descent."""
 
@@ -61,6 +64,13 @@ class Processes:
     def __init__(self) -> None:
         self._running: list[subprocess.Popen] = []
         self._begun_s = time.monotonic()
+        self.started_s: dict[str, float] = {}
+        """Start of each step, seconds after that of the demo."""
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the start of the demo."""
+        return time.monotonic() - self._begun_s
 
     def run(self, title: str, command: list[str]) -> None:
         """Run a command to its end, and end this program with its exit code if it fails."""
@@ -68,8 +78,8 @@ class Processes:
 
     def start(self, title: str, command: list[str], log: Path | None = None) -> subprocess.Popen:
         """Start a command; `log` takes what it prints."""
-        minutes = (time.monotonic() - self._begun_s) / 60
-        print(f"{title}, after {minutes:.1f} minutes" + (f"; progress in {log}" if log else ""), flush=True)
+        self.started_s[title] = round(self.elapsed_s, 1)
+        print(f"{title}, after {self.elapsed_s / 60:.1f} minutes" + (f"; progress in {log}" if log else ""), flush=True)
         program = [str(BIN / command[0]), *command[1:]]
         if log is None:
             process = subprocess.Popen(program, process_group=0)
@@ -102,7 +112,7 @@ class Processes:
 def run_steps(demo: Demo, processes: Processes) -> None:
     """Run the steps that are not finished."""
     if not demo.rendered("detect"):
-        processes.run("render detection frames", demo.render("detect"))
+        processes.run(FIRST_STEP, demo.render("detect"))
     log = demo.data / "nav.log"
     beside = None
     if not demo.rendered("nav"):
@@ -125,6 +135,11 @@ def run_steps(demo: Demo, processes: Processes) -> None:
     report = demo.runs / "report" / demo.name
     place = ["--name", demo.name, "--dataset", str(demo.data), "--runs", str(demo.runs), "--out", str(report)]
     processes.run("report", ["perilune-train", "report", *place])
+    if FIRST_STEP in processes.started_s:
+        # Not after a resume, when the times are those of the rest.
+        figures = {"seconds": round(processes.elapsed_s, 1), "started_s": processes.started_s}
+        write_text(report / "times.json", json.dumps({**figures, "run": asdict(run_record())}, indent=2) + "\n")
+    print(f"after {processes.elapsed_s / 60:.1f} minutes", flush=True)
 
 
 def main(
@@ -135,6 +150,7 @@ def main(
     runs: Path = Path("runs"),
 ) -> None:
     """Run all steps of the demo."""
+    run_record()
     for folder in (data, runs):
         if folder.exists() and not folder.is_dir():
             raise UserError(folder, "folder", "a file", "a folder, or nothing")

@@ -44,9 +44,11 @@ class Recorded:
 
     def __init__(self, demo):
         self.demo, self.titles, self.commands = demo, [], []
+        self.started_s, self.elapsed_s = {}, 0.0
 
     def start(self, title, command, log=None):
         self.titles.append(title)
+        self.started_s[title] = 0.0
         self.commands.append(command)
         return title
 
@@ -69,6 +71,8 @@ def test_navigation_frames_are_rendered_while_the_detector_trains(script, tmp_pa
     beside = "render navigation frames in the background"
     train, end = made.titles.index("train the detector"), made.titles.index(f"end: {beside}")
     assert made.titles.index(beside) < train < end < made.titles.index("train the navigators")
+    times = json.loads((demo.runs / "report/demo/times.json").read_text())
+    assert list(times["started_s"])[0] == "render detection frames"
     # The preset reaches each command that has settings.
     assert sum("--preset" in command for command in made.commands) == 5
 
@@ -80,6 +84,7 @@ def test_finished_frames_are_not_rendered_again(script, tmp_path):
     made = Recorded(demo)
     script.run_steps(demo, made)
     assert not any("render" in title for title in made.titles)
+    assert not (demo.runs / "report/demo/times.json").exists()
 
 
 def test_ctrl_c_reaches_both_sides_once(tmp_path):
