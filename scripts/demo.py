@@ -42,10 +42,13 @@ class Demo:
     """Folder of the runs."""
     settings: tuple[str, ...]
     """Options of all commands: preset, configuration file, single settings."""
+    of_rendering: tuple[str, ...] = ()
+    """Options of rendering alone: elevation model and catalogue."""
 
     def render(self, kind: str, *options: str) -> list[str]:
         """Command that renders a dataset."""
-        return ["perilune-render", "dataset", *self.settings, "--kind", kind, "--out", str(self.data), *options]
+        options = ("--kind", kind, "--out", str(self.data), *self.of_rendering, *options)
+        return ["perilune-render", "dataset", *self.settings, *options]
 
     def train(self, *words: str, dataset: Path) -> list[str]:
         """Command that trains on a dataset, or explains."""
@@ -148,13 +151,17 @@ def main(
     name: str = "demo",
     data: Path = Path("data/demo"),
     runs: Path = Path("runs"),
+    dem: Annotated[str | None, typer.Option(help="Elevation model of the ground.")] = None,
+    catalogue: Annotated[str | None, typer.Option(help="Craters of the elevation model.")] = None,
 ) -> None:
     """Run all steps of the demo."""
     run_record()
     for folder in (data, runs):
         if folder.exists() and not folder.is_dir():
             raise UserError(folder, "folder", "a file", "a folder, or nothing")
-    demo = Demo(name, data, runs, ("--preset", preset, *(settings or ())))
+    given = {"--dem": dem, "--catalogue": catalogue}
+    of_rendering = tuple(word for name, value in given.items() if value is not None for word in (name, value))
+    demo = Demo(name, data, runs, ("--preset", preset, *(settings or ())), of_rendering)
     processes = Processes()
     try:
         run_steps(demo, processes)

@@ -65,16 +65,17 @@ def complete(folder: Path) -> None:
 
 
 def test_navigation_frames_are_rendered_while_the_detector_trains(script, tmp_path):
-    demo = script.Demo("demo", tmp_path / "data", tmp_path / "runs", ("--preset", "demo"))
+    demo = script.Demo("demo", tmp_path / "data", tmp_path / "runs", ("--preset", "demo"), ("--dem", "a.tif"))
     made = Recorded(demo)
     script.run_steps(demo, made)
     beside = "render navigation frames in the background"
     train, end = made.titles.index("train the detector"), made.titles.index(f"end: {beside}")
     assert made.titles.index(beside) < train < end < made.titles.index("train the navigators")
     times = json.loads((demo.runs / "report/demo/times.json").read_text())
-    assert list(times["started_s"])[0] == "render detection frames"
+    assert next(iter(times["started_s"])) == "render detection frames"
     # The preset reaches each command that has settings.
     assert sum("--preset" in command for command in made.commands) == 5
+    assert ["--dem" in command for command in made.commands] == [c[0] == "perilune-render" for c in made.commands]
 
 
 def test_finished_frames_are_not_rendered_again(script, tmp_path):
