@@ -70,7 +70,7 @@ $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt
 
 demo: setup ## run all steps: set-up, frames, detection, navigation, explanation, report (PRESET=demo; tiny shows that all steps work)
 	@$(BIN)/python scripts/demo.py --preset $(PRESET) --name $(NAME) --data $(call quoted,$(DATA)) --runs $(call quoted,$(RUNS)) \
-	  $(if $(DEM),--dem $(call quoted,$(DEM))) $(if $(CATALOGUE),--catalogue $(call quoted,$(CATALOGUE))) -- $(if $(CONFIG),--config $(call quoted,$(CONFIG))) $(SETTINGS)
+	  $(if $(DEM),--dem $(call quoted,$(DEM))) $(if $(CATALOGUE),--catalogue $(call quoted,$(CATALOGUE))) $(if $(CONFIG),--config $(call quoted,$(CONFIG))) $(SETTINGS)
 	@echo
 	@echo "Datasets    $(DATA)/detect  $(DATA)/nav           pictures: overview.png"
 	@echo "Detection   $(RUNS)/detect/$(NAME)                metrics.json, *.png, detections.parquet"

@@ -3,7 +3,7 @@
 Navigation frames are rendered beside the training of the detector; their progress is in <data>/nav.log. Run the same
 command again to resume. Ctrl-C stops both sides, and both keep what is finished.
 
-    python scripts/demo.py --preset demo --name demo --data data/demo --runs runs -- --set dataset.seed=7
+    python scripts/demo.py --preset demo --name demo --data data/demo --runs runs --set dataset.seed=7
 """
 
 import json
@@ -18,13 +18,25 @@ from typing import Annotated
 
 import typer
 
+from perilune_render.config import DatasetConfig
 from perilune_shared.command_line import run_command_line
+from perilune_shared.config import Section, resolve
 from perilune_shared.errors import EXIT_INTERRUPTED, UserError
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import write_text
 from perilune_shared.threads import usable_cores
+from perilune_train.detect.config import DetectConfig
+from perilune_train.explain.config import ExplainConfig
+from perilune_train.navigate.config import NavigateConfig
 
 BIN = Path(sys.executable).parent
+SECTIONS: dict[str, tuple[type[Section], str]] = {
+    "dataset": (DatasetConfig, "perilune_render"),
+    "detect": (DetectConfig, "perilune_train"),
+    "navigate": (NavigateConfig, "perilune_train"),
+    "explain": (ExplainConfig, "perilune_train"),
+}
+"""Sections of a configuration, with the packages of their presets."""
 FIRST_STEP = "render detection frames"
 DRAWS = 10
 """Flights of the filter over each test descent."""
@@ -146,8 +158,9 @@ def run_steps(demo: Demo, processes: Processes) -> None:
 
 
 def main(
-    settings: Annotated[list[str] | None, typer.Argument(help="Options of all commands, after --.")] = None,
     preset: str = "demo",
+    config: Annotated[Path | None, typer.Option(help="YAML file of settings, as for all commands.")] = None,
+    settings: Annotated[list[str] | None, typer.Option("--set", help="One setting, as for all commands.")] = None,
     name: str = "demo",
     data: Path = Path("data/demo"),
     runs: Path = Path("runs"),
@@ -159,9 +172,15 @@ def main(
     for folder in (data, runs):
         if folder.exists() and not folder.is_dir():
             raise UserError(folder, "folder", "a file", "a folder, or nothing")
+    changes = tuple(settings or ())
+    # A mistake in the last step's settings is found before the first step.
+    for section, (model, package) in SECTIONS.items():
+        resolve(model, section, package, preset, config, changes)
     given = {"--dem": dem, "--catalogue": catalogue}
     of_rendering = tuple(word for name, value in given.items() if value is not None for word in (name, value))
-    demo = Demo(name, data, runs, ("--preset", preset, *(settings or ())), of_rendering)
+    common = ["--preset", preset, *(["--config", str(config)] if config else [])]
+    common += [word for change in changes for word in ("--set", change)]
+    demo = Demo(name, data, runs, tuple(common), of_rendering)
     processes = Processes()
     try:
         run_steps(demo, processes)

@@ -103,7 +103,7 @@ def steps(given, processes):
     processes.start("behind", ["python", "-c", child, str(folder / "behind")], folder / "behind.log")
     processes.run("in front", ["python", "-c", child, str(folder / "front")])
 demo.run_steps = steps
-demo.main(None, "tiny", "x", folder / "data", folder / "runs")
+demo.main("tiny", None, None, "x", folder / "data", folder / "runs")
 """
     process = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
     while not all((tmp_path / f"{name}.ready").exists() for name in ("behind", "front")):
@@ -126,6 +126,22 @@ def test_a_failed_command_ends_the_demo_with_its_code(script, tmp_path, capfd):
     assert end.value.code == 2
     assert "error: no space" in capfd.readouterr().err
     assert waiting.returncode == 130
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (("--preset", "tny"), "error: --preset: preset: got tny, expected tiny (nearest known)"),
+        (("--set", "explain.n_frame=4"), "error: --set: explain.n_frame: got an unknown key, expected n_frames"),
+        (("--config", "nowhere.yaml"), "error: nowhere.yaml: configuration: got no such file"),
+    ],
+)
+def test_a_mistake_is_found_before_the_first_step(tmp_path, given, expected):
+    place = ["--data", tmp_path / "data", "--runs", tmp_path / "runs"]
+    done = subprocess.run([sys.executable, ROOT / "scripts/demo.py", *place, *given], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith(expected) and done.stderr.count("\n") == 1
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_file_in_place_of_a_folder(tmp_path):
