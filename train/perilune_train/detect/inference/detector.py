@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from perilune_shared.errors import UserError
+from perilune_shared.threads import warn_if_crowded
 from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
@@ -51,5 +52,7 @@ def load_detector(path: Path) -> YOLOv3:
 def open_detector(checkpoint: Path, config: DetectConfig) -> Detector:
     """Load a detect run's best.ckpt onto the device of the settings. Raises UserError like `load_detector`."""
     device = runs.choose_device(config.device)
+    if device == "cpu":
+        warn_if_crowded()
     network = load_detector(checkpoint).to(device)
     return Detector(network, config, device, runs.choose_bf16(config.precision, device))
