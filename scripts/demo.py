@@ -153,7 +153,7 @@ def run_steps(demo: Demo, processes: Processes) -> None:
     if FIRST_STEP in processes.started_s:
         # Not after a resume, when the times are those of the rest.
         figures = {"seconds": round(processes.elapsed_s, 1), "started_s": processes.started_s}
-        write_text(report / "times.json", json.dumps({**figures, "run": asdict(run_record())}, indent=2) + "\n")
+        write_text(report / "demo.json", json.dumps({**figures, "run": asdict(run_record())}, indent=2) + "\n")
     print(f"after {processes.elapsed_s / 60:.1f} minutes", flush=True)
 
 

@@ -71,7 +71,7 @@ def test_navigation_frames_are_rendered_while_the_detector_trains(script, tmp_pa
     beside = "render navigation frames in the background"
     train, end = made.titles.index("train the detector"), made.titles.index(f"end: {beside}")
     assert made.titles.index(beside) < train < end < made.titles.index("train the navigators")
-    times = json.loads((demo.runs / "report/demo/times.json").read_text())
+    times = json.loads((demo.runs / "report/demo/demo.json").read_text())
     assert next(iter(times["started_s"])) == "render detection frames"
     # The preset reaches each command that has settings.
     assert sum("--preset" in command for command in made.commands) == 5
@@ -85,7 +85,7 @@ def test_finished_frames_are_not_rendered_again(script, tmp_path):
     made = Recorded(demo)
     script.run_steps(demo, made)
     assert not any("render" in title for title in made.titles)
-    assert not (demo.runs / "report/demo/times.json").exists()
+    assert not (demo.runs / "report/demo/demo.json").exists()
 
 
 def test_ctrl_c_reaches_both_sides_once(tmp_path):
