@@ -1,5 +1,6 @@
 """Open the engine that a configuration names: `cycles` (Blender), or `heightfield` (rays over the height field)."""
 
+import contextlib
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
@@ -30,3 +31,12 @@ def open_engine(
     from perilune_render.blender.renderer import Renderer
 
     return Renderer(scene, config, camera, sun)
+
+
+def load_engine(name: str) -> None:
+    """Import the libraries of an engine before there is a scene. `open_engine` reports one that is missing."""
+    with contextlib.suppress(ImportError):
+        if name == "heightfield":
+            import perilune_render.heightfield.engine
+        else:
+            import perilune_render.blender.renderer  # noqa: F401

@@ -21,6 +21,7 @@ from perilune_render.cli.options import (
     resolved_config,
     warn_of_size,
 )
+from perilune_render.config import DatasetConfig
 from perilune_shared.dataset.names import KINDS
 from perilune_shared.errors import UserError
 from perilune_shared.interrupts import ended_by_interrupt
@@ -30,6 +31,7 @@ from perilune_shared.terminal import console, progress_bar
 if TYPE_CHECKING:
     from perilune_render.jobs.job import Job
     from perilune_render.jobs.run import MakeExecutor, RenderingFailed
+    from perilune_render.jobs.worker import Worker
     from perilune_shared.dataset.manifest import Dataset
 
 
@@ -141,29 +143,39 @@ def dataset(
     if kind != "nav":
         warn_of_size(resolved)
     store, failed = open_store(out if out is not None else f"data/{preset}"), False
-    # Importing pyarrow and Numba takes seconds; check the settings first.
-    from perilune_render.jobs.job import Job
-    from perilune_render.jobs.run import RenderingFailed
+    with first_worker(how, resolved) as early:
+        # Importing pyarrow and Numba takes seconds; check the settings first.
+        from perilune_render.jobs.job import Job
+        from perilune_render.jobs.run import RenderingFailed
 
-    for name in KINDS if kind == "both" else (kind,):
-        try:
-            made = _made(Job.planned(resolved, name, preset), store.sub(name), how)
-        except RenderingFailed as error:
-            _print_failures(error)
-            failed = True
-            continue
-        if made is not None:
-            counts = made.info.counts
-            Console().print(
-                f"{made.store}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
-                f"look at {made.store.at('overview.png')}",
-                soft_wrap=True,
-            )
+        for name in KINDS if kind == "both" else (kind,):
+            try:
+                made = _made(Job.planned(resolved, name, preset), store.sub(name), how, early)
+            except RenderingFailed as error:
+                _print_failures(error)
+                failed = True
+                continue
+            if made is not None:
+                counts = made.info.counts
+                Console().print(
+                    f"{made.store}: {counts.frames} frames, {counts.labels} labels, {counts.scenes} scenes; "
+                    f"look at {made.store.at('overview.png')}",
+                    soft_wrap=True,
+                )
     if failed:
         raise typer.Exit(1)
 
 
-def _made(job: "Job", out: Store, how: How) -> "Dataset | None":
+def first_worker(how: How, config: DatasetConfig) -> "contextlib.AbstractContextManager[Worker | None]":
+    """A worker that starts while this process plans the job; None if no worker of this machine renders it."""
+    if how.executor != "local" or how.workers == 0 or how.finish:
+        return contextlib.nullcontext()
+    from perilune_render.jobs.worker import early_worker
+
+    return early_worker(config.render.engine)
+
+
+def _made(job: "Job", out: Store, how: How, early: "Worker | None" = None) -> "Dataset | None":
     """Do what the options ask for; the dataset if it is finished. Raises RenderingFailed if trajectories failed."""
     from perilune_render.jobs.run import Shard, finish_job, render_job, render_shard
 
@@ -176,22 +188,22 @@ def _made(job: "Job", out: Store, how: How) -> "Dataset | None":
     if how.finish:
         return finish_job(job, out)
     if how.dry_run:
-        _print_estimate(job, out, how)
+        _print_estimate(job, out, how, early)
         return None
     with ended_by_interrupt(after_s=_ENDED_S, at_end=_kill_processes), progress_bar() as progress:
         if how.shard is None:
-            return render_job(job, out, progress, _executor(how))
-        n_rendered = render_shard(job, out, Shard(*how.shard), progress, _executor(how))
+            return render_job(job, out, progress, _executor(how, early))
+        n_rendered = render_shard(job, out, Shard(*how.shard), progress, _executor(how, early))
     Console().print(f"{out}: {n_rendered} trajectories rendered; after all shards, --finish", soft_wrap=True)
     return None
 
 
-def made_or_exit(job: "Job", out: Store, how: How) -> "Dataset | None":
+def made_or_exit(job: "Job", out: Store, how: How, early: "Worker | None" = None) -> "Dataset | None":
     """Do what the options ask for; the dataset if it is finished. Ends the command if trajectories failed."""
     from perilune_render.jobs.run import RenderingFailed
 
     try:
-        return _made(job, out, how)
+        return _made(job, out, how, early)
     except RenderingFailed as error:
         _print_failures(error)
         raise typer.Exit(1) from None
@@ -206,11 +218,11 @@ def _kill_processes() -> None:
             process.kill()
 
 
-def _print_estimate(job: "Job", out: Store, how: How) -> None:
+def _print_estimate(job: "Job", out: Store, how: How, early: "Worker | None") -> None:
     from perilune_render.jobs.estimate import estimate
 
     with progress_bar() as progress:
-        found = estimate(job, out, progress, _executor(how), how.workers or 1)
+        found = estimate(job, out, progress, _executor(how, early), how.workers or 1)
     hours = f"{found.seconds / 3600:.2f} hours" if found.seconds > 360 else f"{found.seconds:.0f} seconds"
     size = next(f"{found.n_bytes / 10**n:.3g} {unit}" for n, unit in _UNITS if found.n_bytes >= 10**n or n == 0)
     Console().print(f"{out}: {found.n_frames} frames left, {hours}, {size}", soft_wrap=True)
@@ -223,7 +235,7 @@ def _print_failures(error: "RenderingFailed") -> None:
     console.print(f"error: {error.out}: {len(error.errors)} trajectories failed; {again}", soft_wrap=True)
 
 
-def _executor(how: How) -> "MakeExecutor":
+def _executor(how: How, early: "Worker | None") -> "MakeExecutor":
     if how.workers == 0:
         # Imports Blender, which takes seconds.
         from perilune_render.jobs.here import Here
@@ -237,7 +249,7 @@ def _executor(how: How) -> "MakeExecutor":
         return partial(RayActors, n_workers=how.workers, address=how.address)
     from perilune_render.jobs.local import LocalWorkers
 
-    return partial(LocalWorkers, n_workers=how.workers or 1)
+    return partial(LocalWorkers, n_workers=how.workers or 1, early=early)
 
 
 def _was_given(context: typer.Context, name: str) -> bool:

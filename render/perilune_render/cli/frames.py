@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from perilune_render.cli.dataset import How, made_or_exit
+from perilune_render.cli.dataset import How, first_worker, made_or_exit
 from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
 from perilune_render.config import DatasetConfig
 from perilune_render.config_cameras import CameraConfig
@@ -50,17 +50,18 @@ def frames(
     how = How.of("local", None, workers, threads, None, finish=False, dry_run=False)
     config = with_camera(resolved_config(preset, scene, setting, dem, catalogue, given_scene=True), camera)
     store = open_store(out)
-    from perilune_render.dataset.begin import new_info
-    from perilune_render.jobs.job import Job
-    from perilune_render.poses.file import read_poses
-    from perilune_render.poses.plan import given_plan
-    from perilune_render.provenance.recipe import recipe_of
-    from perilune_render.terrain.scene import site_of
+    with first_worker(how, config) as early:
+        from perilune_render.dataset.begin import new_info
+        from perilune_render.jobs.job import Job
+        from perilune_render.poses.file import read_poses
+        from perilune_render.poses.plan import given_plan
+        from perilune_render.provenance.recipe import recipe_of
+        from perilune_render.terrain.scene import site_of
 
-    given = read_poses(poses, *site_of(config))
-    plan, config = given_plan(given, config, kind, poses)
-    begun = new_info(config, plan, recipe_of(config, kind, preset))
-    made = made_or_exit(Job(plan, config, begun, str(poses)), store, how)
+        given = read_poses(poses, *site_of(config))
+        plan, config = given_plan(given, config, kind, poses)
+        begun = new_info(config, plan, recipe_of(config, kind, preset))
+        made = made_or_exit(Job(plan, config, begun, str(poses)), store, how, early)
     if made is not None:
         counts = made.info.counts
         Console().print(

@@ -5,13 +5,8 @@ loky with all its tasks, and none of them hands a task to the worker that alread
 """
 
 import contextlib
-import os
-import signal
-import subprocess
-import sys
 import tempfile
-from dataclasses import dataclass
-from multiprocessing.connection import Connection, Pipe, wait
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +15,17 @@ import psutil
 from perilune_render.jobs.job import Job
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
+from perilune_render.jobs.worker import Worker, start_worker
 from perilune_render.terrain.grid import graded_grid
 from perilune_shared.errors import UserError
 from perilune_shared.progress import say
 from perilune_shared.storage.store import Store, open_store
 from perilune_shared.threads import usable_cores
 
-WORKER = ("-m", "perilune_render.jobs.worker")
-"""What Python runs in a worker process."""
 RECYCLED_AFTER = 64
 """Number of trajectories after which a worker is replaced, so that its memory cannot grow without limit."""
 LOST_STARTS = 3
 """Number of workers in a row that may end before they are ready."""
-_END_S = 5.0
-"""Longest time for a worker to end by itself, seconds."""
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""The number of threads of linear algebra changes the last digits of results."""
 _BASE_BYTES, _VERTEX_BYTES = 0.75 * 2**30, 500
 """Peak memory of a worker: 1.1 GiB for 1.2 million vertices and 3.1 GiB for 5.7 million were measured."""
 _GROUND_BYTES, _GROWING_BYTES = 16, 70
@@ -44,39 +34,17 @@ _CGROUP = Path("/sys/fs/cgroup")
 """Limits of a container or a batch job, by kernel interface cgroup v2."""
 
 
-@dataclass(slots=True)
-class _Worker:
-    """A worker process, as its parent sees it."""
-
-    process: subprocess.Popen
-    connection: Connection
-    ready: bool = False
-    """Whether it has received the job."""
-    place: int | None = None
-    """The trajectory that it renders."""
-    scene_id: str | None = None
-    """The scene that it keeps."""
-    n_done: int = 0
-    """Number of trajectories that it has rendered."""
-
-    def send(self, command: str, target: object) -> None:
-        """Send a command. That a worker has ended is noticed when its messages are received."""
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.connection.send((command, target))
-
-    @property
-    def end(self) -> str:
-        """How the process ended."""
-        code = self.process.wait()
-        return f"worker killed by {signal.Signals(-code).name}" if code < 0 else f"worker ended with code {code}"
-
-
 class LocalWorkers:
-    """The executor that renders in `n_workers` processes. Its workers end with the block, or with this process."""
+    """The executor that renders in `n_workers` processes. Its workers end with the block, or with this process.
 
-    def __init__(self, job: Job, out: Store, n_workers: int):
+    `early` is a worker that was started before, and is used unless it has ended.
+    """
+
+    def __init__(self, job: Job, out: Store, n_workers: int, early: Worker | None = None):
         self._job, self._out, self._n_workers = job, for_other_processes(out), n_workers
-        self._workers: dict[Connection, _Worker] = {}
+        self._workers: dict[Connection, Worker] = {}
+        if early is not None and early.process.poll() is None:
+            self._workers[early.connection] = early
         self._lost_starts = 0
         self._scratch = tempfile.TemporaryDirectory(prefix="perilune-", ignore_cleanup_errors=True)
 
@@ -85,19 +53,19 @@ class LocalWorkers:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         for worker in list(self._workers.values()):
-            self._end(worker, at_once=kind is not None)
+            self._end(worker, at_once=kind is not None or not worker.ready)
         self._scratch.cleanup()
 
     def check_scene(self, scene_id: str) -> None:
         """Generate a scene in a worker and check that its poses fit it. Raises UserError."""
-        asked: list[_Worker] = []
+        asked: list[Worker] = []
         while True:
             self._start(min(self._n_workers, len(self._job.plan.trajectories)) or 1)
             ready = [worker for worker in self._workers.values() if worker.ready]
             if ready and (not asked or asked[-1].connection not in self._workers):
                 if len(asked) == N_ATTEMPTS:
                     expected = "a scene that can be generated: see the machine's free memory"
-                    raise UserError(self._job.where, scene_id, asked[-1].end, expected)
+                    raise UserError(self._job.where, scene_id, asked[-1].how_ended, expected)
                 asked.append(ready[0])
                 ready[0].send("grow", scene_id)
             for worker in self._heard():
@@ -121,14 +89,14 @@ class LocalWorkers:
             for worker in self._heard():
                 self._handle(worker, self._receive(worker), work, report)
 
-    def _hand_out(self, worker: _Worker, work: WorkList, report: Report) -> None:
+    def _hand_out(self, worker: Worker, work: WorkList, report: Report) -> None:
         place = work.take(worker.scene_id)
         if place is not None:
             worker.place, worker.scene_id = place, self._job.plan.trajectories[place].scene_id
             worker.send("render", place)
             report.started(place)
 
-    def _handle(self, worker: _Worker, message: tuple | None, work: WorkList, report: Report) -> None:
+    def _handle(self, worker: Worker, message: tuple | None, work: WorkList, report: Report) -> None:
         place = worker.place
         match message:
             case ("note", text):
@@ -142,16 +110,16 @@ class LocalWorkers:
                 if worker.n_done >= RECYCLED_AFTER:
                     self._end(worker)
             case None | ("failed", _) if place is not None:
-                error = worker.end if message is None else message[1]
+                error = worker.how_ended if message is None else message[1]
                 report.failed(place, error, work.failed(place, error))
                 self._end(worker)
 
-    def _heard(self) -> list[_Worker]:
+    def _heard(self) -> list[Worker]:
         """Workers that have sent a message or ended; waits for the first."""
         ready = wait(self._workers)
         return [worker for connection, worker in self._workers.items() if connection in ready]
 
-    def _receive(self, worker: _Worker) -> tuple[Any, ...] | None:
+    def _receive(self, worker: Worker) -> tuple[Any, ...] | None:
         """The next message of a worker; None if it has ended, and is no worker any more. Raises its final error."""
         try:
             message = worker.connection.recv()
@@ -162,7 +130,7 @@ class LocalWorkers:
             self._lost_starts += not worker.ready
             if self._lost_starts > LOST_STARTS * self._n_workers:
                 expected = "a worker that starts: see the messages above, and the machine's free memory"
-                raise UserError("perilune-render", "worker", worker.end, expected) from None
+                raise UserError("perilune-render", "worker", worker.how_ended, expected) from None
             return None
         if message == ("ready",):
             worker.ready, self._lost_starts = True, 0
@@ -173,31 +141,12 @@ class LocalWorkers:
     def _start(self, n_workers: int) -> None:
         """Start workers until there are `n_workers`."""
         while len(self._workers) < n_workers:
-            own, theirs = Pipe()
-            arguments = [str(theirs.fileno()), str(os.getpid()), self._scratch.name]
-            with theirs:
-                process = subprocess.Popen(
-                    # -P: a module in the current folder must not take the place of an installed one.
-                    [sys.executable, "-P", *WORKER, *arguments],
-                    pass_fds=[theirs.fileno()],
-                    env={**os.environ, **dict.fromkeys(ONE_THREAD, "1")},
-                    stdin=subprocess.DEVNULL,
-                    # Ctrl-C goes to this process alone, which then ends its workers.
-                    process_group=0,
-                )
-            self._workers[own] = _Worker(process, own)
+            worker = start_worker(self._scratch.name, self._job.config.render.engine)
+            self._workers[worker.connection] = worker
 
-    def _end(self, worker: _Worker, *, at_once: bool = False) -> None:
-        """End a worker; all that it reported as done is on the disk."""
+    def _end(self, worker: Worker, *, at_once: bool = False) -> None:
         self._workers.pop(worker.connection, None)
-        worker.connection.close()
-        if at_once:
-            worker.process.kill()
-        try:
-            worker.process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            worker.process.kill()
-            worker.process.wait()
+        worker.end(at_once=at_once)
 
 
 def for_other_processes(out: Store) -> Store:

@@ -13,10 +13,11 @@ import ray
 from ray.exceptions import RayActorError, RayTaskError
 
 from perilune_render.jobs.job import Job
-from perilune_render.jobs.local import LOST_STARTS, ONE_THREAD, RECYCLED_AFTER, for_other_processes
+from perilune_render.jobs.local import LOST_STARTS, RECYCLED_AFTER, for_other_processes
 from perilune_render.jobs.report import Report
 from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.work_list import WorkList
+from perilune_render.jobs.worker import ONE_THREAD
 from perilune_render.processor import SETTINGS
 from perilune_shared.errors import UserError, ends_run
 from perilune_shared.interrupts import interrupts_held

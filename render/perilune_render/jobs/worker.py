@@ -1,22 +1,97 @@
 """A worker process: renders the trajectories that its parent sends, one at a time (`local.py`).
 
-Started as `python -m perilune_render.jobs.worker DESCRIPTOR PARENT SCRATCH`: the descriptor of its end of the
-connection, the parent's process id, and a folder for temporary files, which the parent removes.
+`start_worker` starts `python -m perilune_render.jobs.worker DESCRIPTOR PARENT SCRATCH ENGINE`: the descriptor of its
+end of the connection, the parent's process id, a folder for temporary files, which the parent removes, and the engine
+to load before the job arrives. What the parent needs is imported quickly, so that a command can start a worker first.
 """
 
 import contextlib
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 import tempfile
-from multiprocessing.connection import Connection
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe
 
-from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_shared.errors import ends_run
 
+WORKER = ("-m", "perilune_render.jobs.worker")
+"""What Python runs in a worker process."""
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""The number of threads of linear algebra changes the last digits of results."""
+_END_S = 5.0
+"""Longest time for a worker to end by itself, seconds."""
 _PR_SET_PDEATHSIG = 1
 """PR_SET_PDEATHSIG from linux/prctl.h."""
+
+
+@dataclass(slots=True)
+class Worker:
+    """A worker process, as its parent sees it."""
+
+    process: subprocess.Popen
+    connection: Connection
+    ready: bool = False
+    """Whether it has received the job."""
+    place: int | None = None
+    """The trajectory that it renders."""
+    scene_id: str | None = None
+    """The scene that it keeps."""
+    n_done: int = 0
+    """Number of trajectories that it has rendered."""
+
+    def send(self, command: str, target: object) -> None:
+        """Send a command. That a worker has ended is noticed when its messages are received."""
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send((command, target))
+
+    @property
+    def how_ended(self) -> str:
+        """How the process ended."""
+        code = self.process.wait()
+        return f"worker killed by {signal.Signals(-code).name}" if code < 0 else f"worker ended with code {code}"
+
+    def end(self, *, at_once: bool = False) -> None:
+        """End the process; all that it reported as done is on the disk. Without effect if it has ended."""
+        self.connection.close()
+        if at_once:
+            self.process.kill()
+        try:
+            self.process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def start_worker(scratch: str, engine: str) -> Worker:
+    """Start a worker, which writes its temporary files into the folder `scratch`."""
+    own, theirs = Pipe()
+    arguments = [str(theirs.fileno()), str(os.getpid()), scratch, engine]
+    with theirs:
+        process = subprocess.Popen(
+            # -P: a module in the current folder must not take the place of an installed one.
+            [sys.executable, "-P", *WORKER, *arguments],
+            pass_fds=[theirs.fileno()],
+            env={**os.environ, **dict.fromkeys(ONE_THREAD, "1")},
+            stdin=subprocess.DEVNULL,
+            # Ctrl-C goes to this process alone, which then ends its workers.
+            process_group=0,
+        )
+    return Worker(process, own)
+
+
+@contextlib.contextmanager
+def early_worker(engine: str) -> Iterator[Worker]:
+    """A worker that loads its libraries while its parent plans the job; it ends with the block at the latest."""
+    with tempfile.TemporaryDirectory(prefix="perilune-", ignore_cleanup_errors=True) as scratch:
+        worker = start_worker(scratch, engine)
+        try:
+            yield worker
+        finally:
+            worker.end(at_once=True)
 
 
 def main() -> None:
@@ -26,14 +101,18 @@ def main() -> None:
     connection = Connection(int(sys.argv[1]))
     with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
         try:
-            _serve(connection)
+            _serve(connection, sys.argv[4])
         except Exception as error:
             if not ends_run(error):
                 raise
             connection.send(("stop", error))
 
 
-def _serve(connection: Connection) -> None:
+def _serve(connection: Connection, engine: str) -> None:
+    from perilune_render.engines import load_engine
+    from perilune_render.jobs.scene_renderer import SceneRenderer
+
+    load_engine(engine)
     connection.send(("started",))
     job, out = connection.recv()
     with SceneRenderer(job, out) as renderer:

@@ -1,18 +1,27 @@
 """Cache folders, for files that can be computed again."""
 
+import contextlib
 import functools
+import hashlib
+import json
 import os
 import shutil
 import stat
+import sys
 import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import platformdirs
+from filelock import FileLock, Timeout
 
-from perilune_render.provenance.fingerprint import compiled_functions, fingerprint
+from perilune_render.provenance.fingerprint import FOLDERS, Fingerprint, compiled_functions, fingerprint
+from perilune_shared.storage.files import write_text
 
 _KEPT = 5
 """Number of machine code folders kept, one for each version of the kernels."""
+_LONGEST_WAIT_S = 120.0
+"""Longest time to wait for another process that compiles a kernel; then this process compiles it too."""
 
 
 def cache_home() -> Path:
@@ -47,8 +56,8 @@ def machine_code_folder() -> Path:
 
     Removes the least recently used folders. If the folder cannot be written, a temporary one is used.
     """
-    parent = Path(os.environ.get("NUMBA_CACHE_DIR") or cache_home() / "kernels")
-    folder = parent / f"perilune-{fingerprint(*compiled_functions()).sha256[:16]}"
+    parent = _kernels()
+    folder = parent / f"perilune-{_kept('compiled', lambda: fingerprint(*compiled_functions())).sha256[:16]}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
@@ -60,3 +69,57 @@ def machine_code_folder() -> Path:
     except OSError:
         pass
     return Path(tempfile.mkdtemp(prefix="perilune-"))
+
+
+@contextlib.contextmanager
+def compiling(path: Path) -> Iterator[None]:
+    """Hold the lock file of a kernel, if the file system has locks and no other process holds it for too long."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError, NotImplementedError, Timeout):
+            stack.enter_context(FileLock(path).acquire(timeout=_LONGEST_WAIT_S, poll_interval=0.02))
+        yield
+
+
+def kept_fingerprint(*roots: str) -> Fingerprint:
+    """`fingerprint` of functions of perilune, kept in a file: computing it parses most sources, which takes 0.1 s."""
+    return _kept(" ".join(roots), lambda: fingerprint(*roots))
+
+
+def _kernels() -> Path:
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or cache_home() / "kernels")
+
+
+def _kept(name: str, compute: Callable[[], Fingerprint]) -> Fingerprint:
+    """A fingerprint from the file of this installation, or computed and stored there.
+
+    The file is valid for one state of the sources. If it is damaged or cannot be written, fingerprints are computed.
+    """
+    place = hashlib.sha256(repr(sorted(FOLDERS.items())).encode()).hexdigest()[:16]
+    path, state = _kernels() / f"hashes-{place}.json", _state_of_sources()
+    stored: dict[str, dict] = {}
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["state"] == state:
+            stored = dict(content["fingerprints"])
+            found = stored[name]
+            return Fingerprint(str(found["sha256"]), frozenset(found["modules"]), frozenset(found["libraries"]))
+    computed = compute()
+    plain = {"modules": sorted(computed.modules), "libraries": sorted(computed.libraries)}
+    content = {"state": state, "fingerprints": {**stored, name: {"sha256": computed.sha256, **plain}}}
+    with contextlib.suppress(OSError):
+        write_text(path, json.dumps(content), durable=False)
+    return computed
+
+
+def _state_of_sources() -> str:
+    """Hash of the version of Python and of path, size and times of every source file.
+
+    The time of the last change of the inode cannot be set, so even a file that was replaced by one of the same size and
+    modification time is noticed.
+    """
+    states = [sys.version]
+    for root in FOLDERS.values():
+        for path in root.rglob("*.py"):
+            state = path.stat()
+            states.append(f"{path} {state.st_size} {state.st_mtime_ns} {state.st_ctime_ns} {state.st_ino}")
+    return hashlib.sha256("\n".join(sorted(states)).encode()).hexdigest()

@@ -16,7 +16,8 @@ from pathlib import Path
 import perilune_render
 import perilune_shared
 
-_FOLDERS = {module.__name__: Path(module.__path__[0]) for module in (perilune_render, perilune_shared)}
+FOLDERS = {module.__name__: Path(module.__path__[0]) for module in (perilune_render, perilune_shared)}
+"""Folder of each package, by its name."""
 _SETTINGS = "perilune_render.config"
 """Prefix of the modules of settings. Their values are in the recipe, so the hash omits defaults, bounds and checks."""
 _NO_EFFECT = (
@@ -69,7 +70,7 @@ def fingerprint(*roots: str, folders: dict[str, Path] | None = None) -> Fingerpr
 
     `folders` gives the folder of each package, by default those of the imported packages.
     """
-    return _fingerprint(roots, tuple(sorted((folders or _FOLDERS).items())))
+    return _fingerprint(roots, tuple(sorted((folders or FOLDERS).items())))
 
 
 @functools.cache
@@ -88,7 +89,7 @@ def _fingerprint(roots: tuple[str, ...], folders: tuple[tuple[str, Path], ...]) 
 def compiled_functions() -> tuple[str, ...]:
     """Every function of perilune_render that numba compiles, as `package.module:name`."""
     found = []
-    root = _FOLDERS["perilune_render"]
+    root = FOLDERS["perilune_render"]
     for path in sorted(root.rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         if "njit" in text:

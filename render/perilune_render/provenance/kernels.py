@@ -1,25 +1,39 @@
 """numba.njit with a machine code cache that is keyed by the sources of all kernels.
 
 numba's own cache only checks the file of the function, although functions and constants of other files are compiled
-into it. Here a change to any of them selects a new cache folder.
+into it. Here a change to any of them selects a new cache folder. Of several processes that need a kernel for the first
+time, one compiles it and the others wait.
 """
 
 from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba.core.compiler_lock import global_compiler_lock
 
-from perilune_render.provenance.caches import machine_code_folder
+from perilune_render.provenance.caches import compiling, machine_code_folder
 
 
 def njit(**options: Any) -> Callable[[Callable], Any]:
     """`numba.njit(cache=True)` with the machine code in `machine_code_folder()`; other threads may run meanwhile."""
 
     def decorate(function: Callable) -> Any:
-        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(machine_code_folder())
+        folder = machine_code_folder()
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
         try:
-            return numba.njit(cache=True, nogil=True, **options)(function)
+            kernel = numba.njit(cache=True, nogil=True, **options)(function)
         finally:
             numba.config.CACHE_DIR = before
+        if numba.config.DISABLE_JIT:
+            return kernel
+        compile_or_load = kernel.compile
+
+        def compile_alone(signature: Any) -> Any:
+            # First numba's lock of threads: one that compiles a caller holds it, and waits here for its callee.
+            with global_compiler_lock, compiling(folder / f"{function.__module__}.{function.__qualname__}.lock"):
+                return compile_or_load(signature)
+
+        kernel.compile = compile_alone
+        return kernel
 
     return decorate

@@ -6,7 +6,7 @@ from importlib import metadata
 import perilune_render
 import perilune_shared
 from perilune_render import processor
-from perilune_render.provenance.fingerprint import fingerprint
+from perilune_render.provenance.caches import kept_fingerprint
 
 _SETTINGS = "perilune_render.processor:SETTINGS"
 GROUND = (
@@ -65,7 +65,7 @@ def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = Fals
 
 @functools.cache
 def _found(names: tuple[str, ...]) -> dict[str, str]:
-    prints = {name: fingerprint(*_NAMES[name]) for name in names}
+    prints = {name: kept_fingerprint(*_NAMES[name]) for name in names}
     used = frozenset().union(*(each.libraries for each in prints.values()))
     return {
         "perilune_render": perilune_render.__version__,

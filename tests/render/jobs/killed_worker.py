@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
-from perilune_render.jobs import worker
+from perilune_render.jobs import scene_renderer, worker
 from perilune_render.jobs.scene_renderer import SceneRenderer
 
 TRAJECTORY, AFTER_FRAMES = 1, 2
@@ -34,5 +34,5 @@ class KilledRenderer(SceneRenderer):
 
 
 if __name__ == "__main__":
-    worker.SceneRenderer = KilledRenderer
+    scene_renderer.SceneRenderer = KilledRenderer
     worker.main()

@@ -8,11 +8,12 @@ import pytest
 from rich.progress import Progress
 
 from perilune_render.dataset.work import committed
-from perilune_render.jobs import local
+from perilune_render.jobs import local, worker
 from perilune_render.jobs.here import Here
 from perilune_render.jobs.local import LocalWorkers
 from perilune_render.jobs.run import RenderingFailed, render_job
 from perilune_render.jobs.scene_renderer import SceneRenderer
+from perilune_render.jobs.worker import early_worker
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
@@ -28,7 +29,7 @@ def kill(tmp_path_factory, monkeypatch):
         for k in range(n_kills):
             kills.joinpath(str(k)).touch()
         monkeypatch.setenv("KILLS", str(kills))
-        monkeypatch.setattr(local, "WORKER", (str(Path(__file__).with_name("killed_worker.py")),))
+        monkeypatch.setattr(worker, "WORKER", (str(Path(__file__).with_name("killed_worker.py")),))
 
     return kill
 
@@ -47,6 +48,21 @@ def test_two_workers_one_killed_and_all_recycled_give_the_same_bytes(
     assert files_of(tmp_path) == whole and len(whole) > 20
     (line,) = capsys.readouterr().err.splitlines()
     assert line == "warning: scene-0000/trajectory-0001: worker killed by SIGKILL; trying again (3 left)"
+
+
+def test_a_worker_that_was_started_early_renders_and_its_successor_too(job, whole, files_of, tmp_path):
+    with early_worker(job.config.render.engine) as early:
+        first = LocalWorkers(job, open_store(tmp_path / "first"), 1, early)
+        render_job(job, tmp_path / "first", Progress(disable=True), lambda *_: first)
+        assert early.ready and early.process.poll() is not None
+        render_job(job, tmp_path / "second", Progress(disable=True), lambda *of: LocalWorkers(*of, 1, early))
+    assert files_of(tmp_path / "first") == files_of(tmp_path / "second") == whole
+
+
+def test_an_early_worker_ends_with_its_block():
+    with pytest.raises(UserError), early_worker("heightfield") as early:
+        raise UserError("file", "field", "found", "expected")
+    assert early.process.poll() is not None
 
 
 @pytest.mark.slow

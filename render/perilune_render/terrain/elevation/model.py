@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
-from scipy.interpolate import RectBivariateSpline
 
 from perilune_render.config_terrain import ElevationConfig, Outside
 from perilune_render.terrain.elevation.continuation import continued, distance_in_holes_m, margin_m, mean_slope
@@ -201,6 +200,8 @@ def base_heights(model: ElevationModel, grid: Grid, outside: Outside = "procedur
     net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 65)
     column, row = raster_places(model, *np.meshgrid(net, net))
     x, y = grid.vertices_xy()
+    from scipy.interpolate import RectBivariateSpline  # here, since it takes 0.2 s and only elevation models need it
+
     column, row = (RectBivariateSpline(net, net, place).ev(y, x) for place in (column, row))
     beyond = beyond_m(model, column, row)
     pixels = float(np.maximum.reduce([-row, row - rows, -column, column - columns]).max())
