@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.helpers.sampling import every
 from tests.helpers.scenes import config_with, flat_scene, round_craters
+from tests.sampling import every
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig

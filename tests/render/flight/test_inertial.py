@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from tests.helpers.sampling import every
+from tests.sampling import every
 
 from perilune_render.config import FlightConfig
 from perilune_render.flight.inertial import GRADES, measured, true_increments

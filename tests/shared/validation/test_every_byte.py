@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from tests.helpers.hostile import digest, edit, pack, put, rewrite, sealed
-from tests.helpers.sampling import every
+from tests.sampling import every
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 from tests.helpers.hostile import assert_refused, edit, sealed
-from tests.helpers.sampling import every
+from tests.sampling import every
 
 from perilune_shared.dataset.index import read_index, write_index
 from perilune_shared.dataset.info_file import read_info, write_info

@@ -10,7 +10,7 @@ import pytest
 from tests.helpers import hostile_parquet as forged
 from tests.helpers.drawn_dataset import seal
 from tests.helpers.hostile import assert_refused, part_of, sealed
-from tests.helpers.sampling import every
+from tests.sampling import every
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 from tests.helpers import hostile_parquet as forged
 from tests.helpers.hostile import assert_refused, digest, edit, pack, part_of, put, rewrite, sealed
-from tests.helpers.sampling import every
+from tests.sampling import every
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import Counts

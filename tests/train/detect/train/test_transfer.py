@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tests.helpers import darknet_by_hand as by_hand
-from tests.helpers.sampling import every
+from tests.sampling import every
 from typer.testing import CliRunner
 
 from perilune_shared.config import resolve
