@@ -101,6 +101,7 @@ def test_there_are_examples():
     assert any(page == "docs/reference/frames.md" for page, _ in BLOCKS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path, quick, tmp_path):
     """Beside a folder where `make dataset PRESET=tiny` was run; as saved, it has outputs without paths of a machine."""

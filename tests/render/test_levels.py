@@ -68,7 +68,7 @@ def test_every_preset_renders_a_megapixel(preset, kind):
         assert np.allclose([level.grid.extent_m for level in levels], whole.extent_m)
 
 
-@pytest.mark.parametrize("sigma_deg", [0.3, 1.0])
+@pytest.mark.parametrize("sigma_deg", [pytest.param(0.3, marks=pytest.mark.slow), 1.0])
 def test_every_frame_sees_half_a_pixel_or_finer_ground_on_its_level(sigma_deg):
     """The ground is flat here; the levels allow for ground that rises by a twentieth of the altitude."""
     flight = FlightConfig(azimuth_deg=Span(low=0, high=360), attitude_sigma_deg=sigma_deg)
@@ -142,7 +142,7 @@ def test_all_levels_show_the_ground_of_the_scene(scene, levels):
     assert_same_ground(scene, levels)
 
 
-@pytest.mark.parametrize("outside", ["procedural", "mirror"])
+@pytest.mark.parametrize("outside", ["procedural", pytest.param("mirror", marks=pytest.mark.slow)])
 def test_all_levels_show_the_ground_of_an_elevation_model(tmp_path, outside):
     """The model covers a part of the ground in view."""
     dem = elevation_models.write(

@@ -78,6 +78,7 @@ def test_a_detector_is_evaluated_on_a_dataset_at_an_address(networks, few, bucke
     assert len(found[0]) > 0 and found[0].equals(found[1])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_a_navigator_is_trained_on_a_dataset_at_an_address(bucket, tmp_path):
     epochs = ("warp.coarse_epochs=0", "warp.fine_epochs=1", "warp.sequence_pairs=4")

@@ -62,6 +62,7 @@ def test_a_mistake_gets_one_line_exit_code_2_and_leaves_nothing(tmp_path, argume
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_mistake_ends_the_process_with_its_line_and_code(tmp_path):
     result = call("detect", "train", "--set", "detect.epoch=3", cwd=tmp_path)
     assert result.returncode == 2 and len(result.stderr.strip().splitlines()) == 1

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.helpers.scenes import config_with, flat_scene, round_craters
+from tests.sampling import every
 
 from perilune_render.blender.renderer import Renderer
 from perilune_render.config import LightConfig, RenderConfig
@@ -34,7 +35,7 @@ def ground_points(camera, position, rotation):
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize(("azimuth", "elevation"), [(70, 25), (200, 80), (310, 6)])
+@pytest.mark.parametrize(("azimuth", "elevation"), every(3, [(70, 25), (200, 80), (310, 6)]))
 def test_radiance_is_the_formulas(law, azimuth, elevation):
     sun = sun_direction(azimuth, elevation)
     config = config_with(
@@ -255,7 +256,7 @@ def test_one_renderer_at_a_time_in_a_process():
 
 def test_one_thread_renders_on_one_core_and_lets_python_run():
     """Blender's pool of threads must not spin while one thread renders; Python's other threads must not wait for it."""
-    config, gap_s = config_with(render=RenderConfig(samples=200, threads=1)), []
+    config, gap_s = config_with(render=RenderConfig(samples=80, threads=1)), []
 
     def cpu_s(thread):
         fields = (thread / "stat").read_text().rpartition(")")[2].split()
@@ -277,7 +278,7 @@ def test_one_thread_renders_on_one_core_and_lets_python_run():
         stopped.set()
         measuring.join()
     used_s = sorted(cpu_s(thread) - start for thread, start in zip(threads, before, strict=True))
-    assert used_s[-1] > 0.5
+    assert used_s[-1] > 0.2
     assert sum(used_s[:-1]) < 0.2 * used_s[-1]
     assert max(gap_s) < 0.5 * used_s[-1]
 

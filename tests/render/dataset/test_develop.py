@@ -82,6 +82,7 @@ def test_developed_alike_the_frames_are_the_same_bytes(quick, developed):
     assert not list(developed[0].rglob("*.exr"))
 
 
+@pytest.mark.slow
 def test_an_object_store_gets_the_same_bytes_and_its_frames_are_verified(quick, developed, s3_bucket):
     source, out = uploaded(quick / "detect", f"{s3_bucket}/moon"), f"{s3_bucket}/developed"
     done = develop(source, out)
@@ -212,6 +213,7 @@ def test_blender_is_not_loaded(developed):
     assert developed[1].returncode == 0, developed[1].stderr
 
 
+@pytest.mark.slow
 def test_a_distorted_dataset_is_rendered_labelled_and_developed(tmp_path):
     """From the lens to the label: an EXR of the wider pinhole, frames and ellipses of the distorted camera."""
     lens = settings("camera.distortion.k1=-0.2", "camera.distortion.p2=0.003", "camera.principal_y_px=60")

@@ -30,7 +30,7 @@ def model(path, height_m, pixel_m):
     return write(path, height_m, POLAR, rasterio.Affine(pixel_m, 0, 1e5, 0, -pixel_m, 0))
 
 
-@pytest.mark.parametrize("command", ["plan", "dataset"])
+@pytest.mark.parametrize("command", ["plan", pytest.param("dataset", marks=pytest.mark.slow)])
 def test_a_model_that_puts_the_camera_under_the_ground_is_refused(command, tmp_path):
     # The site, at the model's middle, has height 0. Walls of 2000 m stand where the descent from 1500 m begins.
     y, x = np.mgrid[-150:151, -150:151] * 20.0

@@ -52,6 +52,7 @@ def plan(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_frames_on_levels_of_ground_are_the_same_bytes(tmp_path):
     """Also from a manifest without the frames before them, which determine no level."""
     source, part = tmp_path / "source", tmp_path / "part"

@@ -215,15 +215,16 @@ def test_a_full_disk_leaves_what_was_finished(tmp_path):
 
 
 def test_preview_and_export(tmp_path):
-    assert run("preview", "--preset", "tiny", "--out", tmp_path / "p.png").returncode == 0
+    coarse = ("--preset", "tiny", "--set", "dataset.terrain.spacing_px=2.0")
+    assert run("preview", *coarse, "--out", tmp_path / "p.png").returncode == 0
     picture = cv2.imread(str(tmp_path / "p.png"))
     assert picture.shape == (520, 1040, 3) and picture.std() > 10
-    assert run("export", "--preset", "tiny", "--step", 8, "--out", tmp_path / "m.ply").returncode == 0
+    assert run("export", *coarse, "--step", 3, "--out", tmp_path / "m.ply").returncode == 0
     import trimesh
 
     mesh = trimesh.load(tmp_path / "m.ply")
     assert len(mesh.faces) > 10_000 and mesh.extents[0] > 2000
-    assert run("export", "--preset", "tiny", "--pixel-m", 10, "--out", tmp_path / "m.tif").returncode == 0
+    assert run("export", *coarse, "--pixel-m", 10, "--out", tmp_path / "m.tif").returncode == 0
     assert (tmp_path / "m.tif").stat().st_size > 10_000
     bad = run("export", "--preset", "tiny", "--out", tmp_path / "m.xyz")
     assert bad.returncode == 2 and ".glb" in bad.stderr

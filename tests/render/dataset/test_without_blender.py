@@ -30,6 +30,7 @@ def run(*arguments):
     return subprocess.run([sys.executable, "-c", HIDDEN, *map(str, arguments)], capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_plans_are_made_without_blender(tmp_path):
     done = run(*PLAN, "--out", tmp_path / "plan")
     assert done.returncode == 0, done.stderr

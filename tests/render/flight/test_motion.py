@@ -28,6 +28,7 @@ def _largest_mps2(motion):
     return np.linalg.norm(acceleration, axis=1).max()
 
 
+@pytest.mark.slow
 def test_a_limit_that_no_draw_keeps_is_an_error():
     impossible = FLIGHT.model_copy(update={"max_perturbation_mps2": 1e-3})
     with pytest.raises(UserError, match="max_perturbation_mps2"):

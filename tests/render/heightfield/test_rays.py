@@ -177,6 +177,7 @@ def test_ground_does_not_shadow_itself_at_an_edge_of_its_triangles():
         assert (found[0] == found[1]).all()
 
 
+@pytest.mark.slow
 def test_the_horizon_changes_no_bit(scene, engine):
     """It only leaves out shadow rays that hit nothing, with most of the lit ground among them."""
     for azimuth, elevation in ((0, 8), (60, 30), (200, 15), (315, 50)):
@@ -257,6 +258,7 @@ def test_it_agrees_with_blender(scene):
     assert np.median(np.abs(image - same)) <= 2
 
 
+@pytest.mark.slow
 def test_grazing_light_agrees_with_blender(scene):
     """Cycles lifts grazing shadow rays off the facets; without it this ground would be darker by some percent."""
     pytest.importorskip("bpy")

@@ -110,6 +110,7 @@ def objects(address):
     return {item.path: store.read(item.path) for item in store.list()}
 
 
+@pytest.mark.slow
 def test_stopped_before_any_write_and_resumed_gives_the_same_bytes(flat_job, flat_whole):
     n_stops = 0
     while True:
@@ -217,6 +218,7 @@ def test_missing_credentials_end_with_one_line(s3_bucket, options):
     assert "expected credentials with access to it: AWS_ACCESS_KEY_ID" in lines[0]
 
 
+@pytest.mark.slow
 def test_two_workers_on_s3_give_the_same_bytes_as_a_folder(options, whole, s3_bucket):
     done = in_process.call(main, "dataset", *options, "--workers", "2", "--out", f"{s3_bucket}/moon")
     assert done.returncode == 0, done.stderr

@@ -60,6 +60,7 @@ def test_the_line_of_a_pose_that_does_not_fit_is_named(tmp_path, z_m, message):
     assert not (tmp_path / "out" / "dataset.json").exists()
 
 
+@pytest.mark.slow
 def test_frames_and_preview_warn_of_each_sun_that_leaves_the_site_in_shadow(tmp_path):
     column, row = np.meshgrid(np.arange(300) + 0.5, np.arange(300) + 0.5)
     dem = write(tmp_path / "pit.tif", -120 * np.clip(1 - (np.hypot(column - 150, row - 150) / 30) ** 2, 0, None), *PIT)

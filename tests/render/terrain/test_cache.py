@@ -112,6 +112,7 @@ except OSError:
 """
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_error_and_leaves_no_file(tmp_path):
     """A file size limit stands in for a full disk."""
     plain = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}

@@ -30,8 +30,8 @@ HIGHLAND = Path(__file__).parents[3] / "configs" / "highland.yaml"
     ("preset", "kind", "place", "n_frames", "config_file"),
     [
         ("tiny", "detect", 0, 8, None),
-        ("tiny", "nav", 0, 9, None),
-        ("tiny", "detect", 0, 8, HIGHLAND),
+        pytest.param("tiny", "nav", 0, 9, None, marks=pytest.mark.slow),
+        pytest.param("tiny", "detect", 0, 8, HIGHLAND, marks=pytest.mark.slow),
         pytest.param("small", "detect", 5, 4, None, marks=pytest.mark.slow),
         pytest.param("small", "nav", 0, 3, None, marks=pytest.mark.slow),
     ],

@@ -77,6 +77,7 @@ def settled(scene, spacings, spared):
     return np.flatnonzero(wide)
 
 
+@pytest.mark.slow
 def test_depth_against_freshness(scene):
     """Depth left on the finished ground against wear, beside the published fit (1 + K/(a R^2))^-p."""
     c = scene.craters

@@ -70,6 +70,7 @@ def test_commands_take_an_address(command, little, s3_bucket):
     assert done.returncode == 0 and ("no fault" if command == "validate" else "6 frames") in done.stdout
 
 
+@pytest.mark.slow
 def test_card_and_croissant_become_files_of_a_dataset_at_an_address(little, s3_bucket):
     address = uploaded(little, f"{s3_bucket}/moon")
     done = in_process.call(main, "card", address)

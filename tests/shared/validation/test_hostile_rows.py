@@ -9,6 +9,7 @@ import pyarrow as pa
 import pytest
 from tests.helpers import hostile_parquet as forged
 from tests.helpers.hostile import assert_refused, digest, edit, pack, part_of, put, rewrite, sealed
+from tests.sampling import every
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.dataset.metadata import Counts
@@ -55,7 +56,7 @@ def renamed(root, scene_id):
         rewrite(root, table, lambda rows: [change(row) for row in rows])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", every(4, NAMES))
 def test_hostile_scene_ids_are_refused(name, victim, capsys, monkeypatch):
     sealed(lambda root: renamed(root, NAMES[name]))(victim)
     assert_refused(victim, "manifest/scenes/all.parquet", "scene_id", capsys, monkeypatch)
@@ -63,7 +64,7 @@ def test_hostile_scene_ids_are_refused(name, victim, capsys, monkeypatch):
         open_dataset(victim).table("frames")
 
 
-@pytest.mark.parametrize("name", ["climbs", "a command", "of 10 kB", "with NUL"])
+@pytest.mark.parametrize("name", every(4, ["climbs", "a command", "of 10 kB", "with NUL"]))
 def test_hostile_trajectory_and_frame_ids_are_refused(name, victim, capsys, monkeypatch):
     sealed(put("trajectories", "trajectory_id", NAMES[name]))(victim)
     sealed(put("frames", "frame_id", f"s000/{NAMES[name]}/000000"))(victim)
@@ -103,7 +104,7 @@ PATHS = {
 }
 
 
-@pytest.mark.parametrize("name", PATHS)
+@pytest.mark.parametrize("name", every(4, PATHS))
 def test_hostile_paths_are_refused(name, victim, capsys, monkeypatch):
     sealed(put("frames", "png_path", PATHS[name]))(victim)
     assert_refused(victim, "", "png_path", capsys, monkeypatch)
@@ -156,7 +157,7 @@ NUMBERS = [
 
 @pytest.mark.parametrize(
     ("table", "column", "value", "distorted"),
-    [(*case, False) for case in NUMBERS] + [(*case, True) for case in NUMBERS[:8]],
+    every(3, [(*case, False) for case in NUMBERS] + [(*case, True) for case in NUMBERS[:8]]),
 )
 def test_hostile_numbers_are_refused(table, column, value, distorted, victim, capsys, monkeypatch):
     # With distortion, ellipses are fitted; without, they are computed.
@@ -194,7 +195,7 @@ HOSTILE_IMAGES = {
 
 
 @pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("name", HOSTILE_IMAGES)
+@pytest.mark.parametrize("name", every(3, HOSTILE_IMAGES))
 def test_hostile_frames_are_refused(name, packed, victim, capsys, monkeypatch):
     content, expected_column = HOSTILE_IMAGES[name]
     (victim / "frames/s000/t000/000000.png").write_bytes(content)
@@ -265,7 +266,7 @@ SHARDS = {
 }
 
 
-@pytest.mark.parametrize("name", SHARDS)
+@pytest.mark.parametrize("name", every(3, SHARDS))
 def test_hostile_shards_are_refused(name, victim, capsys, monkeypatch):
     damage, expected_column = SHARDS[name]
     sealed(damage)(victim)

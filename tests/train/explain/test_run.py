@@ -80,6 +80,7 @@ def _banded(path):
     return red > 150 and max(blue, green) < 80
 
 
+@pytest.mark.slow
 def test_a_run_writes_values_tests_interventions_claims_and_pictures(
     checkpoints, dataset_detect, dataset_nav, tmp_path
 ):

@@ -174,6 +174,7 @@ def test_other_strides_have_no_such_file():
         network_slots(YOLOv3(strides=(4, 8, 16)))
 
 
+@pytest.mark.slow
 def test_identity_gates_keep_a_pretrained_backbones_features(tmp_path):
     """Of a full backbone: cosine to plain Darknet53 at least 0.999 at every stage. CBAM's plain form falls short."""
     path = tmp_path / "darknet53.conv.74"

@@ -67,6 +67,7 @@ def test_a_run_is_evaluated_on_another_dataset(runs, elsewhere, tmp_path):
     assert metrics["terrain/status"] == "disjoint"
 
 
+@pytest.mark.slow
 def test_runs_and_evaluations_are_compared(runs, elsewhere, tmp_path):
     out = tmp_path / "out"
     assert call("evaluate", "--run", runs / "a", "--dataset", elsewhere, "--out", out).returncode == 0

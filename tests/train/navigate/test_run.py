@@ -133,6 +133,7 @@ def test_finished_runs_are_left_as_they_are(runs, dataset_nav, dataset_detect, d
     assert files() == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path, detector):
     given = torch.load(detector, weights_only=True)["state_dict"]

@@ -55,6 +55,7 @@ def test_five_cosines_in_the_fine_stage():
     assert one[300] == pytest.approx(0.5) and (np.diff(one[60:]) < 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_stored_features_give_the_weights_of_whole_epochs(dataset_nav, tmp_path, detector, monkeypatch):
     called = []

@@ -35,6 +35,7 @@ def started(root, name="a"):
     return run
 
 
+@pytest.mark.slow
 def test_a_process_that_lightning_starts_knows_at_once_that_it_is_not_the_first():
     ask = "from perilune_train.training.runs import is_first_process; print(is_first_process())"
     own = {**os.environ, "LOCAL_RANK": "1"}

@@ -283,6 +283,7 @@ def test_batches(split):
         }
 
 
+@pytest.mark.slow
 def test_workers_under_spawn_give_the_same_batches(split):
     """`spawn` pickles the frames and the function that makes batches of them."""
     config = DetectConfig(batch_size=2, in_channels=1, workers=1, seed=3)

@@ -58,8 +58,9 @@ def test_samples_are_those_of_frames_in_memory(few, packed):
     assert sorted(numbers) == list(range(6)) != numbers
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
-@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("workers", [0, 2])
 def test_a_run_stopped_within_an_epoch_is_resumed_with_the_frames_that_were_left(
     packed, tmp_path, workers, monkeypatch
 ):
@@ -96,6 +97,7 @@ def test_a_run_stopped_within_an_epoch_is_resumed_with_the_frames_that_were_left
     assert first.keys() == again.keys() and all(torch.equal(first[key], again[key]) for key in first)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_a_run_on_an_object_store_gives_the_same_weights(packed, s3_bucket, tmp_path, monkeypatch):
     monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})

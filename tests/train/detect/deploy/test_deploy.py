@@ -118,6 +118,7 @@ def test_files_give_torchs_boxes_for_any_number_of_images(exported, images):
     np.testing.assert_allclose(one(images[1:2])[1], scores[1:2], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_no_engine_leaves_an_identity_or_sends_telemetry(exported, tmp_path):
     """The builds of ONNX Runtime send events to their maker, and keep an identity below the home folder for it."""
     code = (
@@ -147,6 +148,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 def test_ctrl_c_after_several_engines(exported):
     """OpenVINO replaces the signal stack of the thread; several cores left one that was unmapped, and Python died."""
     command = [sys.executable, "-c", INTERRUPTED, str(exported / "detector.xml")]
@@ -219,7 +221,8 @@ def quantise_once():
     return quantise
 
 
-@pytest.mark.parametrize("most_loss", [1.0, pytest.param(-1.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("most_loss", [1.0, -1.0])
 def test_int8_is_evaluated_and_kept_only_if_better(
     run_folder, dataset_detect, tmp_path, monkeypatch, quantise_once, most_loss
 ):

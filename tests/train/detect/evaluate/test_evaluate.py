@@ -70,6 +70,7 @@ def test_other_labels_another_threshold_another_split(run, dataset_detect, tmp_p
     assert "most detections in one frame: 7" in (tmp_path / "report.md").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_other_scales_and_a_threshold_of_their_own(run, dataset_detect, tmp_path):
     evaluate_run = ("evaluate", "--run", run, "--dataset", dataset_detect, "--scale", 1, "--scale", 2)

@@ -89,6 +89,7 @@ def test_a_teacher_who_sees_nothing_teaches_no_boxes():
     assert confidence.item() > 0
 
 
+@pytest.mark.slow
 def test_steps_bring_the_student_to_the_teacher():
     torch.manual_seed(0)
     teacher = Teacher(outspoken(ANCHORS))

@@ -148,6 +148,7 @@ def no_evaluation(monkeypatch):
     monkeypatch.setattr("perilune_train.detect.train.run.evaluate", lambda *_: {})
 
 
+@pytest.mark.slow
 def test_resuming_does_not_need_the_initial_weights(finished, few, tmp_path, no_evaluation):
     """The last state of a run that was stopped while it was evaluated: all trained, no figures yet."""
     first = tmp_path / "first.ckpt"
@@ -199,6 +200,7 @@ def test_a_run_in_bfloat16(few, tmp_path, monkeypatch):
         assert 0 <= metrics[account + "ap50_paper"] <= 1
 
 
+@pytest.mark.slow
 def test_a_packed_dataset_gives_the_same_weights(few, tmp_path, no_evaluation):
     pack(open_dataset(few), tmp_path / "packed")
     config = settings("detect.epochs=1")

@@ -81,6 +81,7 @@ def test_long_gradients_are_shortened_and_short_ones_left_alone(split, tmp_path)
             torch.testing.assert_close(p.grad, factor * gradient, rtol=0 if factor == 1 else 1e-4, atol=0)
 
 
+@pytest.mark.slow
 def test_a_few_frames_can_be_learned_by_heart(split, tmp_path):
     """The whole chain (assignment, loss, decoding, suppression, matching) agrees: else this cannot work."""
     config = DetectConfig(width=0.125, in_channels=1, strides=(4, 8, 16), attention="cbam_identity", batch_size=4)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from tests.helpers import darknet_by_hand as by_hand
+from tests.sampling import every
 from typer.testing import CliRunner
 
 from perilune_shared.config import resolve
@@ -101,7 +102,7 @@ def test_yolov3_fills_backbone_neck_and_heads_but_no_output(coco):
     assert not gates.excite.weight.any() and not gates.spatial.weight.any()
 
 
-@pytest.mark.parametrize("kind", ["darknet53.conv.74", "weights.bin", "yolov3.weights"])
+@pytest.mark.parametrize("kind", every(3, ["darknet53.conv.74", "weights.bin", "yolov3.weights"]))
 def test_a_backbone_alone_is_filled_from_conv_74_or_for_finer_strides(coco, tmp_path, kind):
     path, values = coco
     if kind != path.name:
@@ -150,7 +151,7 @@ def saved(path: Path, attention: str = "none", strides=(8, 16, 32), width: float
     return network
 
 
-@pytest.mark.parametrize("suffix", [".conv.74", ".weights"])
+@pytest.mark.parametrize("suffix", every(2, [".conv.74", ".weights"]))
 def test_a_run_is_written_as_a_darknet_file_and_comes_back(tmp_path, suffix):
     """Also the output layers, which have 15 filters in a file of ours."""
     network = saved(tmp_path / "best.ckpt")

@@ -59,7 +59,7 @@ def test_the_bins_of_every_gate_are_figures():
     assert bin_metrics(binned(found, "found"), "found_bins")["found_bins/rendered/radius_px/3-5"] == 1
 
 
-@pytest.mark.parametrize("count", [1, 5, 23])
+@pytest.mark.parametrize("count", [1, 5, pytest.param(23, marks=pytest.mark.slow)])
 def test_all_gates_are_drawn(count, tmp_path, monkeypatch):
     drawn = []
     for name in ("_bars", "_heat"):

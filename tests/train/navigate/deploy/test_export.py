@@ -109,6 +109,7 @@ print(json.dumps(found))
     assert np.abs(translation - reference).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_without_a_dataset_on_noise(run_folder, tmp_path):
     done = call("--run", run_folder, "--out", tmp_path / "flight")
     assert done.returncode == 0, done.stderr

@@ -70,7 +70,7 @@ def test_a_damaged_frame_is_flown_over_and_named(tmp_path, plain):
     assert np.allclose(position(table), position(plain[1]), atol=1e-6)
 
 
-@pytest.mark.parametrize("gone", ["rows", "nan"])
+@pytest.mark.parametrize("gone", ["rows", pytest.param("nan", marks=pytest.mark.slow)])
 def test_a_gap_of_the_inertial_unit_is_bridged(tmp_path, plain, gone):
     folder = write_descent(tmp_path / "descent")
     imu = pd.read_csv(folder / "imu.csv")

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pandas as pd
+import pytest
 from tests.helpers import in_process
 
 from perilune_shared.storage.files import sha256_of
@@ -14,6 +15,7 @@ def methods(*arguments):
     return in_process.call(main, "navigate", "methods", *arguments)
 
 
+@pytest.mark.slow
 def test_a_page_with_every_method(quick, mapped, tmp_path):
     out = tmp_path / "methods"
     done = methods("--dataset", quick / "nav", "--map", mapped, "--out", out)

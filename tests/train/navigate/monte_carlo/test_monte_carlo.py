@@ -15,15 +15,26 @@ def monte_carlo(*arguments):
     return in_process.call(main, "navigate", "monte-carlo", *arguments)
 
 
-def test_a_page_and_the_same_draws_with_any_number_of_workers(quick, tmp_path):
-    tables = []
-    for workers in (1, 2):
-        out = tmp_path / f"workers-{workers}"
-        done = monte_carlo("--dataset", quick / "nav", "--out", out, "--draws", 3, "--workers", workers)
-        assert done.returncode == 0, done.stderr
-        tables.append(pd.read_parquet(out / "draws.parquet"))
+@pytest.fixture(scope="module")
+def drawn(quick, tmp_path_factory):
+    """Folder of three draws of each descent, in this process."""
+    out = tmp_path_factory.mktemp("draws") / "draws"
+    done = monte_carlo("--dataset", quick / "nav", "--out", out, "--draws", 3, "--workers", 1)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.mark.slow
+def test_two_workers_give_the_same_draws(drawn, quick, tmp_path):
+    done = monte_carlo("--dataset", quick / "nav", "--out", tmp_path / "two", "--draws", 3, "--workers", 2)
+    assert done.returncode == 0, done.stderr
+    tables = [pd.read_parquet(out / "draws.parquet") for out in (drawn, tmp_path / "two")]
     pd.testing.assert_frame_equal(*tables)
-    (rows, _) = tables
+
+
+def test_a_page_of_all_flights(drawn, quick):
+    out = drawn
+    rows = pd.read_parquet(out / "draws.parquet")
     assert sorted(rows["draw"].unique()) == [0, 1, 2]
     starts = rows.groupby(["trajectory_id", "draw"])["error_m"].first()
     assert starts.is_unique
