@@ -58,12 +58,12 @@ def training() -> Step:
     bf16, threads = choose_bf16(config.precision, "cpu"), FairThreads()
 
     def step() -> None:
-        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            loss = sum(output.float().square().mean() for output in network(images))
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        threads.step()
+        with threads:
+            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+                loss = sum(output.float().square().mean() for output in network(images))
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
 
     return step
 
@@ -76,19 +76,12 @@ def detection() -> Step:
     from perilune_train.detect.inference.detector import open_detector
     from perilune_train.detect.inference.scales import detect_at_scales
     from perilune_train.shipped.models import shipped_run
-    from perilune_train.training.fair_threads import FairThreads
     from perilune_train.training.runs import RunFolder
 
     run = shipped_run("detect")
     detector = open_detector(RunFolder(run).best, config_of_run(run, ()))
     frames = np.random.default_rng(0).integers(0, 255, (4, 256, 256), np.uint8)
-    threads = FairThreads()
-
-    def step() -> None:
-        detect_at_scales(detector, frames)
-        threads.step()
-
-    return step
+    return lambda: detect_at_scales(detector, frames)
 
 
 def _frames(engine: str) -> Step:

@@ -16,9 +16,10 @@ class Machine:
         """Numbers of threads of the steps of so many seconds."""
         used, until_s = [], self.now_s + seconds
         while self.now_s < until_s:
-            used.append(torch.get_num_threads())
-            self.now_s += self.step_s[used[-1]]
-            threads.step()
+            with threads:
+                used.append(torch.get_num_threads())
+                self.now_s += self.step_s[used[-1]]
+            assert torch.get_num_threads() == 4
         return used
 
 
@@ -37,44 +38,57 @@ def started(machine: Machine) -> FairThreads:
 
 def test_an_idle_machine_keeps_all_threads(four_threads):
     machine = Machine({4: 0.1})
-    with started(machine) as threads:
-        assert set(machine.run(threads, 100)) == {4}
+    threads = started(machine)
+    assert set(machine.run(threads, 100)) == {4}
 
 
 def test_fewer_threads_are_used_while_they_are_faster(four_threads):
     machine = Machine({4: 0.4, 3: 0.2})
-    with started(machine) as threads:
-        machine.others = 1.0
-        machine.run(threads, 10)
-        used = machine.run(threads, 200)
-        # Trials of all threads take a small part of the time.
-        assert set(used) == {3, 4}
-        assert used.count(3) > 0.9 * len(used)
-        machine.others, machine.step_s = 0.0, {4: 0.1, 3: 0.12}
-        machine.run(threads, 5)
-        assert set(machine.run(threads, 100)) == {4}
+    threads = started(machine)
+    machine.others = 1.0
+    machine.run(threads, 10)
+    used = machine.run(threads, 200)
+    # Trials of all threads take a small part of the time.
+    assert set(used) == {3, 4}
+    assert used.count(3) > 0.9 * len(used)
+    machine.others, machine.step_s = 0.0, {4: 0.1, 3: 0.12}
+    machine.run(threads, 5)
+    assert set(machine.run(threads, 100)) == {4}
 
 
 def test_all_threads_stay_where_fewer_are_slower(four_threads):
     machine = Machine({4: 0.1, 2: 0.2})
-    with started(machine) as threads:
-        machine.others = 1.5
-        used = machine.run(threads, 300)
-        assert used.count(4) > 0.9 * len(used)
+    threads = started(machine)
+    machine.others = 1.5
+    used = machine.run(threads, 300)
+    assert used.count(4) > 0.9 * len(used)
 
 
 def test_one_thread_is_the_least(four_threads):
     machine = Machine({4: 0.4, 1: 0.1})
-    with started(machine) as threads:
-        machine.others = 30.0
-        machine.run(threads, 10)
-        assert machine.run(threads, 10)[0] == 1
+    threads = started(machine)
+    machine.others = 30.0
+    machine.run(threads, 10)
+    assert machine.run(threads, 10)[0] == 1
     assert torch.get_num_threads() == 4
+
+
+def test_a_number_that_the_program_chooses_later_stays(four_threads):
+    machine = Machine({4: 0.4, 3: 0.2})
+    threads = started(machine)
+    machine.others = 1.0
+    machine.run(threads, 10)
+    torch.set_num_threads(1)
+    for _ in range(1000):
+        with threads:
+            assert torch.get_num_threads() == 1
+            machine.now_s += 0.1
+    assert torch.get_num_threads() == 1
 
 
 def test_a_number_of_the_user_stays(four_threads, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
     machine = Machine({4: 0.1})
-    with started(machine) as threads:
-        machine.others = 3.0
-        assert set(machine.run(threads, 100)) == {4}
+    threads = started(machine)
+    machine.others = 3.0
+    assert set(machine.run(threads, 100)) == {4}

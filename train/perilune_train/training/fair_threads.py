@@ -8,9 +8,9 @@ import torch
 
 from perilune_shared.threads import OtherWork, chosen_by_user
 
-_CHECK_S = 2.0
+_CHECK_S = 1.0
 """Interval at which the work of other processes is read."""
-_TRIAL_S, _TRIAL_STEPS = 1.5, 3
+_TRIAL_S, _TRIAL_STEPS = 1.0, 3
 """Least duration and number of steps for which a number of threads is tried."""
 _RETRY_S = 20.0
 """Least interval between two trials."""
@@ -21,7 +21,7 @@ _GAIN = 1.03
 
 
 class FairThreads:
-    """Chooses torch's number of threads while a loop runs; restores it when the block ends.
+    """Chooses torch's number of threads for each step of a loop; restores it after the step.
 
     Each operation ends when its slowest thread ends. If another process takes half of one core, all threads of an
     operation therefore run at half speed, and fewer threads are faster. While others use the cores, a trial of some
@@ -32,10 +32,10 @@ class FairThreads:
 
     Example:
 
-        with FairThreads() as threads:
-            for batch in batches:
+        threads = FairThreads()
+        for batch in batches:
+            with threads:
                 train_on(batch)
-                threads.step()
     """
 
     def __init__(
@@ -46,71 +46,67 @@ class FairThreads:
     ):
         """With `enabled` false the number stays; torch computes on a GPU, or several processes share the cores.
 
-        `clock` returns the time, s; `others` the cores that other processes have used since it was last called."""
-        self.most = torch.get_num_threads()
-        self._active = enabled and self.most > 1 and not chosen_by_user("OMP_NUM_THREADS")
+        `clock` returns the time, s; `others` the cores that other processes have used since it was last called.
+        """
+        self._active = enabled and not chosen_by_user("OMP_NUM_THREADS")
         self._clock, self._others = clock, OtherWork().cores if others is None else others
-        self._checked_s = self._tried_s = clock()
-        self._tried_s -= _RETRY_S
+        self._checked_s, self._tried_s = clock(), clock() - _RETRY_S
+        self._most = self._number = self._preferred = torch.get_num_threads()
+        """Numbers of threads of the program, of the next step, and outside trials."""
         self._waiting: list[int] = []
         """Numbers of threads that are still to be tried, the current one first; empty outside a trial."""
         self._speeds: dict[int, float] = {}
-        self._n_steps, self._began_s = 0, 0.0
-        self._preferred = self.most
+        self._n_steps, self._steps_s, self._began_s = 0, 0.0, 0.0
 
     def __enter__(self) -> "FairThreads":
+        if self._active:
+            if torch.get_num_threads() != self._most:
+                # The program has chosen another number since the last step.
+                self._most = self._number = self._preferred = torch.get_num_threads()
+                self._waiting = []
+            _use(self._number)
+            self._began_s = self._clock()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.restore()
-
-    def restore(self) -> None:
-        """Use all threads again."""
-        if self._active:
-            self._use(self.most)
-
-    def step(self) -> None:
-        """Report the end of a step of the loop; may change the number of threads for the next ones."""
         if not self._active:
             return
+        _use(self._most)
         now_s = self._clock()
         if self._waiting:
             self._measure(now_s)
-        elif now_s - self._checked_s >= _CHECK_S:
+        elif self._most > 1 and now_s - self._checked_s >= _CHECK_S:
             self._check(now_s)
 
     def _check(self, now_s: float) -> None:
         self._checked_s, others = now_s, self._others()
         if others < _QUIET_CORES:
-            self._use(self.most)
-            self._preferred = self.most
+            self._number = self._preferred = self._most
         elif now_s - self._tried_s >= _RETRY_S:
-            fewer = max(1, self.most - math.ceil(others - _QUIET_CORES))
-            self._waiting, self._speeds = list(dict.fromkeys([self._preferred, self.most, fewer])), {}
-            self._try_next(now_s)
+            fewer = max(1, self._most - math.ceil(others - _QUIET_CORES))
+            self._waiting, self._speeds = list(dict.fromkeys([self._preferred, self._most, fewer])), {}
+            self._try_next()
 
     def _measure(self, now_s: float) -> None:
-        self._n_steps += 1
-        elapsed_s = now_s - self._began_s
-        if self._n_steps < _TRIAL_STEPS or elapsed_s < _TRIAL_S:
+        self._n_steps, self._steps_s = self._n_steps + 1, self._steps_s + now_s - self._began_s
+        if self._n_steps < _TRIAL_STEPS or self._steps_s < _TRIAL_S:
             return
-        self._speeds[self._waiting.pop(0)] = self._n_steps / elapsed_s
+        self._speeds[self._waiting.pop(0)] = self._n_steps / self._steps_s
         if self._waiting:
-            self._try_next(now_s)
+            self._try_next()
             return
         best = max(self._speeds, key=lambda number: self._speeds[number])
         if self._speeds[best] > _GAIN * self._speeds[self._preferred]:
             self._preferred = best
-        self._use(self._preferred)
+        self._number = self._preferred
         self._checked_s = self._tried_s = now_s
         # What others used during the trial says nothing about the chosen number.
         self._others()
 
-    def _try_next(self, now_s: float) -> None:
-        self._use(self._waiting[0])
-        self._n_steps, self._began_s = 0, now_s
+    def _try_next(self) -> None:
+        self._number, self._n_steps, self._steps_s = self._waiting[0], 0, 0.0
 
-    @staticmethod
-    def _use(number: int) -> None:
-        if torch.get_num_threads() != number:
-            torch.set_num_threads(number)
+
+def _use(number: int) -> None:
+    if torch.get_num_threads() != number:
+        torch.set_num_threads(number)

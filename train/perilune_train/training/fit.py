@@ -128,14 +128,14 @@ class FewerThreadsIfCrowded(Callback):
     def __init__(self, enabled: bool):
         self.threads = FairThreads(enabled)
 
-    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        self.threads.step()
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
+        self.threads.__enter__()
 
-    def on_train_end(self, trainer, pl_module) -> None:
-        self.threads.restore()
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
+        self.threads.__exit__()
 
     def on_exception(self, trainer, pl_module, exception) -> None:
-        self.threads.restore()
+        self.threads.__exit__()
 
 
 class Bar(Callback):

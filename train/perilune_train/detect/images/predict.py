@@ -28,7 +28,6 @@ from perilune_train.detect.inference.tiles import count_tiles, detect_image
 from perilune_train.detect.inference.tiling import Tiling
 from perilune_train.evaluation.pictures import save_image
 from perilune_train.training import runs
-from perilune_train.training.fair_threads import FairThreads
 
 _DETECTED = (227, 211, 25)
 """Cyan, in OpenCV's order blue, green, red."""
@@ -44,8 +43,7 @@ def predict_images(
     Raises UserError on the first image that cannot be read, before detection starts.
     """
     tiling.check()
-    on_cpu = runs.choose_device(config.device) == "cpu"
-    with new_folder(out) as folder, progress_bar() as progress, FairThreads(on_cpu) as threads:
+    with new_folder(out) as folder, progress_bar() as progress:
         check = progress.add_task("check", total=len(paths), unit="images", note="")
         references: list[Georeference | None] = []
         n_tiles = 0
@@ -63,15 +61,10 @@ def predict_images(
         detector = open_detector(runs.RunFolder(run).best, config)
         bar = progress.add_task("detect", total=n_tiles, unit="tiles", note="")
         tables, shapes = [], []
-
-        def advance(n_tiles: int) -> None:
-            progress.advance(bar, n_tiles)
-            threads.step()
-
         for path, reference in zip(paths, references, strict=True):
             progress.update(bar, note=path.name)
             image = read_grey(path)
-            found = detect_image(detector, image, tiling, advance)
+            found = detect_image(detector, image, tiling, lambda n: progress.advance(bar, n))
             found = above(found, threshold)
             tables.append(table_of(path.name, found))
             write_overlay(folder / f"{path.name}.overlay.png", image, found)

@@ -1,6 +1,6 @@
 """A trained detector: its network, settings and device."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
+from perilune_train.training.fair_threads import FairThreads
 
 
 @dataclass(frozen=True)
@@ -29,12 +30,14 @@ class Detector:
     """cpu or cuda."""
     bf16: bool
     """Whether it computes in bfloat16."""
+    threads: FairThreads = field(default_factory=FairThreads)
+    """Number of threads on a CPU, adapted to other work on the machine."""
 
     @torch.no_grad()
     def predict(self, images: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
         """Boxes (N, K, 4) in pixels and scores (N, K) of all predictors, for images (N, height, width)."""
         given = network_input(normalised(images), self.config.in_channels).to(self.device)
-        with torch.autocast(self.device, torch.bfloat16, enabled=self.bf16):
+        with self.threads, torch.autocast(self.device, torch.bfloat16, enabled=self.bf16):
             return self.network.detect(given)
 
 
@@ -55,4 +58,4 @@ def open_detector(checkpoint: Path, config: DetectConfig) -> Detector:
     if device == "cpu":
         warn_if_crowded()
     network = load_detector(checkpoint).to(device)
-    return Detector(network, config, device, runs.choose_bf16(config.precision, device))
+    return Detector(network, config, device, runs.choose_bf16(config.precision, device), FairThreads(device == "cpu"))

@@ -15,7 +15,6 @@ from perilune_train.detect.inference.detector import Detector
 from perilune_train.detect.inference.suppression import detections_of
 from perilune_train.models.size import multiply_adds
 from perilune_train.models.yolo import YOLOv3
-from perilune_train.training.fair_threads import FairThreads
 
 
 def resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
@@ -59,7 +58,7 @@ def detect_at_scales(detector: Detector, frames: NDArray[np.uint8]) -> list[Dete
 
 def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[list[Detections], float]:
     """Detections of all frames of a split, and frames per second."""
-    with progress_bar() as progress, FairThreads(detector.device == "cpu") as threads:
+    with progress_bar() as progress:
         bar = progress.add_task(f"detect {name}", total=len(split), unit="frames", note="")
         started = time.perf_counter()
         found: list[Detections] = []
@@ -67,6 +66,5 @@ def detect_split(detector: Detector, split: DetectSplit, name: str) -> tuple[lis
         for start in range(0, len(split), batch_size):
             frames = split.frames.images[start : start + batch_size]
             found += detect_at_scales(detector, frames)
-            threads.step()
             progress.advance(bar, len(frames))
         return found, len(split) / (time.perf_counter() - started)
