@@ -80,7 +80,7 @@ class Processes:
         self._running: list[subprocess.Popen] = []
         self._begun_s = time.monotonic()
         self.started_s: dict[str, float] = {}
-        """Start of each step, seconds after that of the demo."""
+        """Start of each step, seconds since the start of the demo."""
 
     @property
     def elapsed_s(self) -> float:
@@ -151,7 +151,7 @@ def run_steps(demo: Demo, processes: Processes) -> None:
     place = ["--name", demo.name, "--dataset", str(demo.data), "--runs", str(demo.runs), "--out", str(report)]
     processes.run("report", ["perilune-train", "report", *place])
     if FIRST_STEP in processes.started_s:
-        # Not after a resume, when the times are those of the rest.
+        # A resumed demo has timed only a part of the steps.
         figures = {"seconds": round(processes.elapsed_s, 1), "started_s": processes.started_s}
         write_text(report / "demo.json", json.dumps({**figures, "run": asdict(run_record())}, indent=2) + "\n")
     print(f"after {processes.elapsed_s / 60:.1f} minutes", flush=True)

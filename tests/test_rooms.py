@@ -11,8 +11,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = {
     "shared/perilune_shared": (
-        "errors threads interrupts run_record terminal progress content yaml_text command_line config_errors config "
-        "config_page storage geometry client dataset labels validation editing export cli"
+        "errors cgroups threads interrupts run_record terminal progress content yaml_text command_line config_errors "
+        "config config_page storage geometry client dataset labels validation editing export cli"
     ),
     "render/perilune_render": (
         "processor config_values config_cameras config_terrain config_survey config_counterfactual config_scene "

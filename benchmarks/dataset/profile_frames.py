@@ -50,7 +50,7 @@ FRAME = {
 
 
 class Clock:
-    """Adds up the processor time of functions by name, without that of the timed functions that they call."""
+    """Adds up the processor time of functions by name, excluding timed functions that they call."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)

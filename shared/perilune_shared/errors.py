@@ -21,7 +21,7 @@ DISK_FAULTS = (
     errno.ENAMETOOLONG,
     errno.ELOOP,
 )
-"""Errors of the disk that a user can mend."""
+"""Errors of disk and files that a user can correct: no space, no permission, no such folder."""
 
 
 class UserError(Exception):

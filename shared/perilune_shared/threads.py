@@ -22,13 +22,14 @@ import re
 import warnings
 from pathlib import Path
 
+from perilune_shared.cgroups import processor_quota
 from perilune_shared.errors import UserError
 
-SPIN_COUNT = 3000
-"""Rounds for which a waiting thread of libgomp spins before it sleeps; its default is about 300,000.
+SPIN_COUNT, CROWDED_SPIN_COUNT = 30_000, 1000
+"""Rounds for which a waiting thread of libgomp spins before it sleeps, and on a machine with more work than cores.
 
-Chosen by measurement (`make bench-shared`, docs/notebook/2026-11-27-speed.md): with fewer rounds a program is slower on
-idle cores, with more it is slower beside others.
+libgomp's default is about 300,000. Chosen by measurement (docs/notebook/2026-11-27-speed.md): with less than 30,000
+training is slower on idle cores, and beside a busy process it is fastest with 1000 or less.
 """
 NUMBERS_OF_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 """Variables for the number of threads of OpenMP (torch), OpenBLAS (NumPy, SciPy), MKL and OpenCV."""
@@ -43,7 +44,7 @@ _PATTERNS = {
 }
 """For each variable a pattern of its values and their description."""
 _SPINNING = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
-_CGROUPS, _OWN_CGROUPS, _STATISTICS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup"), Path("/proc/stat")
+_STATISTICS = Path("/proc/stat")
 _set_here: set[str] = set()
 """Variables that `set_up_program` has set, in this process."""
 _warned = False
@@ -64,45 +65,6 @@ def usable_cores() -> int:
     return cores_in_affinity() if quota is None else max(1, min(cores_in_affinity(), math.ceil(quota)))
 
 
-def processor_quota() -> float | None:
-    """Least processor quota, in cores, of this process's cgroup and of those above it; None if there is none."""
-    quotas = [quota for folder in _cgroup_folders() if (quota := _quota_of(folder)) is not None]
-    return min(quotas, default=None)
-
-
-def _cgroup_folders() -> list[Path]:
-    """Folders of this process's cgroups that may state a quota, up to the roots.
-
-    In a container the path that the kernel states may lie outside what is mounted; the root is then the container's.
-    """
-    try:
-        lines = _OWN_CGROUPS.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        lines = []
-    folders = [_CGROUPS, _CGROUPS / "cpu", _CGROUPS / "cpu,cpuacct"]
-    for line in lines:
-        _, _, rest = line.partition(":")
-        controllers, _, path = rest.partition(":")
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        roots = (_CGROUPS / controllers, _CGROUPS / "cpu") if controllers else (_CGROUPS, _CGROUPS / "unified")
-        inner = Path(path.lstrip("/"))
-        folders += [root / part for root in roots for part in (inner, *inner.parents)]
-    return list(dict.fromkeys(folders))
-
-
-def _quota_of(folder: Path) -> float | None:
-    try:
-        if (folder / "cpu.max").is_file():
-            used, period = (folder / "cpu.max").read_text().split()
-        else:
-            used, period = ((folder / f"cpu.cfs_{name}_us").read_text().strip() for name in ("quota", "period"))
-        quota = int(used) / int(period)
-    except (OSError, ValueError, ZeroDivisionError):
-        return None  # no limit ("max"), no such file, or not readable
-    return quota if quota > 0 else None
-
-
 def set_up_program() -> None:
     """Set the threads of the numerical libraries for this program and for the processes that it starts.
 
@@ -112,7 +74,7 @@ def set_up_program() -> None:
     """
     _check()
     if not any(name in os.environ for name in _SPINNING):
-        _set("GOMP_SPINCOUNT", SPIN_COUNT)
+        _set("GOMP_SPINCOUNT", CROWDED_SPIN_COUNT if _load() > cores_in_affinity() else SPIN_COUNT)
     if usable_cores() < cores_in_affinity():
         for name in NUMBERS_OF_THREADS:
             if name not in os.environ:
@@ -131,6 +93,11 @@ def _check() -> None:
         out_of_range = not all(1 <= number <= _MOST_THREADS for number in numbers)
         if value and (out_of_range or not re.fullmatch(pattern, value, re.IGNORECASE)):
             raise UserError("environment", name, value, expected)
+
+
+def _load() -> float:
+    """Mean number of processes that have run or waited for a core in the last minute."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
 
 
 def chosen_by_user(name: str) -> bool:
@@ -153,14 +120,14 @@ def warn_if_crowded() -> None:
     For functions that a program of the user calls; commands have limited the spinning.
     """
     global _warned
-    if _warned or any(name in os.environ for name in _SPINNING) or not hasattr(os, "getloadavg"):
+    if _warned or any(name in os.environ for name in _SPINNING):
         return
-    load = os.getloadavg()[0]
+    load = _load()
     if load > cores_in_affinity():
         _warned = True
         warnings.warn(
             f"the load is {load:.1f} on {cores_in_affinity()} cores, and waiting OpenMP threads spin: "
-            f"set GOMP_SPINCOUNT={SPIN_COUNT} before Python starts, "
+            f"set GOMP_SPINCOUNT={CROWDED_SPIN_COUNT} before Python starts, "
             "or call perilune_shared.threads.set_up_program() before importing torch",
             RuntimeWarning,
             stacklevel=3,

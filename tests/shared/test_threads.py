@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from perilune_shared import threads
+from perilune_shared import cgroups, threads
 from perilune_shared.errors import UserError
 
 PROGRAMS = ("perilune_shared.cli.main", "perilune_render.cli.main", "perilune_train.cli")
@@ -18,8 +18,8 @@ PROGRAMS = ("perilune_shared.cli.main", "perilune_render.cli.main", "perilune_tr
 def machine(tmp_path, monkeypatch):
     """A machine of 64 cores whose files on cgroups a test writes; returns the folder of the cgroups."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(64)))
-    monkeypatch.setattr(threads, "_CGROUPS", tmp_path / "cgroup")
-    monkeypatch.setattr(threads, "_OWN_CGROUPS", tmp_path / "own")
+    monkeypatch.setattr(cgroups, "_ROOT", tmp_path / "cgroup")
+    monkeypatch.setattr(cgroups, "_OWN", tmp_path / "own")
     (tmp_path / "cgroup").mkdir()
     return tmp_path / "cgroup"
 
@@ -56,7 +56,7 @@ def own(machine: Path, *lines: str) -> None:
 
 def test_without_cgroups_the_affinity_counts(machine):
     assert threads.usable_cores() == 64
-    assert threads.processor_quota() is None
+    assert cgroups.processor_quota() is None
 
 
 @pytest.mark.parametrize(("limit", "cores"), [("200000 100000", 2), ("150000 100000", 2), ("50000 100000", 1)])
@@ -98,6 +98,32 @@ def test_a_quota_above_the_cores_is_no_limit(machine):
     own(machine, "0::/")
     unified(machine, ".", "9900000 100000")
     assert threads.usable_cores() == 64
+
+
+@pytest.mark.parametrize(
+    ("names", "unlimited"),
+    [
+        (("memory.max", "memory.current"), "max"),
+        (("memory.limit_in_bytes", "memory.usage_in_bytes"), str(2**63 - 4096)),
+    ],
+)
+def test_memory_left_in_nested_groups(machine, names, unlimited):
+    own(machine, "4:memory:/job/step", "0::/job/step")
+    assert cgroups.memory_left_bytes() is None
+    root = machine if names[0] == "memory.max" else machine / "memory"
+    for path, limit, used in ((".", unlimited, 9000), ("job", "8000", 3000), ("job/step", "7000", 1000)):
+        (root / path).mkdir(parents=True, exist_ok=True)
+        (root / path / names[0]).write_text(f"{limit}\n")
+        (root / path / names[1]).write_text(f"{used}\n")
+    assert cgroups.memory_left_bytes() == 5000
+    (root / "job" / names[0]).write_text("unreadable\n")
+    assert cgroups.memory_left_bytes() == 6000
+
+
+def test_a_program_spins_less_on_a_crowded_machine(machine, environment, monkeypatch):
+    monkeypatch.setattr(os, "getloadavg", lambda: (64.5, 0.0, 0.0))
+    threads.set_up_program()
+    assert environment["GOMP_SPINCOUNT"] == str(threads.CROWDED_SPIN_COUNT)
 
 
 def test_a_program_limits_spinning(machine, environment):

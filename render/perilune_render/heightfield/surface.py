@@ -52,7 +52,7 @@ class Ground(NamedTuple):
     highest_m: float
     """Height above all ground and boulders, metres."""
     ring: np.ndarray
-    """The ring at equal steps of the distance max(|x|, |y|) from that of the first ring (N,) int64."""
+    """Ring at equal steps of the distance max(|x|, |y|), beginning at the first ring (N,) int64."""
     rings_per_m: float
     """Elements of `ring` per metre."""
 

@@ -4,10 +4,8 @@ A small loop over processes instead of a pool from a library: a killed worker br
 loky with all its tasks, and none of them hands a task to the worker that already holds its scene.
 """
 
-import contextlib
 import tempfile
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import Any
 
 import psutil
@@ -17,6 +15,7 @@ from perilune_render.jobs.report import Report
 from perilune_render.jobs.work_list import N_ATTEMPTS, WorkList
 from perilune_render.jobs.worker import Worker, start_worker
 from perilune_render.terrain.grid import graded_grid
+from perilune_shared.cgroups import memory_left_bytes
 from perilune_shared.errors import UserError
 from perilune_shared.progress import say
 from perilune_shared.storage.store import Store, open_store
@@ -30,8 +29,6 @@ _BASE_BYTES, _VERTEX_BYTES = 0.75 * 2**30, 500
 """Peak memory of a worker: 1.1 GiB for 1.2 million vertices and 3.1 GiB for 5.7 million were measured."""
 _GROUND_BYTES, _GROWING_BYTES = 16, 70
 """Memory for each vertex of ground that is rendered in levels, and for each vertex while ground is generated."""
-_CGROUP = Path("/sys/fs/cgroup")
-"""Limits of a container or a batch job, by kernel interface cgroup v2."""
 
 
 class LocalWorkers:
@@ -171,9 +168,6 @@ def default_workers(job: Job, n_threads: int | None) -> int:
 
 
 def _free_bytes() -> float:
-    """Memory that new processes may use, bytes: that of the machine, or of the container or batch job if it is less."""
-    free = float(psutil.virtual_memory().available)
-    with contextlib.suppress(OSError, ValueError):
-        limit, used = (int((_CGROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
-        free = min(free, limit - used)
-    return free
+    """Memory that new processes may use, bytes: free on the machine, or left to the container or batch job if less."""
+    free, left = float(psutil.virtual_memory().available), memory_left_bytes()
+    return free if left is None else min(free, left)

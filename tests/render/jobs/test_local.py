@@ -14,6 +14,7 @@ from perilune_render.jobs.local import LocalWorkers
 from perilune_render.jobs.run import RenderingFailed, render_job
 from perilune_render.jobs.scene_renderer import SceneRenderer
 from perilune_render.jobs.worker import early_worker
+from perilune_shared import cgroups
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import open_store
@@ -101,7 +102,7 @@ def test_default_is_a_worker_for_each_core_as_trajectories_and_memory_allow(
 
 
 def test_free_memory_is_that_of_the_container_if_it_is_less(tmp_path, monkeypatch):
-    monkeypatch.setattr(local, "_CGROUP", tmp_path)
+    monkeypatch.setattr(cgroups, "_ROOT", tmp_path)
     of_machine = local._free_bytes()
     assert 2**27 < of_machine < 2**45
     tmp_path.joinpath("memory.max").write_text("max\n")

@@ -71,12 +71,17 @@ class FairThreads:
     def __exit__(self, *_: object) -> None:
         if not self._active:
             return
-        _use(self._most)
+        self.restore()
         now_s = self._clock()
         if self._waiting:
             self._measure(now_s)
         elif self._most > 1 and now_s - self._checked_s >= _CHECK_S:
             self._check(now_s)
+
+    def restore(self) -> None:
+        """Use the program's number again, after a step that did not end."""
+        if self._active:
+            _use(self._most)
 
     def _check(self, now_s: float) -> None:
         self._checked_s, others = now_s, self._others()

@@ -126,16 +126,23 @@ class FewerThreadsIfCrowded(Callback):
     """Adapt the number of threads on a CPU to other work on the machine (see `FairThreads`)."""
 
     def __init__(self, enabled: bool):
-        self.threads = FairThreads(enabled)
+        # Steps of validation cost less than those of training, so each has its own trials of speed.
+        self.training, self.validation = FairThreads(enabled), FairThreads(enabled)
 
     def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
-        self.threads.__enter__()
+        self.training.__enter__()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
-        self.threads.__exit__()
+        self.training.__exit__()
+
+    def on_validation_batch_start(self, trainer, pl_module, batch, batch_idx, dataloader_idx=0) -> None:
+        self.validation.__enter__()
+
+    def on_validation_batch_end(self, trainer, pl_module, outputs, batch, batch_idx, dataloader_idx=0) -> None:
+        self.validation.__exit__()
 
     def on_exception(self, trainer, pl_module, exception) -> None:
-        self.threads.__exit__()
+        self.training.restore()
 
 
 class Bar(Callback):

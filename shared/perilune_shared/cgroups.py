@@ -1,0 +1,57 @@
+"""Limits of a container or a batch job on processor and memory: Linux cgroups, versions 1 and 2."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+_ROOT, _OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+
+
+def processor_quota() -> float | None:
+    """Least processor quota, in cores, of this process's cgroup and of those above it; None if there is none."""
+    quotas = [used / period for used, period in _pairs("cpu") if used > 0 and period > 0]
+    return min(quotas, default=None)
+
+
+def memory_left_bytes() -> float | None:
+    """Least memory, in bytes, that this process's cgroup and those above it may still use; None without a limit."""
+    left = [float(limit - used) for limit, used in _pairs("memory") if limit >= 0]
+    return min(left, default=None)
+
+
+_FILES = {
+    "cpu": (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")),
+    "memory": (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")),
+}
+"""Files of a controller with two numbers, in version 2 and in version 1."""
+
+
+def _pairs(controller: str) -> Iterator[tuple[int, int]]:
+    """Both numbers of each cgroup that states them; "max", no limit, is none, nor is a file that cannot be read."""
+    for folder in _folders(controller):
+        for names in _FILES[controller]:
+            try:
+                first, second = " ".join((folder / name).read_text(encoding="ascii") for name in names).split()
+                yield int(first), int(second)
+            except (OSError, ValueError):
+                continue
+
+
+def _folders(controller: str) -> list[Path]:
+    """Folders of this process's cgroups for a controller, up to the roots.
+
+    In a container the path that the kernel states may lie outside what is mounted; the root is then the container's.
+    """
+    try:
+        lines = _OWN.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    folders = [_ROOT, _ROOT / controller, _ROOT / "cpu,cpuacct"]
+    for line in lines:
+        _, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if controllers and controller not in controllers.split(","):
+            continue
+        roots = (_ROOT / controllers, _ROOT / controller) if controllers else (_ROOT, _ROOT / "unified")
+        inner = Path(path.lstrip("/"))
+        folders += [root / part for root in roots for part in (inner, *inner.parents)]
+    return list(dict.fromkeys(folders))
