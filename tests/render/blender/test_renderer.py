@@ -256,7 +256,7 @@ def test_one_renderer_at_a_time_in_a_process():
 
 def test_one_thread_renders_on_one_core_and_lets_python_run():
     """Blender's pool of threads must not spin while one thread renders; Python's other threads must not wait for it."""
-    config, gap_s = config_with(render=RenderConfig(samples=80, threads=1)), []
+    config, gap_s = config_with(render=RenderConfig(samples=200, threads=1)), []
 
     def cpu_s(thread):
         fields = (thread / "stat").read_text().rpartition(")")[2].split()
@@ -278,7 +278,7 @@ def test_one_thread_renders_on_one_core_and_lets_python_run():
         stopped.set()
         measuring.join()
     used_s = sorted(cpu_s(thread) - start for thread, start in zip(threads, before, strict=True))
-    assert used_s[-1] > 0.2
+    assert used_s[-1] > 0.5
     assert sum(used_s[:-1]) < 0.2 * used_s[-1]
     assert max(gap_s) < 0.5 * used_s[-1]
 

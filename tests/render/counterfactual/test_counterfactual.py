@@ -90,14 +90,26 @@ def test_labels_lack_the_removed_craters_alone(quick, made):
     assert (both["ellipse_cx_px"] == both["ellipse_cx_px_after"]).mean() > 0.8
 
 
+@pytest.mark.slow
+def test_images_of_blender_change_at_removed_craters_of_a_few_pixels(tiny, tmp_path):
+    done = counterfactual(*command(tiny, tmp_path / "without"))
+    assert done.returncode == 0, done.stderr
+    check_images_change(tiny, tmp_path / "without", 2)
+
+
 def test_images_change_at_the_removed_craters(quick, made):
-    before, after = open_dataset(quick / "detect"), open_dataset(made)
+    # A smaller crater has few vertices on the coarse ground of `quick`.
+    check_images_change(quick, made, 4)
+
+
+def check_images_change(rendered, made, least_radius_px):
+    before, after = open_dataset(rendered / "detect"), open_dataset(made)
     old, table, camera = frames(before), removed_craters(made), after.info.camera.intrinsics()
     z_m = before.table("craters").to_pandas().merge(table, on=["scene_id", "crater_id"])["z_m"].to_numpy()
     row_px, column_px = np.mgrid[: camera.height_px, : camera.width_px] + 0.5
     changed_within = n_checked = 0
     for frame_id, row in frames(after).items():
-        change = np.abs(image(made, row) - image(quick / "detect", old[frame_id]))
+        change = np.abs(image(made, row) - image(rendered / "detect", old[frame_id]))
         centres = np.column_stack([table["x_m"], table["y_m"], z_m])
         in_camera = camera_from_site(centres, row["position_m"], matrix_from_quaternion(row["rotation_wxyz"]))
         radius_px = camera.fx_px * table["diameter_m"].to_numpy() / 2 / in_camera[:, 2]
@@ -106,8 +118,7 @@ def test_images_change_at_the_removed_craters(quick, made):
         for (x, y), radius, reach_radii in zip(camera.project(in_camera), radius_px, reach, strict=True):
             distance = np.hypot(column_px - x, row_px - y)
             far &= distance > (reach_radii + 0.5) * radius + 2
-            # A smaller crater has few vertices on the coarse ground of `quick`.
-            if camera.inside(np.array([[x, y]]))[0] and radius > 4:
+            if camera.inside(np.array([[x, y]]))[0] and radius > least_radius_px:
                 changed_within += bool((change[distance < 1.5 * radius] > 5).any())
                 n_checked += 1
         # Beyond, only the automatic exposure may change.

@@ -27,7 +27,7 @@ def test_noise_grows_with_the_range(scene):
     times = measure_ranges(motion, scene, CONFIG, 65.0, 0).time_s
     assert len(times) == 651 and times[-1] == 65
     true_m = range_to_ground_m(scene, motion.path_at(times)[0], -motion.rotation_site_from_body_at(times)[:, :, 2])
-    error = np.stack([measure_ranges(motion, scene, CONFIG, 65.0, s).range_m - true_m for s in range(60)])
+    error = np.stack([measure_ranges(motion, scene, CONFIG, 65.0, s).range_m - true_m for s in range(200)])
     assert np.allclose(error.std(axis=0)[:100].mean(), 0.2 + 0.0005 * true_m[:100].mean(), rtol=0.05)
     assert np.allclose(error.std(axis=0)[-100:].mean(), 0.2 + 0.0005 * true_m[-100:].mean(), rtol=0.05)
 
@@ -39,7 +39,7 @@ def test_ranges_of_frames_are_along_the_cameras_axis_with_noise_of_their_own(sce
     end = flight.position_m + found.range_m[:, None] * flight.rotation_camera_from_site[:, 2]
     assert np.array_equal(found.time_s, flight.time_s)
     assert np.allclose(end[:, 2], value_at(scene.height_m, scene.grid, end[:, 0], end[:, 1]), atol=0.01)
-    draws = [measure_ranges_of_frames(flight, range(20), scene, CONFIG, seed).range_m for seed in range(60)]
+    draws = [measure_ranges_of_frames(flight, range(20), scene, CONFIG, seed).range_m for seed in range(200)]
     error = np.stack(draws) - found.range_m
     assert np.allclose(error.std(axis=0).mean(), 0.2 + 0.0005 * found.range_m.mean(), rtol=0.05)
     later = measure_ranges_of_frames(flight, range(5, 25), scene, CONFIG, 0).range_m

@@ -62,14 +62,15 @@ def flown(craft, rng, biases, see=lambda k, seen: seen, seconds=30, feel=lambda 
     return np.array(errors), np.array(squared), status
 
 
-def test_errors_are_small_and_of_the_stated_size():
+@pytest.mark.parametrize("n_descents", [4, pytest.param(8, marks=pytest.mark.slow)])
+def test_errors_are_small_and_of_the_stated_size(n_descents):
     squared, last = [], []
-    for seed in range(4):
+    for seed in range(n_descents):
         errors, normalised, status = flown(*lander(seed))
         assert set(status) == {"tracking"}
         squared.append(normalised.mean())
         last.append(np.linalg.norm(errors[-1]))
-    # Errors along a descent hang together: 4 descents have about 8 independent ones of 6 parts, a deviation of 1.2.
+    # Errors along a descent are correlated: 8 descents have about 16 independent ones of 6 parts, a deviation of 0.9.
     assert 3.3 < np.mean(squared) < 8.7
     assert np.mean(last) < 1.5
 

@@ -80,9 +80,11 @@ def fly(lander: Lander, instruments: Instruments, frame_time_s: Array, seen: Ite
 def fly_together(
     landers: Sequence[Lander], instruments: Instruments, frame_time_s: Array, seen: Iterable[Sequence[Sightings]]
 ) -> Iterator[list[Estimate]]:
-    """Run the filters of F flights over descents with measurements at the same times: as `fly`, but several times as
-    fast. `seen` has the sightings of all flights, frame by frame; inertial noise, range and relief are those of the
-    first lander."""
+    """Run the filters of F flights over descents with measurements at the same times, faster than one by one.
+
+    `seen` has the sightings of all flights, frame by frame. All flights take inertial noise, range and relief from the
+    first lander.
+    """
     times = np.concatenate([instruments.range_time_s, frame_time_s])
     is_frame = np.concatenate([np.zeros(len(instruments.range_time_s), bool), np.ones(len(frame_time_s), bool)])
     place = np.concatenate([np.arange(len(instruments.range_time_s)), np.arange(len(frame_time_s))])

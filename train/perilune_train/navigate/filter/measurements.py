@@ -30,7 +30,7 @@ _ALL_SEE = np.r_[POSITION, ATTITUDE, COMMON]
 def pose_fits(state: State, pose: Pose, covariance: Array, rotation_camera_from_body: Array) -> bool:
     """Whether a pose of the camera passes the gate.
 
-    `covariance` (6, 6) is that of the shift, O_L, metres, and of the turn from the left, O_C, radians.
+    `covariance` (6, 6): shift in O_L, metres, then turn from the left in O_C, radians.
     """
     innovation, by_error = _pose_innovation(state, pose, rotation_camera_from_body)
     spread = by_error @ state.covariance[:N_ERRORS, :N_ERRORS] @ by_error.T + covariance

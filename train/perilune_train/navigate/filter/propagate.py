@@ -147,8 +147,9 @@ def integrated(start: Moving, measured: Increments, noise: InertialNoise) -> Mot
 
 
 def _changes(middle: Array, half: Array, force: Array, step_s: Array) -> Array:
-    """Derivatives (N, F, 15, 15) of the errors after each step by those before: that of the attitude turns the force,
-    and those of the biases add up.
+    """Derivatives (N, F, 15, 15) of the errors after each step by the errors before it.
+
+    An error of the attitude turns the measured force; errors of the biases are integrated over the step.
 
     `middle` and `half` (N, F, 3, 3) are the attitudes in the middle of the steps and the turns up to there.
     """
