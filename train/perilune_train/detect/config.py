@@ -153,6 +153,8 @@ class DetectConfig(Section):
     teacher: str | None = None
     """best.ckpt of a detect run, usually wider, to distil from in addition to the labels. The strides and in_channels
     must be the same; its anchors are used."""
+    validate_every: Count = 1
+    """Epochs between validations; `epochs` is a multiple of it. The best validated weights are kept."""
     batch_size: Count = 8
     """Frames of each process in a training step."""
     learning_rate: Positive = 1e-3
@@ -208,4 +210,6 @@ class DetectConfig(Section):
             raise ValueError("expected strides 8, 16, 32 or 4, 8, 16")
         if self.frozen_epochs >= self.epochs:
             raise ValueError("frozen_epochs must be less than epochs")
+        if self.epochs % self.validate_every:
+            raise ValueError("epochs must be a multiple of validate_every")
         return self

@@ -11,9 +11,14 @@ def iou(first: Tensor, second: Tensor) -> Tensor:
     """Intersection over union (...) of boxes (..., 4) that are broadcast against each other; differentiable."""
     areas = _area(first) + _area(second)
     sides = torch.minimum(first[..., 2:], second[..., 2:]) - torch.maximum(first[..., :2], second[..., :2])
-    intersection = sides.clamp(min=0).prod(-1)
+    intersection = _product(sides.clamp(min=0))
     return intersection / (areas - intersection).clamp(min=_MIN_UNION)
 
 
 def _area(boxes: Tensor) -> Tensor:
-    return (boxes[..., 2:] - boxes[..., :2]).clamp(min=0).prod(-1)
+    return _product((boxes[..., 2:] - boxes[..., :2]).clamp(min=0))
+
+
+def _product(sides: Tensor) -> Tensor:
+    # The gradient of `prod` makes the process wait for the GPU, to count zeros.
+    return sides[..., 0] * sides[..., 1]

@@ -204,12 +204,13 @@ def fit(
     strategy: str = "auto",
     checkpoint_minutes: float | None = None,
     accumulate: int = 1,
+    validate_every: int = 1,
 ) -> float:
     """Train `task` for a fixed number of epochs; keep the best weights and the last state in the run's folder.
 
     Returns the training time in seconds, including the time before a resume.
 
-    A step sums the gradients of `accumulate` batches.
+    A step sums the gradients of `accumulate` batches. Validation follows every `validate_every` epochs.
 
     The task provides its own loaders, once; a batch sampler with an attribute `sampler` is told each epoch by
     `set_epoch` (see data/epochs.py), so that order and augmentation can depend on seed and epoch only. With several
@@ -239,6 +240,8 @@ def fit(
     warn_if_crowded()
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
+    # Deterministic algorithms would also fill all memory that is about to be overwritten.
+    torch.utils.deterministic.fill_uninitialized_memory = False
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         trainer = lightning.Trainer(
@@ -254,6 +257,7 @@ def fit(
             gradient_clip_val=gradient_clip,
             accumulate_grad_batches=accumulate,
             num_sanity_val_steps=0,
+            check_val_every_n_epoch=validate_every,
             logger=TensorBoardLogger(run.root, name="", version=""),
             log_every_n_steps=10,
             enable_progress_bar=False,

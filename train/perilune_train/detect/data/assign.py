@@ -4,6 +4,7 @@ The number of positive predictors depends on the labels. A GPU would make the pr
 loader assigns on the CPU, and the loss only gathers.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -34,22 +35,37 @@ class Assignment:
     """Box of its label: x0, y0, x1, y1 in pixels (P, 4)."""
     ignored: Tensor
     """Predictors that are neither positive nor negative (N, 3, h, w), bool."""
+    counted: Tensor | None = None
+    """False for rows that only fill the other arrays up to a constant length (P,); None: all rows count."""
 
     @property
     def positive(self) -> Tensor:
         """The positive predictors (N, 3, h, w), bool."""
-        mask = torch.zeros_like(self.ignored)
-        mask[tuple(self.places)] = True
-        return mask
+        if self.counted is None:
+            mask = torch.zeros_like(self.ignored)
+            mask[tuple(self.places)] = True
+            return mask
+        flat = flat_places(self.places, self.ignored.shape)
+        counts = torch.zeros(self.ignored.numel(), device=flat.device)
+        return (counts.scatter_reduce(0, flat, self.counted.float(), "amax") > 0).view_as(self.ignored)
 
     def pin_memory(self) -> "Assignment":
         """The same in page-locked memory; a DataLoader calls it."""
-        return Assignment(self.places.pin_memory(), self.boxes.pin_memory(), self.ignored.pin_memory())
+        return self._each(Tensor.pin_memory)
 
     def to(self, device: torch.device) -> "Assignment":
         """The same on another device; from page-locked memory without waiting."""
-        moved = (part.to(device, non_blocking=True) for part in (self.places, self.boxes, self.ignored))
-        return Assignment(*moved)
+        return self._each(lambda part: part.to(device, non_blocking=True))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> "Assignment":
+        return Assignment(**{name: change(part) for name, part in vars(self).items() if part is not None})
+
+
+def flat_places(places: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Indices (P,) into a flattened tensor (N, 3, h, w) of places (4, P): frame, anchor, row and column."""
+    frame, anchor, row, column = places
+    _, anchors, height, width = shape
+    return ((frame * anchors + anchor) * height + row) * width + column
 
 
 Targets = list[Assignment]

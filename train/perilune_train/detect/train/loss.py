@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from perilune_train.detect.config import LossSettings
-from perilune_train.detect.data.assign import Targets
+from perilune_train.detect.data.assign import Targets, flat_places
 from perilune_train.models.boxes import iou
 from perilune_train.models.yolo import decode
 
@@ -62,31 +62,28 @@ def detection_loss(
     box, confidence = outputs[0].new_zeros(()), outputs[0].new_zeros(())
     total = sum(1 / stride for stride in strides)
     for raw, own_anchors, stride, found in zip(outputs, anchors, strides, targets, strict=True):
-        frame, anchor, row, column = found.places
-        chosen, cells = raw[frame, anchor, row, column].float(), torch.stack([column, row], 1)
+        _, anchor, row, column = found.places
+        flat = flat_places(found.places, raw.shape[:4])
+        chosen, cells = raw.flatten(0, 3)[flat].float(), torch.stack([column, row], 1)
         boxes, labels = decode(chosen, cells, own_anchors[anchor], stride), found.boxes
+        counted = None if found.counted is None else found.counted.float()
+        n_labels = max(len(labels), 1) if counted is None else counted.sum().clamp(min=1)
         sums = settings.reduction == "sums"
         # What the sums over the predictors of this scale are divided by.
         of_boxes, of_scores = (
-            (len(raw), len(raw))
-            if sums
-            else (max(len(labels), 1) * total * stride, raw[..., 4].numel() * total * stride)
+            (len(raw), len(raw)) if sums else (n_labels * total * stride, raw[..., 4].numel() * total * stride)
         )
         # An empty sum keeps the graph, so that a batch of empty frames remains differentiable.
-        box = box + ciou_loss(boxes, labels, settings.aspect).sum() / of_boxes
+        losses = ciou_loss(boxes, labels, settings.aspect)
+        box = box + (losses if counted is None else losses * counted).sum() / of_boxes
         positive = found.positive
         weight = torch.where(positive, 1.0, settings.lambda_noobj * (~found.ignored))
         target = positive.float()
         if settings.objectness == "iou":
             # If two labels share a predictor, use the larger IoU.
-            _, anchors_here, height, width = target.shape
-            flat = ((frame * anchors_here + anchor) * height + row) * width + column
-            target = (
-                torch.zeros_like(target)
-                .view(-1)
-                .scatter_reduce(0, flat, iou(boxes.detach(), labels), "amax")
-                .view_as(target)
-            )
+            overlap = iou(boxes.detach(), labels)
+            overlap = overlap if counted is None else overlap * counted
+            target = torch.zeros_like(target).view(-1).scatter_reduce(0, flat, overlap, "amax").view_as(target)
         logits = raw[..., 4].float()
         entropy = F.binary_cross_entropy_with_logits(logits, target, weight, reduction="sum")
         confidence = confidence + entropy / of_scores

@@ -115,6 +115,7 @@ def run_detect(
         num_nodes=config.num_nodes,
         strategy="ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy,
         checkpoint_minutes=config.checkpoint_minutes,
+        validate_every=config.validate_every,
     )
     if not runs.is_first_process():
         return run

@@ -11,11 +11,13 @@ from torch import Tensor, nn
 
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import Batch, evaluation_loader, network_input, training_loader
+from perilune_train.detect.data.resident import ResidentFrames, may_reside, resident_loader
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.data.streamed import StreamedSplit, streamed_loader
 from perilune_train.detect.evaluate.matching import Detections, joined, match_split
 from perilune_train.detect.evaluate.metrics import at_threshold, curve
 from perilune_train.detect.inference.suppression import detections_of
+from perilune_train.detect.train.captured import CapturedStep
 from perilune_train.detect.train.distill import Teacher, distill_loss
 from perilune_train.detect.train.guide import guide_loss
 from perilune_train.detect.train.loss import detection_loss
@@ -98,11 +100,19 @@ class DetectTask(lightning.LightningModule):
         self.images_seen = 0
         self.terrain: dict[str, Any] | None = None
         self.resumed = (0, 0)
+        self.resident: ResidentFrames | None = None
+        self.captured: CapturedStep | None = None
+        self.replayable, self.replays = False, False
 
     @property
     def process(self) -> tuple[int, int]:
         """Rank of this process and number of processes that train together."""
         return (self._trainer.global_rank, self._trainer.world_size) if self._trainer else (0, 1)
+
+    @property
+    def resides(self) -> bool:
+        """Whether the training frames are kept on the device, and steps are captured."""
+        return self.device.type == "cuda" and may_reside(self.config)
 
     def train_dataloader(self) -> Any:
         # The current epoch is one too low here if the run is resumed after a whole epoch.
@@ -112,6 +122,8 @@ class DetectTask(lightning.LightningModule):
         split, anchors = self.train_split, self.network.anchors
         if isinstance(split, StreamedSplit):
             return streamed_loader(split, self.config, anchors, epoch, start)
+        if self.resides:
+            return resident_loader(split, self.config, epoch, start)
         return training_loader(split, self.config, anchors, epoch, start)
 
     def val_dataloader(self) -> Any:
@@ -140,8 +152,10 @@ class DetectTask(lightning.LightningModule):
         plain = [p for p in self.network.parameters() if p.ndim <= 1]
         optimizer = torch.optim.AdamW(
             [{"params": decayed, "weight_decay": self.config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
-            lr=self.config.learning_rate,
+            # A captured step reads the learning rate from the device.
+            lr=torch.tensor(self.config.learning_rate, device=self.device) if self.resides else self.config.learning_rate,
             fused=True,
+            capturable=self.resides,
         )
         # Lightning's own count would load the batches of an epoch before it knows the position of a resumed run.
         total = self.config.epochs * len(self.train_dataloader())
@@ -157,9 +171,21 @@ class DetectTask(lightning.LightningModule):
         for part in (backbone.stem, backbone.downs, backbone.units):
             part.requires_grad_(not frozen)
             part.train(not frozen)
+        if self.resides and (self.captured is None or self.current_epoch == self.frozen_epochs):
+            # A captured step computes the gradients of the stage in which it was captured.
+            self.captured = CapturedStep(self.whole_step, self.config.batch_size, self.device)
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        images, targets = batch
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        # The last batch of an epoch may be smaller than those that are captured.
+        self.replayable = isinstance(batch, Tensor) and len(batch) == self.config.batch_size
+
+    def training_step(self, batch: Batch | Tensor, batch_idx: int) -> Tensor:
+        if self.replays and isinstance(batch, Tensor) and self.captured is not None:
+            self.images_seen += len(batch)
+            box, confidence = self.captured(batch)
+            self.log_dict({"train/ciou": box, "train/objectness": confidence}, batch_size=len(batch))
+            return self.config.loss.lambda_iou * box + self.config.loss.lambda_obj * confidence
+        images, targets = self.resident_batch(batch) if isinstance(batch, Tensor) else batch
         self.images_seen += len(images) * self.process[1]
         settings, masks = self.config.loss, {}
         guided = settings.lambda_guide > 0 and self.config.attention != "none"
@@ -181,6 +207,38 @@ class DetectTask(lightning.LightningModule):
             loss = loss + settings.lambda_teacher * (settings.lambda_iou * box + settings.lambda_obj * confidence)
         return loss
 
+    def resident_batch(self, numbers: Tensor) -> Batch:
+        """The batch of the frames `numbers` (B,) of the resident frames."""
+        assert self.resident is not None
+        return self.resident.batch(numbers, self.config.in_channels)
+
+    def whole_step(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Losses of a batch of resident frames; updates the weights. No value is read, so that it may be captured."""
+        optimizer: Any = self.optimizers(use_pl_optimizer=False)
+        optimizer.zero_grad(set_to_none=True)
+        # Weights that a cache casts once would not be those of the next step.
+        kind = self.device.type
+        enabled, dtype = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
+        with torch.autocast(kind, dtype, enabled, cache_enabled=False):
+            images, targets = self.resident_batch(numbers)
+            outputs = self.network(images)
+            settings, network = self.config.loss, self.network
+            box, confidence = detection_loss(outputs, targets, network.anchors, network.strides, settings)
+            loss = settings.lambda_iou * box + settings.lambda_obj * confidence
+        with torch.autocast(kind, enabled=False):
+            loss.backward()
+            self.configure_gradient_clipping(optimizer)
+            optimizer.step()
+        return box.detach(), confidence.detach()
+
+    def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        if not self.replays:
+            super().backward(loss, *args, **kwargs)
+
+    def optimizer_zero_grad(self, *args: Any) -> None:
+        if not self.replays:
+            super().optimizer_zero_grad(*args)
+
     def configure_gradient_clipping(self, optimizer: Any, *_: Any, **__: Any) -> None:
         # Lightning's own clipping raises an error for fused optimisers because of float16's scaled gradients, which are
         # not used here.
@@ -192,9 +250,21 @@ class DetectTask(lightning.LightningModule):
 
     def on_train_start(self) -> None:
         self.tensors = paired_tensors(self.evaluated, self.network)
+        if not self.resides:
+            return
+        assert isinstance(self.train_split, DetectSplit)
+        self.resident = ResidentFrames.of(self.train_split, self.config, self.network.anchors, self.device)
+        for group in self.optimizers(use_pl_optimizer=False).param_groups:  # type: ignore[union-attr]
+            # The state of a resumed run is read to the CPU.
+            group["lr"] = group["lr"].to(self.device)
 
-    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        super().optimizer_step(*args, **kwargs)
+    def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
+        self.replays = self.replayable
+        if self.replays:
+            optimizer_closure()
+            self.replays = False
+        else:
+            super().optimizer_step(epoch, batch_idx, optimizer, optimizer_closure)
         # Update here, not after the batch: a checkpoint in between would lack it. The decay is smaller in early steps;
         # otherwise the random start would dominate the average in a short training.
         steps = self.global_step + 1
@@ -202,7 +272,9 @@ class DetectTask(lightning.LightningModule):
         if steps % every == 0:
             update_average(self.tensors, min(self.config.ema_decay, (1 + steps) / (10 + steps)) ** every)
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        if isinstance(batch, Tensor):
+            return batch.to(device, non_blocking=True)
         images, targets = batch
         # The channels of a grey frame are equal, so copy one.
         moved = network_input(images.to(device, non_blocking=True), self.config.in_channels)

@@ -1,0 +1,123 @@
+"""Training frames and their assignments on the GPU, for batches without work of the processor.
+
+A GPU trains a detector faster than a process can prepare its batches. Without augmentation a frame is the same in every
+epoch, so frames and assignments are moved to the GPU once, and a batch is gathered there. All batches of one size have
+the same shapes, which a captured step needs (`detect/train/captured.py`).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+from torch.utils import data as torch_data
+
+from perilune_train.data.epochs import EpochBatches, batch_loader
+from perilune_train.detect.config import AugmentSettings, DetectConfig
+from perilune_train.detect.data.assign import Assignment, BatchLabels, Targets, assign
+from perilune_train.detect.data.batches import TrainingFrames
+from perilune_train.detect.data.split import DetectSplit
+
+_UNCHANGED = AugmentSettings(
+    flips_and_turns=False, scale=(1.0, 1.0), gain=0.0, gamma=0.0, stretch=0.0, blur_px=0.0, noise=0.0
+)
+_PORTION = 256
+"""Frames whose assignments are computed together."""
+
+
+@dataclass(frozen=True)
+class ResidentScale:
+    """Assignments of all F frames for one scale, K rows each; frames with fewer are filled up."""
+
+    places: Tensor
+    """Anchor, row and column of each positive predictor (F, K, 3)."""
+    boxes: Tensor
+    """Box of its label: x0, y0, x1, y1 in pixels (F, K, 4)."""
+    counted: Tensor
+    """False for the rows that fill up (F, K)."""
+    ignored: Tensor
+    """Predictors that are neither positive nor negative (F, 3, h, w), bool."""
+
+    def batch(self, numbers: Tensor) -> Assignment:
+        """The assignment of a batch of frames (B,)."""
+        places, boxes = self.places[numbers], self.boxes[numbers]
+        frame = torch.arange(len(numbers), device=numbers.device)[:, None].expand(places.shape[:2])
+        rows = torch.cat([frame[..., None], places], -1).flatten(0, 1).T
+        return Assignment(rows, boxes.flatten(0, 1), self.ignored[numbers], self.counted[numbers].flatten())
+
+
+@dataclass(frozen=True)
+class ResidentFrames:
+    """The frames of a split with their assignments, on one device."""
+
+    images: Tensor
+    """Pixels (F, height, width), uint8."""
+    scales: list[ResidentScale]
+    """Assignments, finest stride first."""
+
+    @classmethod
+    def of(cls, split: DetectSplit, config: DetectConfig, anchors: Tensor, device: torch.device) -> "ResidentFrames":
+        """Assign all frames of a split to anchors (scales, 3, 2), and move them to a device."""
+        ratio = config.anchor_ratio if config.assignment == "several" else None
+        height, width = split.frames.images.shape[1:]
+        parts: list[Targets] = []
+        for start in range(0, len(split), _PORTION):
+            labels = split.labels[start : start + _PORTION]
+            rows = BatchLabels(
+                torch.cat([torch.as_tensor(one.boxes, dtype=torch.float32) for one in labels]),
+                torch.repeat_interleave(torch.arange(len(labels)), torch.tensor([len(one.boxes) for one in labels])),
+                torch.cat([torch.as_tensor(one.selected) for one in labels]),
+            )
+            shapes = [(len(labels), height // stride, width // stride) for stride in config.strides]
+            parts.append(assign(rows, anchors.cpu(), config.strides, shapes, ratio))
+        scales = [_padded([targets[k] for targets in parts], device) for k in range(len(config.strides))]
+        return cls(torch.as_tensor(split.frames.images).to(device), scales)
+
+    def batch(self, numbers: Tensor, in_channels: int) -> tuple[Tensor, Targets]:
+        """The network's input (B, in_channels, height, width) and the assignments of the frames `numbers` (B,).
+
+        Frames are normalised as by `perilune_train.data.frames.normalised`.
+        """
+        pixels = self.images[numbers].float()
+        deviation, mean = torch.std_mean(pixels, (-2, -1), correction=0, keepdim=True)
+        frames = ((pixels - mean) / deviation.clamp(min=1.0))[:, None].expand(-1, in_channels, -1, -1)
+        return frames.contiguous(memory_format=torch.channels_last), [scale.batch(numbers) for scale in self.scales]
+
+
+def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
+    """Assignments of portions of the frames as arrays of constant length."""
+    places, boxes = [], []
+    for part in parts:
+        order = torch.argsort(part.places[0], stable=True)
+        counts = torch.bincount(part.places[0], minlength=len(part.ignored)).tolist()
+        places += list(part.places[1:, order].T.split(counts))
+        boxes += list(part.boxes[order].split(counts))
+    counted = pad_sequence([torch.ones(len(one), dtype=torch.bool) for one in boxes], batch_first=True)
+    # A box with an area, since the loss is computed for all rows.
+    filled = pad_sequence([one - one.new_tensor([0, 0, 1, 1]) for one in boxes], batch_first=True)
+    return ResidentScale(
+        pad_sequence(places, batch_first=True).to(device),
+        (filled + filled.new_tensor([0, 0, 1, 1])).to(device),
+        counted.to(device),
+        torch.cat([part.ignored for part in parts]).to(device),
+    )
+
+
+def may_reside(config: DetectConfig) -> bool:
+    """Whether the settings allow frames on the GPU: no augmentation, teacher or guidance, one process, no stream."""
+    alone = config.devices == config.num_nodes == 1
+    plain = config.teacher is None and config.loss.lambda_guide == 0
+    return alone and plain and not config.stream and config.augment == _UNCHANGED
+
+
+class _Numbers(torch_data.Dataset):
+    """The number of a frame in place of the frame."""
+
+    def __getitem__(self, key: tuple[int, int]) -> int:
+        return key[1]
+
+
+def resident_loader(split: DetectSplit, config: DetectConfig, epoch: int = 0, start: int = 0) -> torch_data.DataLoader:
+    """Batches of numbers of frames, in the order of `training_loader`."""
+    batches = EpochBatches(TrainingFrames(split, config).keys, split.n_frames, config.batch_size, epoch, start)
+    return batch_loader(_Numbers(), batches, torch.tensor, 0, False)
