@@ -150,10 +150,14 @@ class DetectTask(lightning.LightningModule):
     def configure_optimizers(self) -> Any:
         decayed = [p for p in self.network.parameters() if p.ndim > 1]
         plain = [p for p in self.network.parameters() if p.ndim <= 1]
+        # A captured step reads the learning rate from the device.
+        rate = self.config.learning_rate
         optimizer = torch.optim.AdamW(
             [{"params": decayed, "weight_decay": self.config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
             # A captured step reads the learning rate from the device.
-            lr=torch.tensor(self.config.learning_rate, device=self.device) if self.resides else self.config.learning_rate,
+            lr=torch.tensor(self.config.learning_rate, device=self.device)
+            if self.resides
+            else self.config.learning_rate,
             fused=True,
             capturable=self.resides,
         )
@@ -254,7 +258,7 @@ class DetectTask(lightning.LightningModule):
             return
         assert isinstance(self.train_split, DetectSplit)
         self.resident = ResidentFrames.of(self.train_split, self.config, self.network.anchors, self.device)
-        for group in self.optimizers(use_pl_optimizer=False).param_groups:  # type: ignore[union-attr]
+        for group in self.optimizers(use_pl_optimizer=False).param_groups:
             # The state of a resumed run is read to the CPU.
             group["lr"] = group["lr"].to(self.device)
 
