@@ -154,10 +154,7 @@ class DetectTask(lightning.LightningModule):
         rate = self.config.learning_rate
         optimizer = torch.optim.AdamW(
             [{"params": decayed, "weight_decay": self.config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
-            # A captured step reads the learning rate from the device.
-            lr=torch.tensor(self.config.learning_rate, device=self.device)
-            if self.resides
-            else self.config.learning_rate,
+            lr=torch.tensor(rate, device=self.device) if self.resides else rate,
             fused=True,
             capturable=self.resides,
         )
