@@ -64,7 +64,7 @@ def all_versions(*, with_dem: bool, engine: str = "cycles", outputs: bool = Fals
 
 
 @functools.cache
-def _found(names: tuple[str, ...]) -> dict[str, str]:
+def _found(names: tuple[str, ...], with_dem: bool) -> dict[str, str]:
     prints = {name: kept_fingerprint(*_NAMES[name]) for name in names}
     used = frozenset().union(*(each.libraries for each in prints.values()))
     return {
@@ -74,15 +74,14 @@ def _found(names: tuple[str, ...]) -> dict[str, str]:
         **{
             recorded: metadata.version(distribution)
             for name, (recorded, distribution) in LIBRARIES.items()
-            if name in used
+            # Without an elevation model rasterio is not used, and need not be installed.
+            if name in used and (with_dem or name != "rasterio")
         },
     }
 
 
 def _versions(names: tuple[str, ...], with_dem: bool) -> dict[str, str]:
-    found = dict(_found(names))
-    if not with_dem:
-        found.pop("rasterio", None)
+    found = dict(_found(names, with_dem))
     if not processor.IN_FORCE:
         found["arithmetic"] = "of the processor"
     return found
