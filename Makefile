@@ -123,9 +123,10 @@ benchmark-landing: setup ## score craters and the filter on the locked benchmark
 	  $(if $(MAPS),--maps $(call quoted,$(MAPS))) --data $(BENCHMARK)
 
 # The experiment has presets of its own: PRESET=paper unless one is given.
-paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=quarter or twentieth for two cores, ATTITUDE=1, DARKNET=yolov3.weights)
+paper: setup ## the paper's experiment: tables, figures and verdicts in runs/paper (PART=whole, gpu or full, GROUND=lunar, CALIBRATE=1, ATTITUDE=1, MINUTES=number, DARKNET=yolov3.weights)
 	@$(BIN)/python scripts/paper.py --preset $(if $(filter file,$(origin PRESET)),paper,$(PRESET)) $(if $(PART),--part $(PART)) \
-	  $(if $(ATTITUDE),--attitude) $(if $(DARKNET),--darknet $(call quoted,$(DARKNET)))
+	  $(if $(GROUND),--ground $(GROUND)) $(if $(CALIBRATE),--calibrate) $(if $(ATTITUDE),--attitude) \
+	  $(if $(MINUTES),--minutes $(MINUTES)) $(if $(DARKNET),--darknet $(call quoted,$(DARKNET)))
 
 # Runs <name>-<change> have the seeds of <name>, the run of train-detect, and one changed setting each.
 ABLATION ?= none:attention=none cbam:attention=cbam identity:attention=cbam_identity unguided:loss.lambda_guide=0 strides-8:strides=[8,16,32] width-0.25:width=0.25 width-1:width=1.0

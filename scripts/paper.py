@@ -1,51 +1,199 @@
 """The paper's experiment: render, train, evaluate, explain, and write its page. Run again to resume (`make paper`).
 
-    python scripts/paper.py [--preset paper] [--part quarter|twentieth] [--attitude] [--darknet yolov3.weights]
+    python scripts/paper.py [--preset paper] [--part whole|gpu|full] [--ground pangu|lunar] [--attitude]
 
-Every step is one of the commands that a user has, printed before it runs. A finished step is left unchanged.
+Every step is one of the commands that a user has, printed before it runs. A finished step is left unchanged. Part `gpu`
+renders frames while networks train on those that are ready. With `--minutes`, what is done by then is on the page.
 """
 
+import itertools
 import json
+import math
+import os
 import re
+import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import resolve
 from perilune_shared.errors import UserError
+from perilune_shared.storage.files import write_text
 from perilune_train.detect.config import DetectConfig
+from perilune_train.detect.train.transfer import check_start
+from perilune_train.evaluation.metrics_file import read_metrics
 from perilune_train.navigate.config import NavigateConfig
-from perilune_train.paper.parts import PARTS, Cut, Part
-from perilune_train.paper.runs import DETECTORS, EXPLAINED, NAVIGATORS
+from perilune_train.paper.claimed import DETECTION
 
-BIN = Path(sys.executable).parent
 PROTOCOL = Path("configs/paper_protocol.yaml")
 ATTITUDE_DEG = 1.0
 """Standard deviation of the attitude in the second experiment, per axis."""
-OWN = "train own network, to start from"
-RENDER_FRAMES_PER_S = 4.0
-"""Roughly, on two cores, scene included; the rendering states its own estimate when it runs."""
+CALIBRATED_AP = DETECTION["YOLOv3"]["ap50_paper"]
+"""Validation AP of YOLOv3 without attention on the headline ground: the paper's."""
+SPARSE, LUNAR = "0.1", "lunar"
+"""The two ends of the curve: a tenth of the equilibrium density, and our usual ground."""
+RENDER_CORE_S = 0.12
+"""Core-seconds of a frame of 256 px with the engine heightfield, scene included."""
+FRAME_BYTES = 75_000
+"""Bytes of a frame with its labels, roughly."""
+
+
+class Part(StrEnum):
+    """How much of the experiment is made, and on what."""
+
+    WHOLE = "whole"
+    GPU = "gpu"
+    FULL = "full"
+
+
+class Ground(StrEnum):
+    """The headline ground."""
+
+    PANGU = "pangu"
+    LUNAR = "lunar"
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a part."""
+
+    trajectories: int
+    """Detection trajectories over each ground, of `frames` frames."""
+    frames: int
+    """Frames of a trajectory, of detection and of navigation."""
+    nav_trajectories: int
+    """Navigation trajectories."""
+    curve: tuple[str, ...]
+    """Shares of the equilibrium density of the grounds between the sparse and our usual one."""
+    epochs: int
+    """Epochs of each detector."""
+    curve_width: float
+    """Width of the detectors on the curve, and of the lunar ones."""
+    half_width: float
+    """Width of the detectors that are trained with three seeds."""
+    seeds: tuple[int, ...]
+    """Seeds of the narrower detectors."""
+    coarse_epochs: int
+    """Coarse epochs of the navigators; an epoch has about 30 steps."""
+    fine_epochs: int
+    """Fine epochs of the navigators in the reading of the paper."""
+    render_workers: int | None = None
+    """Processes that render; None for the command's default."""
+    trainings: int = 1
+    """Trainings at once, beside the rendering; 1 runs one step after another."""
+    benchmark_scenes: int = 0
+    """Scenes of each part of the locked benchmark; 0 for none."""
+    settings: dict[str, str] = field(default_factory=dict)
+    """Settings over the preset and the protocol."""
+
+
+_TWO_CORES = {
+    "detect.batch_size": "8",
+    "detect.warmup_steps": "200",
+    "detect.workers": "0",
+    "navigate.workers": "0",
+    "navigate.stack.batch_sequences": "1",
+    "navigate.stack.accumulate": "8",
+}
+"""Settings that fit two cores and 16 GB."""
+_GPU = {
+    "detect.batch_size": "32",
+    "detect.warmup_steps": "100",
+    "detect.validate_every": "4",
+    "detect.workers": "0",
+    "navigate.workers": "0",
+}
+PARTS = {
+    Part.WHOLE: Sizes(
+        trajectories=40,
+        frames=100,
+        nav_trajectories=49,
+        curve=("0.25", "0.5", "1.0"),
+        epochs=6,
+        curve_width=0.5,
+        half_width=0.5,
+        seeds=(0, 1, 2),
+        coarse_epochs=104,
+        fine_epochs=6,
+        benchmark_scenes=2,
+        settings=_TWO_CORES,
+    ),
+    Part.GPU: Sizes(
+        trajectories=40,
+        frames=100,
+        nav_trajectories=49,
+        curve=("0.25", "0.5", "1.0"),
+        epochs=8,
+        curve_width=1.0,
+        half_width=0.5,
+        seeds=(0, 1, 2),
+        coarse_epochs=104,
+        fine_epochs=6,
+        render_workers=13,
+        trainings=5,
+        settings=_GPU,
+    ),
+    Part.FULL: Sizes(
+        trajectories=343,
+        frames=100,
+        nav_trajectories=49,
+        curve=("0.25", "0.5", "1.0"),
+        epochs=20,
+        curve_width=1.0,
+        half_width=0.5,
+        seeds=(0, 1, 2),
+        coarse_epochs=120,
+        fine_epochs=20,
+        trainings=2,
+        benchmark_scenes=2,
+        settings=_GPU | {"detect.validate_every": "1"},
+    ),
+}
+TINY = Sizes(
+    trajectories=1,
+    frames=8,
+    nav_trajectories=5,
+    curve=("0.5",),
+    epochs=1,
+    curve_width=0.125,
+    half_width=0.125,
+    seeds=(0,),
+    coarse_epochs=2,
+    fine_epochs=1,
+    settings={"detect.batch_size": "8", "detect.validate_every": "1"},
+)
+"""Sizes with PRESET=tiny: all steps in minutes; the networks learn nothing."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One command of the experiment."""
+    """One command of the experiment, or one function of this script."""
 
     title: str
     """What it does."""
-    command: list[str]
-    """Program and arguments."""
+    command: list[str] | Callable[[], None]
+    """Program and arguments, or the function."""
     done: Callable[[], bool]
     """Whether it is finished already."""
-    seconds: float | None = None
-    """Estimated time; None if it is short."""
+    needs: tuple[str, ...] = ()
+    """Titles of the steps whose results it reads."""
+    renders: bool = False
+    """Whether it renders frames, in the lane of its own."""
+    images: float = 0.0
+    """Training images of a detector, or frames to render."""
+    width: float = 1.0
+    """Width of the network that is trained."""
+    attention: str = "none"
+    """Its attention."""
 
 
 @dataclass(frozen=True)
@@ -54,167 +202,302 @@ class Experiment:
 
     preset: str
     part: Part
+    ground: Ground
     attitude: bool
     darknet: Path | None
     benchmark: Path
+    calibrate: bool = False
 
     @property
-    def cut(self) -> Cut:
-        """What is left out."""
-        return PARTS[self.part]
+    def sizes(self) -> Sizes:
+        """How much is made."""
+        if self.preset == "paper":
+            return PARTS[self.part]
+        return replace(TINY, trainings=2) if self.part == Part.GPU else TINY
 
     @property
     def label(self) -> str:
-        """Name of the dataset and of the folders: paper, paper-tiny, paper-attitude."""
-        preset = [] if self.preset == "paper" else [self.preset]
-        return "-".join(["paper", *preset, *(["attitude"] if self.attitude else [])])
+        """Name of the dataset and of the folders: paper, paper-gpu, paper-tiny, paper-lunar-attitude."""
+        parts = ["paper"]
+        parts += [self.preset] if self.preset != "paper" else [] if self.part == Part.WHOLE else [str(self.part)]
+        parts += [LUNAR] if self.ground == Ground.LUNAR else []
+        return "-".join([*parts, *(["attitude"] if self.attitude else [])])
 
     @property
     def data(self) -> Path:
-        """Folder of the rendered datasets."""
-        return Path("data", self.label if self.part == Part.WHOLE else f"{self.label}-{self.part}")
+        """Folder of the rendered grounds."""
+        return Path("data", self.label)
 
     @property
     def runs(self) -> Path:
         """Folder of the runs and of the page."""
-        return Path("runs", self.data.name)
+        return Path("runs", self.label)
 
     @property
     def scored(self) -> Path:
-        """Folder of the rendered benchmark; a part of it has its own, named as `make benchmark SCENES=2` does."""
-        scenes = self.cut.benchmark_scenes
-        return self.benchmark.with_name(f"{self.benchmark.name}-{scenes}-scenes") if scenes else self.benchmark
+        """Folder of the rendered part of the benchmark, named as `make benchmark SCENES=2` does."""
+        return self.benchmark.with_name(f"{self.benchmark.name}-{self.sizes.benchmark_scenes}-scenes")
 
     @property
-    def settings(self) -> dict[str, str]:
-        """Settings over the preset and the protocol."""
-        chosen = self.cut.settings | {"dataset.name": self.label}
-        if self.preset == "tiny":
-            # Frozen and unfrozen epochs, coarse and fine ones, as in the whole experiment.
-            chosen |= {"detect.epochs": "2", "detect.frozen_epochs": "1"}
-        elif self.part == Part.WHOLE:
-            chosen |= {"detect.frozen_epochs": "5"}
-        if self.attitude:
-            for kind in ("detect", "nav"):
-                chosen[f"dataset.{kind}.flight.attitude_sigma_deg"] = str(ATTITUDE_DEG)
-        return chosen
+    def chosen(self) -> Path:
+        """File with the density of the headline ground, if it is chosen in this experiment."""
+        return self.runs / "ground.json"
 
-    def options(self, *sections: str, **more: str) -> list[str]:
-        """Options of a command that reads these sections; `more` are settings of the detector or navigator."""
-        pairs = self.settings | {key.replace("__", "."): value for key, value in more.items()}
-        own = {key: value for key, value in pairs.items() if key.split(".")[0] in sections}
-        sets = [text for key, value in own.items() for text in ("--set", f"{key}={value}")]
+    def settings(self, section: str) -> dict[str, str]:
+        """Settings over the preset and the protocol."""
+        sizes = self.sizes
+        if section == "dataset":
+            found = {"dataset.name": self.label}
+            if self.preset == "paper":
+                counts = {"detect": sizes.trajectories, "nav": sizes.nav_trajectories}
+                for kind, count in counts.items():
+                    found |= {f"dataset.{kind}.trajectories_per_scene": str(count)}
+                    found |= {f"dataset.{kind}.n_frames": str(sizes.frames)}
+            if self.attitude:
+                for kind in ("detect", "nav"):
+                    found[f"dataset.{kind}.flight.attitude_sigma_deg"] = str(ATTITUDE_DEG)
+            return found
+        own = {key: value for key, value in sizes.settings.items() if key.startswith(f"{section}.")}
+        if section == "detect":
+            return own | {"detect.epochs": str(sizes.epochs)}
+        return own | {
+            "navigate.stack.coarse_epochs": str(sizes.coarse_epochs),
+            "navigate.stack.fine_epochs": str(sizes.fine_epochs),
+        }
+
+    def options(self, section: str, **more: str) -> list[str]:
+        """Options of a command that reads this section; `more` are settings over all others."""
+        pairs = self.settings(section) | {key.replace("__", "."): value for key, value in more.items()}
+        sets = [text for key, value in pairs.items() for text in ("--set", f"{key}={value}")]
         return ["--preset", self.preset, "--config", str(PROTOCOL), *sets]
 
 
+def program(name: str) -> list[str]:
+    """How a command is started: as installed, or from its folder where nothing is installed."""
+    installed = Path(sys.executable).parent / name
+    if installed.is_file():
+        return [str(installed)]
+    module = {"perilune-render": "perilune_render.cli.main", "perilune-train": "perilune_train.cli"}[name]
+    return [sys.executable, "-c", f"from {module} import main; main()"]
+
+
+def crater_density(share: float | str) -> dict[str, str]:
+    """Settings of the terrain: the protocol's with another density; our usual terrain for `lunar`."""
+    if share == LUNAR:
+        usual = resolve(DatasetConfig, "dataset", "perilune_render", "paper").terrain
+        craters, relief = usual.craters, usual.relief
+        return {
+            "dataset__terrain__craters": _inline(craters.model_dump(mode="json")),
+            "dataset__terrain__relief": _inline(relief.model_dump(mode="json")),
+        }
+    span = _inline({"low": float(share), "high": float(share)})
+    return {"dataset__terrain__craters__equilibrium_share": span}
+
+
+def _inline(values: Any) -> str:
+    return json.dumps(values).replace('"', "")
+
+
 def steps(one: Experiment) -> list[Step]:
-    """All steps in order."""
-    return [*_data_steps(one), *_network_steps(one), *_benchmark_steps(one), *_page_steps(one)]
+    """All steps in an order in which each one's needs come before it."""
+    sizes = one.sizes
+    pangu = one.ground == Ground.PANGU
+    found: list[Step] = []
+    shares = (SPARSE, *sizes.curve, LUNAR) if pangu else ()
+    if one.calibrate:
+        # The grounds that decide come first.
+        for share in sizes.curve:
+            found += _on_curve(one, share)
+        found.append(_calibration(one))
+    found += _headline(one)
+    for share in shares:
+        if f"render {share}" not in {step.title for step in found}:
+            found += _on_curve(one, share)
+    if pangu:
+        for folder, attention in (("sparse-attention-yolov3", "cbam"), ("sparse-attention-identity", "cbam_identity")):
+            found.append(_detector(one, SPARSE, folder, attention, 1.0))
+        found.append(_detector(one, LUNAR, "lunar-attention-identity", "cbam_identity", sizes.curve_width))
+    found += _transfer(one)
+    found += _benchmark_steps(one)
+    return [*found, _page(one)]
 
 
-def _data_steps(one: Experiment) -> list[Step]:
-    render, manifest = str(BIN / "perilune-render"), str(BIN / "perilune-manifest")
-    found = []
-    for kind in ("detect", "nav"):
-        out = one.data / kind
-        plan = one.data / "plans" / kind
-        options = one.options("dataset")
-        found.append(
-            Step(
-                f"plan {kind}",
-                [render, "plan", "--kind", kind, *options, "--out", str(plan)],
-                _rendered(plan),
-            )
-        )
-        source, where = plan, _chosen(kind, one.cut)
-        if where is not None:
-            source = one.data / "plans" / f"{kind}-{one.part}"
-            command = [manifest, "subset", str(plan), "--out", str(source), "--images", "none", "--where", where]
-            found.append(Step(f"take {where}", command, _rendered(source)))
-        command = [render, "dataset", "--manifest", str(source), "--out", str(out)]
-        found.append(Step(f"render {kind}", command, _rendered(out)))
-    return found
+def _render(one: Experiment, ground: str, kind: str, density: dict[str, str], needs: tuple[str, ...]) -> Step:
+    out = one.data / ground
+    command = [*program("perilune-render"), "dataset", "--kind", kind, *one.options("dataset", **density)]
+    command += [] if one.sizes.render_workers is None else ["--workers", str(one.sizes.render_workers)]
+    count = one.sizes.trajectories if kind == "detect" else one.sizes.nav_trajectories
+    title = f"render {ground}" if kind == "detect" else f"render {ground}, navigation"
+    return Step(
+        title,
+        [*command, "--out", str(out)],
+        _rendered(out / kind),
+        needs,
+        renders=True,
+        images=count * one.sizes.frames,
+    )
 
 
-def _chosen(kind: str, cut: Cut) -> str | None:
-    """Condition on the frames of a plan that a part takes; None for all frames."""
-    if kind == "detect":
-        return f"frame_index % {cut.detect_every} == 0" if cut.detect_every > 1 else None
-    return None if cut.nav_trajectories is None else f"trajectory_id < 'trajectory-{cut.nav_trajectories:04d}'"
+def _detector(one: Experiment, ground: str, folder: str, attention: str, width: float, **more: str) -> Step:
+    """Training of a detector on a ground, into detect/<folder>."""
+    width = 0.125 if one.preset == "tiny" else width
+    settings = {"detect__attention": attention, "detect__width": str(width)}
+    options = one.options("detect", **settings, **more)
+    command = [*program("perilune-train"), "detect", "train", *options, "--dataset", str(one.data / ground / "detect")]
+    images = 0.8 * one.sizes.trajectories * one.sizes.frames * one.sizes.epochs
+    return Step(
+        f"train {folder}",
+        [*command, "--out", str(one.runs), "--name", folder],
+        _finished(one.runs / "detect" / folder),
+        (f"render {ground}",),
+        images=images,
+        width=width,
+        attention=attention,
+    )
 
 
-def _network_steps(one: Experiment) -> list[Step]:
-    train = str(BIN / "perilune-train")
-    found = []
-    if one.darknet is None:
-        found += _own_network(one)
-    start = str(one.darknet or one.runs / "detect" / "own" / "checkpoints" / "best.ckpt")
-    for folder, attention in zip(DETECTORS.values(), ("none", "cbam"), strict=True):
-        options = one.options("detect", detect__attention=attention, detect__init_from=start)
-        command = [train, "detect", "train", *options, "--dataset", str(one.data / "detect"), "--out", str(one.runs)]
-        run = one.runs / "detect" / folder
-        found.append(Step(f"train {folder}", [*command, "--name", folder], _finished(run)))
-    for folder, detector, attention in zip(NAVIGATORS.values(), DETECTORS.values(), ("none", "cbam"), strict=True):
-        backbone = one.runs / "detect" / detector / "checkpoints" / "best.ckpt"
-        options = one.options("navigate", navigate__stack__attention=attention, navigate__detector=str(backbone))
-        command = [train, "navigate", "train", *options, "--dataset", str(one.data / "nav"), "--out", str(one.runs)]
-        run = one.runs / "navigate" / f"{folder}-stack"
-        found.append(Step(f"train {folder}", [*command, "--name", folder], _finished(run)))
-    attended = one.runs / "detect" / DETECTORS["attention-YOLOv3"] / "checkpoints" / "best.ckpt"
-    navigator = one.runs / "navigate" / f"{NAVIGATORS['attention-Darknet53-LSTM']}-stack" / "checkpoints" / "best.ckpt"
-    command = [train, "explain", "--preset", one.preset, "--dataset", str(one.data), "--out", str(one.runs)]
-    command += ["--name", EXPLAINED, "--detector", str(attended), "--navigator", str(navigator)]
-    return [*found, Step("explain", command, _finished(one.runs / "explain" / EXPLAINED))]
-
-
-def _own_network(one: Experiment) -> list[Step]:
-    """The network that stands in for YOLOv3 trained on COCO: the same without attention, on terrain of its own."""
-    pretraining = "tiny" if one.preset == "tiny" else "small"
-    data, run = Path("data", pretraining, "detect"), one.runs / "detect" / "own"
-    settings = {"attention": "none", "in_channels": "3", "strides": "[8, 16, 32]"}
-    settings |= {} if one.preset == "tiny" else {"width": "1.0", "epochs": str(one.cut.own_epochs)}
-    sets = [text for key, value in settings.items() for text in ("--set", f"detect.{key}={value}")]
-    render = [str(BIN / "perilune-render"), "dataset", "--preset", pretraining, "--kind", "detect"]
-    train = [str(BIN / "perilune-train"), "detect", "train", "--preset", pretraining, *sets, "--dataset", str(data)]
+def _on_curve(one: Experiment, share: str) -> list[Step]:
+    """A ground of the curve, and YOLOv3 without attention on it."""
+    folder = {SPARSE: "sparse-yolov3", LUNAR: "lunar-yolov3"}.get(share, f"curve-{share}")
+    width = 1.0 if share == SPARSE else one.sizes.curve_width
     return [
-        Step(f"render {pretraining}, to pretrain on", [*render, "--out", str(data.parent)], _rendered(data)),
-        Step(OWN, [*train, "--out", str(one.runs), "--name", "own"], _finished(run)),
+        _render(one, share, "detect", crater_density(share), ()),
+        _detector(one, share, folder, "none", width),
     ]
+
+
+def _calibration(one: Experiment) -> Step:
+    runs = {share: one.runs / "detect" / f"curve-{share}" for share in one.sizes.curve}
+
+    def choose() -> None:
+        found = {float(share): float(str(read_metrics(run)["val/ap50_paper"])) for share, run in runs.items()}
+        share = share_at(found, CALIBRATED_AP)
+        record = {"equilibrium_share": share, "validation_ap": {f"{key:g}": value for key, value in found.items()}}
+        write_text(one.chosen, json.dumps(record, indent=2) + "\n")
+        print(f"headline ground: equilibrium_share {share:g}, by validation AP {found}", flush=True)
+
+    needs = tuple(f"train curve-{share}" for share in one.sizes.curve)
+    return Step("choose the headline ground", choose, one.chosen.is_file, needs)
+
+
+def share_at(ap_by_share: dict[float, float], ap: float) -> float:
+    """Share of the equilibrium density at which the AP has a value: linear in the logarithm of the share, between the
+    two points around the value or beyond the last two; from 0.1 to 1.7, with two digits."""
+    points = sorted(ap_by_share.items())
+    if len(points) == 1:
+        return points[0][0]
+    pairs = list(itertools.pairwise(points))
+    around = [pair for pair in pairs if pair[0][1] >= ap >= pair[1][1]]
+    (low, first), (high, second) = around[0] if around else pairs[0] if ap > points[0][1] else pairs[-1]
+    part = (first - ap) / (first - second) if first > second else 0.5
+    share = math.exp(math.log(low) + part * (math.log(high) - math.log(low)))
+    return float(f"{min(max(share, 0.1), 1.7):.2g}")
+
+
+def headline_density(one: Experiment) -> dict[str, str]:
+    """Settings of the headline ground: the protocol's, or those chosen in this experiment."""
+    if one.ground == Ground.LUNAR:
+        return crater_density(LUNAR)
+    if one.calibrate and one.chosen.is_file():
+        return crater_density(json.loads(one.chosen.read_text(encoding="utf-8"))["equilibrium_share"])
+    return {}
+
+
+def _headline(one: Experiment) -> list[Step]:
+    """Detectors, navigators and the explanation over the headline ground."""
+    needs = ("choose the headline ground",) if one.calibrate else ()
+    sizes, ground = one.sizes, "headline"
+    found = [
+        _render(one, ground, "detect", headline_density(one), needs),
+        _render(one, ground, "nav", headline_density(one), needs),
+        _detector(one, ground, "yolov3", "none", 1.0),
+        _detector(one, ground, "attention-yolov3", "cbam", 1.0),
+        _detector(one, ground, "attention-identity", "cbam_identity", 1.0),
+    ]
+    for folder, attention in (
+        ("yolov3", "none"),
+        ("attention-yolov3", "cbam"),
+        ("attention-identity", "cbam_identity"),
+    ):
+        for seed in sizes.seeds:
+            name, more = f"{folder}-half-{seed}", {"detect__seed": str(seed)}
+            found.append(_detector(one, ground, name, attention, sizes.half_width, **more))
+    for folder, detector, attention in (
+        ("darknet53-lstm", "yolov3", "none"),
+        ("attention-darknet53-lstm", "attention-yolov3", "cbam"),
+    ):
+        for target in ("pose", "motion"):
+            found.append(_navigator(one, folder, detector, attention, target))
+    attended = one.runs / "detect" / "attention-yolov3" / "checkpoints" / "best.ckpt"
+    navigator = one.runs / "navigate" / "attention-darknet53-lstm-stack" / "checkpoints" / "best.ckpt"
+    command = [*program("perilune-train"), "explain", "--preset", one.preset, "--dataset", str(one.data / ground)]
+    command += ["--out", str(one.runs), "--name", "attention"]
+    command += ["--detector", str(attended), "--navigator", str(navigator)]
+    explained = ("train attention-yolov3", "train attention-darknet53-lstm")
+    return [*found, Step("explain", command, _finished(one.runs / "explain" / "attention"), explained)]
+
+
+def _navigator(one: Experiment, folder: str, detector: str, attention: str, target: str) -> Step:
+    name = folder if target == "pose" else f"{folder}-motion"
+    backbone = one.runs / "detect" / detector / "checkpoints" / "best.ckpt"
+    settings = {"navigate__stack__attention": attention, "navigate__stack__target": target}
+    settings |= {"navigate__detector": str(backbone)}
+    if target == "motion":
+        settings["navigate__stack__fine_epochs"] = "1"
+    options = one.options("navigate", **settings)
+    command = [*program("perilune-train"), "navigate", "train", *options, "--dataset", str(one.data / "headline/nav")]
+    return Step(
+        f"train {name}",
+        [*command, "--out", str(one.runs), "--name", name],
+        _finished(one.runs / "navigate" / f"{name}-stack"),
+        (f"train {detector}", "render headline, navigation"),
+        attention=attention,
+    )
+
+
+def _transfer(one: Experiment) -> list[Step]:
+    """Detectors that start from YOLOv3 of COCO, or from our own on our usual ground in its place; first frozen."""
+    width = 1.0 if one.darknet is not None else one.sizes.curve_width
+    if one.darknet is None and one.ground == Ground.LUNAR:
+        return []
+    start = str(one.darknet or one.runs / "detect" / "lunar-yolov3" / "checkpoints" / "best.ckpt")
+    more = {"detect__init_from": start, "detect__frozen_epochs": str(min(2, one.sizes.epochs - 1))}
+    found = []
+    for folder, attention in (("transfer-yolov3", "none"), ("transfer-attention-yolov3", "cbam")):
+        step = _detector(one, "headline", folder, attention, width, **more)
+        needs = step.needs if one.darknet is not None else (*step.needs, "train lunar-yolov3")
+        found.append(replace(step, needs=needs))
+    return found
 
 
 def _benchmark_steps(one: Experiment) -> list[Step]:
-    """Scores on the locked benchmark; with a preset for trials only if it is rendered already."""
-    found = []
-    train = str(BIN / "perilune-train")
-    for kind, networks in (("detect", DETECTORS), ("nav", NAVIGATORS)):
-        rendered = any(one.scored.glob(f"benchmark-{kind}-*/dataset.json"))
-        if one.preset == "paper":
-            command = ["scripts/render-benchmark", kind, str(one.scored), str(one.cut.benchmark_scenes)]
-            parts = [one.scored / f"benchmark-{kind}-{part}" for part in ("highland", "mare", "camera")]
-            found.append(Step(f"render the benchmark, {kind}", command, _rendered(*parts)))
-        elif not rendered:
-            continue
-        for folder in networks.values():
-            task, run = ("detect", f"detect/{folder}") if kind == "detect" else ("navigate", f"navigate/{folder}-stack")
-            out = one.runs / "benchmark" / folder
-            command = [train, task, "benchmark", "--run", str(one.runs / run), "--data", str(one.scored)]
-            found.append(
-                Step(
-                    f"benchmark {folder}",
-                    [*command, "--out", str(out)],
-                    _written(out / "benchmark.json"),
-                )
-            )
+    """Scores of the detectors on the locked benchmark."""
+    if one.preset != "paper" or not one.sizes.benchmark_scenes:
+        return []
+    command = ["scripts/render-benchmark", "detect", str(one.scored), str(one.sizes.benchmark_scenes)]
+    parts = [one.scored / f"benchmark-detect-{part}" for part in ("highland", "mare", "camera")]
+    found = [Step("render the benchmark", command, _rendered(*parts), renders=True)]
+    for folder in ("yolov3", "attention-yolov3"):
+        out = one.runs / "benchmark" / folder
+        command = [*program("perilune-train"), "detect", "benchmark", "--run", str(one.runs / "detect" / folder)]
+        command += ["--data", str(one.scored), "--out", str(out)]
+        done = (out / "benchmark.json").is_file
+        found.append(Step(f"benchmark {folder}", command, done, (f"train {folder}", "render the benchmark")))
     return found
 
 
-def _page_steps(one: Experiment) -> list[Step]:
-    about = [
-        f"preset `{one.preset}`, part `{one.part}`, attitude noise of {ATTITUDE_DEG if one.attitude else 0:g} degrees"
+def _page(one: Experiment) -> Step:
+    sizes = one.sizes
+    noise = ATTITUDE_DEG if one.attitude else 0
+    about = [f"preset `{one.preset}`, part `{one.part}`, attitude noise of {noise:g} degrees"]
+    about += [
+        f"{sizes.trajectories * sizes.frames} detection frames over each ground (the paper: 34,300), "
+        f"{sizes.nav_trajectories} navigation trajectories of {sizes.frames} frames (the paper: 49 of 100); "
+        f"{sizes.epochs} epochs of each detector"
     ]
-    about += one.cut.lines
-    command = [str(BIN / "perilune-train"), "paper", "--runs", str(one.runs), "--dataset", str(one.data / "detect")]
-    return [Step("page", [*command, *[text for line in about for text in ("--about", line)]], lambda: False)]
+    command = [*program("perilune-train"), "paper", "--runs", str(one.runs)]
+    command += ["--dataset", str(one.data / "headline" / "detect")]
+    return Step("page", [*command, *[text for line in about for text in ("--about", line)]], lambda: False)
 
 
 def _rendered(*datasets: Path) -> Callable[[], bool]:
@@ -226,100 +509,220 @@ def _complete(dataset: Path) -> bool:
     return path.is_file() and json.loads(path.read_text(encoding="utf-8")).get("complete") is True
 
 
-def _written(file: Path) -> Callable[[], bool]:
-    return file.is_file
-
-
 def _finished(run: Path) -> Callable[[], bool]:
-    return _written(run / "metrics.json")
+    return (run / "metrics.json").is_file
 
 
 def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
     """Seconds of the long steps that are left, from a few training steps on this machine, by title."""
     from perilune_train.paper.probe import detect_seconds, navigate_seconds
 
-    dataset = _dataset_settings(one)
-    sets = tuple(f"{key}={value}" for key, value in one.settings.items())
-    detect = resolve(DetectConfig, "detect", "perilune_train", one.preset, PROTOCOL, _of("detect", sets))
-    navigate = resolve(NavigateConfig, "navigate", "perilune_train", one.preset, PROTOCOL, _of("navigate", sets))
-    left = {step.title for step in plan if not step.done()}
-    size = int(dataset["width_px"])
+    size_px = int(resolve(DatasetConfig, "dataset", "perilune_render", one.preset, PROTOCOL).camera.width_px)
+    detect = resolve(DetectConfig, "detect", "perilune_train", one.preset, PROTOCOL, _sets(one, "detect"))
+    navigate = resolve(NavigateConfig, "navigate", "perilune_train", one.preset, PROTOCOL, _sets(one, "navigate"))
+    cores = len(os.sched_getaffinity(0))
+    per_image: dict[tuple[float, str], float] = {}
     found: dict[str, float] = {}
-    for kind in ("detect", "nav"):
-        if f"render {kind}" in left:
-            found[f"render {kind}"] = dataset[kind] / RENDER_FRAMES_PER_S
-    if OWN in left:
-        # `small` has 1088 training frames, `tiny` fewer.
-        found[OWN] = detect_seconds(detect.model_copy(update={"attention": "none"}), size) * 1088 * one.cut.own_epochs
-    for folder, attention in zip(DETECTORS.values(), ("none", "cbam"), strict=True):
-        if f"train {folder}" in left:
-            seconds = detect_seconds(detect.model_copy(update={"attention": attention}), size)
-            # Validation takes a tenth of the frames and a third of the time of a training frame.
-            found[f"train {folder}"] = seconds * dataset["detect"] * detect.epochs * (0.8 + 0.1 / 3)
-    for folder, attention in zip(NAVIGATORS.values(), ("none", "cbam"), strict=True):
-        if f"train {folder}" in left:
-            own = navigate.stack.model_copy(update={"attention": attention})
+    for step in plan:
+        if step.done():
+            continue
+        if step.renders and step.images:
+            found[step.title] = RENDER_CORE_S * step.images / cores
+        elif step.images:
+            kind = (step.width, step.attention)
+            if kind not in per_image:
+                config = detect.model_copy(update={"width": step.width, "attention": step.attention})
+                per_image[kind] = detect_seconds(config, size_px)
+            found[step.title] = per_image[kind] * step.images
+        elif step.title.endswith("lstm"):
+            own = navigate.stack.model_copy(update={"attention": step.attention})
             seconds = navigate_seconds(navigate.model_copy(update={"stack": own}))
-            found[f"train {folder}"] = seconds * dataset["nav"] * (own.fine_epochs * (0.8 + 0.1 / 3) + 0.9 / 3)
+            pairs = 0.8 * one.sizes.nav_trajectories * one.sizes.frames
+            # Features of the coarse stage are computed once, forward only.
+            found[step.title] = seconds * pairs * (one.sizes.fine_epochs + 1 / 3)
     return found
 
 
-def _of(section: str, settings: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(text for text in settings if text.startswith(f"{section}."))
+def _sets(one: Experiment, section: str) -> tuple[str, ...]:
+    return tuple(f"{key}={value}" for key, value in one.settings(section).items())
 
 
-def _dataset_settings(one: Experiment) -> dict[str, float]:
-    """Numbers of frames of both datasets, and the width of a frame."""
-    sets = tuple(f"{key}={value}" for key, value in one.settings.items())
-    dataset = resolve(DatasetConfig, "dataset", "perilune_render", one.preset, PROTOCOL, _of("dataset", sets))
-    frames = {}
-    for kind in ("detect", "nav"):
-        own = dataset.kind(kind)
-        frames[kind] = float(own.n_scenes * own.trajectories_per_scene * own.n_frames)
-    frames["detect"] /= one.cut.detect_every
-    if one.cut.nav_trajectories is not None:
-        frames["nav"] = min(frames["nav"], float(one.cut.nav_trajectories * dataset.nav.n_frames))
-    return {**frames, "width_px": dataset.camera.width_px}
+def check_disk(one: Experiment, plan: list[Step]) -> None:
+    """Raise UserError before the first frame if the frames that are left do not fit on the disk."""
+    folder = one.data
+    while not folder.exists():
+        folder = folder.parent
+    needed = sum(FRAME_BYTES * step.images for step in plan if step.renders and not step.done())
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise UserError(one.data, "free disk", f"{free / 1e9:.1f} GB", f"at least {needed / 1e9:.1f} GB for the frames")
 
 
 def main(
     preset: Annotated[str, typer.Option(help="Preset of sizes: paper, or tiny for a trial.")] = "paper",
-    part: Annotated[Part, typer.Option(help="whole, or quarter or twentieth: for two cores.")] = Part.WHOLE,
+    part: Annotated[
+        Part, typer.Option(help="whole (two cores, 20 core-hours), gpu (minutes), full (all frames of the paper).")
+    ] = Part.WHOLE,
+    ground: Annotated[
+        Ground, typer.Option(help="Headline ground: as difficult as the paper's, or our usual one.")
+    ] = Ground.PANGU,
+    calibrate: Annotated[
+        bool, typer.Option("--calibrate", help="Choose the density of the headline ground again, on validation.")
+    ] = False,
     attitude: Annotated[bool, typer.Option("--attitude", help="The second experiment, with attitude noise.")] = False,
     darknet: Annotated[Path | None, typer.Option(help="YOLOv3's weights of COCO (yolov3.weights).")] = None,
     benchmark: Annotated[Path, typer.Option(help="Folder of the rendered locked benchmark.")] = Path("data/benchmark"),
+    minutes: Annotated[
+        float | None, typer.Option(min=0.1, help="Stop after this time, and write the page from what is done.")
+    ] = None,
 ) -> None:
     """Run all steps."""
-    if preset not in ("paper", "small", "tiny"):
-        raise UserError("--preset", "preset", preset, "paper, small or tiny")
-    if darknet is not None and not darknet.is_file():
-        raise UserError(darknet, "--darknet", "no such file", "yolov3.weights")
-    one = Experiment(preset, part, attitude, darknet, benchmark)
+    if preset not in ("paper", "tiny"):
+        raise UserError("--preset", "preset", preset, "paper or tiny")
+    if darknet is not None:
+        check_start(darknet)
+    one = Experiment(preset, part, ground, attitude, darknet, benchmark, calibrate)
     plan = steps(one)
-    print(f"{one.runs}: {len(plan)} steps; measuring the speed of this machine", flush=True)
-    expected = estimate(one, plan)
-    for title, seconds in expected.items():
-        print(f"  {title}: about {_hours(seconds)}")
-    print(f"  long steps together: about {_hours(sum(expected.values()))}; stop with Ctrl-C, run again to resume")
-    started = time.monotonic()
-    for number, step in enumerate(plan, 1):
-        if step.done():
-            print(f"step {number} of {len(plan)}: {step.title}: finished", flush=True)
-            continue
-        print(f"step {number} of {len(plan)}: {step.title}, after {_hours(time.monotonic() - started)}", flush=True)
-        print("  " + " ".join(_shown(word) for word in step.command), flush=True)
-        done = subprocess.run(step.command, check=False)
-        if done.returncode:
-            raise typer.Exit(done.returncode)
+    check_disk(one, plan)
+    print(f"{one.runs}: {len(plan)} steps", flush=True)
+    if minutes is None:
+        expected = estimate(one, plan)
+        for title, seconds in expected.items():
+            print(f"  {title}: about {_hours(seconds)}")
+        print(f"  long steps together: about {_hours(sum(expected.values()))}; Ctrl-C stops, run again to resume")
+    else:
+        expected = {}
+    deadline = math.inf if minutes is None else time.monotonic() + 60 * minutes
+    run_all(one, expected, deadline)
     print(f"{one.runs}: paper.md")
 
 
+@dataclass
+class Running:
+    """A step that runs."""
+
+    step: Step
+    process: subprocess.Popen
+    log: Path | None
+    started: float
+
+
+def run_all(one: Experiment, expected: dict[str, float], deadline: float) -> None:
+    """Run the steps that are left: one after another, or, with several trainings at once, as soon as they can.
+
+    Raises typer.Exit with the exit code of the first step that fails, after the others have been stopped. At the
+    deadline running steps are stopped as by Ctrl-C, and only the page is written.
+    """
+    running: list[Running] = []
+    together = one.sizes.trainings > 1
+    failed: dict[str, int] = {}
+    began = time.monotonic()
+    try:
+        while True:
+            plan = steps(one)
+            titles = {step.title for step in plan if not step.done()}
+            # A step whose needs failed never starts; the page is written last.
+            page = plan[-1]
+            left = [step for step in plan[:-1] if not step.done() and step.title not in failed]
+            late = time.monotonic() > deadline
+            busy = {each.step.title for each in running}
+            ready = [s for s in left if s.title not in busy and not any(need in titles for need in s.needs)]
+            if not running and (not ready or late):
+                break
+            if not late:
+                for step in ready:
+                    lane = [each for each in running if each.step.renders == step.renders or not together]
+                    if len(lane) < (one.sizes.trainings if together and not step.renders else 1):
+                        running += _start(one, step, together, began, expected)
+                        if callable(step.command) or not together:
+                            break
+            _wait(running, failed, together, deadline)
+            if failed and not together:
+                raise typer.Exit(next(iter(failed.values())))
+    except KeyboardInterrupt:
+        _stop(running)
+        raise
+    for title, code in failed.items():
+        print(f"failed with code {code}: {title}; see {_log(one, title)}", flush=True)
+    _run(page)
+    if failed and deadline == math.inf:
+        raise typer.Exit(next(iter(failed.values())))
+
+
+def _start(one: Experiment, step: Step, together: bool, began: float, expected: dict[str, float]) -> list[Running]:
+    left = sum(seconds for title, seconds in expected.items() if title != step.title)
+    rest = f", about {_hours(left + expected.get(step.title, 0))} left" if expected else ""
+    print(f"{_hours(time.monotonic() - began)}: {step.title}{rest}", flush=True)
+    expected.pop(step.title, None)
+    if callable(step.command):
+        step.command()
+        return []
+    if not together:
+        print("  " + " ".join(_shown(word) for word in step.command), flush=True)
+        return [Running(step, subprocess.Popen(step.command), None, time.monotonic())]
+    log = _log(one, step.title)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w", encoding="utf-8") as file:
+        file.write(" ".join(_shown(word) for word in step.command) + "\n")
+        file.flush()
+        # In a session of its own: Ctrl-C reaches it through this script, once.
+        process = subprocess.Popen(step.command, stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
+    return [Running(step, process, log, time.monotonic())]
+
+
+def _wait(running: list[Running], failed: dict[str, int], together: bool, deadline: float) -> None:
+    """Wait until a step ends or the deadline has passed."""
+    while running:
+        if together and time.monotonic() > deadline:
+            _stop(running)
+        ended = [each for each in running if each.process.poll() is not None]
+        for each in ended:
+            running.remove(each)
+            code = each.process.returncode
+            if code and time.monotonic() <= deadline:
+                failed[each.step.title] = 128 - code if code < 0 else code
+            elif together and not code:
+                print(f"  done in {_hours(time.monotonic() - each.started)}: {each.step.title}", flush=True)
+        if ended:
+            return
+        if not together and time.monotonic() > deadline:
+            _stop(running)
+        time.sleep(0.2)
+
+
+def _stop(running: list[Running]) -> None:
+    """Stop steps as Ctrl-C does, so that they can be resumed."""
+    for each in running:
+        if each.process.poll() is None:
+            each.process.send_signal(signal.SIGINT)
+    for each in running:
+        try:
+            each.process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            each.process.kill()
+            each.process.wait()
+
+
+def _run(step: Step) -> None:
+    assert not callable(step.command)
+    print(f"{step.title}\n  " + " ".join(_shown(word) for word in step.command), flush=True)
+    done = subprocess.run(step.command, check=False)
+    if done.returncode:
+        raise typer.Exit(done.returncode)
+
+
+def _log(one: Experiment, title: str) -> Path:
+    return one.runs / "logs" / (re.sub(r"[^a-z0-9.-]+", "-", title.lower()) + ".log")
+
+
 def _shown(word: str) -> str:
-    word = word.removeprefix(f"{BIN}/")
+    word = word.removeprefix(f"{Path(sys.executable).parent}/")
     return f"'{word}'" if re.search(r"[\s\[\]{}]", word) else word
 
 
 def _hours(seconds: float) -> str:
+    if seconds < 100:
+        return f"{seconds:.0f} s"
     return f"{seconds / 3600:.1f} hours" if seconds >= 3600 else f"{seconds / 60:.0f} minutes"
 
 

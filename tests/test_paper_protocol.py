@@ -1,15 +1,23 @@
 """`make paper`: settings as the paper has them, and the steps of the experiment."""
 
 import importlib.util
+import itertools
+import json
+import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
+import typer
 
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import resolve
+from perilune_shared.errors import UserError
 from perilune_train.detect.config import DetectConfig
 from perilune_train.navigate.config import NavigateConfig
+from perilune_train.training.runs import load_weights, save_weights
 
 ROOT = Path(__file__).parent.parent
 PROTOCOL = ROOT / "configs" / "paper_protocol.yaml"
@@ -26,8 +34,8 @@ def script():
 
 
 def experiment(script, **changes):
-    given = {"preset": "paper", "part": script.Part.WHOLE, "attitude": False, "darknet": None, "benchmark": Path("b")}
-    return script.Experiment(**(given | changes))
+    given = {"preset": "paper", "part": script.Part.WHOLE, "ground": script.Ground.PANGU, "attitude": False}
+    return script.Experiment(**(given | {"darknet": None, "benchmark": Path("b")} | changes))
 
 
 def test_detection_is_as_in_the_paper():
@@ -37,7 +45,7 @@ def test_detection_is_as_in_the_paper():
     assert config.labels.min_contrast is None and config.labels.min_depth_ratio is None
     loss = config.loss
     assert (loss.aspect, loss.objectness, loss.lambda_iou, loss.lambda_obj) == ("circular", "hard", 0.05, 1)
-    assert loss.reduction == "sums" and config.anchor_sampling == "plain"
+    assert loss.reduction == "means" and config.anchor_sampling == "plain"
     assert config.assignment == "one" and config.init_layers == "from_second" and config.ema_decay == 0
     augment = config.augment.model_dump()
     assert augment.pop("scale") == (1, 1) and not any(augment.values())
@@ -63,67 +71,158 @@ def test_one_landing_area_seen_straight_down(preset):
 
 
 def commands(script, one):
-    return {step.title: " ".join(step.command) for step in script.steps(one)}
+    return {step.title: " ".join(step.command) for step in script.steps(one) if not callable(step.command)}
 
 
-def test_the_steps_of_a_quarter(script):
-    one = experiment(script, part=script.Part.QUARTER)
-    found = commands(script, one)
-    assert "--where frame_index % 4 == 0" in found["take frame_index % 4 == 0"]
-    assert "data/paper-quarter/plans/detect-quarter" in found["render detect"]
-    assert "data/paper-quarter/plans/nav" in found["render nav"], "all frames of navigation"
+@pytest.mark.parametrize("part", ["whole", "gpu", "full"])
+@pytest.mark.parametrize("calibrate", [False, True])
+@pytest.mark.parametrize("ground", ["pangu", "lunar"])
+def test_each_step_comes_after_what_it_reads(script, part, calibrate, ground):
+    made = script.steps(experiment(script, part=script.Part(part), ground=script.Ground(ground), calibrate=calibrate))
+    titles = [step.title for step in made]
+    assert len(set(titles)) == len(titles) and titles[-1] == "page"
+    late = set()
+    for step in made:
+        late |= {need for need in step.needs if need not in titles[: titles.index(step.title)]}
+    # Rendering of the curve may follow training on the headline ground, but nothing needs what is not there.
+    assert late <= set(titles)
+    assert not any(need == step.title for step in made for need in step.needs)
+
+
+def test_networks_differ_by_attention_alone(script):
+    found = commands(script, experiment(script))
     plain, attended = found["train yolov3"], found["train attention-yolov3"]
     assert plain.replace("attention=none", "attention=cbam").replace("yolov3", "attention-yolov3") == attended
-    assert "detect.epochs=4" in plain and "detect.frozen_epochs=1" in plain and "detect/own/checkpoints" in plain
-    navigator = found["train attention-darknet53-lstm"]
-    assert "detect/attention-yolov3/checkpoints/best.ckpt" in navigator
-    assert "batch_sequences=1" in navigator and "accumulate=8" in navigator
-    titles = list(found)
-    assert titles.index("train yolov3") < titles.index("train darknet53-lstm") < titles.index("explain")
-    assert titles[-1] == "page"
+    plain, attended = found["train darknet53-lstm"], found["train attention-darknet53-lstm"]
+    changed = plain.replace("attention=none", "attention=cbam").replace("yolov3", "attention-yolov3")
+    assert changed.replace("darknet53-lstm", "attention-darknet53-lstm") == attended
+    assert "detect.seed=2" in found["train yolov3-half-2"] and "detect.width=0.5" in found["train yolov3-half-2"]
+    assert "detect/attention-yolov3/checkpoints/best.ckpt" in attended
+    assert "target=pose" in attended and "target=motion" in found["train darknet53-lstm-motion"]
 
 
-def test_the_steps_of_a_twentieth(script):
-    found = commands(script, experiment(script, part=script.Part.TWENTIETH))
-    assert "--where frame_index % 20 == 0" in found["take frame_index % 20 == 0"]
-    assert "data/paper-twentieth/plans/detect-twentieth" in found["render detect"]
-    assert "--where trajectory_id < 'trajectory-0012'" in found["take trajectory_id < 'trajectory-0012'"]
-    assert "data/paper-twentieth/plans/nav-twentieth" in found["render nav"]
-    assert "detect.epochs=2" in found["train own network, to start from"]
-    assert found["render the benchmark, detect"].endswith(" b-2-scenes 2"), (
-        "two scenes of each part, in their own folder"
-    )
-    assert "--data b-2-scenes" in found["benchmark yolov3"]
-    assert "6 of the 20 scenes" in found["page"] and "every twentieth" in found["page"]
-
-
-def test_the_whole_is_not_cut(script):
+def test_the_curve_has_grounds_of_other_density(script):
     found = commands(script, experiment(script))
-    assert not any(title.startswith("take ") for title in found)
-    assert found["render the benchmark, detect"].endswith(" b 0") and "cut to fit" not in found["page"]
-    assert "detect.epochs=5" in found["train own network, to start from"]
+    assert "equilibrium_share={low: 0.25, high: 0.25}" in found["render 0.25"]
+    assert "equilibrium_share: {low: 0.9, high: 1.7}" in found["render lunar"], "the usual ground"
+    assert "equilibrium_share" not in found["render headline"], "as the protocol says"
+    assert "data/paper/0.25/detect" in found["train curve-0.25"]
+
+
+def test_the_headline_ground_is_chosen_where_the_baseline_has_the_papers_ap(script, tmp_path, monkeypatch):
+    assert script.share_at({0.25: 0.95, 0.5: 0.90, 1.0: 0.70}, 0.95) == 0.25
+    assert script.share_at({0.25: 0.95, 0.5: 0.90, 1.0: 0.70}, 0.80) == pytest.approx(0.5**0.5, abs=0.01)
+    assert script.share_at({0.25: 0.95, 0.5: 0.90}, 0.85) == 1.0, "beyond the last point"
+    assert script.share_at({0.25: 0.60, 0.5: 0.50}, 0.893) == 0.1, "not below the sparse ground"
+    monkeypatch.chdir(tmp_path)
+    one = experiment(script, calibrate=True)
+    for share, ap in (("0.25", 0.97), ("0.5", 0.893), ("1.0", 0.6)):
+        run = one.runs / "detect" / f"curve-{share}"
+        run.mkdir(parents=True)
+        (run / "metrics.json").write_text(json.dumps({"val/ap50_paper": ap}))
+    (choice,) = [step for step in script.steps(one) if callable(step.command)]
+    assert not choice.done()
+    choice.command()
+    assert json.loads(one.chosen.read_text())["equilibrium_share"] == 0.5 and choice.done()
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(script.Experiment, "runs", property(lambda _: tmp_path / "runs" / "paper"))
+    assert "equilibrium_share={low: 0.5, high: 0.5}" in commands(script, one)["render headline"]
 
 
 def test_the_second_experiment_and_given_weights(script):
     one = experiment(script, attitude=True, darknet=Path("yolov3.weights"))
     found = commands(script, one)
-    assert "train own network, to start from" not in found
-    assert "detect.init_from=yolov3.weights" in found["train attention-yolov3"]
+    assert "detect.init_from=yolov3.weights" in found["train transfer-attention-yolov3"]
     for kind in ("detect", "nav"):
-        assert f"dataset.{kind}.flight.attitude_sigma_deg=1.0" in found[f"plan {kind}"]
+        assert f"dataset.{kind}.flight.attitude_sigma_deg=1.0" in found["render headline"]
     assert one.runs == Path("runs/paper-attitude")
     assert experiment(script).runs == Path("runs/paper")
+    assert experiment(script, part=script.Part.GPU).runs == Path("runs/paper-gpu")
+    assert experiment(script, ground=script.Ground.LUNAR).runs == Path("runs/paper-lunar")
 
 
 def test_every_setting_of_every_step_is_valid(script):
-    """Resolve the options of each training as its command would."""
-    for part in script.Part:
-        one = experiment(script, part=part)
-        for title, section, model in (
-            ("train attention-yolov3", "detect", DetectConfig),
-            ("train darknet53-lstm", "navigate", NavigateConfig),
-        ):
-            (step,) = [step for step in script.steps(one) if step.title == title]
+    """Resolve the options of each command as it would itself."""
+    models = {"detect": DetectConfig, "navigate": NavigateConfig, "dataset": DatasetConfig}
+    for part, preset in itertools.product(script.Part, ("paper", "tiny")):
+        for step in script.steps(experiment(script, part=part, preset=preset)):
             words = step.command
             sets = tuple(words[place + 1] for place, word in enumerate(words) if word == "--set")
-            assert sets and resolve(model, section, "perilune_train", "paper", PROTOCOL, sets)
+            for section in {text.split(".")[0] for text in sets}:
+                module = "perilune_render" if section == "dataset" else "perilune_train"
+                assert resolve(models[section], section, module, preset, PROTOCOL, sets)
+
+
+def test_too_little_disk_is_said_before_the_first_frame(script, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    one = experiment(script)
+    monkeypatch.setattr(script.shutil, "disk_usage", lambda _: SimpleNamespace(free=10**9))
+    with pytest.raises(UserError, match=r"free disk: got 1\.0 GB, expected at least"):
+        script.check_disk(one, script.steps(one))
+    monkeypatch.setattr(script.shutil, "disk_usage", lambda _: SimpleNamespace(free=10**12))
+    script.check_disk(one, script.steps(one))
+
+
+def step(script, title, code, done, needs=(), **more):
+    return script.Step(title, [sys.executable, "-c", code], done, needs, **more)
+
+
+def test_steps_run_together_in_their_order_and_stop_in_time(script, tmp_path, monkeypatch):
+    """Frames beside trainings, never two renderings; at the deadline the page is made of what is done."""
+    monkeypatch.chdir(tmp_path)
+    one = experiment(script, part=script.Part.GPU)
+    mark = "import pathlib, time; pathlib.Path({!r}).touch(); time.sleep({}); pathlib.Path({!r}).touch()"
+
+    def of(title, seconds, needs=(), **more):
+        code = mark.format(f"{title}-begun", seconds, title)
+        return step(script, title, code, Path(title).is_file, needs, **more)
+
+    plan = [
+        of("frames", 0.3, renders=True),
+        of("more", 0.1, renders=True),
+        of("network", 0.1, ("frames",)),
+        of("late", 60, ("network",)),
+        step(script, "broken", "raise SystemExit(3)", lambda: False),
+        of("never", 0, ("broken",)),
+        step(script, "page", "open('page', 'w')", lambda: False),
+    ]
+    monkeypatch.setattr(script, "steps", lambda _: plan)
+    script.run_all(one, {}, script.time.monotonic() + 4)
+    assert all(Path(name).is_file() for name in ("frames", "more", "network", "late-begun", "page"))
+    assert not Path("late").is_file() and not Path("never-begun").exists()
+    begun = {name: Path(f"{name}-begun").stat().st_mtime for name in ("frames", "more", "network")}
+    assert begun["more"] >= Path("frames").stat().st_mtime and begun["network"] >= Path("frames").stat().st_mtime
+
+
+def test_a_failed_step_ends_the_experiment_with_its_code(script, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plan = [
+        step(script, "broken", "raise SystemExit(3)", lambda: False),
+        step(script, "page", "open('page', 'w')", lambda: False),
+    ]
+    monkeypatch.setattr(script, "steps", lambda _: plan)
+    with pytest.raises(typer.Exit) as raised:
+        script.run_all(experiment(script), {}, float("inf"))
+    assert raised.value.exit_code == 3 and not Path("page").exists()
+
+
+def test_files_of_an_experiment_are_small_and_come_back(tmp_path):
+    """Weights rounded to 8 bits, metrics and page survive packing and unpacking."""
+    runs = tmp_path / "runs"
+    network = torch.nn.Sequential(torch.nn.Conv2d(3, 8, 3), torch.nn.BatchNorm2d(8))
+    save_weights(runs / "detect" / "attention-yolov3" / "checkpoints" / "best.ckpt", {"width": 1.0}, network)
+    (runs / "detect" / "attention-yolov3" / "metrics.json").write_text('{"test/ap50_paper": 0.5}')
+    (runs / "paper.md").write_text("# page")
+    program = [sys.executable, str(ROOT / "scripts" / "paper_files.py")]
+    for words in (["pack", runs, tmp_path / "files"], ["unpack", tmp_path / "files", tmp_path / "back"]):
+        done = subprocess.run([*program, *map(str, words)], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "files").iterdir())) == 3
+    assert (tmp_path / "back" / "paper.md").read_text() == "# page"
+    content = load_weights(tmp_path / "back" / "detect" / "attention-yolov3" / "checkpoints" / "best.ckpt")
+    assert content["architecture"] == {"width": 1.0}
+    for name, value in network.state_dict().items():
+        step_size = value.abs().max() / 127 if value.ndim > 1 else 0
+        assert (content["state_dict"][name] - value).abs().max() <= step_size / 2 + 1e-7
+    done = subprocess.run([*program, "pack", str(tmp_path / "no"), "out"], capture_output=True, text=True)
+    assert done.returncode == 2 and "no such folder" in done.stderr and done.stderr.count("\n") == 1

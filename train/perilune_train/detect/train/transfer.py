@@ -51,6 +51,15 @@ def rescale_input(backbone: AttentionDarknet53, to: Literal["normalised", "grey"
         mean.copy_(mean.double() + shift / _GREY_DEVIATION)
 
 
+def check_start(path: Path) -> None:
+    """Raise UserError if a file does not have the weights of YOLOv3 or of Darknet53, in Darknet's format."""
+    if not path.is_file():
+        raise UserError(path, "initial weights", "no such file", "yolov3.weights or darknet53.conv.74")
+    if not is_darknet(path):
+        raise UserError(path, "initial weights", "another format", "yolov3.weights or darknet53.conv.74")
+    start_from_darknet(YOLOv3(), path, DetectConfig())
+
+
 def start_from(network: YOLOv3, path: Path, config: DetectConfig) -> None:
     """Fill the network with weights of an earlier detect run or of a Darknet file.
 

@@ -1,0 +1,33 @@
+#!/usr/bin/env bash
+# The paper's experiment on one GPU within minutes: frames are rendered on all cores while networks train on those that
+# are ready. Leaves at most eight files of 16 MiB in OUT.
+#
+#   scripts/paper_gpu.sh wheels                fetch into .wheels what a bare machine lacks (Python 3.12, own torch)
+#   MINUTES=8 OUT=out scripts/paper_gpu.sh     run; PRESET=tiny is a trial, on the processor too
+#
+# On a machine without packages of this project, the folder .wheels is installed beside, and the code is used in place.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+minutes=${MINUTES:-8} out=${OUT:-runs/paper-gpu-files} preset=${PRESET:-paper}
+
+if [ "${1:-}" = wheels ]; then
+  exec "${PYTHON:-python3}" -m pip download --no-deps --only-binary=:all: --python-version 3.12 --implementation cp \
+    --platform manylinux_2_28_x86_64 --platform manylinux_2_17_x86_64 --platform manylinux2014_x86_64 \
+    -d .wheels -c constraints.txt license-expression boolean.py pydantic pydantic_core annotated-types \
+    typing-inspection typing_extensions ruamel.yaml captum affine OpenEXR trimesh platformdirs pyzmq
+fi
+
+python=${PYTHON:-python3}
+[ -x .venv/bin/python ] && python=${PYTHON:-.venv/bin/python}
+if ls .wheels/*.whl >/dev/null 2>&1; then
+  site=$(mktemp -d)
+  trap 'rm -rf "$site"' EXIT
+  "$python" -m pip install -q --no-index --no-deps --no-compile --no-cache-dir --target "$site" .wheels/*.whl
+fi
+export PYTHONPATH="${site:+$site:}$PWD/shared:$PWD/render:$PWD/train${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
+part=gpu
+[ "$preset" = tiny ] && runs=runs/paper-tiny || runs=runs/paper-gpu
+# What is done by then is packed, whatever happened.
+"$python" scripts/paper.py --preset "$preset" --part $part --calibrate --minutes "$minutes" || code=$?
+"$python" scripts/paper_files.py pack "$runs" "$out"
+exit "${code:-0}"
