@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-profile bench-serve bench-infer bench-latency bench-captured bench-shared results clean
+.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-shared results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -283,6 +283,9 @@ bench-gates: detect-frames ## AP and variation of attention masks of detect runs
 
 bench-infer: setup-dev ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer
+
+bench-paper-causes: setup-dev ## why short trainings of the paper's detector failed: ground, loss and gates, about half an hour on two cores; writes runs/paper-causes/paper-causes.json
+	@$(BIN)/python -m benchmarks.train.paper_causes
 
 bench-captured: setup-dev ## training speed of both detectors with steps one operation at a time and captured, on a GPU; writes runs/bench/captured.json
 	@$(BIN)/python -m benchmarks.train.captured
