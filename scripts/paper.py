@@ -108,13 +108,13 @@ _TWO_CORES = {
 _GPU = {
     "detect.batch_size": "32",
     "detect.warmup_steps": "100",
-    "detect.validate_every": "4",
+    "detect.validate_every": "6",
     "detect.workers": "0",
     "navigate.workers": "0",
 }
 PARTS = {
     Part.WHOLE: Sizes(
-        trajectories=40,
+        trajectories=30,
         frames=100,
         nav_trajectories=49,
         curve=("0.25", "0.5", "1.0"),
@@ -128,16 +128,16 @@ PARTS = {
         settings=_TWO_CORES,
     ),
     Part.GPU: Sizes(
-        trajectories=40,
+        trajectories=30,
         frames=100,
         nav_trajectories=49,
         curve=("0.25", "0.5", "1.0"),
-        epochs=8,
+        epochs=12,
         curve_width=1.0,
         half_width=0.5,
         seeds=(0, 1, 2),
         coarse_epochs=104,
-        fine_epochs=6,
+        fine_epochs=10,
         render_workers=13,
         trainings=5,
         settings=_GPU,
@@ -299,26 +299,49 @@ def _inline(values: Any) -> str:
 
 
 def steps(one: Experiment) -> list[Step]:
-    """All steps in an order in which each one's needs come before it."""
-    sizes = one.sizes
-    pangu = one.ground == Ground.PANGU
-    found: list[Step] = []
-    shares = (SPARSE, *sizes.curve, LUNAR) if pangu else ()
-    if one.calibrate:
-        # The grounds that decide come first.
-        for share in sizes.curve:
-            found += _on_curve(one, share)
-        found.append(_calibration(one))
-    found += _headline(one)
-    for share in shares:
-        if f"render {share}" not in {step.title for step in found}:
-            found += _on_curve(one, share)
-    if pangu:
-        for folder, attention in (("sparse-attention-yolov3", "cbam"), ("sparse-attention-identity", "cbam_identity")):
-            found.append(_detector(one, SPARSE, folder, attention, 1.0))
-        found.append(_detector(one, LUNAR, "lunar-attention-identity", "cbam_identity", sizes.curve_width))
-    found += _transfer(one)
-    found += _benchmark_steps(one)
+    """All steps, the most important first, since a run with a limit on its time may not reach the last."""
+    sizes, ground = one.sizes, "headline"
+    curve = [step for share in sizes.curve for step in _on_curve(one, share)] if one.ground == Ground.PANGU else []
+    first = [*curve, _calibration(one)] if one.calibrate else []
+    needs = ("choose the headline ground",) if one.calibrate else ()
+    navigators = [("darknet53-lstm", "yolov3", "none"), ("attention-darknet53-lstm", "attention-yolov3", "cbam")]
+
+    def seeds(folder: str, attention: str) -> list[Step]:
+        return [
+            _detector(one, ground, f"{folder}-half-{seed}", attention, sizes.half_width, detect__seed=str(seed))
+            for seed in sizes.seeds
+        ]
+
+    headline = [
+        _render(one, ground, "detect", headline_density(one), needs),
+        _render(one, ground, "nav", headline_density(one), needs),
+        _detector(one, ground, "yolov3", "none", 1.0),
+        _detector(one, ground, "attention-yolov3", "cbam", 1.0),
+        *(_navigator(one, *words, "pose") for words in navigators),
+        _explanation(one),
+    ]
+    sparse = [*_on_curve(one, SPARSE), _detector(one, SPARSE, "sparse-attention-yolov3", "cbam", 1.0)]
+    identity = [
+        _detector(one, ground, "attention-identity", "cbam_identity", 1.0),
+        _detector(one, SPARSE, "sparse-attention-identity", "cbam_identity", 1.0),
+        _detector(one, LUNAR, "lunar-attention-identity", "cbam_identity", sizes.curve_width),
+    ]
+    if one.ground == Ground.LUNAR:
+        sparse, identity = [], identity[:1]
+    found = [
+        *first,
+        *headline,
+        *sparse,
+        *seeds("yolov3", "none"),
+        *seeds("attention-yolov3", "cbam"),
+        *(_on_curve(one, LUNAR) if one.ground == Ground.PANGU else []),
+        *identity,
+        *([] if first else curve),
+        *seeds("attention-identity", "cbam_identity"),
+        *(_navigator(one, *words, "motion") for words in navigators),
+        *_transfer(one),
+        *_benchmark_steps(one),
+    ]
     return [*found, _page(one)]
 
 
@@ -403,38 +426,14 @@ def headline_density(one: Experiment) -> dict[str, str]:
     return {}
 
 
-def _headline(one: Experiment) -> list[Step]:
-    """Detectors, navigators and the explanation over the headline ground."""
-    needs = ("choose the headline ground",) if one.calibrate else ()
-    sizes, ground = one.sizes, "headline"
-    found = [
-        _render(one, ground, "detect", headline_density(one), needs),
-        _render(one, ground, "nav", headline_density(one), needs),
-        _detector(one, ground, "yolov3", "none", 1.0),
-        _detector(one, ground, "attention-yolov3", "cbam", 1.0),
-        _detector(one, ground, "attention-identity", "cbam_identity", 1.0),
-    ]
-    for folder, attention in (
-        ("yolov3", "none"),
-        ("attention-yolov3", "cbam"),
-        ("attention-identity", "cbam_identity"),
-    ):
-        for seed in sizes.seeds:
-            name, more = f"{folder}-half-{seed}", {"detect__seed": str(seed)}
-            found.append(_detector(one, ground, name, attention, sizes.half_width, **more))
-    for folder, detector, attention in (
-        ("darknet53-lstm", "yolov3", "none"),
-        ("attention-darknet53-lstm", "attention-yolov3", "cbam"),
-    ):
-        for target in ("pose", "motion"):
-            found.append(_navigator(one, folder, detector, attention, target))
+def _explanation(one: Experiment) -> Step:
     attended = one.runs / "detect" / "attention-yolov3" / "checkpoints" / "best.ckpt"
     navigator = one.runs / "navigate" / "attention-darknet53-lstm-stack" / "checkpoints" / "best.ckpt"
-    command = [*program("perilune-train"), "explain", "--preset", one.preset, "--dataset", str(one.data / ground)]
+    command = [*program("perilune-train"), "explain", "--preset", one.preset, "--dataset", str(one.data / "headline")]
     command += ["--out", str(one.runs), "--name", "attention"]
     command += ["--detector", str(attended), "--navigator", str(navigator)]
-    explained = ("train attention-yolov3", "train attention-darknet53-lstm")
-    return [*found, Step("explain", command, _finished(one.runs / "explain" / "attention"), explained)]
+    needs = ("train attention-yolov3", "train attention-darknet53-lstm")
+    return Step("explain", command, _finished(one.runs / "explain" / "attention"), needs)
 
 
 def _navigator(one: Experiment, folder: str, detector: str, attention: str, target: str) -> Step:
@@ -581,6 +580,8 @@ def main(
         raise UserError("--preset", "preset", preset, "paper or tiny")
     if darknet is not None:
         check_start(darknet)
+    if calibrate and ground == Ground.LUNAR:
+        raise UserError("--calibrate", "--ground", ground, f"{Ground.PANGU}, whose density is chosen")
     one = Experiment(preset, part, ground, attitude, darknet, benchmark, calibrate)
     plan = steps(one)
     check_disk(one, plan)

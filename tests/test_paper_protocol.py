@@ -75,8 +75,7 @@ def commands(script, one):
 
 
 @pytest.mark.parametrize("part", ["whole", "gpu", "full"])
-@pytest.mark.parametrize("calibrate", [False, True])
-@pytest.mark.parametrize("ground", ["pangu", "lunar"])
+@pytest.mark.parametrize(("ground", "calibrate"), [("pangu", False), ("pangu", True), ("lunar", False)])
 def test_each_step_comes_after_what_it_reads(script, part, calibrate, ground):
     made = script.steps(experiment(script, part=script.Part(part), ground=script.Ground(ground), calibrate=calibrate))
     titles = [step.title for step in made]
