@@ -89,6 +89,7 @@ def main(
     frames: Annotated[int, typer.Option(help="Number of frames.")] = 512,
     steps: Annotated[int, typer.Option(help="Steps that are timed.")] = 20,
     batch: Annotated[list[int] | None, typer.Option(help="Batch sizes. Repeatable.")] = None,
+    attention: Annotated[list[str] | None, typer.Option(help="Forms of attention. Repeatable.")] = None,
     fused: Annotated[bool, typer.Option(help="Also compile the attention modules.")] = False,
     out: Annotated[Path, typer.Option(help="JSON file with the figures.")] = Path("runs/bench/captured.json"),
 ) -> None:
@@ -101,15 +102,16 @@ def main(
         ("captured", True, False),
         *([("captured, fused", True, True)] if fused else []),
     ]
-    for attention, size, (way, captured, compiled) in itertools.product(("none", "cbam"), batch or [32], ways):
-        if compiled and (attention == "none" or not fused):
+    forms = attention or ["none", "cbam"]
+    for form, size, (way, captured, compiled) in itertools.product(forms, batch or [32], ways):
+        if compiled and (form == "none" or not fused):
             continue
         config = DetectConfig.model_validate(
-            {"width": width, "attention": attention, "batch_size": size, "assignment": "one", "augment": _PLAIN}
+            {"width": width, "attention": form, "batch_size": size, "assignment": "one", "augment": _PLAIN}
         )
         found = images_per_s(split, config, captured, steps, compiled)
-        print(f"{attention}, batch {size}, {way}: {found}", flush=True)
-        figures[f"{attention}, batch {size}, {way}"] = found
+        print(f"{form}, batch {size}, {way}: {found}", flush=True)
+        figures[f"{form}, batch {size}, {way}"] = found
     write_figures(out, figures)
 
 
