@@ -75,8 +75,9 @@ def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline
         "Attention": _attention(runs),
         "Deviations that remain": [f"- {line}" for line in DEVIATIONS],
     }
-    lines = ["# The paper's experiment", "", lead(runs, share, given=headline_share is not None), ""]
-    lines += [f"- {line}" for line in (*about, *_settings(runs))]
+    lines = ["# The paper's experiment", "", lead(runs, share, given=headline_share is not None)]
+    if settings := [f"- {line}" for line in (*about, *_settings(runs))]:
+        lines += ["", *settings]
     for title, own in sections.items():
         lines += ["", f"## {title}", "", *own]
     write_text(root / PAGE, "\n".join([*lines, ""]))

@@ -33,9 +33,11 @@ _GROUNDS = {
     HEADLINE: "headline",
     SPARSE: f"sparse ({SPARSE_SHARE})",
     USUAL: "our usual",
-    TRANSFER: "headline, after transfer",
+    TRANSFER: "headline after transfer",
 }
-_HALF = "headline, half width"
+_HALF = "headline at half width"
+_PLAIN_ONLY = (_GROUNDS[USUAL], _GROUNDS[TRANSFER])
+"""Where gates from identity are not planned."""
 _POSITION, _VECTOR = "position_rmse_per_component_m", "position_rmse_vector_m"
 _ORIENTATION = "orientation_rmse_per_component_deg"
 _NAVIGATION = {_POSITION: 3, _VECTOR: 3, _ORIENTATION: 5}
@@ -62,10 +64,9 @@ def table_2(runs: PaperRuns) -> list[str]:
     groups |= {title: runs.detections(ground) for ground, title in _GROUNDS.items() if ground != HEADLINE}
     scored = {network: runs.scored(network) for network in NAMES}
     for title, trainings in groups.items():
-        # Gates from identity are not planned on our usual ground and after transfer.
         planned = [network for network in NAMES if network != "attention-identity" or title not in _PLAIN_ONLY]
         absent = [NAMES[network] for network in planned if not trainings[network]]
-        missing += [f"{title}: {', '.join(absent)}"] if absent else []
+        missing += [title if len(absent) == len(planned) else f"{title} ({'; '.join(absent)})"] if absent else []
         for network, own in trainings.items():
             if own:
                 cells = [values(own, f"test/{key}") for key in _DETECTION]
@@ -75,10 +76,7 @@ def table_2(runs: PaperRuns) -> list[str]:
             cells = [values([metrics], f"paper/{key}") for key in _DETECTION]
             rows.append(["locked benchmark", NAMES[network], "1", *cells, labels_a_frame(metrics, "paper")])
     lines = table(["ground", "network", "trainings", *_DETECTION.values(), "labels a frame"], rows)
-    return [*lines, "", f"Not run: {'; '.join(missing)}."] if missing else lines
-
-
-_PLAIN_ONLY = (_GROUNDS[USUAL], _GROUNDS[TRANSFER])
+    return [*lines, "", f"Not run: {', '.join(missing)}."] if missing else lines
 
 
 def curve_table(curve: Mapping[str, Metrics], headline: str | None) -> list[str]:

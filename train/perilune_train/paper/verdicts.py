@@ -62,6 +62,8 @@ def _detection(runs: PaperRuns, claim: str, claimed: str, key: str, gates: str) 
 
 def _measured(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics]) -> str:
     known = numbers(plain, key)
+    if not known and not numbers(attended, key):
+        return "-"
     size = max(map(abs, known), default=0.0)
     # Four digits, so that small differences show.
     places = max(0, 3 - math.floor(math.log10(size))) if size else 3
