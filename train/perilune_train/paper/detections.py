@@ -8,6 +8,7 @@ import pandas as pd
 import pyarrow as pa
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
 
 from perilune_shared.dataset.manifest import open_single
 from perilune_shared.errors import UserError
@@ -16,6 +17,7 @@ from perilune_train.detect.data.split import DetectSplit, load_split
 from perilune_train.detect.evaluate.matching import Detections, find_overlaps
 from perilune_train.detect.finished_run import chosen_threshold, config_of_run
 from perilune_train.evaluation.pictures import save_figure
+from perilune_train.evaluation.spread import Interval, Resamples, draw_resamples, spreads
 
 LARGE_PX = (20.0, 50.0)
 """Radii of large craters, pixels."""
@@ -64,8 +66,18 @@ def read_detections(run: Path, dataset: Address, trained: Path | None = None) ->
     )
 
 
-def median_width_ratio(detected: Detected) -> float | None:
-    """Median of the width of detected large craters, divided by that of their labels; None if none was found."""
+@dataclass(frozen=True)
+class WidthRatio:
+    """Width of detected large craters, divided by that of their labels."""
+
+    median: float
+    """Median over the craters."""
+    interval: Interval | None
+    """95 % interval over trajectories, or over scenes; None with fewer than five of them."""
+
+
+def width_ratio(detected: Detected) -> WidthRatio | None:
+    """Width of the large craters that were found, relative to the truth; None if none was found."""
     split = detected.split
     height, width = split.frames.images.shape[1:]
     sizes = np.tile((width, height), (len(split), 1))
@@ -76,7 +88,20 @@ def median_width_ratio(detected: Detected) -> float | None:
     ours, truth = overlaps.boxes[hit], overlaps.label_boxes[matches.label[hit]]
     large = (radius_px >= LARGE_PX[0]) & (radius_px <= LARGE_PX[1])
     ratios = ((ours[:, 2] - ours[:, 0]) / (truth[:, 2] - truth[:, 0]))[large]
-    return float(np.median(ratios)) if len(ratios) else None
+    if not len(ratios):
+        return None
+    order, frames = np.argsort(ratios), matches.frame[hit][large]
+
+    def medians(resamples: Resamples) -> dict[str, NDArray[np.float64]]:
+        weights = np.cumsum(resamples.weights[:, resamples.of_row[frames[order]]], axis=1)
+        # A resample without large craters has no median.
+        middle = (weights < weights[:, -1:] / 2).sum(axis=1)
+        return {"ratio": np.where(weights[:, -1] > 0, ratios[order][np.minimum(middle, len(ratios) - 1)], np.nan)}
+
+    table = split.frames.table
+    scenes, trajectories, ids = (list(map(str, table[name])) for name in ("scene_id", "trajectory_id", "frame_id"))
+    resamples = draw_resamples(scenes, trajectories, ids, np.random.default_rng(0))
+    return WidthRatio(float(np.median(ratios)), spreads(medians, frames, resamples)["ratio"].interval)
 
 
 def draw_detections(path: Path, by_network: dict[str, Detected]) -> None:

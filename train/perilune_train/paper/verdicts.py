@@ -1,231 +1,146 @@
-"""The paper's claims, each with what was measured here and whether it holds."""
+"""The paper's claims, each with what was measured here and whether it holds (rule.py)."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Sequence
 
 from perilune_train.evaluation.metrics_file import Metrics
-from perilune_train.evaluation.spread import MIN_UNITS, read_spread
-from perilune_train.paper.claimed import (
-    DEEP_ALIKE,
-    DEEP_ALIKE_GATES,
-    DETECTION,
-    MODERATE,
-    MOTION_GATES,
-    NAVIGATION,
-    SHALLOW_CRATER_GATES,
-    STILL_GATES,
-)
-from perilune_train.paper.runs import PaperRuns
+from perilune_train.paper.claimed import DETECTION, NAVIGATION
+from perilune_train.paper.detections import WidthRatio
+from perilune_train.paper.gates import gate_verdicts
+from perilune_train.paper.rule import AS_FAST, Answer, Verdict, by_order, compared
+from perilune_train.paper.runs import NAVIGATORS, READINGS, PaperRuns
+from perilune_train.paper.tables import FLOORS, lost_to, numbers, values
 
-Answer = Literal["holds", "does not hold", "within the spread", "undecided", "not measured"]
+ONE = "one training each"
+_CONSTANT_DEG = 1e-4
+"""Without attitude noise the orientation is constant, and a mean has an error below this."""
+GATES = {"attention-yolov3": "plain CBAM", "attention-identity": "gates from identity"}
+"""Detectors with attention."""
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """One claim."""
-
-    claim: str
-    """What the paper says."""
-    claimed: str
-    """The paper's figures."""
-    measured: str
-    """Ours, with intervals where there are five units or more."""
-    answer: Answer
-    """within the spread: the difference has the claimed sign, but the intervals overlap, or there are none. undecided:
-    masks were measured over fewer than five scenes."""
+def verdicts(runs: PaperRuns, large: WidthRatio | None) -> list[Verdict]:
+    """All claims in the order of the paper; `large` is the width of the large craters that attention-YOLOv3 finds."""
+    found = []
+    for key, (name, claimed) in _detection_claims().items():
+        found += [_detection(runs, f"attention raises {name} ({GATES[gates]})", claimed, key, gates) for gates in GATES]
+    found.append(_large_craters(large))
+    for reading in READINGS:
+        found += _navigation(runs, reading)
+    return [*found, _as_fast(runs), *gate_verdicts(runs.explanation() or {})]
 
 
-def verdicts(runs: PaperRuns, large_width_ratio: float | None) -> list[Verdict]:
-    """All claims in the order of the paper. Raises UserError if a run is not finished.
-
-    `large_width_ratio` is the width of the large craters that attention-YOLOv3 finds, divided by the true one.
-    """
-    detection, navigation, explained = runs.detection(), runs.navigation(), runs.explanation()
-    plain, attended = detection.values()
-    found = [_detection(key, name, plain, attended) for key, name in _FIGURES.items()]
-    small = [f"test/radius_{low}_px/ap50_paper" for low in ("2_3", "3_5")]
-    found += [
-        _compared(
-            f"attention detects small craters ({key.split('/')[1][7:-3].replace('_', ' to ')} px) better",
-            "no figure",
-            (plain, key),
-            (attended, key),
-            higher=True,
-        )
-        for key in small
-    ]
-    found.append(_large_craters(large_width_ratio))
-    bare, gated = navigation.values()
-    for name, key, field in _NAVIGATION:
-        claimed = " against ".join(f"{one[field]:g}" for one in reversed(NAVIGATION.values()))
-        found.append(_compared(name, claimed, (bare, key), (gated, key), higher=False))
-    found.append(_as_fast(bare, gated))
-    found += _gates(explained)
-    return found
+def _detection_claims() -> dict[str, tuple[str, str]]:
+    """Name and the paper's figures of each claim, by the key of metrics.json."""
+    names = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", "f1": "F1"}
+    plain, attended = DETECTION.values()
+    found = {f"test/{key}": (name, f"{attended[key]:.4f} against {plain[key]:.4f}") for key, name in names.items()}
+    found |= {
+        f"test/strict/{key}": (f"{names[key]}, strict account", found[f"test/{key}"][1])
+        for key in ("precision", "ap50_paper")
+    }
+    small = {"2_3": "AP of small craters, 2 to 3 px", "3_5": "AP of small craters, 3 to 5 px"}
+    return found | {f"test/radius_{bin_}_px/ap50_paper": (name, "no figure") for bin_, name in small.items()}
 
 
-_ZERO = 1e-4
-"""Errors below this are those of a constant: without attitude noise the camera does not rotate."""
-_PIXELS = {
-    "_all_pixels": "all pixels, 0 where the other half is not seen",
-    "": "pixels that both halves see",
-}
-"""PCC3 and PCC4 by the pixels that they are computed over."""
-_FIGURES = {"precision": "precision", "recall": "recall", "ap50_paper": "AP", "f1": "F1"}
-_NAVIGATION = (
-    (
-        "attention lowers the position RMSE (per component)",
-        "test/position_rmse_per_component_m",
-        "position_m",
-    ),
-    (
-        "attention lowers the orientation RMSE (per component)",
-        "test/orientation_rmse_per_component_deg",
-        "orientation_deg",
-    ),
-)
+def _detection(runs: PaperRuns, claim: str, claimed: str, key: str, gates: str) -> Verdict:
+    """Compare at half width if there are several trainings, and name the one training at full width beside them."""
+    full, half = runs.detections(), runs.halves()
+    counts = [len(numbers(half[network], key)) for network in (gates, "yolov3")]
+    pair = full[gates], full["yolov3"]
+    alone = compared(key, *pair, higher=True)
+    if min(counts) < 2:
+        return Verdict(claim, claimed, _measured(key, *pair), _of(alone, ONE), alone)
+    answer = compared(key, half[gates], half["yolov3"], higher=True)
+    if {answer, alone} == {"holds", "does not hold"}:
+        answer = "open"
+    measured = _measured(key, half[gates], half["yolov3"])
+    if alone != "not measured":
+        measured += f"; full width, one training each: {_measured(key, *pair)}, {alone}"
+    each = f"{counts[0]}" if counts[0] == counts[1] else " and ".join(map(str, counts))
+    return Verdict(claim, claimed, measured, f"{each} each, half width", answer)
 
 
-def _detection(key: str, name: str, plain: Metrics, attended: Metrics) -> Verdict:
-    claimed = f"{DETECTION['attention-YOLOv3'][key]:.4f} against {DETECTION['YOLOv3'][key]:.4f}"
-    return _compared(
-        f"attention raises {name}", claimed, (plain, f"test/{key}"), (attended, f"test/{key}"), higher=True
-    )
+def _measured(key: str, attended: Sequence[Metrics], plain: Sequence[Metrics]) -> str:
+    known = numbers(plain, key)
+    if not known and not numbers(attended, key):
+        return "-"
+    size = max(map(abs, known), default=0.0)
+    # Four digits, so that small differences show.
+    places = max(0, 3 - math.floor(math.log10(size))) if size else 3
+    return f"{values(attended, key, places)} against {values(plain, key, places)}"
 
 
-def _compared(
-    claim: str, claimed: str, without: tuple[Metrics, str], with_: tuple[Metrics, str], *, higher: bool
-) -> Verdict:
-    """Compare a figure of the network with attention with that of the one without."""
-    values = [metrics.get(key) for metrics, key in (with_, without)]
-    if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
-        return Verdict(claim, claimed, "-", "not measured")
-    ours, other = (float(value) for value in values if isinstance(value, int | float))
-    if max(abs(ours), abs(other)) < _ZERO:
-        return Verdict(claim, claimed, "the truth is 0 in all pairs, and both networks know it", "not measured")
-    spreads = [read_spread(metrics, key) for metrics, key in (with_, without)]
-    places = max(0, 3 - math.floor(math.log10(max(abs(other), 1e-12)))) if other else 3
-    measured = f"{_text(ours, spreads[0].interval, places)} against {_text(other, spreads[1].interval, places)}"
-    if (ours > other) != higher or ours == other:
-        return Verdict(claim, claimed, measured, "does not hold")
-    first, second = spreads[0].interval, spreads[1].interval
-    apart = first and second and (first[0] > second[1] if higher else first[1] < second[0])
-    return Verdict(claim, claimed, measured, "holds" if apart else "within the spread")
+def _of(answer: Answer, trainings: str) -> str:
+    return "-" if answer == "not measured" else trainings
 
 
-def _text(value: float, interval: tuple[float, float] | None, places: int) -> str:
-    limits = f" ({interval[0]:.{places}f} to {interval[1]:.{places}f})" if interval else ""
-    return f"{value:.{places}f}{limits}"
-
-
-def _large_craters(ratio: float | None) -> Verdict:
+def _large_craters(ratio: WidthRatio | None) -> Verdict:
     claim = "with attention, boxes of large craters (radius 20 to 50 px) are slightly smaller than the truth"
     if ratio is None:
-        return Verdict(claim, "no figure", "no such crater was found", "not measured")
-    return Verdict(claim, "no figure", f"median width {ratio:.3f} of it", "holds" if ratio < 1 else "does not hold")
+        return Verdict(claim, "no figure", "-", "-", "not measured")
+    limits = f" ({ratio.interval[0]:.3f} to {ratio.interval[1]:.3f})" if ratio.interval else ""
+    answer = by_order(ratio.interval, (1.0, 1.0), higher=False)
+    return Verdict(claim, "no figure", f"median width {ratio.median:.3f}{limits} of it", "one training", answer)
 
 
-def _as_fast(bare: Metrics, gated: Metrics) -> Verdict:
-    key, claim, claimed = "test/ms_per_single_pair", "a pair takes as long with attention as without", "0.22 s both"
-    without, with_ = bare.get(key), gated.get(key)
-    if not isinstance(without, int | float) or not isinstance(with_, int | float):
-        return Verdict(claim, claimed, "-", "not measured")
-    measured = f"{with_ / 1e3:.3f} s against {without / 1e3:.3f} s on this machine"
-    return Verdict(claim, claimed, measured, "holds" if with_ < 1.05 * without else "does not hold")
-
-
-def _gates(explained: Metrics) -> list[Verdict]:
-    """Claims on attention gates, with the range of each null over the same gates.
-
-    Single figures without an interval, so each is a plain comparison; over fewer than five scenes it decides nothing.
-    """
-
-    def of(measure: str, gates: Sequence[str]) -> dict[str, float]:
-        found = {gate: explained.get(f"{measure}/{gate}") for gate in gates}
-        return {gate: float(value) for gate, value in found.items() if isinstance(value, int | float)}
-
-    def nulls(measure: str, gates: Sequence[str]) -> str:
-        found: dict[str, list[float]] = {}
-        for gate in gates:
-            prefix = f"{measure}_null/{gate}/"
-            for key, value in explained.items():
-                if key.startswith(prefix) and isinstance(value, float):
-                    found.setdefault(key.removeprefix(prefix), []).append(value)
-        ranges = ", ".join(f"{null} {min(values):.2f} to {max(values):.2f}" for null, values in found.items())
-        return f"; nulls: {ranges}" if ranges else ""
-
-    def judged(
-        claim: str,
-        claimed: str,
-        gates: Sequence[str],
-        values: dict[str, float],
-        ok: Callable,
-        null: str,
-        scenes: str,
-    ) -> Verdict:
-        if not values:
-            return Verdict(claim, claimed, "-", "not measured")
-        fit = [gate for gate, value in values.items() if ok(value)]
-        listed = ", ".join(f"{gate} {value:.2f}" for gate, value in values.items())
-        n_scenes = explained.get(scenes)
-        few = not isinstance(n_scenes, int) or n_scenes < MIN_UNITS
-        measured = f"{len(fit)} of {len(gates)}: {listed}{nulls(null, gates)}"
-        return Verdict(
-            claim,
-            claimed,
-            f"{measured}; {n_scenes if isinstance(n_scenes, int) else 'unknown number of'} scenes",
-            "undecided" if few else "holds" if len(fit) == len(gates) else "does not hold",
-        )
-
-    def difference(gates: Sequence[str], pixels: str) -> dict[str, float]:
-        still, moved = of(f"pcc3{pixels}", gates), of(f"pcc4{pixels}", gates)
-        return {gate: moved[gate] - still[gate] for gate in gates if gate in still and gate in moved}
-
-    craters = of("pcc1_background", SHALLOW_CRATER_GATES)
-    deep = of("pcc2", DEEP_ALIKE_GATES)
-    return [
-        judged(
-            f"PCC1 of {' and '.join(SHALLOW_CRATER_GATES)} is moderate (here: at least {MODERATE} in size)",
-            "figure only",
-            SHALLOW_CRATER_GATES,
-            craters,
-            lambda value: abs(value) >= MODERATE,
-            "pcc1_background",
-            "scenes",
-        ),
-        judged(
-            f"PCC2 of {', '.join(DEEP_ALIKE_GATES)} is above {DEEP_ALIKE}",
-            f"> {DEEP_ALIKE}",
-            DEEP_ALIKE_GATES,
-            deep,
-            lambda value: value > DEEP_ALIKE,
-            "pcc2",
-            "scenes",
-        ),
-        *(
-            judged(
-                f"PCC4 is above PCC3 for {', '.join(MOTION_GATES)} (PCC4 - PCC3, {words})",
-                "> 0",
-                MOTION_GATES,
-                difference(MOTION_GATES, pixels),
-                lambda value: value > 0,
-                "" if pixels else "pcc4_minus_pcc3",
-                "pair_scenes",
+def _navigation(runs: PaperRuns, reading: str) -> list[Verdict]:
+    found = runs.navigation(reading)
+    plain, attended = ([found[name]] if name in found else [] for name in NAVIGATORS)
+    where = {"pose": "pose in O_L", "motion": "motion between frames"}[reading]
+    verdicts = []
+    for what, field in (("position", "position_m"), ("orientation", "orientation_deg")):
+        unit = field.rpartition("_")[2]
+        key = f"test/{what}_rmse_per_component_{unit}"
+        claim = f"attention lowers the {what} RMSE, per component ({where})"
+        claimed = " against ".join(f"{one[field]:g} {unit}" for one in reversed(NAVIGATION.values()))
+        answer = compared(key, attended, plain, higher=False)
+        measured = _measured(key, attended, plain)
+        if what == "orientation" and answer != "not measured" and _is_constant([*plain, *attended], key):
+            measured, answer = "the true orientation is constant; ATTITUDE=1 measures it", "not measured"
+        elif what == "position":
+            names = (("with", attended), ("without", plain))
+            lost = {name: lost_to(own[0]) for name, own in names if own}
+            measured += "".join(
+                f"; {name} attention, not better than the {FLOORS[by]}" for name, by in lost.items() if by
             )
-            for pixels, words in _PIXELS.items()
-        ),
-        *(
-            judged(
-                f"PCC3 is above PCC4 from B_37 on (PCC4 - PCC3, {words})",
-                "< 0",
-                STILL_GATES,
-                difference(STILL_GATES, pixels),
-                lambda value: value < 0,
-                "" if pixels else "pcc4_minus_pcc3",
-                "pair_scenes",
-            )
-            for pixels, words in _PIXELS.items()
-        ),
-    ]
+        verdicts.append(Verdict(claim, claimed, measured, _of(answer, ONE), answer))
+    return verdicts
+
+
+def _is_constant(trained: Sequence[Metrics], key: str) -> bool:
+    """Whether the mean pose or motion already knows the orientation; without a mean, whether all networks do."""
+    means = [f"baseline/{name}/{key.removeprefix('test/')}" for name in ("mean", "mean_pose")]
+    known = [value for mean in means for value in numbers(trained, mean)] or numbers(trained, key)
+    return max(known) < _CONSTANT_DEG
+
+
+def _as_fast(runs: PaperRuns) -> Verdict:
+    """Compare seconds per pair in each reading, and on the benchmark, where one machine measured both networks."""
+    claim, claimed = "a pair takes as long with attention as without", "0.22 s both"
+    pairs = {reading: list(runs.navigation(reading).values()) for reading in READINGS}
+    scored = [runs.scored(name) for name in NAVIGATORS.values()]
+    pairs["locked benchmark"] = [metrics for metrics in scored if metrics is not None]
+    key, ratios, listed = "test/ms_per_single_pair", [], []
+    for where, both in pairs.items():
+        times = numbers(both, key)
+        if len(times) < 2:
+            continue
+        without, with_ = times
+        alike = len({(metrics.get("run/hardware"), _program(metrics)) for metrics in both}) == 1
+        ratios += [with_ / without] if alike else []
+        note = "" if alike else ", different machines or commands, not compared"
+        loads = " and ".join(f"{value:g}" for value in reversed(numbers(both, "run/load")))
+        load = f" at load {loads}" if loads else ""
+        listed.append(f"{where}: {with_ / 1e3:.3f} s against {without / 1e3:.3f} s{load}{note}")
+    if not ratios:
+        return Verdict(claim, claimed, "; ".join(listed) or "-", "-", "not measured")
+    # Above, below or within the tolerance.
+    sides = {(ratio > AS_FAST) - (ratio < 1 / AS_FAST) for ratio in ratios}
+    answer: Answer = "holds" if sides == {0} else "does not hold" if sides in ({1}, {-1}) else "open"
+    return Verdict(claim, claimed, "; ".join(listed), f"{len(ratios)} comparisons" if len(ratios) > 1 else ONE, answer)
+
+
+def _program(metrics: Metrics) -> tuple[str, ...]:
+    """The command that measured, without its options."""
+    words = str(metrics.get("run/command") or "").split()
+    return tuple(word for word in words[:3] if not word.startswith("-"))

@@ -52,7 +52,8 @@ def paper_section(folder: Path, run: Run) -> Section:
     lead = (f"Claims of the paper: {_counted([answer for _, _, answer in rows])}.",)
     table = Table("Claims of the paper", ("claim", "measured here", "verdict"), tuple(rows), (run.provenance,))
     captions = {
-        "detections.png": "Detections of both networks: truth red, detections cyan.",
+        "detections.png": "Detections of the networks: truth red, detections cyan.",
+        "curve.png": "AP of YOLOv3 without attention against the density of craters.",
         "learning.png": "Learning curves.",
         "trajectory.png": "Errors along a test trajectory.",
     }
