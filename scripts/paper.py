@@ -194,6 +194,9 @@ def _benchmark_steps(one: Experiment) -> list[Step]:
             found.append(Step(f"render the benchmark, {kind}", command, _rendered(*parts)))
         elif not rendered:
             continue
+        if kind == "nav" and _navigate_settings(one).stack.target == "pose":
+            # A pose is known over the landing area of the training only.
+            continue
         for folder in networks.values():
             task, run = ("detect", f"detect/{folder}") if kind == "detect" else ("navigate", f"navigate/{folder}-stack")
             out = one.runs / "benchmark" / folder
@@ -241,7 +244,7 @@ def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
     dataset = _dataset_settings(one)
     sets = tuple(f"{key}={value}" for key, value in one.settings.items())
     detect = resolve(DetectConfig, "detect", "perilune_train", one.preset, PROTOCOL, _of("detect", sets))
-    navigate = resolve(NavigateConfig, "navigate", "perilune_train", one.preset, PROTOCOL, _of("navigate", sets))
+    navigate = _navigate_settings(one)
     left = {step.title for step in plan if not step.done()}
     size = int(dataset["width_px"])
     found: dict[str, float] = {}
@@ -262,6 +265,11 @@ def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
             seconds = navigate_seconds(navigate.model_copy(update={"stack": own}))
             found[f"train {folder}"] = seconds * dataset["nav"] * (own.fine_epochs * (0.8 + 0.1 / 3) + 0.9 / 3)
     return found
+
+
+def _navigate_settings(one: Experiment) -> NavigateConfig:
+    sets = tuple(f"{key}={value}" for key, value in one.settings.items())
+    return resolve(NavigateConfig, "navigate", "perilune_train", one.preset, PROTOCOL, _of("navigate", sets))
 
 
 def _of(section: str, settings: tuple[str, ...]) -> tuple[str, ...]:

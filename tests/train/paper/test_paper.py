@@ -16,6 +16,7 @@ from perilune_train.cli import main
 from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.paper.detections import median_width_ratio, read_detections
 from perilune_train.paper.runs import DETECTORS, NAVIGATORS, PaperRuns
+from perilune_train.paper.tables import table_3
 from perilune_train.paper.verdicts import verdicts
 
 POSITION, ORIENTATION = "position_rmse_per_component_m", "orientation_rmse_per_component_deg"
@@ -143,6 +144,17 @@ def test_verdicts(runs):
     assert [a for claim, a in answers_of(runs).items() if claim.startswith("PCC")] == ["does not hold"] * 6
     write_metrics(PaperRuns(runs).explained, {})
     assert [a for claim, a in answers_of(runs).items() if claim.startswith("PCC")] == ["not measured"] * 6
+
+
+def test_a_navigator_that_loses_to_a_floor_is_named(runs):
+    own = navigator_metrics(3.0, 100.0) | {"evaluation/target": "pose", "evaluation/worse_than": "ridge"}
+    own |= {f"baseline/ridge/{key}": 2.0 for key in (POSITION, "position_rmse_vector_m", ORIENTATION)}
+    write_metrics(PaperRuns(runs).navigator("Darknet53-LSTM"), own)
+    lines = table_3(PaperRuns(runs))
+    (losing,) = (line for line in lines if "worse than" in line)
+    assert losing.startswith("| Darknet53-LSTM | here, worse than ridge | 3.000 |")
+    (floor,) = (line for line in lines if "ridge regression" in line)
+    assert "of Darknet53-LSTM | here | 2.000" in floor and sum("KLT" in line for line in lines) == 1
 
 
 def test_width_of_large_craters(runs, dataset):

@@ -41,7 +41,7 @@ def draw_learning(path: Path, runs: PaperRuns) -> None:
         for network, folder in own.items():
             values = learning_curve(folder, key)
             axes.plot(range(1, len(values) + 1), values, marker="o", label=network)
-        axes.set(xlabel="epoch", title=title)
+        axes.set(xlabel="validation", title=title)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
         axes.legend()
@@ -59,7 +59,7 @@ def draw_trajectory_errors(path: Path, runs: PaperRuns) -> None:
         for one, column in zip(axes, ("position_error_m", "orientation_error_deg"), strict=True):
             one.plot(first["step"], first[column], label=network)
     name = f"{first['scene_id'].iloc[0]}/{first['trajectory_id'].iloc[0]}"
-    for one, title in zip(axes, ("position error of a step (m)", "orientation error of a step (deg)"), strict=True):
+    for one, title in zip(axes, ("position error (m)", "orientation error (deg)"), strict=True):
         one.set(xlabel="step", title=f"{title}, {name}")
         one.grid(alpha=0.3)
         one.legend()

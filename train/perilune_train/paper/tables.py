@@ -3,6 +3,7 @@
 from perilune_train.evaluation.markdown import number, table
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.spread import read_spread
+from perilune_train.navigate.evaluate.floors import FLOORS
 from perilune_train.paper.claimed import DETECTION, NAVIGATION
 from perilune_train.paper.runs import PaperRuns
 
@@ -39,13 +40,14 @@ def table_3(runs: PaperRuns) -> list[str]:
         claimed = NAVIGATION[network]
         given = [f"{claimed['position_m']:g}", "-", f"{claimed['orientation_deg']:g}", f"{claimed['seconds']:g}"]
         rows.append([network, "paper", *given])
-        rows.append([network, "here", *_navigation(metrics, "test"), _seconds(metrics)])
+        here = (
+            f"here, worse than {metrics['evaluation/worse_than']}" if metrics.get("evaluation/worse_than") else "here"
+        )
+        rows.append([network, here, *_navigation(metrics, "test"), _seconds(metrics)])
         scored = runs.scored(network)
         if scored is not None:
             rows.append([network, "here, locked benchmark", *_navigation(scored, "stack"), _seconds(scored)])
-    baselines = next(iter(runs.navigation().values()))
-    for method, name in _WITHOUT_NETWORK.items():
-        rows.append([name, "here", *_navigation(baselines, f"baseline/{method}"), "-"])
+    rows += _floors(runs)
     return table(
         [
             "network",
@@ -57,6 +59,17 @@ def table_3(runs: PaperRuns) -> list[str]:
         ],
         rows,
     )
+
+
+def _floors(runs: PaperRuns) -> list[list[str]]:
+    """Rows of the methods beside the networks; ridge regression of each network's features, the others once."""
+    rows: dict[str, list[str]] = {}
+    for network, metrics in runs.navigation().items():
+        for method, name in (_WITHOUT_NETWORK | FLOORS).items():
+            if f"baseline/{method}/{_VECTOR}" in metrics:
+                title = f"{name} of {network}" if method == "ridge" else name
+                rows.setdefault(title, [title, "here", *_navigation(metrics, f"baseline/{method}"), "-"])
+    return list(rows.values())
 
 
 def _navigation(metrics: Metrics, prefix: str) -> list[str]:
