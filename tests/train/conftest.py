@@ -14,7 +14,7 @@ from perilune_train.navigate.train.run import navigate_run
 
 DRAWING = {
     "perilune_train.detect.evaluate.report": ("draw_bins", "draw_curves", "draw_frames"),
-    "perilune_train.navigate.evaluate.report": ("draw_trajectory", "draw_errors"),
+    "perilune_train.navigate.evaluate.report": ("draw_trajectory", "draw_errors", "draw_pose_errors"),
 }
 """Functions that write pictures, by the module that calls them."""
 

@@ -9,17 +9,20 @@ from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data.epochs import TrainingSequences
 from perilune_train.navigate.train import run
 from perilune_train.navigate.train.task import NavigationTask
+from perilune_train.navigate.train.windows import WindowPlaces
 from perilune_train.training import runs
 
 
 def main(dataset: Path, out: Path, name: str, settings: str, stop: str) -> None:
     seen: dict[str, list[tuple[int, ...]]] = {"stack": [], "warp": []}
     ended: dict[str, dict] = {}
-    load, step = TrainingSequences.__getitem__, NavigationTask.training_step
+    step = NavigationTask.training_step
+    loads = {"warp": TrainingSequences.__getitem__, "stack": WindowPlaces.__getitem__}
 
     def recorded(self, key):
-        seen["warp" if self.warp else "stack"].append(key)
-        return load(self, key)
+        fusion = "warp" if self.warp else "stack"
+        seen[fusion].append(key)
+        return loads[fusion](self, key)
 
     def stopped(self, batch, batch_idx):
         if stop == f"{self.fusion} {self.current_epoch}":
@@ -30,7 +33,8 @@ def main(dataset: Path, out: Path, name: str, settings: str, stop: str) -> None:
         figures = {key: value for key, value in self.trainer.callback_metrics.items() if key.startswith("val/")}
         ended[self.fusion] = {"seen": seen[self.fusion], "figures": figures, "state": self.state_dict()}
 
-    TrainingSequences.__getitem__ = recorded  # type: ignore[method-assign]
+    for own in (TrainingSequences, WindowPlaces):
+        own.__getitem__ = recorded  # type: ignore[method-assign]
     NavigationTask.training_step = stopped  # type: ignore[method-assign]
     NavigationTask.on_train_end = on_train_end  # type: ignore[method-assign]
     for drawing in ("draw_trajectory", "draw_errors"):

@@ -55,6 +55,8 @@ class Pairs:
     """True homographies (N, 3, 3) of the ground plane, from pixels of the earlier frame to those of the later one."""
     translation_m: NDArray[np.float64]
     """True translations (runs, pairs of a run, 3), metres, O_C of the earlier frame."""
+    position_m: NDArray[np.float64]
+    """True positions (runs, pairs of a run, 3) at the later frames, metres, O_L."""
     pair_ids: list[str]
     """Scene, trajectory and step of each pair, separated by "/"."""
     scene_ids: list[str]
@@ -117,9 +119,10 @@ def pairs_of_descent(descent: navigation.Trajectory, count: int) -> Pairs:
 
 def _pairs_of(runs: Sequence[tuple[navigation.Trajectory, int, int]]) -> Pairs:
     """Pairs of runs of equal length: trajectory, first step, number of pairs."""
-    images, homographies, translations, ids, scenes, heights = [], [], [], [], [], []
+    images, homographies, translations, positions, ids, scenes, heights = [], [], [], [], [], [], []
     for one, start, length in runs:
         translations.append(one.motion[0][start : start + length])
+        positions.append(one.pose[0][start : start + length])
         for step in range(start, start + length):
             images.append(np.concatenate([one.images[step], one.images[step + 1]]))
             poses = [(one.position_m[k], one.rotation_camera_from_site[k]) for k in (step, step + 1)]
@@ -127,7 +130,8 @@ def _pairs_of(runs: Sequence[tuple[navigation.Trajectory, int, int]]) -> Pairs:
             ids.append("/".join([*one.ids, str(step)]))
             scenes.append(one.ids[0])
             heights.append(float(one.position_m[step][2]))
-    return Pairs(np.stack(images), np.stack(homographies), np.stack(translations), ids, scenes, heights)
+    truths = np.stack(translations), np.stack(positions)
+    return Pairs(np.stack(images), np.stack(homographies), *truths, ids, scenes, heights)
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:

@@ -26,6 +26,7 @@ from perilune_train.explain.inputs import Pairs, evenly_spaced
 from perilune_train.explain.maps.baselines import baseline_maps
 from perilune_train.explain.maps.masks import Masks, navigator_masks, stacked_input
 from perilune_train.models.navigator import StackNavigator
+from perilune_train.navigate.network import build, target_of
 
 TASK = "navigate"
 
@@ -62,14 +63,15 @@ def explain_navigator(
     permutations = pair_permutations(masks, homographies, scenes, rng)
     differences = pd.concat([null_differences(values, {}, rng), permutations], ignore_index=True)
 
-    length = pairs.translation_m.shape[1]
-    runs = evenly_spaced(len(pairs.translation_m), max(1, settings.n_changed_pairs // length))
+    truth_m = pairs.position_m if target_of(architecture) == "pose" else pairs.translation_m
+    length = truth_m.shape[1]
+    runs = evenly_spaced(len(truth_m), max(1, settings.n_changed_pairs // length))
     changed = [length * run + k for run in runs for k in range(length)]
     images = pairs.images[changed]
     ids = pd.DataFrame({"frame_id": pairs.pair_ids, "scene_id": pairs.scene_ids}).iloc[changed].reset_index(drop=True)
     scales = architecture["scales"]
     measure = MotionPerformance(
-        navigator, pairs.translation_m[runs], np.array(scales["mean_m"]), np.array(scales["spread_m"]), size_px
+        navigator, truth_m[runs], np.array(scales["mean_m"]), np.array(scales["spread_m"]), size_px
     )
     gates = forced_gates(navigator.backbone, gate_means(known), images, measure, "force gates of the navigator")
     edge = f"edge/stage_{strongest[2]}"
@@ -98,10 +100,9 @@ def untrained_navigator(
     trained: StackNavigator, architecture: dict[str, Any], pairs: NDArray[np.uint8], seed: int
 ) -> StackNavigator:
     """A network of the same form with random weights; its batch statistics are measured on pairs (N, 2 h, w)."""
-    form = (architecture[key] for key in ("in_channels", "width", "attention", "hidden"))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = StackNavigator(*form)
+        network: Any = build(architecture)
     device = next(trained.parameters()).device
     network.to(device)
     first, second = stacked_input(pairs, architecture["size_px"])

@@ -1,4 +1,4 @@
-"""Two networks that estimate the motion between consecutive frames of a trajectory."""
+"""Two networks over pairs of consecutive frames of a trajectory: their motion, or the pose at the later frame."""
 
 import torch
 from torch import Tensor, nn
@@ -16,48 +16,107 @@ State = tuple[Tensor, Tensor]
 class Recurrent(nn.Module):
     """Two LSTM layers (as in DeepVO, Wang et al. 2017, doi 10.1109/ICRA.2017.7989236), then a linear layer to 9.
 
-    The linear layer starts at zero, so that an untrained network outputs the reference motion.
+    The last linear layer starts at zero, so that an untrained network outputs the reference motion. With `summary`, a
+    linear layer to that number of values comes before the LSTM. `dropout` acts on the LSTM's input and output.
 
     Shape: features (batch, pairs, inputs) to (batch, pairs, 9) and the state after the last pair. `state` is that after
     the pair before the first; None at the start of a trajectory.
     """
 
-    def __init__(self, inputs: int, hidden: int):
+    def __init__(self, inputs: int, hidden: int, summary: int | None = None, dropout: float = 0.0):
         super().__init__()
-        self.lstm = nn.LSTM(inputs, hidden, num_layers=2, batch_first=True)
+        self.summary = nn.Linear(inputs, summary) if summary else nn.Identity()
+        self.dropout = nn.Dropout(dropout)
+        self.lstm = nn.LSTM(summary or inputs, hidden, num_layers=2, batch_first=True)
         self.output = nn.Linear(hidden, OUTPUTS)
         nn.init.zeros_(self.output.weight)
         nn.init.zeros_(self.output.bias)
 
     def forward(self, features: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-        hidden, state = self.lstm(features, state)
-        return self.output(hidden).float(), state
+        return self.over_time(self.summary(features), state)
+
+    def over_time(self, summaries: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+        """`forward` from the outputs of `summary`, each of which depends on one pair only."""
+        hidden, state = self.lstm(self.dropout(summaries), state)
+        return self.output(self.dropout(hidden)).float(), state
 
 
 class StackNavigator(nn.Module):
     """The paper's network: the pair stacked in height, attention-Darknet53, global average pool, LSTM.
 
+    Deviations on request: `pool` > 1 averages over a grid of pool x pool cells of each frame and adds a linear layer to
+    at most 512 values; `stages` 4 leaves out the last stage; `standardised` subtracts the mean of each feature over the
+    training pairs and divides by its spread, which `measure` sets.
+
     Shape: earlier and later frames (batch, pairs, height, width), normalised, to (batch, pairs, 9) and the state of
     the LSTM.
     """
 
-    def __init__(self, in_channels: int, width: float, attention: Attention, hidden: int):
+    SUMMARY = 512
+    """Largest number of inputs of the LSTM behind a grid of cells."""
+    feature_mean: Tensor
+    feature_spread: Tensor
+
+    def __init__(
+        self,
+        in_channels: int,
+        width: float,
+        attention: Attention,
+        hidden: int,
+        *,
+        pool: int = 1,
+        stages: int = 5,
+        dropout: float = 0.0,
+        standardised: bool = False,
+    ):
         super().__init__()
-        self.in_channels = in_channels
-        self.backbone = AttentionDarknet53(in_channels, width, attention, stages=5)
-        self.recurrent = Recurrent(self.backbone.channels[-1], hidden)
+        self.in_channels, self.pool, self.standardised = in_channels, pool, standardised
+        self.backbone = AttentionDarknet53(in_channels, width, attention, stages=stages)
+        inputs = self.backbone.channels[-1] * (1 if pool == 1 else 2 * pool**2)
+        self.recurrent = Recurrent(inputs, hidden, None if pool == 1 else min(inputs, self.SUMMARY), dropout)
+        if standardised:
+            self.register_buffer("feature_mean", torch.zeros(inputs))
+            self.register_buffer("feature_spread", torch.ones(inputs))
 
     def stacked(self, first: Tensor, second: Tensor) -> Tensor:
         """The backbone's input (batch * pairs, in_channels, 2 height, width): the earlier frame above."""
         both = torch.cat([first, second], dim=2).flatten(0, 1)
         return both[:, None].expand(-1, self.in_channels, -1, -1).contiguous(memory_format=torch.channels_last)
 
+    def pooled(self, first: Tensor, second: Tensor) -> Tensor:
+        """The backbone's last features, averaged over the pair or over each cell (batch, pairs, inputs)."""
+        features = self.backbone(self.stacked(first, second))[-1]
+        grid = (1, 1) if self.pool == 1 else (2 * self.pool, self.pool)
+        return cell_means(features, *grid).flatten(1).unflatten(0, first.shape[:2])
+
     def features(self, first: Tensor, second: Tensor) -> Tensor:
-        """The backbone's last features, averaged over the pair (batch, pairs, channels)."""
-        return self.backbone(self.stacked(first, second))[-1].mean((2, 3)).unflatten(0, first.shape[:2])
+        """The recurrent part's input (batch, pairs, inputs)."""
+        return self.scaled(self.pooled(first, second))
+
+    def scaled(self, pooled: Tensor) -> Tensor:
+        """Averages (..., inputs), standardised if the network is."""
+        return (pooled - self.feature_mean) / self.feature_spread if self.standardised else pooled
+
+    def measure(self, pooled: Tensor) -> None:
+        """Set mean and spread of a standardised network to those of the averages (pairs, inputs) of training pairs."""
+        spread = pooled.std(0)
+        self.feature_mean.copy_(pooled.mean(0))
+        # Features that hardly vary would otherwise be amplified without limit.
+        self.feature_spread.copy_(spread.clamp(min=1e-6).maximum(0.1 * spread.mean()))
 
     def forward(self, first: Tensor, second: Tensor, state: State | None = None) -> tuple[Tensor, State]:
         return self.recurrent(self.features(first, second), state)
+
+
+def cell_means(features: Tensor, rows: int, columns: int) -> Tensor:
+    """Means of feature maps (N, C, H, W) over a grid of cells (N, C, rows, columns)."""
+    if rows == columns == 1:
+        return features.mean((2, 3), keepdim=True)
+    height, width = (int(size) for size in features.shape[2:])
+    if height % rows or width % columns:
+        return functional.adaptive_avg_pool2d(features, (rows, columns))
+    # Unlike adaptive pooling, the gradient of this is deterministic on a GPU.
+    return features.unflatten(3, (columns, -1)).unflatten(2, (rows, -1)).mean((3, 5))
 
 
 class WarpNavigator(nn.Module):

@@ -21,7 +21,7 @@ from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.metrics import motion_errors, summary, summary_spreads
 from perilune_train.navigate.evaluate.report import write_evaluation
 from perilune_train.navigate.evaluate_run import fusion_of
-from perilune_train.navigate.network import load_navigator, predict, predict_by_pairs
+from perilune_train.navigate.network import check_motion, load_navigator, predict, predict_by_pairs
 from perilune_train.training.runs import RunFolder, load_weights
 
 PAGE, FIGURES = "benchmark.md", "benchmark.json"
@@ -51,6 +51,7 @@ def score_navigator(run: Path, data: Address, manifests: Address, out: Path, all
     best = RunFolder(run).best
     content = load_weights(best)
     fusion = fusion_of(best, content["architecture"])
+    check_motion(best, content["architecture"])
     provenance = read_provenance(content, best)
     checks = [check_terrain(provenance, part.dataset, "test", allow_overlap) for part in parts]
     network, architecture = load_navigator(best, fusion)

@@ -13,6 +13,7 @@ from perilune_train.evaluation.marks import mark_files
 from perilune_train.evaluation.metrics_file import METRICS_FILE, Metrics, read_metrics
 from perilune_train.evaluation.spread import read_spread
 from perilune_train.navigate.evaluate.figures import draw_errors
+from perilune_train.navigate.evaluate.floors import FLOORS
 from perilune_train.navigate.evaluate.report import ERRORS_FILE
 
 _COLUMNS = {
@@ -29,9 +30,10 @@ _DRAWN = ["position_error_m", "orientation_error_deg", "error_x_m", "error_y_m",
 def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = False) -> str:
     """Write compare.md and errors.png into `out`; returns the table.
 
-    Each evaluation has one row for its network, and one for each method without training of the first evaluation of a
-    dataset and split. Raises UserError if a folder is no evaluation of navigation, or was evaluated on terrain that its
-    network was trained on, unless `allow_overlap`; then table and picture are marked.
+    Each evaluation has one row for its network, which names a network for poses, and one for each method without
+    training of the first evaluation of a dataset and split. Raises UserError if a folder is no evaluation of
+    navigation, or was evaluated on terrain that its network was trained on, unless `allow_overlap`; then table and
+    picture are marked.
     """
     rows, errors, marks, seen = [], {}, [], set()
     for folder in folders:
@@ -47,13 +49,15 @@ def compare_folders(folders: Sequence[Path], out: Path, allow_overlap: bool = Fa
         marks += [f"{name}: {mark}"] if mark else []
         where = [_text(metrics.get(key)) for key in ("dataset/name", "evaluation/split", "dataset/protocol")]
         where += [_text(metrics.get(f"{split}/pairs")), _text(metrics.get("terrain/status"))]
-        rows.append([f"{name} ({method})", *where, *_cells(metrics, split)])
+        target = metrics.get("evaluation/target", "motion")
+        label = method if target == "motion" else f"{method}, {target}"
+        rows.append([f"{name} ({label})", *where, *_cells(metrics, split)])
         own = _read_errors(folder / ERRORS_FILE)
         errors[name] = own[own["method"] == method]
-        for other in ("klt", "nominal", "mean_at_step", "mean"):
-            if tuple(where[:-1]) not in seen and f"baseline/{other}/position_rmse_vector_m" in metrics:
+        for other in ("klt", "nominal", "mean_at_step", "mean", *FLOORS):
+            if (target, *where[:-1]) not in seen and f"baseline/{other}/position_rmse_vector_m" in metrics:
                 rows.append([other, *where[:-1], "-", *_cells(metrics, f"baseline/{other}")])
-        seen.add(tuple(where[:-1]))
+        seen.add((target, *where[:-1]))
     head = ["run (network) or method", "dataset", "split", "protocol", "pairs", "terrain", *_COLUMNS.values()]
     text = "\n".join(table(head, rows)) + "\n"
     note = "In brackets: 95 % intervals, or the value of each unit if there are fewer than five."

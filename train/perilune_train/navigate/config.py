@@ -8,6 +8,8 @@ from pydantic import Field, model_validator
 from perilune_shared.config import Section
 from perilune_train.config import Attention, Count, Device, Positive, Precision
 
+Target = Literal["motion", "pose"]
+
 
 class FusionConfig(Section):
     """One network and its training."""
@@ -20,6 +22,16 @@ class FusionConfig(Section):
     """Attention after every residual unit."""
     hidden: Count
     """Hidden size of each of the two LSTM layers; the paper uses 1000."""
+    target: Target = "motion"
+    """What stack estimates. motion: the motion from the earlier to the later frame. pose: position and attitude of the
+    camera in O_L at the later frame, over the landing area of the training; the dataset must have one scene."""
+    pool: Literal[1, 2, 4] = 1
+    """Grid over which stack averages the backbone's features. 1: over the pair, as in the paper. 2 or 4: over so many
+    by so many cells of each frame, with a linear layer to at most 512 values before the LSTM."""
+    stages: Literal[4, 5] = 5
+    """Stages of the backbone of stack; the paper has 5. A detector with strides 4, 8, 16 has 4."""
+    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    """Share of the inputs and outputs of the LSTM of stack that a training step sets to 0."""
     sequence_pairs: Count = 16
     """Pairs of frames in a training sequence; the paper's value."""
     batch_sequences: Count = 8
@@ -28,11 +40,15 @@ class FusionConfig(Section):
     """Batches whose gradients are summed for a step. On little memory, batch_sequences=1 with accumulate=8 is the
     paper's batch, except that batch norms see one sequence at a time."""
     coarse_epochs: Annotated[int, Field(ge=0)]
-    """Epochs with the loss L^(S1). A backbone from a detector is frozen in them."""
+    """Epochs with the loss L^(S1). A backbone from a detector is frozen in them. If a detector gives all of it, its
+    features are computed once, and validation comes about ten times in the stage instead of after every epoch."""
     fine_epochs: Annotated[int, Field(ge=0)]
     """Epochs with the loss L^(S2), all weights trained."""
     learning_rate: Positive
     """Peak learning rate; the paper uses 1e-4."""
+    coarse_learning_rate: Positive | None = None
+    """Peak learning rate of the coarse stage, which then has a cosine of its own down to 0. None: that of both stages,
+    as `cycles` says."""
     cycles: Count = 1
     """Cosines of the learning rate. 1: one over both stages. More (the paper: 5): constant in the coarse stage, then
     this number of cosines, each from the peak down to 0, in the fine stage."""
@@ -99,4 +115,12 @@ class NavigateConfig(Section):
     def _can_stream(self) -> "NavigateConfig":
         if self.stream is not None and (self.fusion != "warp" or self.workers > 0):
             raise ValueError("fusion=warp and workers=0, since stream is given")
+        return self
+
+    @model_validator(mode="after")
+    def _only_stack(self) -> "NavigateConfig":
+        for name in ("target", "pool", "stages", "dropout"):
+            default = FusionConfig.model_fields[name].default
+            if getattr(self.warp, name) != default:
+                raise ValueError(f"warp.{name}={default}, since only stack has another")
         return self

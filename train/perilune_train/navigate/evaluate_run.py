@@ -1,19 +1,25 @@
 """Evaluate a finished navigation run on a split of any dataset."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from perilune_shared.dataset.manifest import open_single
+import numpy as np
+
+from perilune_shared.dataset.manifest import Dataset, open_single
 from perilune_shared.errors import UserError
 from perilune_shared.storage.store import Address
-from perilune_shared.terminal import progress_bar
-from perilune_train.evaluation.provenance import check_terrain, protocol_of, read_provenance
+from perilune_shared.terminal import console, progress_bar
+from perilune_train.evaluation.metrics_file import Metrics
+from perilune_train.evaluation.provenance import Provenance, check_terrain, protocol_of, read_provenance, split_terrain
 from perilune_train.navigate.covariance import stated_covariances
-from perilune_train.navigate.data.trajectories import Motion, Trajectory, load_split
+from perilune_train.navigate.data.trajectories import Motion, Pose, Trajectory, load_split
 from perilune_train.navigate.evaluate.baselines import baselines
-from perilune_train.navigate.evaluate.report import write_evaluation
-from perilune_train.navigate.network import Fusion, load_navigator, predict, predict_by_pairs
+from perilune_train.navigate.evaluate.floors import constant_pose
+from perilune_train.navigate.evaluate.report import write_evaluation, write_pose_evaluation
+from perilune_train.navigate.network import Fusion, Scales, load_navigator, predict, predict_by_pairs, target_of
+from perilune_train.navigate.pose import predict_pose, predict_pose_by_pairs
 from perilune_train.training.runs import RunFolder, load_weights
 
 
@@ -33,7 +39,12 @@ def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Pat
     terrain_check = check_terrain(read_provenance(content, best), dataset, split, allow_overlap)
     trajectories = load_split(dataset, split)
     network, architecture = load_navigator(best, fusion)
-    found, seconds = _predicted(network, architecture, trajectories)
+    if target_of(architecture) == "pose":
+        _check_area(best, read_provenance(content, best), dataset, split)
+        named: Metrics = {"dataset/name": dataset.info.name, "dataset/protocol": protocol_of(dataset.info)}
+        _evaluate_pose(network, architecture, split, trajectories, out, named | terrain_check.metrics())
+        return out
+    found, seconds = _timed(predict, network, architecture, trajectories)
     pairs = sum(trajectory.n_pairs for trajectory in trajectories)
     details = {
         f"{split}/pairs": pairs,
@@ -54,6 +65,34 @@ def evaluate_navigator(run: Path, dataset_address: Address, split: str, out: Pat
     return out
 
 
+def _check_area(path: Path, known: Provenance, dataset: Dataset, split: str) -> None:
+    """Raise UserError unless a split is over the landing area that a pose network was trained on."""
+    trained = {use.sha256 for use in known.uses if use.use == "trained"}
+    if trained and not {use.sha256 for use in split_terrain(dataset, split, "tested")} <= trained:
+        expected = f"the landing area of the training of {path}, which estimates poses over it only"
+        raise UserError(dataset.store, "terrain", "another one", expected)
+
+
+def _evaluate_pose(
+    network: Any, architecture: dict[str, Any], split: str, trajectories: list[Trajectory], out: Path, details: Metrics
+) -> None:
+    """Evaluate a pose network beside the mean pose of its training, the only floor that its checkpoint has."""
+    scales = Scales(**architecture["scales"])
+    poses, seconds = _timed(predict_pose, network, architecture, trajectories)
+    mean = np.array(scales.mean_m), np.array(scales.mean_rotation)
+    pairs = sum(trajectory.n_pairs for trajectory in trajectories)
+    _, by_pairs = predict_pose_by_pairs(network, architecture, trajectories[0])
+    own: Metrics = {
+        f"{split}/pairs": pairs,
+        f"{split}/ms_per_pair": round(1e3 * seconds / pairs, 2),
+        f"{split}/ms_per_single_pair": round(1e3 * by_pairs, 2),
+        "network/parameters": sum(p.numel() for p in network.parameters()),
+    }
+    methods = {"stack": poses, "mean_pose": [constant_pose(*mean, one.n_pairs) for one in trajectories]}
+    page = write_pose_evaluation(out, "stack", split, trajectories, methods, own | details)
+    console.print(page, markup=False)
+
+
 def fusion_of(path: Path, architecture: dict[str, Any]) -> Fusion:
     """Which network a checkpoint holds. Raises UserError if it is no navigator's."""
     fusion = architecture.get("fusion")
@@ -62,15 +101,18 @@ def fusion_of(path: Path, architecture: dict[str, Any]) -> Fusion:
     return fusion
 
 
-def _predicted(
-    network: Any, architecture: dict[str, Any], trajectories: list[Trajectory]
-) -> tuple[list[Motion], float]:
-    """Motions of all trajectories, and seconds."""
+def _timed(
+    predicted: Callable[[Any, dict[str, Any], Trajectory], Motion | Pose],
+    network: Any,
+    architecture: dict[str, Any],
+    trajectories: list[Trajectory],
+) -> tuple[list[Motion | Pose], float]:
+    """Motions or poses of all trajectories, and seconds."""
     started = time.monotonic()
     with progress_bar() as progress:
         task = progress.add_task("evaluate", total=len(trajectories), unit="trajectories", note="")
         found = []
         for trajectory in trajectories:
-            found.append(predict(network, architecture, trajectory))
+            found.append(predicted(network, architecture, trajectory))
             progress.advance(task)
     return found, time.monotonic() - started

@@ -97,3 +97,9 @@ def euler_from_rotation(rotation: Tensor) -> Tensor:
         ],
         dim=-1,
     )
+
+
+def mean_rotation(rotations: Array) -> Array:
+    """The rotation nearest to the mean of the matrices (Moakher 2002, doi 10.1137/S0895479801383877)."""
+    u, _, vt = np.linalg.svd(rotations.mean(0))
+    return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)

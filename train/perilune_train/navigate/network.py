@@ -10,11 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.models.navigator import StackNavigator, State, WarpNavigator
+from perilune_train.navigate.config import Target
 from perilune_train.navigate.data.sequences import Sequence, pair_sequence
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
-from perilune_train.navigate.geometry import euler_from_rotation, rotation_from_sixd
+from perilune_train.navigate.geometry import euler_from_rotation, mean_rotation, rotation_from_sixd
 from perilune_train.training.runs import check_architecture, load_state, load_weights
 
 Fusion = Literal["warp", "stack"]
@@ -22,23 +24,34 @@ Fusion = Literal["warp", "stack"]
 
 @dataclass(frozen=True, slots=True)
 class Scales:
-    """Scales that convert a network's standardised output to a motion.
+    """Scales that convert a network's standardised output to a motion, or to a pose (navigate/pose.py).
 
     stack: translation = mean_m + spread_m * y. warp: translation = nominal + spread_m * y. Both: rotation_c2_from_c1 =
     the rotation whose continuous representation is (1, 0, 0, 0, 1, 0) + rotation_rad * y; the nominal motion has no
-    rotation.
+    rotation. pose: position = mean_m + spread_m * y, and the rotation from the mean attitude to the attitude likewise.
     """
 
     mean_m: list[float]
-    """Mean translation of the training set, metres, O_C of the earlier frame (3,); zeros for warp."""
+    """Mean translation of the training set, metres, O_C of the earlier frame (3,); zeros for warp. pose: mean position,
+    O_L."""
     spread_m: list[float]
-    """Standard deviation of the translation about the mean (stack) or the nominal one (warp), metres (3,)."""
+    """Standard deviation of the translation about the mean (stack) or the nominal one (warp), metres (3,). pose: of the
+    position."""
     rotation_rad: float
-    """Root mean square of a motion's rotation about one axis, radians."""
+    """Root mean square of a motion's rotation about one axis, radians. pose: of the attitude about the mean one."""
+    mean_rotation: list[list[float]] | None = None
+    """pose: mean rotation_camera_from_site of the training set (3, 3)."""
 
     @classmethod
-    def measured(cls, trajectories: list[Trajectory], fusion: Fusion) -> "Scales":
+    def measured(cls, trajectories: list[Trajectory], fusion: Fusion, target: Target = "motion") -> "Scales":
         """Compute the scales of a training set."""
+        if target == "pose":
+            position, attitude = (np.concatenate([one.pose[i] for one in trajectories]) for i in range(2))
+            mean = mean_rotation(attitude)
+            spread_m = np.maximum(position.std(0), 1e-3).tolist()
+            turns = rotation_vectors(attitude @ mean.T)
+            rotation_rad = max(float(np.sqrt(np.mean(turns**2))), 1e-6)
+            return cls(position.mean(0).tolist(), spread_m, rotation_rad, mean.tolist())
         translation = np.concatenate([trajectory.motion[0] for trajectory in trajectories])
         rotation = rotation_vectors(np.concatenate([trajectory.motion[1] for trajectory in trajectories]))
         rotation_rad = max(float(np.sqrt(np.mean(rotation**2))), 1e-6)
@@ -54,11 +67,33 @@ def build(architecture: dict[str, Any]) -> StackNavigator | WarpNavigator:
     """Build the untrained network of an architecture."""
     a = architecture
     if a["fusion"] == "stack":
-        return StackNavigator(a["in_channels"], a["width"], a["attention"], a["hidden"])
+        return StackNavigator(
+            a["in_channels"],
+            a["width"],
+            a["attention"],
+            a["hidden"],
+            # Checkpoints of older versions have none of these.
+            pool=a.get("pool", 1),
+            stages=a.get("stages", 5),
+            dropout=a.get("dropout", 0.0),
+            standardised=target_of(a) == "pose",
+        )
     scales = a["scales"]
     return WarpNavigator(
         a["width"], a["attention"], a["hidden"], a["focal_over_width"], scales["spread_m"], scales["rotation_rad"]
     )
+
+
+def target_of(architecture: dict[str, Any]) -> Target:
+    """What a network estimates: the motion, or the pose in O_L."""
+    return architecture.get("target", "motion")
+
+
+def check_motion(path: Path, architecture: dict[str, Any]) -> None:
+    """Raise UserError unless a checkpoint's network estimates motions."""
+    if target_of(architecture) != "motion":
+        expected = "a network trained with target=motion; a pose is known over the landing area of the training only"
+        raise UserError(path, "target", target_of(architecture), expected)
 
 
 def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:

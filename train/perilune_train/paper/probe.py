@@ -33,7 +33,8 @@ def detect_seconds(config: DetectConfig, size_px: int) -> float:
 def navigate_seconds(config: NavigateConfig) -> float:
     """Seconds of a training pair of the paper's navigator, forward and backward, for square frames."""
     own = config.stack
-    network = StackNavigator(config.in_channels, own.width, own.attention, own.hidden)
+    form = config.in_channels, own.width, own.attention, own.hidden
+    network = StackNavigator(*form, pool=own.pool, stages=own.stages)
     device = choose_device(config.device)
     trained = network.to(device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     pairs = [torch.randn(1, _IMAGES, own.size_px, own.size_px, device=device) for _ in range(2)]

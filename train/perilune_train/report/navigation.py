@@ -11,6 +11,7 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_train.evaluation.markdown import number
 from perilune_train.evaluation.spread import read_spread
+from perilune_train.navigate.evaluate.floors import FLOORS
 from perilune_train.navigate.monte_carlo.summary import by_trajectory, run_summary
 from perilune_train.report.content import Figure, Provenance, Section, Table
 from perilune_train.report.pictures import COLOURS, DASHES, drawing, label_axes, logarithmic, picture_of, plain, svg_of
@@ -22,6 +23,12 @@ _ERRORS = (
 )  # fmt: skip
 _DRAWN = ("warp", "stack", "klt", "klt_gyroscope", "nominal")
 """Methods of the figures, beside those of the runs; the table has all."""
+_POSE = {
+    "position_rmse_vector_m": "position RMSE, vector (m)",
+    "position_rmse_per_component_m": "per component (m)",
+    "position_error_median_m": "median (m)",
+    "orientation_rmse_angle_deg": "orientation RMSE (deg)",
+}
 _BINS = 8
 _PERCENTILES = (5, 50, 95)
 _SCORED = ("position_rmse_vector_m", "position_rmse_m")
@@ -57,6 +64,12 @@ _METHOD_COLUMNS = {
 
 def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
     """Show the runs of navigation; `dataset` has the true positions for the trajectory, which is left out without."""
+    of_poses = [run for run in runs if run.metrics.get("evaluation/target") == "pose"]
+    leads = (*(headline(run) for run in runs), *_starts(runs))
+    tables, pictures = (_poses(of_poses),) if of_poses else (), [_pose_picture(run) for run in of_poses]
+    runs = [run for run in runs if run not in of_poses]
+    if not runs:
+        return Section("navigation", "Navigation", leads, tables, tuple(pictures))
     errors = {run.name: _read(run.folder / "errors.parquet", _ERRORS) for run in runs}
     joined = pd.concat([table.assign(run=name) for name, table in errors.items()], ignore_index=True)
     # Each run also evaluates the methods without a network; they are the same in all.
@@ -69,9 +82,9 @@ def navigation_section(runs: Sequence[Run], dataset: Dataset | None) -> Section:
     return Section(
         "navigation",
         "Navigation",
-        (*(headline(run) for run in runs), *_starts(runs)),
-        (_table(runs),),
-        tuple(figures),
+        leads,
+        (_table(runs), *tables),
+        (*figures, *pictures),
     )
 
 
@@ -81,6 +94,10 @@ def headline(run: Run) -> str:
         _spread(run, f"test/{key}") for key in ("position_rmse_vector_m", "orientation_rmse_angle_deg")
     )  # fmt: skip
     method = run.metrics.get("evaluation/method", run.name)
+    if run.metrics.get("evaluation/target") == "pose":
+        loses = run.metrics.get("evaluation/worse_than")
+        text = f"{run.name} ({method}): RMSE of the pose in the landing frame {position} m in position, {angle} degrees"
+        return f"{text}: worse than {loses}" if loses else text
     return f"{run.name} ({method}): RMSE of a step {position} m in position, {angle} degrees in orientation"
 
 
@@ -176,6 +193,23 @@ def _table(runs: Sequence[Run]) -> Table:
         "drift at the end (m)",
     )
     return Table("Motion between consecutive frames", head, tuple(rows), sources_of(runs))
+
+
+def _poses(runs: Sequence[Run]) -> Table:
+    """Errors of the poses in the landing frame, and of the floors of each run."""
+    rows = []
+    for run in runs:
+        loses = run.metrics.get("evaluation/worse_than")
+        prefixes = {"test": f"{run.name}, worse than {loses}" if loses else run.name}
+        known = [name for name in FLOORS if f"baseline/{name}/position_rmse_vector_m" in run.metrics]
+        prefixes |= {f"baseline/{name}": FLOORS[name] for name in known}
+        rows += [(name, *(_spread(run, f"{prefix}/{key}") for key in _POSE)) for prefix, name in prefixes.items()]
+    return Table("Pose in the landing frame", ("method", *_POSE.values()), tuple(rows), sources_of(runs))
+
+
+def _pose_picture(run: Run) -> Figure:
+    caption = f"{run.name}: errors of the position in the landing frame, by component, and their distribution."
+    return Figure(picture_of(run.folder / "errors.png", caption), caption, sources_of([run]), wide=True)
 
 
 def _trajectory(

@@ -65,7 +65,7 @@ class KeepBest(Callback):
 
 
 class KeepLast(Callback):
-    """Save the whole state after every epoch and, with `minutes`, within an epoch at this interval.
+    """Save the whole state after every validated epoch and, with `minutes`, within an epoch at this interval.
 
     If a run is resumed within an epoch, also calls the task's `on_train_epoch_start`, which Lightning then skips.
     """
@@ -103,7 +103,9 @@ class KeepLast(Callback):
                 self.save(trainer)
 
     def on_train_epoch_end(self, trainer, pl_module) -> None:
-        self.save(trainer)
+        # A task with many short epochs validates and saves after some of them only.
+        if (trainer.current_epoch + 1) % trainer.check_val_every_n_epoch == 0:
+            self.save(trainer)
 
     def on_exception(self, trainer, pl_module, exception) -> None:
         # Loaders raise it between two batches, when the state is whole. Several processes cannot save, since the

@@ -1,4 +1,4 @@
-"""Effect of removed craters on the motion that the stack navigator estimates."""
+"""Effect of removed craters on the motion or pose that the stack navigator estimates."""
 
 from collections import Counter
 from typing import Any
@@ -10,8 +10,9 @@ from perilune_shared.dataset.manifest import Dataset
 from perilune_shared.errors import UserError
 from perilune_train.data.frames import frame_table
 from perilune_train.models.navigator import StackNavigator
-from perilune_train.navigate.data.trajectories import Trajectory, load_split
-from perilune_train.navigate.network import predict
+from perilune_train.navigate.data.trajectories import load_split
+from perilune_train.navigate.network import predict, target_of
+from perilune_train.navigate.pose import predict_pose
 
 _TRAJECTORY = ["scene_id", "trajectory_id"]
 
@@ -27,11 +28,13 @@ def pose_effects(
     """
     check_descents(factual, counterfactual, split)
     originals = {one.ids: one for one in load_split(factual, split)}
-    tables = []
+    of_pose, tables = target_of(architecture) == "pose", []
+    predicted = predict_pose if of_pose else predict
     for changed in load_split(counterfactual, split):
         original = originals[changed.ids]
-        estimates = [predict(navigator, architecture, one)[0] for one in (original, changed)]
-        before, after = (_errors(one, original) for one in estimates)
+        estimates = [predicted(navigator, architecture, one)[0] for one in (original, changed)]
+        truth_m = original.pose[0] if of_pose else original.motion[0]
+        before, after = (np.linalg.norm(one - truth_m, axis=1) for one in estimates)
         steps = ["/".join([*changed.ids, str(step)]) for step in range(changed.n_pairs)]
         moved = np.linalg.norm(estimates[1] - estimates[0], axis=1)
         columns = {"frame_id": steps, "scene_id": changed.ids[0], "before": before, "after": after, "moved_m": moved}
@@ -49,7 +52,3 @@ def check_descents(factual: Dataset, counterfactual: Dataset, split: str) -> Non
             found = f"{count} frames of {trajectory}"
             expected = "all frames of a trajectory of the dataset; render with --frames-per-trajectory 1000"
             raise UserError(counterfactual.store, "frames", found, expected)
-
-
-def _errors(translation_m: np.ndarray, trajectory: Trajectory) -> np.ndarray:
-    return np.asarray(np.linalg.norm(translation_m - trajectory.motion[0], axis=1))

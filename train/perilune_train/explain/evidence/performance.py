@@ -53,22 +53,22 @@ class MotionPerformance:
 
     navigator: StackNavigator
     """The network, in evaluation mode."""
-    translation_m: Values
-    """True translations (runs, pairs, 3), metres, O_C of the earlier frame."""
+    truth_m: Values
+    """True translations, O_C of the earlier frame, or positions, O_L, (runs, pairs, 3), metres."""
     mean_m: Values
-    """Mean translation of the training set (3,), metres."""
+    """Their mean over the training set (3,), metres."""
     spread_m: Values
-    """Standard deviation of the translations of the training set (3,), metres."""
+    """Their standard deviation over the training set (3,), metres."""
     size_px: int
     """Width of the network's frames."""
 
     def __call__(self, images: NDArray[np.uint8]) -> Values:
         """Position error (n,), metres, of n = runs * pairs stacked pairs (n, 2 height, width)."""
-        runs, pairs = self.translation_m.shape[:2]
+        runs, pairs = self.truth_m.shape[:2]
         first, second = stacked_input(images, self.size_px)
         device = next(self.navigator.parameters()).device
         halves = [torch.from_numpy(half).unflatten(0, (runs, pairs)).to(device) for half in (first, second)]
         with torch.no_grad():
             output = torch.cat([self.navigator(*(half[k : k + 1] for half in halves))[0] for k in range(runs)])
         found = self.mean_m + self.spread_m * output[..., :3].double().cpu().numpy()
-        return np.linalg.norm(found - self.translation_m, axis=-1).ravel()
+        return np.linalg.norm(found - self.truth_m, axis=-1).ravel()

@@ -74,8 +74,9 @@ class DetectorTarget(nn.Module):
 class NavigatorTarget(nn.Module):
     """Norm of the stack navigator's translation output for pairs stacked in height, the earlier frame above.
 
-    The output is in spreads about the mean translation (navigate/network.py:Scales). Each pair is treated as the first
-    of a trajectory: the LSTM's state is zero. The network must be in evaluation mode.
+    A network for poses outputs positions instead. The output is in spreads about its mean
+    (navigate/network.py:Scales). Each pair is treated as the first of a trajectory: the LSTM's state is zero. The
+    network must be in evaluation mode.
     """
 
     def __init__(self, network: StackNavigator):
@@ -89,7 +90,7 @@ class NavigatorTarget(nn.Module):
 
     @property
     def last_layer(self) -> nn.Module:
-        return last_of_stage(self.backbone, len(UNITS))
+        return last_of_stage(self.backbone, len(self.backbone.channels))
 
     def fixed(self, grey: Tensor) -> tuple[Tensor, ...]:
         return ()

@@ -27,7 +27,8 @@ def evaluate(
     """Evaluate a run's best weights together with KLT tracks and the nominal motion.
 
     Writes metrics.json, navigation.parquet (one row per method), errors.parquet (one row per pair), descent.png and
-    errors.png.
+    errors.png. A run for poses (navigate.stack.target=pose) is evaluated over the landing area of its training, beside
+    the mean pose, with pose.md in place of descent.png.
     """
     if split not in SPLITS:
         raise UserError("--split", "split", split, "one of " + ", ".join(SPLITS))
@@ -36,4 +37,4 @@ def evaluate(
 
     default = run / "evaluation" if run else Path("runs/evaluation", "lander-navigator")
     folder = evaluate_navigator(run or shipped_run("navigate"), dataset, split, out or default, allow_overlap)
-    console.print(f"{folder}: metrics.json, navigation.parquet, errors.parquet, descent.png, errors.png")
+    console.print(f"{folder}: metrics.json, navigation.parquet, errors.parquet, errors.png")

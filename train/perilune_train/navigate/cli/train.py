@@ -28,7 +28,8 @@ def train(
 
     Writes runs/navigate/<name>/ (fusion warp) and runs/navigate/<name>-stack/ (fusion stack, the paper's network), each
     with config.yaml, checkpoints/best.ckpt and last.ckpt, metrics.json, navigation.parquet (one row per method),
-    errors.parquet (one row per pair), descent.png, errors.png and TensorBoard events. The stack network is initialised
+    errors.parquet (one row per pair), descent.png, errors.png and TensorBoard events. With navigate.stack.target=pose
+    the stack run has pose.md (the table) in place of descent.png. The stack network is initialised
     with the backbone of runs/detect/<name>, if that has the same architecture. The same command resumes an interrupted
     run and leaves finished ones unchanged; --overwrite replaces them.
     """
@@ -40,4 +41,4 @@ def train(
     detector = runs / "detect" / name / "checkpoints" / "best.ckpt"
     address = dataset or Path("data", preset, "nav")
     for run in navigate_run(settings, address, runs, name, detector, overwrite, allow_overlap):
-        console.print(f"{run.root}: metrics.json, navigation.parquet, descent.png, errors.png")
+        console.print(f"{run.root}: metrics.json, navigation.parquet, errors.png")

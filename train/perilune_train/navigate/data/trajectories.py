@@ -22,6 +22,8 @@ from perilune_train.navigate.geometry import relative_poses
 
 Motion = tuple[Array, Array]
 """translation_m (n - 1, 3) in O_C of the earlier frame and rotation_c2_from_c1 (n - 1, 3, 3) of one trajectory."""
+Pose = tuple[Array, Array]
+"""position_m (n - 1, 3) in O_L and rotation_camera_from_site (n - 1, 3, 3) at the later frame of each pair."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,11 @@ class Trajectory:
     def motion(self) -> Motion:
         """True motions: translation_m (n - 1, 3) and rotation_c2_from_c1 (n - 1, 3, 3)."""
         return relative_poses(self.position_m, self.rotation_camera_from_site)
+
+    @property
+    def pose(self) -> Pose:
+        """True poses at the later frame of each pair: position_m (n - 1, 3) and rotation_camera_from_site."""
+        return self.position_m[1:], self.rotation_camera_from_site[1:]
 
     @property
     def nominal_motion(self) -> Motion:

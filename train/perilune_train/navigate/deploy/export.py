@@ -22,7 +22,7 @@ from perilune_train.navigate.data.trajectories import load_split
 from perilune_train.navigate.deploy.flight_navigator import INPUTS, OUTPUTS, FlightNavigator
 from perilune_train.navigate.deploy.readme import readme
 from perilune_train.navigate.evaluate_run import fusion_of
-from perilune_train.navigate.network import Fusion, load_navigator
+from perilune_train.navigate.network import Fusion, check_motion, load_navigator
 from perilune_train.training.runs import RunFolder, load_weights
 
 ONNX, METADATA, README = "navigator.onnx", "navigator.json", "README.md"
@@ -64,6 +64,7 @@ def export_navigator(root: Path, out: Path, dataset: Address | None = None) -> f
     best = RunFolder(root).best
     content = load_weights(best)
     fusion = fusion_of(best, content["architecture"])
+    check_motion(best, content["architecture"])
     network, architecture = load_navigator(best, fusion)
     pairs, camera = _pairs(architecture, fusion, dataset)
     focal = camera.fx_px / camera.width_px

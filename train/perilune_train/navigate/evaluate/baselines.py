@@ -8,6 +8,7 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.terminal import progress_bar
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
+from perilune_train.navigate.geometry import mean_rotation
 from perilune_train.navigate.relative.descent import aligned_trajectory
 from perilune_train.navigate.relative.estimate import EstimatedMotion
 from perilune_train.navigate.relative.klt import klt_trajectory
@@ -56,7 +57,7 @@ def baselines(training: list[Trajectory], test: list[Trajectory]) -> Baselines:
 def mean_motion(training: list[Trajectory], trajectory: Trajectory) -> Motion:
     """The training set's mean motion, for every pair of the trajectory."""
     translation = np.concatenate([one.motion[0] for one in training]).mean(0)
-    rotation = _mean_rotation(np.concatenate([one.motion[1] for one in training]))
+    rotation = mean_rotation(np.concatenate([one.motion[1] for one in training]))
     return np.tile(translation, (trajectory.n_pairs, 1)), np.tile(rotation, (trajectory.n_pairs, 1, 1))
 
 
@@ -71,11 +72,5 @@ def mean_motion_at_step(training: list[Trajectory], trajectory: Trajectory) -> M
             if one.n_pairs > min(step, longest - 1)
         ]
         translations.append(np.mean([t for t, _ in motions], axis=0))
-        rotations.append(_mean_rotation(np.stack([r for _, r in motions])))
+        rotations.append(mean_rotation(np.stack([r for _, r in motions])))
     return np.stack(translations), np.stack(rotations)
-
-
-def _mean_rotation(rotations: Array) -> Array:
-    """The rotation nearest to the mean of the matrices (Moakher 2002, doi 10.1137/S0895479801383877)."""
-    u, _, vt = np.linalg.svd(rotations.mean(0))
-    return u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt

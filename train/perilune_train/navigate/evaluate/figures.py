@@ -21,6 +21,9 @@ COLOURS = {
     "nominal": "tab:gray",
     "mean_at_step": "tab:orange",
     "mean": "tab:brown",
+    "mean_pose": "tab:brown",
+    "mean_pose_at_frame": "tab:orange",
+    "ridge": "tab:green",
 }
 
 
@@ -58,6 +61,32 @@ def draw_trajectory(
     frame.set_title(f"frame 0 of {'/'.join(trajectory.ids)}, {true[0, 2]:.0f} m")
     frame.axis("off")
     side.legend()
+    save_figure(path, figure)
+
+
+def draw_pose_errors(path: Path, errors: dict[str, pd.DataFrame], own: str) -> None:
+    """Draw errors of the position in O_L along the test trajectories, by component, and their distribution.
+
+    Lines are root mean squares over the trajectories at each step; thin ones are single trajectories of the method
+    `own`.
+    """
+    figure = Figure(figsize=(16, 9), layout="constrained")
+    axes = figure.subplots(2, 2).ravel()
+    for axis, name in zip(axes, "xyz", strict=False):
+        column = f"error_{name}_m"
+        for _, single in errors[own].groupby(["scene_id", "trajectory_id"]):
+            axis.plot(single["step"], single[column].abs(), color=COLOURS[own], linewidth=0.5, alpha=0.5)
+        for method, table in errors.items():
+            of_step = np.sqrt(table.assign(squared=table[column] ** 2).groupby("step")["squared"].mean())
+            axis.plot(of_step.index, of_step, color=COLOURS[method], label=method)
+        axis.set_yscale("log")
+        _label(axis, f"position error along {name} of O_L", "step", "error (m)")
+    for method, table in errors.items():
+        values = np.sort(table["position_error_m"])
+        axes[3].plot(values, np.arange(1, len(values) + 1) / len(values), color=COLOURS[method], label=method)
+    axes[3].set_xscale("log")
+    _label(axes[3], "position error", "length of the error vector (m)", "fraction of pairs below")
+    axes[3].legend()
     save_figure(path, figure)
 
 

@@ -1,12 +1,17 @@
-"""Errors of estimated motions, and their summary."""
+"""Errors of estimated motions and poses, and their summary."""
+
+import itertools
 
 import numpy as np
 import pandas as pd
 
 from perilune_shared.geometry.frames import Array, rotation_vectors
 from perilune_train.evaluation.spread import Resamples, Spread, draw_resamples, spreads
-from perilune_train.navigate.data.trajectories import Motion, Trajectory
+from perilune_train.navigate.data.trajectories import Motion, Pose, Trajectory
 from perilune_train.navigate.geometry import dead_reckoning
+
+_ALTITUDES_M = (0, 200, 400, 800, 1200, 1600, 100_000)
+"""Limits of the bands of altitude of poses."""
 
 
 def motion_errors(
@@ -48,6 +53,43 @@ def motion_errors(
     return pd.concat(tables, ignore_index=True)
 
 
+def pose_errors(trajectories: list[Trajectory], poses: list[Pose]) -> pd.DataFrame:
+    """Errors of the pose in O_L at the later frame of each pair; one row per pair.
+
+    Columns as those of `motion_errors` without drift. Components of the position error are along O_L, and altitude_m is
+    the nominal altitude at the later frame.
+    """
+    tables = []
+    for trajectory, (position_m, rotation) in zip(trajectories, poses, strict=True):
+        true_position_m, true_rotation = trajectory.pose
+        shift = position_m - true_position_m
+        turn = np.degrees(rotation_vectors(rotation @ np.swapaxes(true_rotation, 1, 2)))
+        columns = {
+            "scene_id": trajectory.ids[0],
+            "trajectory_id": trajectory.ids[1],
+            "step": np.arange(trajectory.n_pairs),
+            "altitude_m": trajectory.nominal_position_m[1:, 2],
+            "position_error_m": np.linalg.norm(shift, axis=1),
+            "orientation_error_deg": np.linalg.norm(turn, axis=1),
+        }
+        for i, axis in enumerate("xyz"):
+            columns |= {f"error_{axis}_m": shift[:, i], f"error_{axis}_deg": turn[:, i]}
+        tables.append(pd.DataFrame(columns))
+    return pd.concat(tables, ignore_index=True)
+
+
+def pose_summary(errors: pd.DataFrame) -> dict[str, float]:
+    """`summary` of poses, with the medians of the lengths of both errors, and the position by altitude."""
+    figures = summary(errors)
+    figures["position_error_median_m"] = float(errors["position_error_m"].median())
+    figures["orientation_error_median_deg"] = float(errors["orientation_error_deg"].median())
+    for low, high in itertools.pairwise(_ALTITUDES_M):
+        own = errors[(errors["altitude_m"] >= low) & (errors["altitude_m"] < high)]
+        if len(own):
+            figures[f"altitude_{low}_{high}_m/position_rmse_per_component_m"] = _rms(own["position_error_m"]) / 3**0.5
+    return figures
+
+
 def normalised_errors(trajectory: Trajectory, motion: Motion, covariance: Array) -> Array:
     """Squared errors of rotation and shift together, divided by their covariance (n - 1, 6, 6): 6 in the mean if right.
 
@@ -68,14 +110,16 @@ def signed_errors(trajectory: Trajectory, motion: Motion) -> Array:
 def summary(errors: pd.DataFrame) -> dict[str, float]:
     """Root mean squares over all pairs of all trajectories; drift (length) over all frames and at the last frames.
 
+    Poses have no drift.
+
     Each RMSE has two forms (`squared_errors`) and is also given by axis. docs/reference/metrics.md has the formulas.
     """
-    ends = errors.groupby(["scene_id", "trajectory_id"])["drift_m"].last()
     figures = {key: float(np.sqrt(np.mean(values))) for key, values in squared_errors(errors).items()}
     figures |= {f"position_rmse_{axis}_m": _rms(errors[f"error_{axis}_m"]) for axis in "xyz"}
     figures |= {f"orientation_rmse_{axis}_deg": _rms(errors[f"error_{axis}_deg"]) for axis in "xyz"}
-    figures["drift_rms_m"] = _rms(errors["drift_m"])
-    figures["drift_final_m"] = _rms(ends)
+    if "drift_m" in errors:
+        figures["drift_rms_m"] = _rms(errors["drift_m"])
+        figures["drift_final_m"] = _rms(errors.groupby(["scene_id", "trajectory_id"])["drift_m"].last())
     if "normalised_error_squared" in errors:
         figures["stated_position_rmse_vector_m"] = _rms(errors["stated_error_m"])
         figures["normalised_error_squared_mean"] = float(errors["normalised_error_squared"].mean())

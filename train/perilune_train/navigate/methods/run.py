@@ -27,7 +27,7 @@ from perilune_train.navigate.methods.absolute import absolute_errors, absolute_s
 from perilune_train.navigate.methods.figures import draw_by_altitude, draw_flights, draw_matches
 from perilune_train.navigate.methods.page import page_of
 from perilune_train.navigate.methods.seen import SeenDescent, seen_descents
-from perilune_train.navigate.network import load_navigator, predict
+from perilune_train.navigate.network import check_motion, load_navigator, predict
 from perilune_train.training.begin import hashes_of
 from perilune_train.training.runs import RunFolder, load_weights
 
@@ -57,6 +57,7 @@ def fly_methods(
     best = {name: RunFolder(run).best for name, run in (("navigator", navigator), ("detector", detector))}
     contents = {name: load_weights(path) for name, path in best.items()}
     fusion = fusion_of(best["navigator"], contents["navigator"]["architecture"])
+    check_motion(best["navigator"], contents["navigator"]["architecture"])
     checks = [
         check_terrain(read_provenance(contents[name], path), dataset, split, allow_overlap)
         for name, path in best.items()

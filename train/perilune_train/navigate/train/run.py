@@ -12,6 +12,7 @@ from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
 from perilune_train.data.shares import Share
+from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.provenance import (
     Provenance,
     check_terrain,
@@ -26,6 +27,7 @@ from perilune_train.navigate.data.trajectories import Trajectory, load_trajector
 from perilune_train.navigate.evaluate.baselines import baselines
 from perilune_train.navigate.evaluate.report import write_evaluation
 from perilune_train.navigate.network import Fusion, Scales, load_navigator, predict, predict_by_pairs
+from perilune_train.navigate.train.pose_results import check_one_area, evaluate_pose_run
 from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.shipped.models import weights_file
 from perilune_train.training.begin import hashes_of, start_run, state_of
@@ -74,6 +76,8 @@ def navigate_run(
     if set(states.values()) == {"finished"}:
         return list(folders.values())
     opened = open_single(dataset_address)
+    if "stack" in fusions and settings.stack.target == "pose":
+        check_one_area(opened)
     own = training_provenance(opened)
     start = _start_of_warp(settings) if "warp" in fusions else None
     of_start = [] if start is None else [read_provenance(start, weights_file(str(settings.init_from)))]
@@ -84,6 +88,7 @@ def navigate_run(
     stream = Stream(settings.stream, opened) if settings.stream is not None else None
     trajectories = load_trajectories(opened, share)
     seconds: dict[Fusion, float] = {}
+    tasks: dict[Fusion, NavigationTask] = {}
     # Train all before any is evaluated, so that the other processes do not wait for the first.
     for fusion, run in folders.items():
         if states[fusion] != "finished":
@@ -95,9 +100,36 @@ def navigate_run(
             else:
                 task = _warp_task(settings, trajectories, share, stream, start)
             task.provenance = terrain[fusion]
+            tasks[fusion] = task
             seconds[fusion] = _train(run, task, resume)
     if not is_first_process():
         return list(folders.values())
+    common: dict[Fusion, Metrics] = {
+        fusion: {
+            "train/seconds": round(spent, 1),
+            "dataset/name": opened.info.name,
+            "network/backbone": source if fusion == "stack" else f"from {settings.init_from or 'scratch'}",
+            "dataset/protocol": protocol_of(opened.info),
+            **terrain_check.metrics(),
+        }
+        for fusion, spent in seconds.items()
+    }
+    # Errors of poses are not those of motions, so no table has both.
+    of_motions = {fusion: run for fusion, run in folders.items() if getattr(settings, fusion).target == "motion"}
+    if "stack" in tasks and "stack" not in of_motions:
+        evaluate_pose_run(folders["stack"], tasks["stack"], trajectories, backbone, common["stack"])
+    if of_motions:
+        _evaluate_motions(of_motions, trajectories, common)
+    return list(folders.values())
+
+
+def _evaluate_motions(
+    folders: dict[Fusion, RunFolder], trajectories: list[Trajectory], common: dict[Fusion, Metrics]
+) -> None:
+    """Evaluate networks for motion beside the methods without training; write the tables of the trained ones.
+
+    `common` has those entries of the metrics of each trained run that need no evaluation.
+    """
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)
     motions, covariances = classical.motions, classical.covariances
@@ -106,28 +138,23 @@ def navigate_run(
         network, architecture = load_navigator(run.best, fusion)
         started = time.monotonic()
         motions = {fusion: [predict(network, architecture, trajectory) for trajectory in test], **motions}
-        if fusion == "warp" and fusion in seconds:
+        if fusion == "warp" and fusion in common:
             chosen_on = [trajectory for trajectory in trajectories if trajectory.split == "val"]
             calibrate(run.root, network, architecture, chosen_on)
         stated = stated_covariances(run.root, network, architecture, test)
         if stated is not None:
             covariances = {fusion: stated, **covariances}
-        if fusion not in seconds:
+        if fusion not in common:
             continue
         pairs = sum(trajectory.n_pairs for trajectory in test)
         details = {
-            "train/seconds": round(seconds[fusion], 1),
             "test/pairs": pairs,
             "test/ms_per_pair": round(1e3 * (time.monotonic() - started) / pairs, 2),
             "test/ms_per_single_pair": round(1e3 * predict_by_pairs(network, architecture, test[0])[1], 2),
-            "dataset/name": opened.info.name,
             "network/parameters": sum(p.numel() for p in network.parameters()),
-            "network/backbone": source if fusion == "stack" else f"from {settings.init_from or 'scratch'}",
-            "dataset/protocol": protocol_of(opened.info),
-            **terrain_check.metrics(),
+            **common[fusion],
         }
         write_evaluation(run.root, fusion, "test", test, motions, covariances, details)
-    return list(folders.values())
 
 
 def _start_of_warp(settings: NavigateConfig) -> dict[str, Any] | None:
@@ -206,6 +233,7 @@ def _detector_backbone(
     weights = content["state_dict"].items()
     state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
     stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)
-    source = f"stages 1 to {stages} of 5 from {path}"
+    own = settings.stack.stages
+    source = f"stages 1 to {min(stages, own)} of {own} from {path}"
     console.print(f"stack: backbone {source}")
     return state, source, [read_provenance(content, path)]

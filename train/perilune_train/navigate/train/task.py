@@ -1,6 +1,7 @@
 """Training of the navigation networks."""
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 import lightning
@@ -18,8 +19,8 @@ from perilune_train.navigate.data.epochs import TrainingSequences
 from perilune_train.navigate.data.sequences import Jitter
 from perilune_train.navigate.data.stream import Stream
 from perilune_train.navigate.data.streamed import StreamedSequences
-from perilune_train.navigate.data.trajectories import Motion, Trajectory, own_trajectories
-from perilune_train.navigate.evaluate.metrics import motion_errors, summary
+from perilune_train.navigate.data.trajectories import Motion, Pose, Trajectory, own_trajectories
+from perilune_train.navigate.evaluate.metrics import motion_errors, pose_errors, summary
 from perilune_train.navigate.geometry import euler_from_rotation
 from perilune_train.navigate.network import (
     Batch,
@@ -31,14 +32,32 @@ from perilune_train.navigate.network import (
     network_output,
     predict,
 )
+from perilune_train.navigate.pose import predict_pose
 from perilune_train.navigate.train.stored import stored_features
+from perilune_train.navigate.train.windows import WindowPlaces, Windows, collated
 from perilune_train.training.runs import choose_bf16, choose_device
 
+_OF_STACK = ("target", "pool", "stages", "dropout", "sequence_pairs")
+"""Settings in the architecture of a stack network."""
+_VALIDATIONS = 10
+"""About so many validations of a coarse stage on stored features, whose epochs take a second or less."""
+_WARM_STEPS = 50
 
-def learning_rate_factor(step: int, coarse_steps: int, fine_steps: int, cycles: int) -> float:
-    """Factor on the learning rate: a short warm-up, then the cosines that `FusionConfig.cycles` describes."""
+
+def learning_rate_factor(
+    step: int, coarse_steps: int, fine_steps: int, cycles: int, coarse: float | None = None
+) -> float:
+    """Factor on the learning rate: a short warm-up, then the cosines that `FusionConfig.cycles` describes.
+
+    With `coarse`, the factor at the peak of the coarse stage, each stage has a warm-up and cosines of its own.
+    """
+    if coarse is not None:
+        if step < coarse_steps:
+            return coarse * learning_rate_factor(step, 0, coarse_steps, 1)
+        fine_step = step - coarse_steps
+        return min((fine_step + 1) / _WARM_STEPS, learning_rate_factor(fine_step, 0, fine_steps, cycles))
     total = max(1, coarse_steps + fine_steps)
-    warm = (step + 1) / max(1, min(50, total // 10))
+    warm = (step + 1) / max(1, min(_WARM_STEPS, total // 10))
     done = min(step / total, 1.0)
     if cycles > 1:
         turns = cycles * (step - coarse_steps) / max(1, fine_steps)
@@ -54,7 +73,8 @@ class NavigationTask(lightning.LightningModule):
     s_p, s_phi. Deviations: means over the pairs instead of sums; one cosine instead of five cycles, unless
     `cycles` is 5; warp's pairs are mirrored and jittered (see data/sequences.py).
 
-    In the coarse stage a stack network whose whole backbone is given computes the backbone's features once.
+    In the coarse stage a stack network whose whole backbone is given computes the backbone's features once. The target
+    `pose` replaces the motion by the pose in O_L at the later frame; P is then the position.
     """
 
     def __init__(
@@ -71,7 +91,8 @@ class NavigationTask(lightning.LightningModule):
         self.settings, self.fusion, self.stream = settings, fusion, stream
         self.own: FusionConfig = getattr(settings, fusion)
         # Initial weights predict motions on the scales of their own training.
-        self.scales = scales or Scales.measured([one for one in trajectories if one.split == "train"], fusion)
+        training = [one for one in trajectories if one.split == "train"]
+        self.scales = scales or Scales.measured(training, fusion, self.own.target)
         self.architecture = {
             "fusion": fusion,
             "size_px": self.own.size_px,
@@ -80,12 +101,10 @@ class NavigationTask(lightning.LightningModule):
             "hidden": self.own.hidden,
             "in_channels": settings.in_channels if fusion == "stack" else WarpNavigator.CHANNELS,
             "focal_over_width": trajectories[0].camera.fx_px / trajectories[0].camera.width_px,
-            "scales": {
-                "mean_m": self.scales.mean_m,
-                "spread_m": self.scales.spread_m,
-                "rotation_rad": self.scales.rotation_rad,
-            },
+            "scales": {key: value for key, value in asdict(self.scales).items() if value is not None},
         }
+        if fusion == "stack":
+            self.architecture |= {key: getattr(self.own, key) for key in _OF_STACK}
         network: Any = build(self.architecture)
         self.network = network.to(memory_format=torch.channels_last)
         self.pretrained = frozenset(pretrained or ())
@@ -94,11 +113,12 @@ class NavigationTask(lightning.LightningModule):
         self.provenance: Provenance | None = None
         self.log_weights = nn.Parameter(torch.zeros(2))
         self.share = share
-        self.training_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "train"]
+        self.training_trajectories = [one.shrunk(self.own.size_px) for one in training]
         self.validation_trajectories = [one.shrunk(self.own.size_px) for one in trajectories if one.split == "val"]
         given = {name for name, _ in self.network.backbone.named_parameters()} <= self.pretrained
         self.stores = fusion == "stack" and given and self.own.coarse_epochs > 0
         self.stored: dict[str, list[Tensor]] = {}
+        self.windows: Windows | None = None
         self.resumed = (0, 0)
         self.validated = own_trajectories("val", len(self.validation_trajectories), share)
         jitter, scales = self.own.jitter, self.scales
@@ -137,6 +157,8 @@ class NavigationTask(lightning.LightningModule):
             "share": self.share,
         }
         place = self.training_trajectories, self.own.sequence_pairs
+        if self.fusion == "stack":
+            return WindowPlaces(*place, **own)
         if self.stream is None:
             return TrainingSequences(*place, **own)
         return StreamedSequences(self.stream, self.own.size_px, *place, **own)
@@ -148,6 +170,9 @@ class NavigationTask(lightning.LightningModule):
         start = done if epoch == resumed_epoch else 0
         batches = EpochBatches(self.sequences.keys, self.sequences.fewest, self.own.batch_sequences, epoch, start)
         pinned = choose_device(self.settings.device) == "cuda"
+        if self.fusion == "stack":
+            # Workers would have nothing to prepare.
+            return batch_loader(self.sequences, batches, collated, 0, pinned)
         return batch_loader(self.sequences, batches, Collate(self.scales, self.fusion), self.settings.workers, pinned)
 
     def val_dataloader(self) -> DataLoader:
@@ -155,6 +180,8 @@ class NavigationTask(lightning.LightningModule):
         return DataLoader(own, batch_size=None)  # type: ignore[arg-type]
 
     def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        if isinstance(batch, Tensor):
+            return batch.to(device, non_blocking=True)
         # In validation a batch is a trajectory; `predict` moves it.
         return batch.to(device) if isinstance(batch, Batch) else batch
 
@@ -176,42 +203,70 @@ class NavigationTask(lightning.LightningModule):
         for name, module in self.network.backbone.named_modules():
             if isinstance(module, nn.BatchNorm2d):
                 module.train(not (self.coarse and f"{name}.weight" in self.pretrained))
-        if self.coarse and self.stores and not self.stored:
-            own = [self.validation_trajectories[number] for number in self.validated]
-            for split, trajectories in (("train", self.training_trajectories), ("val", own)):
-                bf16 = choose_bf16(self.settings.precision, self.device.type)
-                self.stored[split] = stored_features(self.network, trajectories, self.device, bf16)
+        if self.fusion == "stack" and self.windows is None:
+            numbers = list(self.share.of(len(self.training_trajectories)))
+            place = self.training_trajectories, numbers, self.sequences.n_pairs
+            self.windows = Windows(*place, self.scales, self.own.target, self.device)
+        stores, last = self.coarse and self.stores, self.current_epoch + 1 == self.own.coarse_epochs
+        if stores and not self.stored:
+            self._store()
+        # Lightning reads it after the last batch of every epoch.
+        often = not stores or last
+        self.trainer.check_val_every_n_epoch = 1 if often else max(1, self.own.coarse_epochs // _VALIDATIONS)
 
-    def _output(self, batch: Batch) -> tuple[Tensor, Tensor | None]:
-        if self.coarse and self.stores:
-            n_pairs, stored = batch.first.shape[1], self.stored["train"]
-            places = batch.place.tolist()
-            features = torch.stack([stored[number][start : start + n_pairs] for number, start in places])
-            return self.network.recurrent(features.to(self.device))[0], None
-        return network_output(self.network, batch)[:2]
+    def _store(self) -> None:
+        """Compute the features of the frozen backbone."""
+        training = [self.training_trajectories[number] for number in self.share.of(len(self.training_trajectories))]
+        validation = [self.validation_trajectories[number] for number in self.validated]
+        bf16 = choose_bf16(self.settings.precision, self.device.type)
+        pooled = [stored_features(self.network, own, self.device, bf16) for own in (training, validation)]
+        if self.network.standardised:
+            self.network.measure(torch.cat(pooled[0]))
+        train, val = ([self.network.scaled(one) for one in own] for own in pooled)
+        self.stored = {"train": [torch.cat(train)], "val": val}
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        output, flow_px = self._output(batch)
+    def _loss(self, output: Tensor, true_position: Tensor, true_angles: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of the stage, and its parts."""
         found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
-        position = (output[..., :3] - batch.translation).square().sum(-1).mean()
-        orientation = (found - batch.angles).square().sum(-1).mean()
+        position = (output[..., :3] - true_position).square().sum(-1).mean()
+        orientation = (found - true_angles).square().sum(-1).mean()
         if self.coarse:
             loss = position + self.settings.kappa * orientation
         else:
             weighted = torch.stack([position, orientation]) * torch.exp(-self.log_weights)
             loss = (weighted + self.log_weights).sum()
+        return loss, {"train/position": position, "train/orientation": orientation}
+
+    def training_step(self, batch: Batch | Tensor, batch_idx: int) -> Tensor:
+        if isinstance(batch, Tensor):
+            return self._stack_step(batch, batch_idx)
+        output, flow_px, _ = network_output(self.network, batch)
+        loss, parts = self._loss(output, batch.translation, batch.angles)
         if flow_px is not None and batch.flow_px is not None:
             flow_error = (flow_px - batch.flow_px).square().sum(-1).add(1e-4).sqrt().mean()
             self.log("train/flow_px", flow_error, batch_size=len(batch.first))
             loss = loss + self.settings.flow_weight * flow_error
-        self.log_dict(
-            {"train/loss": loss, "train/position": position, "train/orientation": orientation},
-            batch_size=len(batch.first),
-        )
+        self.log_dict({"train/loss": loss, **parts}, batch_size=len(batch.first))
+        return loss
+
+    def _stack_step(self, places: Tensor, batch_idx: int) -> Tensor:
+        """The step of a stack network on the sequences at some places (see `Windows`)."""
+        assert self.windows is not None
+        if self.own.dropout:
+            # A resumed run has the same dropout.
+            place = [self.settings.seed, self.current_epoch, batch_idx, self.share.process]
+            torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0]))
+        pairs = self.windows.pairs(places)
+        if self.coarse and self.stores:
+            output, _ = self.network.recurrent(self.stored["train"][0][pairs])
+        else:
+            output, _ = self.network(*self.windows.pictures(places))
+        loss, parts = self._loss(output, self.windows.position[pairs], self.windows.angles[pairs])
+        self.log_dict({"train/loss": loss, **parts}, batch_size=len(places))
         return loss
 
     def on_validation_epoch_start(self) -> None:
-        self.validation_motions: list[Motion] = []
+        self.validation_motions: list[Motion | Pose] = []
         if self.share.processes > 1:
             # Weights are equal in all processes; batch statistics differ, and those of the first process are used.
             for value in self.network.buffers():
@@ -219,7 +274,8 @@ class NavigationTask(lightning.LightningModule):
 
     def validation_step(self, batch: Trajectory, batch_idx: int) -> None:
         features = self.stored["val"][batch_idx] if self.coarse and self.stores else None
-        self.validation_motions.append(predict(self.network, self.architecture, batch, features))
+        predicted = predict_pose if self.own.target == "pose" else predict
+        self.validation_motions.append(predicted(self.network, self.architecture, batch, features))
 
     def on_validation_epoch_end(self) -> None:
         motions, processes, count = self.validation_motions, self.share.processes, len(self.validation_trajectories)
@@ -227,8 +283,8 @@ class NavigationTask(lightning.LightningModule):
             parts: list[Any] = [None] * processes
             torch.distributed.all_gather_object(parts, motions)
             motions = [parts[i % processes][i // processes] for i in range(count)]
-        errors = motion_errors(self.validation_trajectories, motions)
-        figures = summary(errors)
+        errors = pose_errors if self.own.target == "pose" else motion_errors
+        figures = summary(errors(self.validation_trajectories, motions))
         for key in ("position_rmse_vector_m", "orientation_rmse_angle_deg"):
             self.log(f"val/{key}", figures[key], batch_size=1)
 
@@ -241,10 +297,10 @@ class NavigationTask(lightning.LightningModule):
                 {"params": [self.log_weights], "lr": 1e-2, "weight_decay": 0.0},
             ]
         )
+        own = self.own
+        coarse = own.coarse_learning_rate and own.coarse_learning_rate / own.learning_rate
+        stages = own.coarse_epochs * steps, own.fine_epochs * steps
         schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer,
-            lambda step: learning_rate_factor(
-                step, self.own.coarse_epochs * steps, self.own.fine_epochs * steps, self.own.cycles
-            ),
+            optimizer, lambda step: learning_rate_factor(step, *stages, own.cycles, coarse)
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
