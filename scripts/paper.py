@@ -86,8 +86,10 @@ class Sizes:
     """Coarse epochs of the navigators; an epoch has about 30 steps."""
     fine_epochs: int
     """Fine epochs of the navigators in the reading of the paper."""
+    renderings: int = 1
+    """Renderings at once beside the trainings."""
     render_workers: int | None = None
-    """Processes that render; None for the command's default."""
+    """Processes of each rendering; None for the command's default."""
     trainings: int = 1
     """Trainings at once, beside the rendering; 1 runs one step after another."""
     benchmark_scenes: int = 0
@@ -111,6 +113,9 @@ _GPU = {
     "detect.validate_every": "6",
     "detect.workers": "0",
     "navigate.workers": "0",
+    # Two navigators and three detectors at once need 60 GB so.
+    "navigate.stack.batch_sequences": "4",
+    "navigate.stack.accumulate": "2",
 }
 PARTS = {
     Part.WHOLE: Sizes(
@@ -137,8 +142,9 @@ PARTS = {
         half_width=0.5,
         seeds=(0, 1, 2),
         coarse_epochs=104,
-        fine_epochs=10,
-        render_workers=13,
+        fine_epochs=8,
+        renderings=2,
+        render_workers=7,
         trainings=5,
         settings=_GPU,
     ),
@@ -633,7 +639,8 @@ def run_all(one: Experiment, expected: dict[str, float], deadline: float) -> Non
             if not late:
                 for step in ready:
                     lane = [each for each in running if each.step.renders == step.renders or not together]
-                    if len(lane) < (one.sizes.trainings if together and not step.renders else 1):
+                    most = one.sizes.renderings if step.renders else one.sizes.trainings
+                    if len(lane) < (most if together else 1):
                         running += _start(one, step, together, began, expected)
                         if callable(step.command) or not together:
                             break

@@ -167,7 +167,7 @@ def step(script, title, code, done, needs=(), **more):
 
 
 def test_steps_run_together_in_their_order_and_stop_in_time(script, tmp_path, monkeypatch):
-    """Frames beside trainings, never two renderings; at the deadline the page is made of what is done."""
+    """Frames beside trainings, never three renderings; at the deadline the page is made of what is done."""
     monkeypatch.chdir(tmp_path)
     one = experiment(script, part=script.Part.GPU)
     mark = "import pathlib, time; pathlib.Path({!r}).touch(); time.sleep({}); pathlib.Path({!r}).touch()"
@@ -178,7 +178,8 @@ def test_steps_run_together_in_their_order_and_stop_in_time(script, tmp_path, mo
 
     plan = [
         of("frames", 0.3, renders=True),
-        of("more", 0.1, renders=True),
+        of("more", 0.3, renders=True),
+        of("third", 0.1, renders=True),
         of("network", 0.1, ("frames",)),
         of("late", 60, ("network",)),
         step(script, "broken", "raise SystemExit(3)", lambda: False),
@@ -187,10 +188,14 @@ def test_steps_run_together_in_their_order_and_stop_in_time(script, tmp_path, mo
     ]
     monkeypatch.setattr(script, "steps", lambda _: plan)
     script.run_all(one, {}, script.time.monotonic() + 4)
-    assert all(Path(name).is_file() for name in ("frames", "more", "network", "late-begun", "page"))
+    assert all(Path(name).is_file() for name in ("frames", "third", "network", "late-begun", "page"))
     assert not Path("late").is_file() and not Path("never-begun").exists()
-    begun = {name: Path(f"{name}-begun").stat().st_mtime for name in ("frames", "more", "network")}
-    assert begun["more"] >= Path("frames").stat().st_mtime and begun["network"] >= Path("frames").stat().st_mtime
+    begun, ended = (
+        {name: Path(name + end).stat().st_mtime for name in ("frames", "more", "third", "network")}
+        for end in ("-begun", "")
+    )
+    assert begun["network"] >= ended["frames"] and begun["third"] >= min(ended["frames"], ended["more"])
+    assert begun["more"] < ended["frames"], "beside"
 
 
 def test_a_failed_step_ends_the_experiment_with_its_code(script, tmp_path, monkeypatch):
