@@ -3,7 +3,7 @@
 # are ready. Leaves at most eight files of 16 MiB in OUT.
 #
 #   scripts/paper_gpu.sh wheels                fetch into .wheels what a bare machine lacks (Python 3.12, own torch)
-#   MINUTES=8 OUT=out scripts/paper_gpu.sh     run; PRESET=tiny is a trial, on the processor too
+#   MINUTES=8 OUT=out scripts/paper_gpu.sh     run; PRESET=tiny is a trial, on the processor too; CALIBRATE=1 chooses the ground
 #
 # On a machine without packages of this project, the folder .wheels is installed beside, and the code is used in place.
 set -euo pipefail
@@ -28,6 +28,6 @@ export PYTHONPATH="${site:+$site:}$PWD/shared:$PWD/render:$PWD/train${PYTHONPATH
 part=gpu
 [ "$preset" = tiny ] && runs=runs/paper-tiny || runs=runs/paper-gpu
 # What is done by then is packed, whatever happened.
-"$python" scripts/paper.py --preset "$preset" --part $part --calibrate --minutes "$minutes" || code=$?
+"$python" scripts/paper.py --preset "$preset" --part $part ${CALIBRATE:+--calibrate} --minutes "$minutes" || code=$?
 "$python" scripts/paper_files.py pack "$runs" "$out"
 exit "${code:-0}"
