@@ -142,10 +142,9 @@ PARTS = {
         half_width=0.5,
         seeds=(0, 1, 2),
         coarse_epochs=104,
-        fine_epochs=8,
-        renderings=2,
-        render_workers=7,
-        trainings=5,
+        fine_epochs=6,
+        render_workers=14,
+        trainings=4,
         settings=_GPU,
     ),
     Part.FULL: Sizes(

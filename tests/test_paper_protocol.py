@@ -5,6 +5,7 @@ import itertools
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -169,6 +170,8 @@ def step(script, title, code, done, needs=(), **more):
 def test_steps_run_together_in_their_order_and_stop_in_time(script, tmp_path, monkeypatch):
     """Frames beside trainings, never three renderings; at the deadline the page is made of what is done."""
     monkeypatch.chdir(tmp_path)
+    sizes = replace(script.PARTS[script.Part.GPU], renderings=2, trainings=3)
+    monkeypatch.setitem(script.PARTS, script.Part.GPU, sizes)
     one = experiment(script, part=script.Part.GPU)
     mark = "import pathlib, time; pathlib.Path({!r}).touch(); time.sleep({}); pathlib.Path({!r}).touch()"
 
