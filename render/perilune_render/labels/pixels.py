@@ -78,7 +78,9 @@ class Rims(NamedTuple):
     """Sines of the angles (M,)."""
 
 
-def rim_shares(rims: Rims, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth: Array) -> Array:
+def rim_shares(
+    rims: Rims, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth: np.ndarray
+) -> Array:
     """Share (N,) of the points of rims that an image without distortion shows, given its depth (h, w), metres.
 
     The same as `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside`, to the bit, in one loop.
