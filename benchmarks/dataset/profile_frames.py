@@ -34,9 +34,9 @@ PREPARATION = {
 """Steps for each scene."""
 FRAME = {
     "rays, shadow rays, shading": "perilune_render.heightfield.engine.see",
-    "photometry": "perilune_render.heightfield.engine.reflectance_factor",
+    "photometry": "perilune_render.heightfield.engine.reflected",
     "random numbers of the samples": "perilune_render.heightfield.engine.HeightfieldEngine._drawn",
-    "points of the Sun's disc": "perilune_render.heightfield.engine.HeightfieldEngine._disc",
+    "points of the Sun's disc": "perilune_render.heightfield.engine.disc_places",
     "sensor": "perilune_render.frame_source.FrameSource.develop",
     "PNG": "perilune_render.dataset.frame_files.png_bytes",
     "write and hash files": "perilune_render.dataset.trajectory.write_frame",

@@ -1,4 +1,5 @@
-"""Where the rays of a block of pixels begin: the height above which none of them can hit anything.
+"""Where the rays of a block of pixels begin, the height above which none of them can hit anything, and the part of the
+mesh below.
 
 A raster of squares has the largest height of the ground and its boulders, in levels of 1, 2, 4 ... squares. The rays of
 a block of pixels fill a pyramid. It is followed downwards, layer after layer: as long as the ground and the boulders
@@ -135,3 +136,38 @@ def begin_m(tops, ground, origin, basis, u0, u1, v0, v1):
         else:
             z, layer = min(z, found), layer / 2
     return z + _MARGIN_M
+
+
+@njit(**WITHOUT_COUNTS)
+def only_part(ground, origin, basis, u0, u1, v0, v1, begin):
+    """Part of the mesh that has the whole way of all rays of `begin_m` from the height `begin` to below the ground.
+
+    0 for the inner square, 1 to 4 for the sectors, -1 if there are several, or if the ways are not known.
+    """
+    if begin > min(ground.highest_m, origin[2]):
+        return -1
+    x_low, x_high, y_low, y_high = np.inf, -np.inf, np.inf, -np.inf
+    for k in range(4):
+        u, v = u0 if k & 1 == 0 else u1, v0 if k & 2 == 0 else v1
+        dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
+        if dz > _LEAST_FALL:
+            return -1
+        for height in (begin - origin[2], ground.lowest_m - origin[2]):
+            x = origin[0] + height * ((u * basis[0, 0] + v * basis[1, 0] + basis[2, 0]) / dz)
+            y = origin[1] + height * ((u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]) / dz)
+            x_low, x_high, y_low, y_high = min(x_low, x), max(x_high, x), min(y_low, y), max(y_high, y)
+    x_low, x_high, y_low, y_high = x_low - _MARGIN_M, x_high + _MARGIN_M, y_low - _MARGIN_M, y_high + _MARGIN_M
+    half, outer = ground.half_widths_m[0], ground.half_widths_m[-1]
+    x_far, y_far = max(-x_low, x_high), max(-y_low, y_high)
+    if max(x_far, y_far) < half:
+        return 0
+    if max(x_far, y_far) < outer:
+        if -y_high > max(half, x_far):
+            return 1
+        if x_low > max(half, y_far):
+            return 2
+        if y_low > max(half, x_far):
+            return 3
+        if -x_high > max(half, y_far):
+            return 4
+    return -1

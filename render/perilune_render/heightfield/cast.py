@@ -370,3 +370,22 @@ def first_hit(ground, rocks, horizon, ox, oy, oz, dx, dy, dz, t0, t1, skip):
                 return found
         start = end
     return np.inf, -1, -1, -1, -1, -1, -1
+
+
+@njit(**INLINED)
+def first_hit_in_part(ground, rocks, part, ox, oy, oz, dx, dy, dz, t0, t1):
+    """As `first_hit` without horizon for a ray whose way from t0 to the lowest ground is in one part of the mesh.
+
+    It leaves out the tests of the parts' borders. The ray falls, and begins below the highest ground.
+    """
+    skip = -1, -1, -1, -1, -1
+    t1 = min(t1, (ground.lowest_m - oz) / dz)
+    if part == 0:
+        return _walk_inner(ground, rocks, None, ox, oy, oz, dx, dy, dz, t0, t1, skip)
+    return _walk_sector(ground, rocks, None, part - 1, ox, oy, oz, dx, dy, dz, t0, t1, skip)
+
+
+@njit(**WITHOUT_COUNTS)
+def first_hit_anywhere(ground, rocks, ox, oy, oz, dx, dy, dz, t0, t1):
+    """As `first_hit` for a ray from above the ground, compiled apart, since it is rarely called in an image."""
+    return first_hit(ground, rocks, None, ox, oy, oz, dx, dy, dz, t0, t1, (-1, -1, -1, -1, -1))

@@ -12,9 +12,9 @@ import numpy as np
 from perilune_render.config import DatasetConfig
 from perilune_render.heightfield.beam import tops_of
 from perilune_render.heightfield.horizon import NOWHERE, Horizon, horizon_of
+from perilune_render.heightfield.light import disc_places, reflected
 from perilune_render.heightfield.shade import see
 from perilune_render.heightfield.surface import Surface, surface_of
-from perilune_render.imaging.photometry import reflectance_factor
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.streams import stream
 from perilune_render.sub_poses import Pose, RowPoses
@@ -123,12 +123,11 @@ class HeightfieldEngine:
         def cast(first: tuple[int, int]) -> None:
             last_row = min(first[0] + tile_rows, rows.stop)
             tile = slice(first[0], last_row), slice(first[1], first[1] + _TILE_PX)
-            places, suns = moved[:, *tile], self._disc(disc[:, *tile])
+            places, suns = moved[:, *tile], disc_places(disc[:, *tile], self._disc_rad)
             angles = np.empty((5, *places.shape[:3]), np.float32)
             light = horizon, origin, basis, self.sun, plane
             see(ground, rocks, self.tops, *light, self._far_m, first, places, suns, found.depth_m, found.normal, angles)
-            mu0, mu, cos_phase, albedo, lit = angles
-            seen = (reflectance_factor(self._law, mu0, mu, cos_phase) * albedo * lit).mean(axis=0)
+            seen = reflected(self._law, angles).mean(axis=0)
             found.radiance_factor[tile], found.sunlit[tile] = seen, seen > _LIT
 
         tile_rows = max(_RAYS_AT_ONCE // (_TILE_PX * self._samples), 1)
@@ -139,12 +138,6 @@ class HeightfieldEngine:
             return
         for each in firsts:
             cast(each)
-
-    def _disc(self, drawn: np.ndarray) -> np.ndarray:
-        """Uniform places (..., 2) on the Sun's disc at unit distance, for uniform random numbers (..., 2)."""
-        radius, angle = self._disc_rad * np.sqrt(drawn[..., 0]), np.float32(2 * np.pi) * drawn[..., 1]
-        length = np.tan(radius)
-        return np.stack([length * np.cos(angle), length * np.sin(angle)], axis=-1)
 
     def _horizon_now(self) -> Horizon:
         """The horizon for a frame; `NOWHERE` as long as it costs less. Frames are the same with any horizon."""

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from perilune_render.heightfield.beam import BLOCK_PX, begin_m
-from perilune_render.heightfield.cast import any_ring_at, first_hit
+from perilune_render.heightfield.beam import BLOCK_PX, begin_m, only_part
+from perilune_render.heightfield.cast import any_ring_at, first_hit, first_hit_anywhere, first_hit_in_part
 from perilune_render.heightfield.horizon import surely_lit
 from perilune_render.heightfield.prefetch import prefetch
 from perilune_render.heightfield.surface import INLINED, WITHOUT_COUNTS, place_of, ring_vertex, vertex
@@ -113,9 +113,10 @@ def rock_normal(rocks, k, face):
 
 
 @njit(**INLINED)
-def _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out):
+def _see(ground, rocks, horizon, view, drawn, begin, below, first, s, i, j, out):
     """Cast the ray of one sample, which begins at the height `begin`, and its shadow ray; see `see`.
 
+    `below` is the part of the mesh below the ray, -1 if it is not known (`only_part`).
     Returns the height of the hit, or `begin` if there is none.
     """
     (origin, basis, sun, plane, far_m), (moved, disc), (depth, normal, angles) = view, drawn, out
@@ -124,9 +125,12 @@ def _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out):
     dy = u * basis[0, 1] + v * basis[1, 1] + basis[2, 1]
     dz = u * basis[0, 2] + v * basis[1, 2] + basis[2, 2]
     start = max((begin - origin[2]) / dz, 0.0) if begin < np.inf else 0.0
-    t, rock, face, part, row, column, triangle = first_hit(
-        ground, rocks, None, origin[0], origin[1], origin[2], dx, dy, dz, start, far_m, (-1, -1, -1, -1, -1)
-    )
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    if below >= 0:
+        hit = first_hit_in_part(ground, rocks, below, ox, oy, oz, dx, dy, dz, start, far_m)
+    else:
+        hit = first_hit_anywhere(ground, rocks, ox, oy, oz, dx, dy, dz, start, far_m)
+    t, rock, face, part, row, column, triangle = hit
     nx, ny, nz, albedo, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     x, y, z = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
     hit_z = z if t < np.inf else begin
@@ -219,8 +223,11 @@ def see(ground, rocks, tops, horizon, origin, basis, sun, plane, far_m, first, m
         for column in range(0, width, BLOCK_PX):
             last_row, last_column = min(row + BLOCK_PX, height), min(column + BLOCK_PX, width)
             u, v = first[1] + column, first[0] + row
-            begin = begin_m(tops, ground, origin, basis, u, u + last_column - column, v, v + last_row - row)
+            last_u, last_v = u + last_column - column, v + last_row - row
+            begin = begin_m(tops, ground, origin, basis, u, last_u, v, last_v)
+            below = -1
             if begin < np.inf:
+                below = only_part(ground, origin, basis, u, last_u, v, last_v, begin)
                 # Close rays hit at similar heights, so the last hit says where memory will be read.
                 for i in range(row, last_row):
                     for j in range(column, last_column):
@@ -234,4 +241,4 @@ def see(ground, rocks, tops, horizon, origin, basis, sun, plane, far_m, first, m
             for i in range(row, last_row):
                 for j in range(column, last_column):
                     for s in range(n_samples):
-                        near_m = _see(ground, rocks, horizon, view, drawn, begin, first, s, i, j, out)
+                        near_m = _see(ground, rocks, horizon, view, drawn, begin, below, first, s, i, j, out)

@@ -5,6 +5,8 @@ phase angle. The reflectance factor is the radiance over that of a perfectly dif
 Multiplied by mu0 it is the radiance factor I/F, the radiance over that of the plate lit from the zenith. The phase
 angle equals i + e in the principal plane only.
 
+`perilune_render.heightfield.light` has a compiled copy of Hapke's law; a test compares the bits.
+
 Use: `radiance_factor("hapke_highland", mu0, mu, cos_phase)`. The functions use only arithmetic and NumPy's ufuncs, so
 that `perilune_render.blender.nodes` can call them with symbols and build shader nodes from the same code. Sources:
 docs/reference/sources.md.
@@ -12,13 +14,14 @@ docs/reference/sources.md.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 Law = Callable[[Any, Any, Any], Any]
 
-_LEAST_SINE_SQUARED = 1e-7
+LEAST_SINE_SQUARED = 1e-7
 """Prevents division by 0 at i = 0 and e = 0, also in float32; the roughness terms already vanish at larger angles."""
 
 
@@ -86,8 +89,7 @@ def roughness(theta_bar_deg: float, mu0: Any, mu: Any, cos_phase: Any) -> tuple[
     case, and S / (mu0 mue) is the same in both. The formulas are those of Hapke's book of 2012, chapter 12. In this
     form S exceeds 1 at grazing angles, by at most 7 percent up to 85 degrees.
     """
-    slope = float(np.tan(np.radians(theta_bar_deg)))
-    chi = float(1 / np.sqrt(1 + np.pi * slope**2))
+    slope, chi = slope_of(theta_bar_deg), chi_of(theta_bar_deg)
     # Cosine of the larger angle, and of the smaller.
     cos_l, cos_s = np.minimum(mu0, mu), np.maximum(mu0, mu)
     sin_l, e1_l, e2_l = _slopes(slope, cos_l)
@@ -110,9 +112,19 @@ def roughness(theta_bar_deg: float, mu0: Any, mu: Any, cos_phase: Any) -> tuple[
     return larger * chi, smaller * chi, shadowing
 
 
+def slope_of(theta_bar_deg: float) -> float:
+    """Tangent of the mean slope."""
+    return float(np.tan(np.radians(theta_bar_deg)))
+
+
+def chi_of(theta_bar_deg: float) -> float:
+    """Hapke's chi: effective cosine of a vertical ray."""
+    return float(1 / np.sqrt(1 + np.pi * slope_of(theta_bar_deg) ** 2))
+
+
 def _slopes(slope: float, cosine: Any) -> tuple[Any, Any, Any]:
     """Sine of an angle, and Hapke's E1 and E2."""
-    sine = np.sqrt(np.maximum(cosine * cosine * -1 + 1, _LEAST_SINE_SQUARED))
+    sine = np.sqrt(np.maximum(cosine * cosine * -1 + 1, LEAST_SINE_SQUARED))
     exponent = cosine / sine * (-2 / np.pi / slope)
     return sine, np.exp(exponent), np.exp(exponent * exponent * (-np.pi / 4))
 
@@ -144,10 +156,10 @@ def lambert(mu0: Any, mu: Any, cos_phase: Any) -> Any:
     return 0.12 + 0 * mu0 + 0 * mu + 0 * cos_phase
 
 
+HAPKE = {"hapke_highland": HIGHLAND, "hapke_mare": MARE, "hapke_mean": MEAN}
+"""Parameters of the laws by Hapke's model."""
 LAWS: dict[str, Law] = {
-    "hapke_highland": lambda mu0, mu, cos_phase: hapke(HIGHLAND, mu0, mu, cos_phase),
-    "hapke_mare": lambda mu0, mu, cos_phase: hapke(MARE, mu0, mu, cos_phase),
-    "hapke_mean": lambda mu0, mu, cos_phase: hapke(MEAN, mu0, mu, cos_phase),
+    **{name: partial(hapke, parameters) for name, parameters in HAPKE.items()},
     "lommel_seeliger": lommel_seeliger,
     "lunar_lambert": lunar_lambert,
     "lambert": lambert,

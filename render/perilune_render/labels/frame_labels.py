@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from perilune_render.imaging.radiance import Radiance
-from perilune_render.labels.pixels import centred_in, contrasts, smallest_crater, sunlit_fractions
+from perilune_render.labels.pixels import Rims, centred_in, contrasts, rim_shares, smallest_crater, sunlit_fractions
 from perilune_render.terrain.scene import Scene
 from perilune_shared.geometry.camera import Camera, camera_from_site
 from perilune_shared.geometry.ellipse import Ellipses, plane_basis, project_circles, rim_points
@@ -14,6 +14,8 @@ from perilune_shared.geometry.frames import Array
 from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII
 
 _N_RIM = 48
+_ANGLES = 2 * np.pi * np.arange(_N_RIM) / _N_RIM
+_RIM = np.cos(_ANGLES), np.sin(_ANGLES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,15 +108,18 @@ def label_frame(
     (`perilune_render.imaging.resampling.seen_by`). The contrast also depends on the sensor and is NaN here:
     `with_contrast` measures it.
     """
-    in_camera = _in_camera(circles.centre_m, position_m, rotation_camera_from_site)
+    pose = position_m, rotation_camera_from_site
     if any(camera.distortion):
+        in_camera = _in_camera(circles.centre_m, *pose)
         rough = camera.fx_px * circles.radius_m / np.maximum(in_camera[:, 2], 1e-9)
         candidate = np.flatnonzero(camera.inside(camera.project(in_camera)) & (rough > 0.5 * min_radius_px))
+        in_camera = in_camera[candidate]
     else:
-        candidate = np.flatnonzero(centred_in(camera, in_camera, circles.radius_m, 0.5 * min_radius_px))
+        shape = circles.centre_m, circles.normal, circles.radius_m
+        candidate, in_camera = centred_in(camera, *pose, *shape, min_radius_px)
     ellipses = project_circles(
         camera,
-        in_camera[candidate],
+        in_camera,
         circles.normal[candidate] @ rotation_camera_from_site.T,
         circles.radius_m[candidate],
     )
@@ -183,8 +188,11 @@ def _visible_fraction(
     if not len(rows):
         return np.empty(0)
     radii = circles.radius_m[rows]
-    rims = rim_points(circles.centre_m[rows], circles.normal[rows], radii, _N_RIM)
-    points = camera_from_site(rims, position_m, rotation)
+    if not any(camera.distortion):
+        rims = Rims(circles.centre_m[rows], *plane_basis(circles.normal[rows]), radii, *_RIM)
+        return rim_shares(rims, camera, position_m, rotation, depth_m)
+    points_m = rim_points(circles.centre_m[rows], circles.normal[rows], radii, _N_RIM)
+    points = camera_from_site(points_m, position_m, rotation)
     pixels = camera.project(points)
     inside = camera.inside(pixels)
     column = np.where(inside, pixels[..., 0], 0).astype(int)

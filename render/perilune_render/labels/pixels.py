@@ -1,4 +1,6 @@
-"""Loops over the pixels of labels, compiled by numba: sunlit share, contrast, and crater index image."""
+"""Loops over craters and their pixels, compiled by numba: selection, visible and sunlit share, contrast, index."""
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,27 +13,107 @@ from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII
 REACH = 1.5
 """Radius of the disc in which contrast is measured, rim radii."""
 _N_FITTED = 4
+_SLACK = 0.99
+"""Of the least radius of selected craters: covers rounding, their ellipses are computed after."""
 
 
-def centred_in(camera: Camera, centre_m: Array, radius_m: Array, least_px: float) -> np.ndarray:
-    """Whether circles (N, 3), (N,) in O_C are centred in an image without distortion, and wider than a radius (N,).
+def centred_in(
+    camera: Camera,
+    position_m: Array,
+    rotation_camera_from_site: Array,
+    centre_m: Array,
+    normal: Array,
+    radius_m: Array,
+    least_px: float,
+) -> tuple[np.ndarray, Array]:
+    """Circles of N craters in O_L that are centred in an image without distortion and may reach a radius sqrt(a b).
 
-    The same as `Camera.project` and `Camera.inside`, to the bit, without arrays between the steps.
+    `centre_m` and `normal` are (N, 3), `radius_m` is (N,). A few smaller ones are selected too. Returns their indices
+    (M,) and their centres in O_C (M, 3). The places are those of `camera_from_site`, `Camera.project` and
+    `Camera.inside`, to the bit, in one loop: a scene has far more craters than an image.
     """
     pinhole = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
-    return _centred_in(centre_m, radius_m, pinhole, camera.width_px, camera.height_px, least_px)
+    size = camera.width_px, camera.height_px
+    pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
+    return _centred_in(centre_m, normal, radius_m, *pose, pinhole, size, least_px)
+
+
+@njit(error_model="numpy")
+def _centred_in(centre, normal, radius, position, rotation, pinhole, size, least):
+    (fx, fy, cx, cy), (width, height) = pinhole, size
+    rows, places = np.empty(len(centre), np.int64), np.empty((len(centre), 3))
+    count = 0
+    for k in range(len(centre)):
+        dx, dy, dz = centre[k, 0] - position[0], centre[k, 1] - position[1], centre[k, 2] - position[2]
+        z = dx * rotation[2, 0] + dy * rotation[2, 1] + dz * rotation[2, 2]
+        if z > 0 and fx * radius[k] / max(z, 1e-9) > 0.5 * least:
+            x = dx * rotation[0, 0] + dy * rotation[0, 1] + dz * rotation[0, 2]
+            y = dx * rotation[1, 0] + dy * rotation[1, 1] + dz * rotation[1, 2]
+            u, v = fx * (x / z) + cx, fy * (y / z) + cy
+            if 0 <= u < width and 0 <= v < height:
+                # a b = fx fy r^2 |n c| / (z^2 - r^2 (1 - n_z^2))^1.5, here compared by its square.
+                along = normal[k, 0] * dx + normal[k, 1] * dy + normal[k, 2] * dz
+                n_z = normal[k, 0] * rotation[2, 0] + normal[k, 1] * rotation[2, 1] + normal[k, 2] * rotation[2, 2]
+                depth_2 = z * z - radius[k] ** 2 * (1 - n_z * n_z)
+                if (fx * fy * radius[k] ** 2 * along) ** 2 >= (_SLACK * least) ** 4 * depth_2**3:
+                    rows[count], places[count, 0], places[count, 1], places[count, 2] = k, x, y, z
+                    count += 1
+    return rows[:count].copy(), places[:count].copy()
+
+
+class Rims(NamedTuple):
+    """N circles in O_L, as points c + r (cos t p + sin t q) at M angles t; an argument of compiled functions."""
+
+    centre_m: Array
+    """Centres, metres (N, 3)."""
+    p: Array
+    """Unit vectors in the planes of the circles (N, 3)."""
+    q: Array
+    """Unit vectors in the planes, normal to `p` (N, 3)."""
+    radius_m: Array
+    """Radii, metres (N,)."""
+    cos: Array
+    """Cosines of the angles (M,)."""
+    sin: Array
+    """Sines of the angles (M,)."""
+
+
+def rim_shares(
+    rims: Rims, camera: Camera, position_m: Array, rotation_camera_from_site: Array, depth: np.ndarray
+) -> Array:
+    """Share (N,) of the points of rims that an image without distortion shows, given its depth (h, w), metres.
+
+    The same as `rim_points`, `camera_from_site`, `Camera.project` and `Camera.inside`, to the bit, in one loop.
+    """
+    pinhole = camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+    pose = np.asarray(position_m, np.float64), np.ascontiguousarray(rotation_camera_from_site, np.float64)
+    return _rim_shares(rims, *pose, pinhole, depth)
 
 
 @njit()
-def _centred_in(centre, radius, pinhole, width, height, least):
-    fx, fy, cx, cy = pinhole
-    found = np.zeros(len(centre), np.bool_)
-    for k in range(len(centre)):
-        z = centre[k, 2]
-        if z > 0 and fx * radius[k] / max(z, 1e-9) > least:
-            u, v = fx * (centre[k, 0] / z) + cx, fy * (centre[k, 1] / z) + cy
-            found[k] = 0 <= u < width and 0 <= v < height
-    return found
+def _rim_shares(rims, position, rotation, pinhole, depth):
+    (fx, fy, cx, cy), (height, width) = pinhole, depth.shape
+    shares = np.empty(len(rims.radius_m))
+    for k in range(len(shares)):
+        centre, p, q, radius = rims.centre_m[k], rims.p[k], rims.q[k], rims.radius_m[k]
+        slack, shown = 0.0, 0
+        for m in range(len(rims.cos)):
+            cos, sin = rims.cos[m], rims.sin[m]
+            dx = centre[0] + radius * (cos * p[0] + sin * q[0]) - position[0]
+            dy = centre[1] + radius * (cos * p[1] + sin * q[1]) - position[1]
+            dz = centre[2] + radius * (cos * p[2] + sin * q[2]) - position[2]
+            z = dx * rotation[2, 0] + dy * rotation[2, 1] + dz * rotation[2, 2]
+            if m == 0:
+                slack = max(SLACK_RADII * radius, SLACK_PX * z / fx)
+            if z > 0:
+                x = dx * rotation[0, 0] + dy * rotation[0, 1] + dz * rotation[0, 2]
+                y = dx * rotation[1, 0] + dy * rotation[1, 1] + dz * rotation[1, 2]
+                u, v = fx * (x / z) + cx, fy * (y / z) + cy
+                if 0 <= u < width and 0 <= v < height:
+                    found = depth[int(v), int(u)]
+                    shown += np.isfinite(found) and z <= found + slack
+        shares[k] = shown / len(rims.cos)
+    return shares
 
 
 def sunlit_fractions(ellipses: Ellipses, sunlit: np.ndarray) -> Array:

@@ -9,7 +9,7 @@ from perilune_render.config import LightConfig, RenderConfig
 from perilune_render.config_terrain import BouldersConfig, TerrainConfig
 from perilune_render.flight.view import view_envelope
 from perilune_render.frame_source import FrameSource, Shot
-from perilune_render.heightfield.beam import begin_m, tops_of
+from perilune_render.heightfield.beam import begin_m, only_part, tops_of
 from perilune_render.heightfield.engine import HeightfieldEngine, rays_of
 from perilune_render.heightfield.horizon import NOWHERE, horizon_of
 from perilune_render.heightfield.query import first_hits
@@ -217,6 +217,31 @@ def test_rays_begin_near_the_ground_that_they_hit(scene, engine):
             above.append(height - (500 - depth[row : row + 8, column : column + 8].min()))
     assert min(above) > 0
     assert np.median(above) < 0.3 * (ground.highest_m - ground.lowest_m)
+
+
+def test_the_part_below_a_block_holds_the_ways_of_its_rays(scene, engine):
+    """From above the border of the inner square and above a diagonal, blocks lie in all parts, and some in several."""
+    ground = engine.surface.ground
+    half, tops, seen = float(ground.half_widths_m[0]), tops_of(ground), set()
+    basis = rays_of(CAMERA) @ np.diag([1.0, -1.0, -1.0])
+    for x, y in ((0.0, 0.0), (half, half), (-half, -half)):
+        origin = np.array([x, y, ground.highest_m + 3 * half])
+        for row in range(0, CAMERA.height_px - 8, 8):
+            for column in range(0, CAMERA.width_px - 8, 8):
+                block = column, column + 8, row, row + 8
+                begin = begin_m(tops, ground, origin, basis, *block)
+                part = only_part(ground, origin, basis, *block, begin)
+                seen.add(part)
+                if part < 0:
+                    continue
+                u, v, z = np.meshgrid(np.linspace(*block[:2], 9), np.linspace(*block[2:], 9), [begin, ground.lowest_m])
+                ray = u[..., None] * basis[0] + v[..., None] * basis[1] + basis[2]
+                at = origin + ray * ((z - origin[2]) / ray[..., 2])[..., None]
+                x_m, y_m = at[..., 0], at[..., 1]
+                inner = np.maximum(abs(x_m), abs(y_m)) < half
+                sector = np.where(abs(x_m) > abs(y_m), np.where(x_m > 0, 2, 4), np.where(y_m > 0, 3, 1))
+                assert (np.where(inner, 0, sector) == part).all()
+    assert seen == {-1, 0, 1, 2, 3, 4}
 
 
 def test_the_horizon_is_made_after_many_rays(scene, engine):

@@ -9,11 +9,11 @@ from perilune_render.config import LabelsConfig, SensorConfig
 from perilune_render.imaging.radiance import Radiance
 from perilune_render.imaging.sensor import expected, expose
 from perilune_render.labels.frame_labels import RimCircles, Shown, crater_index, label_frame, with_contrast
-from perilune_render.labels.pixels import REACH, centred_in, contrasts, sunlit_fractions
+from perilune_render.labels.pixels import REACH, Rims, centred_in, contrasts, rim_shares, sunlit_fractions
 from perilune_shared.geometry.camera import ROTATION_CAMERA_FROM_BODY, Camera, camera_from_site
-from perilune_shared.geometry.ellipse import Ellipses
+from perilune_shared.geometry.ellipse import Ellipses, plane_basis, project_circles, rim_points
 from perilune_shared.geometry.frames import matrix_from_rotation_vector, sun_direction
-from perilune_shared.labels.masks import crater_masks
+from perilune_shared.labels.masks import SLACK_PX, SLACK_RADII, crater_masks
 from perilune_shared.labels.thresholds import REACH_RADII
 
 CAMERA = Camera.from_field_of_view(128, 128, 50.0)
@@ -193,14 +193,42 @@ def test_the_rule_of_visible_counts_the_pixels_in_which_contrast_is_measured():
     assert REACH == REACH_RADII
 
 
-def test_craters_centred_in_the_image_are_those_that_the_camera_projects_into_it():
+def test_craters_that_may_have_a_label_are_selected():
     rng = np.random.default_rng(3)
-    centre = rng.normal(0, 100, (5000, 3))
-    # On the image's left and upper edge, and outside its right and lower edge.
-    x, y = -CAMERA.cx_px / CAMERA.fx_px, -CAMERA.cy_px / CAMERA.fy_px
-    centre[:4] = [[x, 0, 1], [0, y, 1], [-x, 0, 1], [0, -y, 1]]
-    radius = np.concatenate([np.ones(4), rng.uniform(0, 20, 4996)])
-    expected_px = CAMERA.fx_px * radius / np.maximum(centre[:, 2], 1e-9)
-    expected_in = CAMERA.inside(CAMERA.project(centre)) & (expected_px > 4.0)
-    assert expected_in[:2].all() and not expected_in[2:4].any() and expected_in.sum() > 200
-    np.testing.assert_array_equal(centred_in(CAMERA, centre, radius, 4.0), expected_in)
+    centre, normal = rng.normal(0, 100, (20000, 3)), rng.normal(size=(20000, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    radius = rng.uniform(0, 20, 20000)
+    position, rotation = np.array([3.0, -2.0, 1.0]), np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    found, places = centred_in(CAMERA, position, rotation, centre, normal, radius, 4.0)
+    exact = camera_from_site(centre, position, rotation)
+    np.testing.assert_array_equal(places, exact[found])
+    inside = CAMERA.inside(CAMERA.project(exact))
+    assert inside[found].all()
+    with np.errstate(all="ignore"):
+        radius_px = project_circles(CAMERA, exact, normal @ rotation.T, radius).radius_px()
+    labelled = np.flatnonzero(inside & (radius_px >= 4.0) & (CAMERA.fx_px * radius > 2.0 * exact[:, 2]))
+    assert len(labelled) > 500 and np.isin(labelled, found).all()
+    closed = np.isfinite(radius_px[found])
+    assert closed.sum() > 500 and (radius_px[found[closed]] > 0.985 * 4.0).all()
+
+
+def test_visible_shares_of_rims_are_those_of_the_projected_points():
+    rng = np.random.default_rng(5)
+    normal = rng.normal(size=(300, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    centre, radius = rng.uniform(-60, 60, (300, 3)), rng.uniform(0.5, 15, 300)
+    position = np.array([2.0, 1.0, 80.0])
+    rotation = np.diag([1.0, -1.0, -1.0]) @ matrix_from_rotation_vector([0.1, 0.2, 0.3])
+    depth = rng.uniform(40, 140, (CAMERA.height_px, CAMERA.width_px)).astype(np.float32)
+    depth[:20] = np.inf
+    angle = 2 * np.pi * np.arange(48) / 48
+    rims = Rims(centre, *plane_basis(normal), radius, np.cos(angle), np.sin(angle))
+    points = camera_from_site(rim_points(centre, normal, radius, 48), position, rotation)
+    pixels = CAMERA.project(points)
+    inside = CAMERA.inside(pixels)
+    column, row = (np.where(inside, pixels[..., k], 0).astype(int) for k in range(2))
+    slack = np.maximum(SLACK_RADII * radius, SLACK_PX * points[:, 0, 2] / CAMERA.fx_px)
+    there = depth[row, column]
+    expected_shares = (inside & np.isfinite(there) & (points[..., 2] <= there + slack[:, None])).mean(axis=1)
+    assert ((expected_shares > 0) & (expected_shares < 1)).sum() > 50
+    np.testing.assert_array_equal(rim_shares(rims, CAMERA, position, rotation, depth), expected_shares)

@@ -63,7 +63,7 @@ def changed(copy, module, pattern, replacement):
         ("perilune_render.terrain.craters.rims", "_N_RIM", {"generator"}),
         ("perilune_render.blender.stage", "_EARTH_ANGULAR_DIAMETER_DEG", {"renderer"}),
         ("perilune_render.blender.renderer", "_FAR_M", {"renderer"}),
-        ("perilune_render.imaging.photometry", "_LEAST_SINE_SQUARED", {"renderer", "rays"}),
+        ("perilune_render.imaging.photometry", "LEAST_SINE_SQUARED", {"renderer", "rays"}),
         ("perilune_render.heightfield.shade", "_TERMINATOR", {"rays"}),
         ("perilune_render.imaging.sensor", "_FAINT_E", {"imaging"}),
         ("perilune_render.config", "_SPREAD_FIELDS", set(ROOTS)),
@@ -171,4 +171,15 @@ def test_every_library_that_computes_is_recorded():
 def test_compiled_functions_are_found_in_every_module():
     known = {name.partition(":")[0].rpartition(".")[2] for name in compiled_functions()}
     terrain = {"grid", "albedo", "older_ground", "stamp", "noise", "interpolation", "level_ground"}
-    assert known == terrain | {"pixels", "surface", "rocks", "cast", "shade", "query", "beam", "horizon", "hazard"}
+    assert known == terrain | {
+        "pixels",
+        "surface",
+        "rocks",
+        "cast",
+        "shade",
+        "light",
+        "query",
+        "beam",
+        "horizon",
+        "hazard",
+    }
