@@ -34,8 +34,8 @@ ROOMS = {
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
     ),
     "train/perilune_train/navigate": (
-        "config geometry data network relative craters filter fly evaluate covariance train evaluate_run compare_runs "
-        "benchmark map methods monte_carlo deploy cli"
+        "config compiled geometry data network relative craters filter fly evaluate covariance train evaluate_run "
+        "compare_runs benchmark map methods monte_carlo deploy cli"
     ),
 }
 """Rooms (folders) and files of each folder, in order: each may import those before it."""

@@ -37,7 +37,10 @@ class Catalogue:
 
     def part(self, chosen: Chosen) -> "Catalogue":
         """Some of the craters."""
-        return replace(self, centre_m=self.centre_m[chosen], normal=self.normal[chosen], radius_m=self.radius_m[chosen])
+        places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
+        # Many times as fast as an index.
+        centre_m, normal, radius_m = (own.take(places, axis=0) for own in (self.centre_m, self.normal, self.radius_m))
+        return replace(self, centre_m=centre_m, normal=normal, radius_m=radius_m)
 
     def ground_m(self, position_m: Array, count: int) -> float:
         """Median height of the `count` craters nearest to a position, over ground: (2,) or (3,), O_L."""
