@@ -34,7 +34,7 @@ ROOMS = {
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
     ),
     "train/perilune_train/navigate": (
-        "config geometry data network pose relative craters filter fly evaluate covariance train evaluate_run "
+        "config compiled geometry data network pose relative craters filter fly evaluate covariance train evaluate_run "
         "compare_runs benchmark map methods monte_carlo deploy cli"
     ),
 }

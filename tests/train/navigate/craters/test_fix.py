@@ -4,13 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.optimize import linear_sum_assignment
 from tests.train.navigate.craters.crater_world import CAMERA, nearby, pose, sighted, world
 
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import rotation_vectors
 from perilune_train.navigate.craters.catalogue import CatalogueErrors, with_errors
-from perilune_train.navigate.craters.fix import PosePrior, _assigned, _near, refine
+from perilune_train.navigate.craters.fix import PosePrior, refine
 from perilune_train.navigate.craters.locate import locate
 from perilune_train.navigate.craters.projection import projected
 from perilune_train.navigate.craters.sightings import Sightings
@@ -130,28 +129,3 @@ def test_boxes_are_those_of_the_ellipses():
     assert len(boxes) > 300
     np.testing.assert_allclose(seen.centre_px, (boxes[:, :2] + boxes[:, 2:]) / 2, atol=1e-9)
     np.testing.assert_allclose(seen.radius_px, np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)) / 2, atol=1e-9)
-
-
-@pytest.mark.parametrize("n_pairs", [0, 1, 20, 60])
-def test_pairs_are_those_of_the_assignment_of_all(n_pairs):
-    rng = np.random.default_rng(n_pairs)
-    pairs = np.unique(rng.integers(0, [25, 40], (n_pairs, 2)), axis=0)
-    own, other, cost = pairs[:, 0], pairs[:, 1], rng.uniform(0, 20, len(pairs))
-    whole = np.full((25, 40), 1e6)
-    allowed = cost < 3.5**2
-    whole[own[allowed], other[allowed]] = cost[allowed]
-    expected = [pair for pair in zip(*linear_sum_assignment(whole), strict=True) if whole[pair] < 1e6]
-    found = _assigned(own, other, cost)
-    assert list(zip(own[found], other[found], strict=True)) == expected
-
-
-def test_near_pairs_are_those_of_all_within_reach():
-    rng = np.random.default_rng(6)
-    true = pose(rng, 900.0)
-    seen = projected(WORLD, CAMERA, true)
-    centre, reach = rng.uniform(-10, 266, (40, 2)), rng.uniform(0, 30, 40)
-    sightings = Sightings(centre, np.full(40, 3.0), np.full(40, 0.8))
-    near = np.abs(centre[:, None] - seen.centre_px).max(axis=2) <= reach[:, None]
-    found = np.zeros_like(near)
-    found[_near(sightings, seen, reach)] = True
-    np.testing.assert_array_equal(found, near)

@@ -9,18 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_train.navigate.compiled import compiled
 from perilune_train.navigate.craters.catalogue import Catalogue
-from perilune_train.navigate.craters.projection import Pose, Projected, in_view, projected
+from perilune_train.navigate.craters.matching import Circles, matched
+from perilune_train.navigate.craters.projection import Pose, in_view, projected
 from perilune_train.navigate.craters.sightings import Sightings
 
 _GATES_PX = (6.0, 3.0, 1.5, 0.0, 0.0, 0.0)
 """Uncertainty of the pose in each round, pixels, beside that of the sightings."""
 _GATE_SIGMAS = 3.5
-_FORBIDDEN = 1e6
 _FARTHEST_PX, _SMALLER = 64.0, 0.8
 """Craters beside the image at the start by more pixels, or below a share of the least size, are left out of all rounds.
 The start is right to a few pixels; the rounds look 18 px beside the image."""
@@ -68,84 +68,56 @@ def refine(sightings: Sightings, catalogue: Catalogue, camera: Camera, prior: Po
         return None
     precision = np.linalg.inv(prior.covariance)
     pose, noise_px = start, np.hypot(sightings.noise_px, sightings.static_px)
-    size_sigma = float(np.hypot(sightings.size_sigma, catalogue.radius_sigma_share))
+    size, size_sigma = np.log(sightings.radius_px), float(np.hypot(sightings.size_sigma, catalogue.radius_sigma_share))
     least_px = _LEAST_SIZE * float(sightings.radius_px.min())
     places = in_view(catalogue, camera, start, _FARTHEST_PX, _SMALLER * least_px)
     catalogue = catalogue.part(places)
     for gate_px in _GATES_PX:
         seen = projected(catalogue, camera, pose, 3 * gate_px, least_px)
         placed_px = camera.fx_px / seen.depth_m * catalogue.position_sigma_m
-        own_px = np.hypot(noise_px, gate_px)
-        reach_px = _GATE_SIGMAS * np.sqrt(2 * (own_px**2 + np.max(placed_px, initial=0.0) ** 2))
-        own, other = _near(sightings, seen, reach_px)
-        error = _errors(sightings, seen, own, other)
-        cost = (error[:, :2] ** 2).sum(axis=1) / (own_px[own] ** 2 + placed_px[other] ** 2) / 2
-        cost += error[:, 2] ** 2 / (size_sigma**2 + (gate_px / 60) ** 2)
-        matched = _assigned(own, other, cost)
-        if len(matched) < _LEAST_MATCHES:
+        found = Circles(sightings.centre_px, size, np.hypot(noise_px, gate_px))
+        expected = Circles(seen.centre_px, np.log(seen.radius_px), placed_px)
+        own, other, error = matched(found, expected, size_sigma**2 + (gate_px / 60) ** 2, _GATE_SIGMAS)
+        if len(own) < _LEAST_MATCHES:
             return None
-        own, other, error = own[matched], other[matched], error[matched]
         centre_sigma = np.hypot(noise_px[own], placed_px[other])
-        sigma = np.column_stack([centre_sigma, centre_sigma, np.full(len(own), size_sigma)])
-        distance = np.sqrt((error[:, :2] ** 2).sum(axis=1) / (centre_sigma**2 + gate_px**2) / 2)
-        weight = np.clip(1 - (distance / _TUKEY) ** 2, 0, None) ** 2
-        jacobian = (seen.jacobian(other) / sigma[:, :, None]).reshape(-1, 6)
-        weighted = np.repeat(weight, 3)[:, None] * jacobian
-        normal = weighted.T @ jacobian + precision
-        gradient = (error / sigma).ravel() @ weighted - precision @ _offset(pose, prior.pose)
+        weight, normal, gradient = _normal_equations(error, centre_sigma, size_sigma, gate_px, seen.jacobian(other))
+        normal += precision
+        gradient -= precision @ _offset(pose, prior.pose)
         pose = pose.changed(np.linalg.solve(normal, gradient))
     if len(own) < _LEAST_SHARE * len(sightings):
         return None
     # Stated errors that are too small must not make the fix look better than it is.
-    squares = np.sum(weight[:, None] * (error[:, :2] / sigma[:, :2]) ** 2)
+    squares = np.sum(weight[:, None] * (error[:, :2] / centre_sigma[:, None]) ** 2)
     factor = max(1.0, float(squares / max(2 * weight.sum() - 6, 1.0)))
     covariance = factor * np.linalg.inv(normal)
     covariance[3:5, 3:5] += np.eye(2) * (COMMON_PX / camera.fx_px) ** 2
     return Fix(pose, covariance, own, places[seen.index[other]], weight, float(np.sqrt(np.mean(error[:, :2] ** 2))))
 
 
-def _near(sightings: Sightings, seen: Projected, reach_px: Array) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
-    """All pairs that are at most `reach_px` (M,) apart along each axis: places in `sightings` and in `seen` (K,)."""
-    order = np.argsort(seen.centre_px[:, 0])
-    x, y = seen.centre_px[order].T
-    first = np.searchsorted(x, sightings.centre_px[:, 0] - reach_px)
-    count = np.searchsorted(x, sightings.centre_px[:, 0] + reach_px, side="right") - first
-    own = np.repeat(np.arange(len(sightings)), count)
-    other = np.arange(len(own)) + np.repeat(first - np.cumsum(count) + count, count)
-    near = np.abs(sightings.centre_px[own, 1] - y[other]) <= reach_px[own]
-    return own[near], order[other[near]]
+@compiled
+def _normal_equations(
+    error: Array, centre_sigma: Array, size_sigma: float, gate_px: float, jacobian: Array
+) -> tuple[Array, Array, Array]:
+    """Weights (K,) of K matches, and normal matrix (6, 6) and right side (6,) of their step of the pose.
 
-
-def _assigned(own: NDArray[np.integer], other: NDArray[np.integer], cost: Array) -> NDArray[np.integer]:
-    """The pairs of the one-to-one assignment of most pairs within the gate and of least cost, by increasing `own`."""
-    allowed = np.flatnonzero(cost < _GATE_SIGMAS**2)
-    if not len(allowed):
-        return allowed
-    # Pairs without a rival belong to every such assignment; without them the rest is small.
-    own, other = own[allowed], other[allowed]
-    alone = (np.bincount(own)[own] == 1) & (np.bincount(other)[other] == 1)
-    rivals = allowed[~alone]
-    rows, row = _numbered(own[~alone])
-    columns, column = _numbered(other[~alone])
-    costs, pair = np.full((rows, columns), _FORBIDDEN), np.zeros((rows, columns), int)
-    costs[row, column], pair[row, column] = cost[rivals], rivals
-    chosen = linear_sum_assignment(costs)
-    matched = np.concatenate([allowed[alone], pair[chosen][costs[chosen] < _FORBIDDEN]])
-    return np.sort(matched)
-
-
-def _numbered(places: NDArray[np.integer]) -> tuple[int, NDArray[np.integer]]:
-    """The number of different places, and the places numbered without gaps."""
-    different = np.flatnonzero(np.bincount(places))
-    return len(different), np.searchsorted(different, places)
-
-
-def _errors(sightings: Sightings, seen: Projected, own: NDArray[np.integer], other: NDArray[np.integer]) -> Array:
-    """Differences of centre and logarithm of radius (K, 3), sighting less projection."""
-    error = np.empty((len(own), 3))
-    error[:, :2] = sightings.centre_px[own] - seen.centre_px[other]
-    error[:, 2] = np.log(sightings.radius_px[own] / seen.radius_px[other])
-    return error
+    From their differences (K, 3), the deviations of these, the uncertainty of the pose and the derivatives (K, 3, 6).
+    """
+    weight, normal, right = np.empty(len(error)), np.zeros((6, 6)), np.zeros(6)
+    for k in range(len(error)):
+        squared = (error[k, 0] ** 2 + error[k, 1] ** 2) / (centre_sigma[k] ** 2 + gate_px**2) / 2
+        weight[k] = max(1 - squared / _TUKEY**2, 0.0) ** 2
+        for part in range(3):
+            own = weight[k] / (size_sigma if part == 2 else centre_sigma[k]) ** 2
+            for i in range(6):
+                along = own * jacobian[k, part, i]
+                right[i] += along * error[k, part]
+                for j in range(i + 1):
+                    normal[i, j] += along * jacobian[k, part, j]
+    for i in range(6):
+        for j in range(i):
+            normal[j, i] = normal[i, j]
+    return weight, normal, right
 
 
 def _offset(pose: Pose, prior: Pose) -> Array:

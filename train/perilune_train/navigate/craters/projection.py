@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perilune_shared.geometry.camera import Camera, camera_from_site
+from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
+from perilune_train.navigate.compiled import compiled
 from perilune_train.navigate.craters.catalogue import Catalogue
 
 
@@ -53,18 +54,29 @@ class Projected:
 
         The ellipse's own offset from the image of the circle's centre changes far more slowly.
         """
-        x, y, z = (self.point_m if chosen is None else self.point_m[chosen]).T
-        by_point = np.zeros((len(z), 3, 3))
-        by_point[:, 0, 0], by_point[:, 0, 2] = self.camera.fx_px / z, -self.camera.fx_px * x / z**2
-        by_point[:, 1, 1], by_point[:, 1, 2] = self.camera.fy_px / z, -self.camera.fy_px * y / z**2
-        by_point[:, 2, 2] = -1 / z
-        # X = R (c - p), and by a turn w from the left X moves by w x X.
-        by_step = np.zeros((len(z), 3, 6))
-        by_step[:, :, :3] = -self.pose.rotation_camera_from_site
-        by_step[:, 0, 4], by_step[:, 0, 5] = z, -y
-        by_step[:, 1, 3], by_step[:, 1, 5] = -z, x
-        by_step[:, 2, 3], by_step[:, 2, 4] = y, -x
-        return by_point @ by_step
+        points = self.point_m if chosen is None else self.point_m[chosen]
+        return _derivatives(points, self.pose.rotation_camera_from_site, self.camera.fx_px, self.camera.fy_px)
+
+
+@compiled
+def _derivatives(point_m: Array, rotation: Array, fx_px: float, fy_px: float) -> Array:
+    """`Projected.jacobian` at points (K, 3), O_C.
+
+    A point X = R (c - p) moves by -R times a shift of the camera, and by w x X when it turns by w from the left.
+    """
+    derivatives = np.empty((len(point_m), 3, 6))
+    for k in range(len(point_m)):
+        x, y, z = point_m[k]
+        right, down = fx_px / z, fy_px / z
+        own = derivatives[k]
+        for axis in range(3):
+            own[0, axis] = right * (rotation[2, axis] * x / z - rotation[0, axis])
+            own[1, axis] = down * (rotation[2, axis] * y / z - rotation[1, axis])
+            own[2, axis] = rotation[2, axis] / z
+        own[0, 3], own[0, 4], own[0, 5] = -right * x * y / z, right * (z + x * x / z), -right * y
+        own[1, 3], own[1, 4], own[1, 5] = -down * (z + y * y / z), down * x * y / z, down * x
+        own[2, 3], own[2, 4], own[2, 5] = -y / z, x / z, 0.0
+    return derivatives
 
 
 def projected(
@@ -72,8 +84,13 @@ def projected(
 ) -> Projected:
     """Craters of a least radius whose centre is in the image or at most `margin_px` beside it."""
     index, points = _in_view(catalogue, camera, pose, margin_px, least_radius_px)
-    normals = catalogue.normal[index] @ pose.rotation_camera_from_site.T
-    centre, half = _boxes(camera, points, normals, catalogue.radius_m[index])
+    rotation = pose.rotation_camera_from_site
+    if any(camera.distortion):
+        normals = catalogue.normal[index] @ rotation.T
+        boxes = project_circles(camera, points, normals, catalogue.radius_m[index]).bounding_boxes()
+        centre, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
+    else:
+        centre, half = _boxes(points, index, catalogue.normal, catalogue.radius_m, rotation, _lens(camera))
     seen = np.isfinite(half).all(axis=1)
     if not seen.all():
         index, points, centre, half = index[seen], points[seen], centre[seen], half[seen]
@@ -91,37 +108,93 @@ def _in_view(
     catalogue: Catalogue, camera: Camera, pose: Pose, margin_px: float, least_radius_px: float
 ) -> tuple[NDArray[np.integer], Array]:
     """As `in_view`, and the centres of the craters (N, 3), O_C."""
-    axis = pose.rotation_camera_from_site[2]
-    depth = catalogue.centre_m @ axis - pose.position_m @ axis
-    # Size first: it alone excludes most craters of a catalogue.
-    radius = catalogue.radius_m
-    index = np.flatnonzero((depth > radius) & (camera.fx_px * radius >= least_radius_px * depth))
-    points = camera_from_site(catalogue.centre_m[index], pose.position_m, pose.rotation_camera_from_site)
-    x, y, depth = points.T
-    x, y = camera.fx_px * x / depth + camera.cx_px, camera.fy_px * y / depth + camera.cy_px
-    near = (x > -margin_px) & (x < camera.width_px + margin_px) & (y > -margin_px) & (y < camera.height_px + margin_px)
-    return index[near], points[near]
+    limits = margin_px, least_radius_px
+    rotation = pose.rotation_camera_from_site
+    return _visible(catalogue.centre_m, catalogue.radius_m, pose.position_m, rotation, _lens(camera), limits)
 
 
-def _boxes(camera: Camera, points: Array, normal: Array, radius_m: Array) -> tuple[Array, Array]:
-    """Centres and half sizes (N, 2) of the boxes of circles, pixels, from their centres and normals (N, 3), O_C.
+_Lens = tuple[float, float, float, float, float, float]
+"""Focal lengths, principal point and size of the image of a pinhole, pixels."""
 
-    NaN if the image of a circle is not an ellipse. Without distortion, from the dual conic r^2 (I - n n^T) - c c^T of
-    the circle (Hartley & Zisserman, Multiple View Geometry, 2nd ed., section 8.1): its tangents along the axes of the
-    image are the sides of the box. This is many times as fast as `project_circles`, which also has axes and directions.
+
+def _lens(camera: Camera) -> _Lens:
+    width, height = float(camera.width_px), float(camera.height_px)
+    return camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, width, height
+
+
+@compiled
+def _visible(
+    centre_m: Array, radius_m: Array, position_m: Array, rotation: Array, lens: _Lens, limits: tuple[float, float]
+) -> tuple[NDArray[np.int64], Array]:
+    """`_in_view` for circles with centres (N, 3), O_L, and radii (N,); `limits` are the margin and the least radius."""
+    fx_px, fy_px, cx_px, cy_px, width_px, height_px = lens
+    margin_px, least_px = limits
+    # No branches: which craters pass cannot be predicted. Size first: it alone excludes most craters of a catalogue.
+    index = np.empty(len(radius_m) + 1, np.int64)
+    large = 0
+    for k in range(len(radius_m)):
+        x, y, z = centre_m[k, 0] - position_m[0], centre_m[k, 1] - position_m[1], centre_m[k, 2] - position_m[2]
+        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        index[large] = k
+        large += (depth > radius_m[k]) & (fx_px * radius_m[k] >= least_px * depth)
+    count = 0
+    for place in range(large):
+        k = index[place]
+        across, down, depth = _turned(centre_m[k], position_m, rotation)
+        column, row = fx_px * across / depth + cx_px, fy_px * down / depth + cy_px
+        index[count] = k
+        near = (column > -margin_px) & (column < width_px + margin_px)
+        count += near & (row > -margin_px) & (row < height_px + margin_px)
+    index, points = index[:count].copy(), np.empty((count, 3))
+    for place in range(count):
+        points[place] = _turned(centre_m[index[place]], position_m, rotation)
+    return index, points
+
+
+@compiled
+def _turned(point_m: Array, position_m: Array, rotation: Array) -> tuple[float, float, float]:
+    """A point (3,), O_L, in O_C."""
+    x, y, z = point_m[0] - position_m[0], point_m[1] - position_m[1], point_m[2] - position_m[2]
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+    )
+
+
+@compiled
+def _boxes(
+    points: Array, index: NDArray[np.integer], normals: Array, radius_m: Array, rotation: Array, lens: _Lens
+) -> tuple[Array, Array]:
+    """Centres and half sizes (K, 2), pixels, of the boxes of circles, for a pinhole.
+
+    From the centres (K, 3), O_C, and places in the catalogue (K,) of the circles, and the normals (N, 3), O_L, and
+    radii (N,) of the catalogue. NaN if the image of a circle is not an ellipse. From the dual conic
+    r^2 (I - n n^T) - c c^T of the circle (Hartley & Zisserman, Multiple View Geometry, 2nd ed., section 8.1): its
+    tangents along the axes of the image are the sides of the box. This is many times as fast as `project_circles`,
+    which also has axes and directions.
     """
-    if any(camera.distortion):
-        boxes = project_circles(camera, points, normal, radius_m).bounding_boxes()
-        return (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
-    focal_px, depth = np.array([camera.fx_px, camera.fy_px]), points[:, 2:]
-    # Image coordinates relative to the image of the circle's centre: otherwise small, distant circles lose precision.
-    middle = points[:, :2] / depth
-    along = focal_px * (normal[:, :2] - middle * normal[:, 2:])
-    own, mixed = focal_px**2 * (1 + middle**2) - along**2, -focal_px * middle - along * normal[:, 2:]
-    radius = radius_m[:, None]
-    last = radius**2 * (1 - normal[:, 2:] ** 2) - depth**2
-    edge_on = np.abs(np.einsum("ij,ij->i", normal, points)) < 1e-9 * np.linalg.norm(points, axis=1)
-    bad = (depth <= 0) | (last >= 0) | edge_on[:, None]
-    last = np.where(bad, np.nan, last)
-    centre = focal_px * middle + [camera.cx_px, camera.cy_px] + radius**2 * mixed / last
-    return centre, radius * np.sqrt(radius**2 * mixed**2 - own * last) / -last
+    focal_px, middle_px = lens[:2], lens[2:4]
+    centre, half = np.full((len(points), 2), np.nan), np.full((len(points), 2), np.nan)
+    normal = np.empty(3)
+    for k in range(len(points)):
+        x, y, depth = points[k]
+        for axis in range(3):
+            normal[axis] = 0.0
+            for i in range(3):
+                normal[axis] += rotation[axis, i] * normals[index[k], i]
+        squared = radius_m[index[k]] ** 2
+        last = squared * (1 - normal[2] ** 2) - depth**2
+        distance = np.sqrt(x * x + y * y + depth * depth)
+        edge_on = abs(normal[0] * x + normal[1] * y + normal[2] * depth) < 1e-9 * distance
+        if depth <= 0 or last >= 0 or edge_on:
+            continue
+        for axis in range(2):
+            # Relative to the image of the circle's centre: otherwise small, distant circles lose precision.
+            middle = points[k, axis] / depth
+            along = focal_px[axis] * (normal[axis] - middle * normal[2])
+            own = focal_px[axis] ** 2 * (1 + middle**2) - along**2
+            mixed = -focal_px[axis] * middle - along * normal[2]
+            centre[k, axis] = focal_px[axis] * middle + middle_px[axis] + squared * mixed / last
+            half[k, axis] = np.sqrt(squared * (squared * mixed**2 - own * last)) / -last
+    return centre, half

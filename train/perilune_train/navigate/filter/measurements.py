@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_train.navigate.compiled import compiled
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.craters.fix import Fix
 from perilune_train.navigate.craters.projection import Pose, in_view, projected
@@ -135,10 +136,33 @@ def _crossed(state: State, crater: NDArray[np.integer], by_error: Array, by_offs
     `by_error` (N, 2, 11) and `by_offset` (N, 2, 2) are their derivatives by the errors `_ALL_SEE` and by the offsets of
     their craters, whose places in the state are `crater` (N,). The other derivatives are zero.
     """
-    places = N_ERRORS + 2 * crater[:, None] + [0, 1]
     by_error = by_error.reshape(-1, len(_ALL_SEE))
-    crossed = by_offset @ state.covariance[places]
-    crossed = by_error @ state.covariance[_ALL_SEE] + crossed.reshape(2 * len(crater), -1)
-    # The derivative by a crater's offset has two columns.
-    own = by_offset[:, None] @ crossed[:, places].transpose(1, 2, 0).reshape(len(crater), 1, 2, -1)
-    return crossed, by_error @ crossed[:, _ALL_SEE].T + own.reshape(2 * len(crater), -1)
+    crossed = by_error @ state.covariance[_ALL_SEE]
+    first = N_ERRORS + 2 * crater
+    _add_offsets(crossed, by_offset, state.covariance, first)
+    spread = crossed[:, _ALL_SEE] @ by_error.T
+    _add_own(spread, by_offset, crossed, first)
+    return crossed, spread
+
+
+@compiled
+def _add_offsets(crossed: Array, by_offset: Array, covariance: Array, first: NDArray[np.int64]) -> None:
+    """Add what the offsets of the craters, from rows `first` on, give to the covariance `crossed` of `_crossed`."""
+    for k in range(len(first)):
+        east = first[k]
+        for axis in range(2):
+            own, by_east, by_north = crossed[2 * k + axis], by_offset[k, axis, 0], by_offset[k, axis, 1]
+            for column in range(len(own)):
+                own[column] += by_east * covariance[east, column] + by_north * covariance[east + 1, column]
+
+
+@compiled
+def _add_own(spread: Array, by_offset: Array, crossed: Array, first: NDArray[np.int64]) -> None:
+    """Add what the offsets of the craters, from rows `first` on, give to the covariance `spread` of `_crossed`."""
+    for row in range(len(crossed)):
+        for k in range(len(first)):
+            east = first[k]
+            for axis in range(2):
+                spread[row, 2 * k + axis] += (
+                    by_offset[k, axis, 0] * crossed[row, east] + by_offset[k, axis, 1] * crossed[row, east + 1]
+                )

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
+from perilune_train.navigate.compiled import compiled
 
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, FORCE_BIAS = slice(9, 12), slice(12, 15)
@@ -128,19 +129,19 @@ class State:
 
     def with_craters(self, craters: NDArray[np.integer], sigma_m: Array) -> "State":
         """The state with the offsets of these craters alone (n,), which have a deviation (n,) where they are new."""
-        place = {int(crater): k for k, crater in enumerate(self.craters)}
-        before = np.array([place.get(int(crater), -1) for crater in craters], int)
-        new = np.flatnonzero(before < 0)
-        # Of new craters the rows of the first crater are taken, or of another part, and replaced.
-        old = N_ERRORS + 2 * np.maximum(before, 0)[:, None] + [0, 1] if len(place) else np.zeros((len(craters), 2), int)
+        place = np.full(1 + max(self.craters.max(initial=-1), craters.max(initial=-1)), -1)
+        place[self.craters] = np.arange(len(self.craters))
+        before = place[craters]
+        known, new = before >= 0, np.flatnonzero(before < 0)
+        rows = np.full((len(craters), 2), -1)
+        rows[known] = N_ERRORS + 2 * before[known, None] + [0, 1]
         past = N_ERRORS + 2 * len(self.craters) + np.arange(6 * len(self.past_position_m))
-        source = np.concatenate([np.arange(N_ERRORS), old.ravel(), past])
-        covariance = self.covariance.take(source, axis=0).take(source, axis=1)
+        source = np.concatenate([np.arange(N_ERRORS), rows.ravel(), past])
+        covariance = _rearranged(self.covariance, source)
         rows = (N_ERRORS + 2 * new[:, None] + [0, 1]).ravel()
-        covariance[rows], covariance[:, rows] = 0, 0
         covariance[rows, rows] = np.repeat(sigma_m[new] ** 2, 2)
         offsets = np.zeros((len(craters), 2))
-        offsets[before >= 0] = self.offsets_m[before[before >= 0]]
+        offsets[known] = self.offsets_m[before[known]]
         return replace(self, craters=craters, offsets_m=offsets, covariance=covariance)
 
     def past_pose_error(self, number: int, position_m: Array, rotation_site_from_body: Array) -> tuple[Array, Array]:
@@ -154,6 +155,19 @@ class State:
         """Shift and turn (6,) from the estimate to a true pose."""
         turn = rotation_vectors(self.rotation_site_from_body.T @ rotation_site_from_body)
         return np.concatenate([position_m - self.position_m, turn])
+
+
+@compiled
+def _rearranged(covariance: Array, source: NDArray[np.int64]) -> Array:
+    """The covariance (n, n) of n parts, from their places in another one; those with the place -1 are zero."""
+    found = np.zeros((len(source), len(source)))
+    for i in range(len(source)):
+        if source[i] < 0:
+            continue
+        for j in range(len(source)):
+            if source[j] >= 0:
+                found[i, j] = covariance[source[i], source[j]]
+    return found
 
 
 _CROSS = np.zeros((3, 9))

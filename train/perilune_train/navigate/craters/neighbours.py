@@ -1,0 +1,108 @@
+"""Neighbours among points of a plane, by a grid (compiled by numba)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perilune_shared.geometry.frames import Array
+from perilune_train.navigate.compiled import compiled
+
+
+class Grid(NamedTuple):
+    """N points in a grid of n x n cells, about as many as points."""
+
+    place: Array
+    """The points (N, 2)."""
+    n: int
+    """Number of rows, and of columns."""
+    corner: Array
+    """Least coordinates (2,)."""
+    side: Array
+    """Sides of a cell (2,)."""
+    begin: NDArray[np.int64]
+    """Place in `order` of the first point of each cell, row by row, and the number of points (n^2 + 1,)."""
+    order: NDArray[np.int64]
+    """The points in the order of cells (N,)."""
+
+
+@compiled
+def grid_of(place: Array) -> Grid:
+    """Points (N, 2) in a grid."""
+    n = int(np.ceil(np.sqrt(max(len(place), 1))))
+    corner, side = np.zeros(2), np.ones(2)
+    if len(place):
+        for axis in range(2):
+            corner[axis] = place[:, axis].min()
+            side[axis] = max((place[:, axis].max() - corner[axis]) / n, 1e-9)
+    cell, begin = np.empty(len(place), np.int64), np.zeros(n * n + 1, np.int64)
+    for k in range(len(place)):
+        row, column = _cell(place[k, 1], corner[1], side[1], n), _cell(place[k, 0], corner[0], side[0], n)
+        cell[k] = row * n + column
+        begin[cell[k] + 1] += 1
+    begin = np.cumsum(begin)
+    following, order = begin.copy(), np.empty(len(place), np.int64)
+    for k in range(len(place)):
+        order[following[cell[k]]] = k
+        following[cell[k]] += 1
+    return Grid(place, n, corner, side, begin, order)
+
+
+@compiled
+def _cell(place: float, corner: float, side: float, n: int) -> int:
+    """The cell along an axis, the nearest one for a place beside the grid."""
+    return int(min(max((place - corner) / side, 0.0), n - 1.0))
+
+
+@compiled
+def within_reach(place: Array, reach: Array, others: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For each of M places (M, 2), the points (N, 2) that are at most `reach` (M,) away along each axis.
+
+    Returns the place of the first pair of each place, and the number of pairs (M + 1,), then the point of each pair.
+    """
+    grid = grid_of(others)
+    first, other, count = np.zeros(len(place) + 1, np.int64), np.empty(8 * len(place) + 1, np.int64), 0
+    for i in range(len(place)):
+        left = _cell(place[i, 0] - reach[i], grid.corner[0], grid.side[0], grid.n)
+        right = _cell(place[i, 0] + reach[i], grid.corner[0], grid.side[0], grid.n)
+        top = _cell(place[i, 1] - reach[i], grid.corner[1], grid.side[1], grid.n)
+        bottom = _cell(place[i, 1] + reach[i], grid.corner[1], grid.side[1], grid.n)
+        for row in range(top, bottom + 1):
+            for k in range(grid.begin[row * grid.n + left], grid.begin[row * grid.n + right + 1]):
+                j = grid.order[k]
+                if abs(place[i, 0] - others[j, 0]) <= reach[i] and abs(place[i, 1] - others[j, 1]) <= reach[i]:
+                    if count == len(other):
+                        other = np.append(other, other)
+                    other[count] = j
+                    count += 1
+        first[i + 1] = count
+    return first, other[:count]
+
+
+@compiled
+def nearest(grid: Grid, x: float, y: float, count: int) -> NDArray[np.int64]:
+    """The `count` points nearest to a place, or all if there are fewer, the nearest first."""
+    count = min(count, len(grid.place))
+    found, squared = np.empty(count, np.int64), np.full(count, np.inf)
+    column, row = _cell(x, grid.corner[0], grid.side[0], grid.n), _cell(y, grid.corner[1], grid.side[1], grid.n)
+    for ring in range(grid.n):
+        # Points farther out than the ring before are at least this far away.
+        if count and squared[count - 1] <= ((ring - 1) * min(grid.side[0], grid.side[1])) ** 2 and ring > 0:
+            break
+        for down in range(max(row - ring, 0), min(row + ring, grid.n - 1) + 1):
+            step = 1 if abs(down - row) == ring or ring == 0 else 2 * ring
+            for right in range(column - ring, column + ring + 1, step):
+                if not 0 <= right < grid.n:
+                    continue
+                for k in range(grid.begin[down * grid.n + right], grid.begin[down * grid.n + right + 1]):
+                    j = grid.order[k]
+                    apart = (grid.place[j, 0] - x) ** 2 + (grid.place[j, 1] - y) ** 2
+                    if not count or apart >= squared[count - 1]:
+                        continue
+                    # Insert in the order of distances.
+                    at = count - 1
+                    while at > 0 and squared[at - 1] > apart:
+                        squared[at], found[at] = squared[at - 1], found[at - 1]
+                        at -= 1
+                    squared[at], found[at] = apart, j
+    return found
