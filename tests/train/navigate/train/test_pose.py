@@ -22,7 +22,7 @@ from perilune_train.navigate.pose import (
     normalised_frames,
     pose_of,
 )
-from perilune_train.navigate.train.task import NavigationTask, learning_rate_factor
+from perilune_train.navigate.train.task import NavigationTask, axis_weights, learning_rate_factor
 from perilune_train.navigate.train.windows import Windows, truth
 from perilune_train.training.runs import save_weights
 
@@ -83,6 +83,13 @@ def test_the_truth_as_output_gives_the_pose(trajectories):
     found, rotation = pose_of(output, scales)
     np.testing.assert_allclose(found, own.position_m[1:], atol=1e-3)
     np.testing.assert_allclose(rotation, own.rotation_camera_from_site[1:], atol=1e-6)
+
+
+def test_axes_weigh_between_metres_and_spreads():
+    scales = Scales([0.0] * 3, [8.0, 128.0, 512.0], 0.1, np.eye(3).tolist())
+    weights = axis_weights(scales, "pose")
+    assert float(weights[1] / weights[0]) == pytest.approx(4) and float(weights[2] / weights[1]) == pytest.approx(2)
+    assert axis_weights(scales, "motion").tolist() == [1, 1, 1]
 
 
 def test_cells_of_each_frame_by_hand():
