@@ -217,7 +217,10 @@ class NavigationTask(lightning.LightningModule):
             parameter.requires_grad_(not (self.coarse and name in self.pretrained))
         for name, module in self.network.backbone.named_modules():
             if isinstance(module, nn.BatchNorm2d):
-                module.train(not (self.coarse and f"{name}.weight" in self.pretrained))
+                # Statistics of single batches change the features by more than their spread over the trajectories, so a
+                # network for poses keeps those of the detector.
+                kept = self.coarse or self.own.target == "pose"
+                module.train(not (kept and f"{name}.weight" in self.pretrained))
         if self.fusion == "stack" and self.windows is None:
             numbers = list(self.share.of(len(self.training_trajectories)))
             place = self.training_trajectories, numbers, self.sequences.n_pairs
