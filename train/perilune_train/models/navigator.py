@@ -1,5 +1,7 @@
 """Two networks over pairs of consecutive frames of a trajectory: their motion, or the pose at the later frame."""
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -17,14 +19,16 @@ class Recurrent(nn.Module):
     """Two LSTM layers (as in DeepVO, Wang et al. 2017, doi 10.1109/ICRA.2017.7989236), then a linear layer to 9.
 
     The last linear layer starts at zero, so that an untrained network outputs the reference motion. With `summary`, a
-    linear layer to that number of values comes before the LSTM. `dropout` acts on the LSTM's input and output.
+    linear layer to that number of values comes before the LSTM. `dropout` acts on the LSTM's input and output. `exact`
+    computes in float32 under autocast too: positions vary over hundreds of metres, of which bfloat16 resolves a 256th.
 
     Shape: features (batch, pairs, inputs) to (batch, pairs, 9) and the state after the last pair. `state` is that after
     the pair before the first; None at the start of a trajectory.
     """
 
-    def __init__(self, inputs: int, hidden: int, summary: int | None = None, dropout: float = 0.0):
+    def __init__(self, inputs: int, hidden: int, summary: int | None = None, dropout: float = 0.0, exact: bool = False):
         super().__init__()
+        self.exact = exact
         self.summary = nn.Linear(inputs, summary) if summary else nn.Identity()
         self.dropout = nn.Dropout(dropout)
         self.lstm = nn.LSTM(summary or inputs, hidden, num_layers=2, batch_first=True)
@@ -33,12 +37,18 @@ class Recurrent(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, features: Tensor, state: State | None = None) -> tuple[Tensor, State]:
-        return self.over_time(self.summary(features), state)
+        with self.precision(features):
+            return self.over_time(self.summary(features), state)
+
+    def precision(self, values: Tensor) -> AbstractContextManager:
+        """Float32 if the layers are exact, otherwise as the caller computes."""
+        return torch.autocast(values.device.type, enabled=False) if self.exact else nullcontext()
 
     def over_time(self, summaries: Tensor, state: State | None = None) -> tuple[Tensor, State]:
         """`forward` from the outputs of `summary`, each of which depends on one pair only."""
-        hidden, state = self.lstm(self.dropout(summaries), state)
-        return self.output(self.dropout(hidden)).float(), state
+        with self.precision(summaries):
+            hidden, state = self.lstm(self.dropout(summaries), state)
+            return self.output(self.dropout(hidden)).float(), state
 
 
 class StackNavigator(nn.Module):
@@ -73,7 +83,8 @@ class StackNavigator(nn.Module):
         self.in_channels, self.pool, self.standardised = in_channels, pool, standardised
         self.backbone = AttentionDarknet53(in_channels, width, attention, stages=stages)
         inputs = self.backbone.channels[-1] * (1 if pool == 1 else 2 * pool**2)
-        self.recurrent = Recurrent(inputs, hidden, None if pool == 1 else min(inputs, self.SUMMARY), dropout)
+        summary = None if pool == 1 else min(inputs, self.SUMMARY)
+        self.recurrent = Recurrent(inputs, hidden, summary, dropout, exact=standardised)
         if standardised:
             self.register_buffer("feature_mean", torch.zeros(inputs))
             self.register_buffer("feature_spread", torch.ones(inputs))
@@ -87,7 +98,8 @@ class StackNavigator(nn.Module):
         """The backbone's last features, averaged over the pair or over each cell (batch, pairs, inputs)."""
         features = self.backbone(self.stacked(first, second))[-1]
         grid = (1, 1) if self.pool == 1 else (2 * self.pool, self.pool)
-        return cell_means(features, *grid).flatten(1).unflatten(0, first.shape[:2])
+        # An average has more digits than the bfloat16 of the features.
+        return cell_means(features.float(), *grid).flatten(1).unflatten(0, first.shape[:2])
 
     def features(self, first: Tensor, second: Tensor) -> Tensor:
         """The recurrent part's input (batch, pairs, inputs)."""

@@ -67,7 +67,8 @@ def predict_pose(
     if features is None:
         frames = torch.from_numpy(trajectory.shrunk(architecture["size_px"]).images)
         features = network.scaled(torch.cat(list(pooled_features(network, frames))))
-    summaries = network.recurrent.summary(features)
+    with network.recurrent.precision(features):
+        summaries = network.recurrent.summary(features)
     output = causal_outputs(network.recurrent, summaries, architecture["sequence_pairs"])
     return pose_of(output, Scales(**architecture["scales"]))
 

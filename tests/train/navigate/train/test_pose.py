@@ -9,7 +9,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.data.frames import normalised
-from perilune_train.models.navigator import Recurrent, cell_means
+from perilune_train.models.navigator import Recurrent, StackNavigator, cell_means
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data.trajectories import load_trajectories
@@ -22,7 +22,7 @@ from perilune_train.navigate.pose import (
     normalised_frames,
     pose_of,
 )
-from perilune_train.navigate.train.task import NavigationTask, learning_rate_factor
+from perilune_train.navigate.train.task import NavigationTask, axis_weights, learning_rate_factor
 from perilune_train.navigate.train.windows import Windows, truth
 from perilune_train.training.runs import save_weights
 
@@ -85,6 +85,13 @@ def test_the_truth_as_output_gives_the_pose(trajectories):
     np.testing.assert_allclose(rotation, own.rotation_camera_from_site[1:], atol=1e-6)
 
 
+def test_axes_weigh_between_metres_and_spreads():
+    scales = Scales([0.0] * 3, [8.0, 128.0, 512.0], 0.1, np.eye(3).tolist())
+    weights = axis_weights(scales, "pose")
+    assert float(weights[1] / weights[0]) == pytest.approx(4) and float(weights[2] / weights[1]) == pytest.approx(2)
+    assert axis_weights(scales, "motion").tolist() == [1, 1, 1]
+
+
 def test_cells_of_each_frame_by_hand():
     features = torch.arange(8 * 4, dtype=torch.float32).reshape(1, 1, 8, 4)
     cells = cell_means(features, 4, 2)
@@ -110,6 +117,21 @@ def test_causal_windows_are_those_of_a_loop(n_pairs):
         found = causal_outputs(recurrent, features, n_pairs)
         naive = [recurrent(features[max(0, i + 1 - n_pairs) : i + 1][None])[0][0, -1] for i in range(9)]
     torch.testing.assert_close(found, torch.stack(naive))
+
+
+def test_positions_keep_their_digits_under_autocast():
+    torch.manual_seed(0)
+    network = StackNavigator(1, 0.125, "none", 16, pool=2, standardised=True).eval()
+    torch.nn.init.normal_(network.recurrent.output.weight, std=0.1)
+    torch.nn.init.constant_(network.recurrent.output.bias, 1.5)
+    pooled = torch.randn(6, network.feature_mean.numel())
+    with torch.no_grad():
+        expected = causal_outputs(network.recurrent, network.recurrent.summary(pooled), 4)
+        with torch.autocast("cpu", torch.bfloat16):
+            whole, _ = network.recurrent(pooled[None, :4])
+            features = network.pooled(*torch.randn(2, 1, 2, 64, 64))
+    torch.testing.assert_close(whole[0], expected[:4])
+    assert features.dtype == torch.float32
 
 
 def test_windows_gather_what_the_trajectories_have(trajectories):

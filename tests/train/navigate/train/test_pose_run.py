@@ -141,6 +141,14 @@ def test_a_killed_run_goes_on_to_the_same_weights(run, dataset_nav, tmp_path, de
     assert all(torch.equal(first[key], again[key]) for key in first)
 
 
+def test_the_fine_stage_trains_the_backbone_with_the_detectors_statistics(run, detector):
+    given = torch.load(detector, weights_only=True)["state_dict"]
+    own = torch.load(run.last, weights_only=True)["state_dict"]
+    assert torch.equal(
+        own["network.backbone.stem.norm.running_mean"], given["backbone.stem.norm.running_mean"]
+    ) and not torch.equal(own["network.backbone.stem.conv.weight"], given["backbone.stem.conv.weight"])
+
+
 def test_short_coarse_epochs_are_validated_ten_times(dataset_nav, tmp_path, detector, monkeypatch, no_pictures):
     validated = []
     original = NavigationTask.on_validation_epoch_end

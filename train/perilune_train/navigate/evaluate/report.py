@@ -94,14 +94,15 @@ def _pose_page(own: str, split: str, metrics: Metrics, methods: list[str], worse
         prefix = _prefix(method, own, split)
         name = f"**{method}, worse than {worse_than}**" if method == own and worse_than else FLOORS.get(method, method)
         cells.append([name, *[_with_interval(metrics, f"{prefix}/{key}") for key in _POSE_COLUMNS]])
-    text = "In brackets: 95 % intervals over trajectories, or the value of each if there are fewer than five."
+    text = "In brackets: 95 % intervals over trajectories, if there are five or more."
     lines = ["# Pose in the landing frame", "", f"Split {split}. {text}", ""]
     return "\n".join([*lines, *table(["method", *_POSE_COLUMNS.values()], cells), ""])
 
 
 def _with_interval(metrics: Metrics, key: str) -> str:
-    value = metrics.get(key)
-    return read_spread(metrics, key).text(float(value)) if isinstance(value, int | float) else number(None)
+    value, spread = metrics.get(key), read_spread(metrics, key)
+    # Values of single trajectories would fill the table.
+    return spread.text(float(value)) if spread.interval and isinstance(value, int | float) else number(value)
 
 
 def _metrics(

@@ -14,7 +14,7 @@ from perilune_train.data.epochs import EpochBatches, batch_loader
 from perilune_train.data.shares import ALONE, Share
 from perilune_train.evaluation.provenance import Provenance
 from perilune_train.models.navigator import WarpNavigator
-from perilune_train.navigate.config import FusionConfig, NavigateConfig
+from perilune_train.navigate.config import FusionConfig, NavigateConfig, Target
 from perilune_train.navigate.data.epochs import TrainingSequences
 from perilune_train.navigate.data.sequences import Jitter
 from perilune_train.navigate.data.stream import Stream
@@ -65,6 +65,18 @@ def learning_rate_factor(
     return min(warm, 0.5 * (1 + math.cos(math.pi * done)))
 
 
+def axis_weights(scales: Scales, target: Target) -> Tensor:
+    """Weights (3,) of the standardised errors of the axes in the loss.
+
+    Positions spread over hundreds of metres along the descent and over a few across it. Equal weights then leave the
+    first inaccurate, and errors in metres the second. The weights are the geometric mean of both.
+    """
+    if target == "motion":
+        return torch.ones(3)
+    spread_m = torch.tensor(scales.spread_m)
+    return (spread_m / spread_m.square().mean().sqrt()).sqrt()
+
+
 class NavigationTask(lightning.LightningModule):
     """Training of one network: the paper's coarse, then fine stage; AdamW, short warm-up, cosine to zero.
 
@@ -74,7 +86,8 @@ class NavigationTask(lightning.LightningModule):
     `cycles` is 5; warp's pairs are mirrored and jittered (see data/sequences.py).
 
     In the coarse stage a stack network whose whole backbone is given computes the backbone's features once. The target
-    `pose` replaces the motion by the pose in O_L at the later frame; P is then the position.
+    `pose` replaces the motion by the pose in O_L at the later frame; P is then the position, its axes weighted by
+    `axis_weights`.
     """
 
     def __init__(
@@ -107,6 +120,8 @@ class NavigationTask(lightning.LightningModule):
             self.architecture |= {key: getattr(self.own, key) for key in _OF_STACK}
         network: Any = build(self.architecture)
         self.network = network.to(memory_format=torch.channels_last)
+        self.axis_weights: Tensor
+        self.register_buffer("axis_weights", axis_weights(self.scales, self.own.target), persistent=False)
         self.pretrained = frozenset(pretrained or ())
         if pretrained:
             self.network.backbone.load_state_dict(pretrained, strict=False)
@@ -202,7 +217,10 @@ class NavigationTask(lightning.LightningModule):
             parameter.requires_grad_(not (self.coarse and name in self.pretrained))
         for name, module in self.network.backbone.named_modules():
             if isinstance(module, nn.BatchNorm2d):
-                module.train(not (self.coarse and f"{name}.weight" in self.pretrained))
+                # Statistics of single batches change the features by more than their spread over the trajectories, so a
+                # network for poses keeps those of the detector.
+                kept = self.coarse or self.own.target == "pose"
+                module.train(not (kept and f"{name}.weight" in self.pretrained))
         if self.fusion == "stack" and self.windows is None:
             numbers = list(self.share.of(len(self.training_trajectories)))
             place = self.training_trajectories, numbers, self.sequences.n_pairs
@@ -228,7 +246,7 @@ class NavigationTask(lightning.LightningModule):
     def _loss(self, output: Tensor, true_position: Tensor, true_angles: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of the stage, and its parts."""
         found = euler_from_rotation(decoded_rotation(output, self.scales)) / self.scales.rotation_rad
-        position = (output[..., :3] - true_position).square().sum(-1).mean()
+        position = ((output[..., :3] - true_position) * self.axis_weights).square().sum(-1).mean()
         orientation = (found - true_angles).square().sum(-1).mean()
         if self.coarse:
             loss = position + self.settings.kappa * orientation
