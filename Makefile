@@ -284,7 +284,7 @@ bench-gates: detect-frames ## AP and variation of attention masks of detect runs
 bench-infer: setup-dev ## time of the detector per image on two cores, by engine; writes runs/bench/infer.json
 	@$(BIN)/python -m benchmarks.train.infer
 
-bench-paper-causes: setup-dev ## why short trainings of the paper's detector failed: ground, loss and gates, about half an hour on two cores; writes runs/paper-causes/paper-causes.json
+bench-paper-causes: setup-dev ## why short trainings of the paper's detector failed: ground, loss and gates, about half an hour on two cores; writes runs/paper/paper-causes.json
 	@$(BIN)/python -m benchmarks.train.paper_causes
 
 bench-captured: setup-dev ## training speed of both detectors with steps one operation at a time and captured, on a GPU; writes runs/bench/captured.json

@@ -286,7 +286,7 @@ def program(name: str) -> list[str]:
     return [sys.executable, "-c", f"from {module} import main; main()"]
 
 
-def crater_density(share: float | str) -> dict[str, str]:
+def crater_density(share: str) -> dict[str, str]:
     """Settings of the terrain: the protocol's with another density; our usual terrain for `lunar`."""
     if share == LUNAR:
         usual = resolve(DatasetConfig, "dataset", "perilune_render", "paper").terrain
@@ -307,6 +307,9 @@ def steps(one: Experiment) -> list[Step]:
     """All steps, the most important first, since a run with a limit on its time may not reach the last."""
     sizes, ground = one.sizes, "headline"
     curve = [step for share in sizes.curve for step in _on_curve(one, share)] if one.ground == Ground.PANGU else []
+    if curve and sizes.curve_width != 1.0:
+        # The network on the sparse ground has full width.
+        curve.append(_detector(one, SPARSE, f"curve-{SPARSE}", "none", sizes.curve_width))
     first = [*curve, _calibration(one)] if one.calibrate else []
     needs = ("choose the headline ground",) if one.calibrate else ()
     navigators = [("darknet53-lstm", "yolov3", "none"), ("attention-darknet53-lstm", "attention-yolov3", "cbam")]
@@ -422,13 +425,20 @@ def share_at(ap_by_share: dict[float, float], ap: float) -> float:
     return float(f"{min(max(share, 0.1), 1.7):.2g}")
 
 
+def headline_share(one: Experiment) -> str:
+    """Share of the equilibrium density of the headline ground, or `lunar`."""
+    if one.ground == Ground.LUNAR:
+        return LUNAR
+    if one.calibrate and one.chosen.is_file():
+        return f"{json.loads(one.chosen.read_text(encoding='utf-8'))['equilibrium_share']:g}"
+    dataset = resolve(DatasetConfig, "dataset", "perilune_render", one.preset, PROTOCOL)
+    return f"{dataset.terrain.craters.equilibrium_share.low:g}"
+
+
 def headline_density(one: Experiment) -> dict[str, str]:
     """Settings of the headline ground: the protocol's, or those chosen in this experiment."""
-    if one.ground == Ground.LUNAR:
-        return crater_density(LUNAR)
-    if one.calibrate and one.chosen.is_file():
-        return crater_density(json.loads(one.chosen.read_text(encoding="utf-8"))["equilibrium_share"])
-    return {}
+    chosen = one.ground == Ground.LUNAR or (one.calibrate and one.chosen.is_file())
+    return crater_density(headline_share(one)) if chosen else {}
 
 
 def _explanation(one: Experiment) -> Step:
@@ -500,7 +510,7 @@ def _page(one: Experiment) -> Step:
         f"{sizes.epochs} epochs of each detector"
     ]
     command = [*program("perilune-train"), "paper", "--runs", str(one.runs)]
-    command += ["--dataset", str(one.data / "headline" / "detect")]
+    command += ["--dataset", str(one.data / "headline" / "detect"), "--headline-share", headline_share(one)]
     return Step("page", [*command, *[text for line in about for text in ("--about", line)]], lambda: False)
 
 

@@ -115,6 +115,7 @@ def test_the_headline_ground_is_chosen_where_the_baseline_has_the_papers_ap(scri
     assert script.share_at({0.25: 0.95, 0.5: 0.90}, 0.85) == 1.0, "beyond the last point"
     assert script.share_at({0.25: 0.60, 0.5: 0.50}, 0.893) == 0.1, "not below the sparse ground"
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(script, "PROTOCOL", PROTOCOL)
     one = experiment(script, calibrate=True)
     for share, ap in (("0.25", 0.97), ("0.5", 0.893), ("1.0", 0.6)):
         run = one.runs / "detect" / f"curve-{share}"
@@ -155,6 +156,7 @@ def test_every_setting_of_every_step_is_valid(script):
 
 def test_too_little_disk_is_said_before_the_first_frame(script, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(script, "PROTOCOL", PROTOCOL)
     one = experiment(script)
     monkeypatch.setattr(script.shutil, "disk_usage", lambda _: SimpleNamespace(free=10**9))
     with pytest.raises(UserError, match=r"free disk: got 1\.0 GB, expected at least"):

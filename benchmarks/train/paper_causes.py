@@ -7,7 +7,7 @@ command resumes.
 
     python -m benchmarks.train.paper_causes --data data/paper-causes --runs runs/paper-causes
 
-Writes paper-causes.json into the folder of the runs, from which the page of the experiment takes its table.
+Writes runs/paper/paper-causes.json, from which the page of the experiment takes its tables.
 """
 
 import json
@@ -25,7 +25,13 @@ from benchmarks.figures import write_figures
 from perilune_shared.command_line import run_command_line
 
 PROTOCOL = Path("configs/paper_protocol.yaml")
-_FIGURES = ("val/ap50_paper", "val/precision", "val/recall", "test/ap75_paper")
+_COLUMNS = {
+    "AP, validation": "val/ap50_paper",
+    "precision": "val/precision",
+    "recall": "val/recall",
+    "AP at IoU 0.75, test": "test/ap75_paper",
+}
+"""Columns of the table, and their keys in metrics.json."""
 
 
 @dataclass(frozen=True)
@@ -36,29 +42,30 @@ class Row:
     """Name of its run."""
     words: str
     """What it changes, for the table."""
-    ground: str
-    """lunar or sparse."""
+    causes: tuple[str, ...]
+    """The tables that have it: loss, gates, ground."""
     settings: dict[str, str] = field(default_factory=dict)
     """Settings of the detector over the protocol's."""
 
+    @property
+    def ground(self) -> str:
+        """lunar or sparse."""
+        return self.name.partition("-")[0]
+
 
 _SUMS = {"loss.reduction": "sums"}
+_BOXES = _SUMS | {"loss.lambda_iou": "1"}
 _SEVERAL = {"assignment": "several", "loss.objectness": "iou"}
 ROWS = (
-    Row("lunar-sums", "no attention, plain sums", "lunar", _SUMS),
-    Row("sparse-sums", "no attention, plain sums", "sparse", _SUMS),
-    Row(
-        "lunar-sums-box-1",
-        "plain sums, weight of the boxes 1 in place of 0.05",
-        "lunar",
-        _SUMS | {"loss.lambda_iou": "1"},
-    ),
-    Row("lunar-means", "means", "lunar"),
-    Row("sparse-means", "means", "sparse"),
-    Row("lunar-means-several", "means, several predictors a label, IoU as target", "lunar", _SEVERAL),
-    Row("lunar-cbam-sums", "plain CBAM, plain sums", "lunar", _SUMS | {"attention": "cbam"}),
-    Row("sparse-cbam-means", "plain CBAM, means", "sparse", {"attention": "cbam"}),
-    Row("sparse-identity-means", "gates that start at identity, means", "sparse", {"attention": "cbam_identity"}),
+    Row("lunar-sums", "plain sums", ("loss", "ground"), _SUMS),
+    Row("sparse-sums", "plain sums", ("loss", "ground"), _SUMS),
+    Row("lunar-sums-box-1", "plain sums, weight of the boxes 1 in place of 0.05", ("loss",), _BOXES),
+    Row("lunar-means", "means", ("loss", "ground")),
+    Row("sparse-means", "means", ("loss", "gates", "ground")),
+    Row("lunar-means-several", "means, several predictors a label, IoU as target", ("loss",), _SEVERAL),
+    Row("lunar-cbam-sums", "plain CBAM, plain sums", ("gates",), _SUMS | {"attention": "cbam"}),
+    Row("sparse-cbam-means", "plain CBAM, means", ("gates",), {"attention": "cbam"}),
+    Row("sparse-identity-means", "gates from identity, means", ("gates",), {"attention": "cbam_identity"}),
 )
 
 
@@ -106,11 +113,15 @@ def _run(program: str, *words: str | list[str]) -> None:
     subprocess.run(command, check=True, env=os.environ | threads)
 
 
-def figures(row: Row, runs: Path) -> dict[str, object]:
-    """Figures of a finished row."""
-    metrics = json.loads((runs / "detect" / row.name / "metrics.json").read_text(encoding="utf-8"))
-    own: dict[str, object] = {key: metrics.get(key) for key in _FIGURES}
-    return {"change": row.words, "ground": row.ground, **own}
+def figures(runs: Path) -> dict[str, object]:
+    """Figures of all rows by <cause>/<row>/<column>."""
+    found: dict[str, object] = {}
+    for row in ROWS:
+        metrics = json.loads((runs / "detect" / row.name / "metrics.json").read_text(encoding="utf-8"))
+        ground = {"lunar": "our usual ground", "sparse": "sparse ground"}[row.ground]
+        for cause in row.causes:
+            found |= {f"{cause}/{row.words}, {ground}/{name}": metrics[key] for name, key in _COLUMNS.items()}
+    return found
 
 
 def main(
@@ -118,13 +129,16 @@ def main(
     runs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("runs/paper-causes"),
     frames: Annotated[int, typer.Option(help="Frames over each ground.")] = 600,
     steps: Annotated[int, typer.Option(help="Steps of each training.")] = 490,
+    out: Annotated[Path, typer.Option(help="JSON file with the figures, for the page.")] = Path(
+        "runs/paper/paper-causes.json"
+    ),
 ) -> None:
     """Render, train and write the table; two trainings at a time, each on one core."""
     for ground in ("lunar", "sparse"):
         render(ground, data, frames)
     with ThreadPoolExecutor(max(1, len(os.sched_getaffinity(0)))) as pool:
         list(pool.map(lambda row: train(row, data, runs, steps), ROWS))
-    write_figures(runs / "paper-causes.json", {row.name: figures(row, runs) for row in ROWS})
+    write_figures(out, figures(runs))
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ def _start(start: str) -> str:
 
 
 def _curve(runs: PaperRuns, share: str | None) -> list[str]:
-    curve = runs.curve()
+    curve = runs.curve(share)
     if not curve:
         return [NOT_RUN]
     draw_curve(runs.root / "curve.png", curve, share)

@@ -60,7 +60,7 @@ def verdict_note() -> str:
 
 
 def _ground(runs: PaperRuns, share: str | None, given: bool) -> str:
-    curve = runs.curve()
+    curve = runs.curve(share)
     reason = (
         "a ground of the paper's difficulty, chosen by YOLOv3 without attention alone, so that it favours neither "
         "network"

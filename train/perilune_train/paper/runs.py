@@ -115,12 +115,25 @@ class PaperRuns:
         names = {network: [detect_name(network, seed=seed) for seed in SEEDS] for network in ATTENTION}
         return {network: self._detect(*own) for network, own in names.items()}
 
-    def curve(self) -> dict[str, Metrics]:
-        """Metrics of the finished runs of the curve by share, from sparse to `lunar`."""
-        found = {path.name.removeprefix(f"{CURVE}-"): path for path in self.root.glob(f"detect/{CURVE}-*")}
-        shares = sorted((share for share in found if _is_number(share)), key=float)
-        read = {share: finished(found[share]) for share in [*shares, *({USUAL} & set(found))]}
-        return {share: metrics for share, metrics in read.items() if metrics is not None}
+    def curve(self, headline: str | None = None) -> dict[str, Metrics]:
+        """Metrics of YOLOv3 without attention by equilibrium_share, from sparse to `lunar`.
+
+        Beside the runs of the curve, those on the sparse ground, on the headline ground (with its share) and on our
+        usual one are points of it if their networks are as large as those of the curve.
+        """
+        found = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
+        read = {share: finished(self.detector(name)) for share, name in found.items()}
+        plain = next(iter(ATTENTION))
+        sizes = {metrics.get("parameters") for metrics in read.values() if metrics is not None}
+        others = [(SPARSE_SHARE, detect_name(plain, SPARSE)), (USUAL, detect_name(plain, USUAL))]
+        others += [(headline, detect_name(plain, seed=seed)) for seed in (None, SEEDS[0]) if headline is not None]
+        for share, name in others:
+            metrics = finished(self.detector(name))
+            if metrics is not None and read.get(share) is None and metrics.get("parameters") in sizes:
+                read[share] = metrics
+        shares = sorted((share for share in read if _is_number(share)), key=float)
+        ordered = {share: read[share] for share in [*shares, *({USUAL} & set(read))]}
+        return {share: metrics for share, metrics in ordered.items() if metrics is not None}
 
     def navigation(self, reading: str) -> dict[str, Metrics]:
         """Metrics of the finished navigators of a reading, by the paper's names."""
