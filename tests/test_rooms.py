@@ -28,13 +28,13 @@ ROOMS = {
         "job records identity steps work_list report scene_renderer worker local here ray_actors run status estimate"
     ),
     "train/perilune_train": (
-        "config cli_options data evaluation models training shipped detect navigate explain paper report cli"
+        "config cli_options compiled data evaluation models training shipped detect navigate explain paper report cli"
     ),
     "train/perilune_train/detect": (
         "config finished_run data evaluate inference train evaluate_run compare_runs benchmark images deploy cli"
     ),
     "train/perilune_train/navigate": (
-        "config compiled geometry data network pose relative craters filter fly evaluate covariance train evaluate_run "
+        "config geometry data network pose relative craters filter fly evaluate covariance train evaluate_run "
         "compare_runs benchmark map methods monte_carlo deploy cli"
     ),
 }

@@ -1,5 +1,6 @@
-"""Suppression of a whole batch against OpenCV's, frame by frame."""
+"""Suppression, frame by frame and of a whole batch, against OpenCV's."""
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,28 @@ def crowd(rng: np.random.Generator, count: int) -> tuple[torch.Tensor, torch.Ten
     boxes = torch.tensor(np.concatenate([centre - half, centre + half], axis=1), dtype=torch.float32)
     boxes[count // 2 :: 7] = boxes[0].clone()
     return boxes, torch.tensor(rng.uniform(0.01, 1, count).round(2), dtype=torch.float32)
+
+
+def opencv(boxes, scores, threshold):
+    """What OpenCV keeps, best first."""
+    corner_and_size = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
+    return np.asarray(cv2.dnn.NMSBoxes(corner_and_size, scores, 0.0, threshold), np.intp).reshape(-1)
+
+
+@pytest.mark.parametrize("count", [1, 40, 300, 1500, 6000])
+@pytest.mark.parametrize("spread", [1.0, 0.02, 30.0])
+def test_the_boxes_that_opencv_keeps(count, spread):
+    """Boxes of any size, far outside the image too, with equal scores, equal boxes and boxes without area."""
+    rng = np.random.default_rng(count)
+    boxes, scores = (part.double().numpy() for part in crowd(rng, count))
+    boxes = boxes * spread
+    boxes[5::97] += rng.normal(0, 3000, (len(boxes[5::97]), 4)).cumsum(1)
+    boxes[:, 2:] = np.maximum(boxes[:, :2], boxes[:, 2:])
+    boxes[11::211, 2:] = boxes[11::211, :2]
+    for threshold in (0.2, 0.45, 0.7):
+        expected = opencv(boxes, scores, threshold)
+        assert suppress(boxes, scores, threshold, count).tolist() == expected.tolist()
+        assert suppress(boxes, scores, threshold, 7).tolist() == expected[:7].tolist()
 
 
 @pytest.mark.parametrize("count", [1, 40, 300, 1500])

@@ -1,8 +1,9 @@
 """Overlap and suppression of boxes in NumPy. A box is x0, y0, x1, y1 in pixels, x1 >= x0, y1 >= y0."""
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from perilune_train.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -21,23 +22,95 @@ def iou_matrix(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_count: int) -> NDArray[np.intp]:
-    """Non-maximum suppression (OpenCV's): indices of the kept boxes, best first, at most `max_count`.
+    """Non-maximum suppression: indices of the kept boxes, best first, at most `max_count`.
 
     A box is removed if its IoU with a kept box of a higher score exceeds `threshold_iou`; equal scores keep their
-    order. No limit on candidates cuts the result short: several hundred craters with a dozen predictors each would
-    exceed any usual one.
+    order. Scores are above 0. The result is OpenCV's (`cv2.dnn.NMSBoxes`), which compares scores and overlaps as
+    float32. No limit on candidates cuts it short: several hundred craters with a dozen predictors each would exceed any
+    usual one.
     """
     boxes, scores = np.asarray(boxes, np.float64).reshape(-1, 4), np.asarray(scores, np.float64)
     if not len(boxes):
         return np.empty(0, np.intp)
-    corner_and_size = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
-    # OpenCV compares scores as float32. Its time grows with candidates times kept boxes, and the best `max_count` kept
-    # boxes depend on no lower score, so suppress only as many of the best candidates as give that number.
     order = np.argsort(-scores.astype(np.float32), kind="stable")
-    considered = max(max_count, 1)
-    while True:
-        considered *= 2
-        best = order[:considered]
-        kept = cv2.dnn.NMSBoxes(corner_and_size[best], scores[best], 0.0, threshold_iou)
-        if len(kept) >= max_count or considered >= len(order):
-            return best[np.asarray(kept, np.intp).reshape(-1)[:max_count]]
+    corner_and_size = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)[order]
+    return order[_kept(corner_and_size, np.float32(threshold_iou), max_count)]
+
+
+@compiled
+def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np.intp]:
+    """Places of the boxes (N, 4), x, y, width and height, best first, that suppression keeps, at most `max_count`.
+
+    Kept boxes are listed in the cells of a grid that they touch, so that a box is compared with those near it alone.
+    Two boxes that overlap touch a common cell, also where the grid's edge takes what lies beyond. A box that touches
+    more than `most` cells, or has no area, is kept in a list of its own, and compared with all.
+    """
+    side, most = 32, 64
+    n, low, high = len(boxes), np.empty(2), np.empty(2)
+    for axis in range(2):
+        middle = boxes[:, axis] + boxes[:, 2 + axis] / 2
+        low[axis], high[axis] = middle.min(), middle.max()
+    cell = np.maximum((high - low) / side, 1e-6)
+    heads = np.full((side, side), -1)
+    # Chains of entries: the kept box, and the next entry of its cell.
+    entries, n_entries = np.empty((4 * n + most, 2), np.int64), 0
+    kept, n_kept = np.empty(min(n, max_count), np.int64), 0
+    large, n_large = np.empty(n, np.int64), 0
+    first, last = np.empty(2, np.int64), np.empty(2, np.int64)
+    for k in range(n):
+        if n_kept >= max_count:
+            break
+        for axis in range(2):
+            start, stop = boxes[k, axis], boxes[k, axis] + boxes[k, 2 + axis]
+            first[axis] = min(max((start - low[axis]) / cell[axis], 0.0), side - 1.0)
+            last[axis] = min(max((stop - low[axis]) / cell[axis], 0.0), side - 1.0)
+        touched = (last[0] - first[0] + 1) * (last[1] - first[1] + 1)
+        # OpenCV gives two boxes without area, wherever they are, an overlap of 1.
+        everywhere = touched > most or boxes[k, 2] * boxes[k, 3] <= 0
+        removed = False
+        if everywhere:
+            for i in range(n_kept):
+                if _overlap(boxes[kept[i]], boxes[k]) > threshold_iou:
+                    removed = True
+                    break
+        else:
+            for i in range(n_large):
+                if _overlap(boxes[large[i]], boxes[k]) > threshold_iou:
+                    removed = True
+                    break
+            for column in range(first[0], last[0] + 1):
+                for row in range(first[1], last[1] + 1):
+                    entry = heads[row, column]
+                    while entry >= 0 and not removed:
+                        removed = _overlap(boxes[entries[entry, 0]], boxes[k]) > threshold_iou
+                        entry = entries[entry, 1]
+        if removed:
+            continue
+        kept[n_kept] = k
+        n_kept += 1
+        if everywhere:
+            large[n_large] = k
+            n_large += 1
+            continue
+        if n_entries + touched > len(entries):
+            longer = np.empty((2 * len(entries), 2), np.int64)
+            longer[:n_entries] = entries[:n_entries]
+            entries = longer
+        for column in range(first[0], last[0] + 1):
+            for row in range(first[1], last[1] + 1):
+                entries[n_entries, 0], entries[n_entries, 1] = k, heads[row, column]
+                heads[row, column] = n_entries
+                n_entries += 1
+    return kept[:n_kept]
+
+
+@compiled
+def _overlap(first: Array, second: Array) -> np.float32:
+    """IoU of two boxes (4,) x, y, width and height, rounded as OpenCV does; 1 for two boxes without area."""
+    areas = first[2] * first[3] + second[2] * second[3]
+    if areas <= 2.220446049250313e-16:
+        return np.float32(1.0)
+    width = min(first[0] + first[2], second[0] + second[2]) - max(first[0], second[0])
+    height = min(first[1] + first[3], second[1] + second[3]) - max(first[1], second[1])
+    common = max(width, 0.0) * max(height, 0.0)
+    return np.float32(1.0) - np.float32(1.0 - common / (areas - common))

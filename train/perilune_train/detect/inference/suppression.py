@@ -15,8 +15,8 @@ _BLOCK = 256
 def detections_of(boxes: Tensor, scores: Tensor, settings: EvaluationSettings) -> list[Detections]:
     """Detections of each frame from all predictors' boxes (N, K, 4) and scores (N, K).
 
-    On a GPU the whole batch is suppressed there; on a CPU OpenCV suppresses frame by frame, which is faster (`make
-    bench-suppress`). Both keep the same boxes in the same order.
+    On a GPU the whole batch is suppressed there; on a CPU frame by frame, which is faster (`make bench-suppress`).
+    Both keep the boxes that OpenCV keeps, in its order.
     """
     strong = scores >= settings.min_score
     if settings.max_aspect is not None:

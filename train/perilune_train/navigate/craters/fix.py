@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.frames import Array, rotation_vectors
-from perilune_train.navigate.compiled import compiled
+from perilune_train.compiled import compiled
 from perilune_train.navigate.craters.catalogue import Catalogue
 from perilune_train.navigate.craters.matching import Circles, matched
 from perilune_train.navigate.craters.projection import Pose, in_view, projected

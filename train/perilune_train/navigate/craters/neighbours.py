@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.geometry.frames import Array
-from perilune_train.navigate.compiled import compiled
+from perilune_train.compiled import compiled
 
 
 class Grid(NamedTuple):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from perilune_shared.geometry.camera import Camera
 from perilune_shared.geometry.ellipse import project_circles
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector
-from perilune_train.navigate.compiled import compiled
+from perilune_train.compiled import compiled
 from perilune_train.navigate.craters.catalogue import Catalogue
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perilune_shared.geometry.frames import Array, matrix_from_rotation_vector, rotation_vectors
-from perilune_train.navigate.compiled import compiled
+from perilune_train.compiled import compiled
 
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, FORCE_BIAS = slice(9, 12), slice(12, 15)
