@@ -26,7 +26,7 @@ import typer
 
 from perilune_render.config import DatasetConfig
 from perilune_shared.config import resolve
-from perilune_shared.errors import UserError
+from perilune_shared.errors import EXIT_INTERRUPTED, UserError
 from perilune_shared.storage.files import write_text
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.train.transfer import check_start
@@ -657,8 +657,13 @@ def run_all(one: Experiment, expected: dict[str, float], deadline: float) -> Non
             if failed and not together:
                 raise typer.Exit(next(iter(failed.values())))
     except KeyboardInterrupt:
-        _stop(running)
-        raise
+        if together:
+            _stop(running)
+            raise
+        # The terminal has stopped the step too, which has printed how to resume.
+        _end(running)
+        sys.stdout.flush()
+        os._exit(EXIT_INTERRUPTED)
     for title, code in failed.items():
         print(f"failed with code {code}: {title}; see {_log(one, title)}", flush=True)
     _run(page)
@@ -705,6 +710,15 @@ def _wait(running: list[Running], failed: dict[str, int], together: bool, deadli
         if not together and time.monotonic() > deadline:
             _stop(running)
         time.sleep(0.2)
+
+
+def _end(running: list[Running]) -> None:
+    """Wait for steps that were stopped together with this script; stop them if they were not."""
+    for each in running:
+        try:
+            each.process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            _stop([each])
 
 
 def _stop(running: list[Running]) -> None:

@@ -3,8 +3,11 @@
 import importlib.util
 import itertools
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -213,6 +216,38 @@ def test_a_failed_step_ends_the_experiment_with_its_code(script, tmp_path, monke
     with pytest.raises(typer.Exit) as raised:
         script.run_all(experiment(script), {}, float("inf"))
     assert raised.value.exit_code == 3 and not Path("page").exists()
+
+
+STOPPED = """
+import importlib.util, sys, pathlib
+spec = importlib.util.spec_from_file_location("paper_script", sys.argv[1])
+script = importlib.util.module_from_spec(spec)
+sys.modules["paper_script"] = script
+spec.loader.exec_module(script)
+from perilune_shared.command_line import run_command_line
+own = "import time; from perilune_shared.command_line import run_command_line as run; " \
+    "import pathlib; pathlib.Path('begun').touch(); run(lambda **_: time.sleep(60))"
+plan = [script.Step(title, [sys.executable, "-c", own], lambda: False) for title in ("a", "page")]
+script.steps = lambda _: plan
+one = script.Experiment("paper", script.Part[sys.argv[2]], script.Ground.PANGU, False, None, pathlib.Path("b"))
+app = script.typer.Typer()
+app.command()(lambda: script.run_all(one, {}, float("inf")))
+sys.argv = sys.argv[:1]
+run_command_line(app)
+"""
+
+
+@pytest.mark.parametrize("part", ["WHOLE", "GPU"])
+def test_ctrl_c_ends_the_experiment_with_one_line(tmp_path, part):
+    command = [sys.executable, "-c", STOPPED, str(ROOT / "scripts" / "paper.py"), part]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, process_group=0)
+    while not (tmp_path / "begun").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.5)
+    os.killpg(process.pid, signal.SIGINT)
+    _, lines = process.communicate(timeout=60)
+    assert process.returncode == 130 and lines.count("\n") == 1 and lines.startswith("stopped"), lines
 
 
 def test_files_of_an_experiment_are_small_and_come_back(tmp_path):
