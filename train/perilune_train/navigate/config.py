@@ -29,7 +29,7 @@ class FusionConfig(Section):
     """Grid over which stack averages the backbone's features. 1: over the pair, as in the paper. 2 or 4: over so many
     by so many cells of each frame, with a linear layer to at most 512 values before the LSTM."""
     stages: Literal[4, 5] = 5
-    """Stages of the backbone of stack; the paper has 5. A detector with strides 4, 8, 16 has 4."""
+    """Stages of the backbone of stack; the paper has 5. 4 leaves out the last one."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the inputs and outputs of the LSTM of stack that a training step sets to 0."""
     sequence_pairs: Count = 16

@@ -220,7 +220,8 @@ class NavigationTask(lightning.LightningModule):
                 # Statistics of single batches change the features by more than their spread over the trajectories, so a
                 # network for poses keeps those of the detector.
                 kept = self.coarse or self.own.target == "pose"
-                module.train(not (kept and f"{name}.weight" in self.pretrained))
+                # The norms of some gates have statistics, but no weight.
+                module.train(not (kept and f"{name}.running_mean" in self.pretrained))
         if self.fusion == "stack" and self.windows is None:
             numbers = list(self.share.of(len(self.training_trajectories)))
             place = self.training_trajectories, numbers, self.sequences.n_pairs
