@@ -37,8 +37,8 @@ DEVIATIONS = (
     "reading. The backbone starts from the detector. It is frozen in the coarse stage, and its features are stored.",
     "Rotations are output in units of their r.m.s. in training. Without attitude noise the camera does not rotate, and "
     "the orientation error says nothing. The second experiment (ATTITUDE=1) measures it.",
-    "The navigators' errors are standardised before they enter the loss, and means replace sums over pairs. For the pose "
-    "the axes are weighed between metres and spreads. The coarse stage has a higher learning rate of its own (the "
+    "The navigators' errors are standardised before they enter the loss, and means replace sums over pairs. For the "
+    "pose the axes are weighed between metres and spreads. The coarse stage has a higher learning rate of its own (the "
     "paper: 1e-4 in both).",
     "Features of the backbone are standardised before the LSTM, and its batch statistics stay those of the detector. "
     "Poses are evaluated in causal windows as long as the training's, not with a state carried over the descent.",
