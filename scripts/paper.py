@@ -82,6 +82,10 @@ class Sizes:
     """Width of the detectors that are trained with three seeds."""
     seeds: tuple[int, ...]
     """Seeds of the narrower detectors."""
+    navigator_width: float
+    """Width of the navigators: 1, or that of the narrower detectors, from the first seed of which they then start."""
+    more: bool
+    """Whether gates from identity on the sparse ground, and transfer from our own network, are trained too."""
     coarse_epochs: int
     """Coarse epochs of the navigators; an epoch has about 30 steps."""
     fine_epochs: int
@@ -123,10 +127,12 @@ PARTS = {
         frames=100,
         nav_trajectories=49,
         curve=("0.25", "0.5", "1.0"),
-        epochs=6,
+        epochs=5,
         curve_width=0.5,
         half_width=0.5,
         seeds=(0, 1, 2),
+        navigator_width=0.5,
+        more=False,
         coarse_epochs=104,
         fine_epochs=6,
         benchmark_scenes=2,
@@ -141,6 +147,8 @@ PARTS = {
         curve_width=1.0,
         half_width=0.5,
         seeds=(0, 1, 2),
+        navigator_width=1.0,
+        more=True,
         coarse_epochs=104,
         fine_epochs=6,
         render_workers=14,
@@ -156,6 +164,8 @@ PARTS = {
         curve_width=1.0,
         half_width=0.5,
         seeds=(0, 1, 2),
+        navigator_width=1.0,
+        more=True,
         coarse_epochs=120,
         fine_epochs=20,
         trainings=2,
@@ -172,6 +182,8 @@ TINY = Sizes(
     curve_width=0.125,
     half_width=0.125,
     seeds=(0,),
+    navigator_width=1.0,
+    more=True,
     coarse_epochs=2,
     fine_epochs=1,
     settings={"detect.batch_size": "8", "detect.validate_every": "1"},
@@ -312,7 +324,6 @@ def steps(one: Experiment) -> list[Step]:
         curve.append(_detector(one, SPARSE, f"curve-{SPARSE}", "none", sizes.curve_width))
     first = [*curve, _calibration(one)] if one.calibrate else []
     needs = ("choose the headline ground",) if one.calibrate else ()
-    navigators = [("darknet53-lstm", "yolov3", "none"), ("attention-darknet53-lstm", "attention-yolov3", "cbam")]
 
     def seeds(folder: str, attention: str) -> list[Step]:
         return [
@@ -320,18 +331,23 @@ def steps(one: Experiment) -> list[Step]:
             for seed in sizes.seeds
         ]
 
+    navigators = [("darknet53-lstm", "yolov3", "none"), ("attention-darknet53-lstm", "attention-yolov3", "cbam")]
+    whole = sizes.navigator_width == 1.0
+    half = [] if whole else [*seeds("yolov3", "none")[:1], *seeds("attention-yolov3", "cbam")[:1]]
+
     headline = [
         _render(one, ground, "detect", headline_density(one), needs),
         _render(one, ground, "nav", headline_density(one), needs),
         _detector(one, ground, "yolov3", "none", 1.0),
         _detector(one, ground, "attention-yolov3", "cbam", 1.0),
+        *half,
         *(_navigator(one, *words, "pose") for words in navigators),
         _explanation(one),
     ]
     sparse = [*_on_curve(one, SPARSE), _detector(one, SPARSE, "sparse-attention-yolov3", "cbam", 1.0)]
     identity = [
         _detector(one, ground, "attention-identity", "cbam_identity", 1.0),
-        _detector(one, SPARSE, "sparse-attention-identity", "cbam_identity", 1.0),
+        *([_detector(one, SPARSE, "sparse-attention-identity", "cbam_identity", 1.0)] if sizes.more else []),
         _detector(one, LUNAR, "lunar-attention-identity", "cbam_identity", sizes.curve_width),
     ]
     if one.ground == Ground.LUNAR:
@@ -340,8 +356,8 @@ def steps(one: Experiment) -> list[Step]:
         *first,
         *headline,
         *sparse,
-        *seeds("yolov3", "none"),
-        *seeds("attention-yolov3", "cbam"),
+        *seeds("yolov3", "none")[len(half) // 2 :],
+        *seeds("attention-yolov3", "cbam")[len(half) // 2 :],
         *(_on_curve(one, LUNAR) if one.ground == Ground.PANGU else []),
         *identity,
         *([] if first else curve),
@@ -453,9 +469,12 @@ def _explanation(one: Experiment) -> Step:
 
 def _navigator(one: Experiment, folder: str, detector: str, attention: str, target: str) -> Step:
     name = folder if target == "pose" else f"{folder}-motion"
+    sizes = one.sizes
+    detector = detector if sizes.navigator_width == 1.0 else f"{detector}-half-{sizes.seeds[0]}"
+    width = 0.125 if one.preset == "tiny" else sizes.navigator_width
     backbone = one.runs / "detect" / detector / "checkpoints" / "best.ckpt"
     settings = {"navigate__stack__attention": attention, "navigate__stack__target": target}
-    settings |= {"navigate__detector": str(backbone)}
+    settings |= {"navigate__detector": str(backbone), "navigate__stack__width": str(width)}
     if target == "motion":
         settings["navigate__stack__fine_epochs"] = "1"
     options = one.options("navigate", **settings)
@@ -465,6 +484,7 @@ def _navigator(one: Experiment, folder: str, detector: str, attention: str, targ
         [*command, "--out", str(one.runs), "--name", name],
         _finished(one.runs / "navigate" / f"{name}-stack"),
         (f"train {detector}", "render headline, navigation"),
+        width=width,
         attention=attention,
     )
 
@@ -472,7 +492,7 @@ def _navigator(one: Experiment, folder: str, detector: str, attention: str, targ
 def _transfer(one: Experiment) -> list[Step]:
     """Detectors that start from YOLOv3 of COCO, or from our own on our usual ground in its place; first frozen."""
     width = 1.0 if one.darknet is not None else one.sizes.curve_width
-    if one.darknet is None and one.ground == Ground.LUNAR:
+    if one.darknet is None and (one.ground == Ground.LUNAR or not one.sizes.more):
         return []
     start = str(one.darknet or one.runs / "detect" / "lunar-yolov3" / "checkpoints" / "best.ckpt")
     more = {"detect__init_from": start, "detect__frozen_epochs": str(min(2, one.sizes.epochs - 1))}
@@ -548,12 +568,13 @@ def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
                 config = detect.model_copy(update={"width": step.width, "attention": step.attention})
                 per_image[kind] = detect_seconds(config, size_px)
             found[step.title] = per_image[kind] * step.images
-        elif step.title.endswith("lstm"):
-            own = navigate.stack.model_copy(update={"attention": step.attention})
+        elif "lstm" in step.title:
+            own = navigate.stack.model_copy(update={"attention": step.attention, "width": step.width})
             seconds = navigate_seconds(navigate.model_copy(update={"stack": own}))
             pairs = 0.8 * one.sizes.nav_trajectories * one.sizes.frames
             # Features of the coarse stage are computed once, forward only.
-            found[step.title] = seconds * pairs * (one.sizes.fine_epochs + 1 / 3)
+            fine = 1 if step.title.endswith("motion") else one.sizes.fine_epochs
+            found[step.title] = seconds * pairs * (fine + 1 / 3)
     return found
 
 

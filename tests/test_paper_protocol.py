@@ -96,6 +96,11 @@ def test_networks_differ_by_attention_alone(script):
     found = commands(script, experiment(script))
     plain, attended = found["train yolov3"], found["train attention-yolov3"]
     assert plain.replace("attention=none", "attention=cbam").replace("yolov3", "attention-yolov3") == attended
+    assert "detect/yolov3-half-0/checkpoints/best.ckpt" in found["train darknet53-lstm"], "two cores: half width"
+    titles = list(found)
+    assert titles.index("train yolov3-half-0") < titles.index("train darknet53-lstm") < titles.index("explain")
+    assert len(set(titles)) == len(titles) and {f"train yolov3-half-{seed}" for seed in (0, 1, 2)} <= set(titles)
+    found = commands(script, experiment(script, part=script.Part.GPU))
     plain, attended = found["train darknet53-lstm"], found["train attention-darknet53-lstm"]
     changed = plain.replace("attention=none", "attention=cbam").replace("yolov3", "attention-yolov3")
     assert changed.replace("darknet53-lstm", "attention-darknet53-lstm") == attended
@@ -136,6 +141,7 @@ def test_the_headline_ground_is_chosen_where_the_baseline_has_the_papers_ap(scri
 def test_the_second_experiment_and_given_weights(script):
     one = experiment(script, attitude=True, darknet=Path("yolov3.weights"))
     found = commands(script, one)
+    assert "train transfer-yolov3" not in commands(script, experiment(script)), "too long for two cores"
     assert "detect.init_from=yolov3.weights" in found["train transfer-attention-yolov3"]
     for kind in ("detect", "nav"):
         assert f"dataset.{kind}.flight.attitude_sigma_deg=1.0" in found["render headline"]
