@@ -134,7 +134,7 @@ def test_the_headline_ground_is_chosen_where_the_baseline_has_the_papers_ap(scri
     choice.command()
     assert json.loads(one.chosen.read_text())["equilibrium_share"] == 0.5 and choice.done()
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(script.Experiment, "runs", property(lambda _: tmp_path / "runs" / "paper"))
+    monkeypatch.setattr(script.Experiment, "runs", property(lambda _: tmp_path / "runs" / "paper-gpu"))
     assert "equilibrium_share={low: 0.5, high: 0.5}" in commands(script, one)["render headline"]
 
 
