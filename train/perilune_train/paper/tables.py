@@ -1,8 +1,10 @@
 """Tables of the page: Table II, the curve, Table III, ablations of the causes."""
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 
+from perilune_shared.errors import UserError
 from perilune_train.evaluation.markdown import number, table
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.spread import read_spread
@@ -17,7 +19,6 @@ from perilune_train.paper.runs import (
     TRANSFER,
     USUAL,
     PaperRuns,
-    finished,
 )
 
 _DETECTION = {
@@ -139,9 +140,19 @@ def read_causes(runs: PaperRuns) -> dict[str, list[str]]:
     Keys of paper-causes.json are <cause>/<row>/<column>, with cause loss, gates or ground; values are numbers or texts.
     Other keys are not shown.
     """
-    content = finished(runs.root, CAUSES) or {}
+    path = runs.root / CAUSES
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise UserError(path, "content", str(error), "the file that make bench-paper-causes writes") from None
+    if not isinstance(content, dict):
+        raise UserError(path, "content", type(content).__name__, "the file that make bench-paper-causes writes")
+    # The record of the run is an object.
+    figures = {key: value for key, value in content.items() if isinstance(value, str | int | float)}
     causes: dict[str, dict[str, dict[str, str]]] = {}
-    for key, value in content.items():
+    for key, value in figures.items():
         cause, _, rest = key.partition("/")
         row, _, column = rest.rpartition("/")
         if row and cause != "run":
