@@ -83,7 +83,8 @@ def main() -> None:
     all_s = median_s(lambda: suppress(several_boxes, several_scores, THRESHOLD_IOU, len(several_boxes)))
     limited_s = median_s(lambda: suppress(several_boxes, several_scores, THRESHOLD_IOU, limit))
     sizes = np.concatenate([several_boxes[:, :2], several_boxes[:, 2:] - several_boxes[:, :2]], axis=1)
-    opencv_s = median_s(lambda: cv2.dnn.NMSBoxes(sizes, several_scores, 0.0, THRESHOLD_IOU))
+    scores_list = several_scores.tolist()
+    opencv_s = median_s(lambda: cv2.dnn.NMSBoxes(sizes, scores_list, 0.0, THRESHOLD_IOU))
     result["untrained"] = {
         "candidates": len(several_boxes),
         "limit": limit,
