@@ -3,7 +3,7 @@
     python scripts/paper.py [--preset paper] [--part whole|gpu|full] [--ground pangu|lunar] [--attitude]
 
 Every step is one of the commands that a user has, printed before it runs. A finished step is left unchanged. Part `gpu`
-renders frames while networks train on those that are ready. With `--minutes`, what is done by then is on the page.
+renders frames while networks train on finished datasets. With `--minutes`, the page shows what is done by then.
 """
 
 import itertools
@@ -83,7 +83,7 @@ class Sizes:
     seeds: tuple[int, ...]
     """Seeds of the narrower detectors."""
     navigator_width: float
-    """Width of the navigators: 1, or that of the narrower detectors, from the first seed of which they then start."""
+    """Width of the navigators. At half width they start from the narrower detectors of the first seed."""
     more: bool
     """Whether gates from identity on the sparse ground, and transfer from our own network, are trained too."""
     coarse_epochs: int
@@ -452,7 +452,7 @@ def headline_share(one: Experiment) -> str:
 
 
 def headline_density(one: Experiment) -> dict[str, str]:
-    """Settings of the headline ground: the protocol's, or those chosen in this experiment."""
+    """Settings of the headline ground that differ from the protocol's."""
     chosen = one.ground == Ground.LUNAR or (one.calibrate and one.chosen.is_file())
     return crater_density(headline_share(one)) if chosen else {}
 
@@ -688,7 +688,7 @@ def run_all(one: Experiment, expected: dict[str, float], deadline: float) -> Non
     for title, code in failed.items():
         print(f"failed with code {code}: {title}; see {_log(one, title)}", flush=True)
     _run(page)
-    if failed and deadline == math.inf:
+    if failed:
         raise typer.Exit(next(iter(failed.values())))
 
 

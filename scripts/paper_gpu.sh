@@ -18,16 +18,16 @@ if [ "${1:-}" = wheels ]; then
 fi
 
 python=${PYTHON:-python3}
-[ -x .venv/bin/python ] && python=${PYTHON:-.venv/bin/python}
-if ls .wheels/*.whl >/dev/null 2>&1; then
+if [ -x .venv/bin/python ]; then
+  python=${PYTHON:-.venv/bin/python}
+elif ls .wheels/*.whl >/dev/null 2>&1; then
   site=$(mktemp -d)
   trap 'rm -rf "$site"' EXIT
   "$python" -m pip install -q --no-index --no-deps --no-compile --no-cache-dir --target "$site" .wheels/*.whl
 fi
 export PYTHONPATH="${site:+$site:}$PWD/shared:$PWD/render:$PWD/train${PYTHONPATH:+:$PYTHONPATH}" PYTHONUNBUFFERED=1
-part=gpu
 [ "$preset" = tiny ] && runs=runs/paper-tiny || runs=runs/paper-gpu
 # What is done by then is packed, whatever happened.
-"$python" scripts/paper.py --preset "$preset" --part $part ${CALIBRATE:+--calibrate} --minutes "$minutes" || code=$?
+"$python" scripts/paper.py --preset "$preset" --part gpu ${CALIBRATE:+--calibrate} --minutes "$minutes" || code=$?
 "$python" scripts/paper_files.py pack "$runs" "$out"
 exit "${code:-0}"

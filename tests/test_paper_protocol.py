@@ -201,7 +201,9 @@ def test_steps_run_together_in_their_order_and_stop_in_time(script, tmp_path, mo
         step(script, "page", "open('page', 'w')", lambda: False),
     ]
     monkeypatch.setattr(script, "steps", lambda _: plan)
-    script.run_all(one, {}, script.time.monotonic() + 4)
+    with pytest.raises(typer.Exit) as raised:
+        script.run_all(one, {}, script.time.monotonic() + 4)
+    assert raised.value.exit_code == 3, "the code of the broken step, after the page"
     assert all(Path(name).is_file() for name in ("frames", "third", "network", "late-begun", "page"))
     assert not Path("late").is_file() and not Path("never-begun").exists()
     begun, ended = (

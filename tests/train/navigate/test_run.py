@@ -4,11 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from tests.train.navigate.train.small_networks import NETWORK, saved_detector
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
-from perilune_train.models.yolo import YOLOv3
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data.sequences import pair_sequence
 from perilune_train.navigate.data.trajectories import load_trajectories
@@ -16,23 +16,11 @@ from perilune_train.navigate.network import Collate, Scales, load_navigator, pre
 from perilune_train.navigate.train.run import navigate_run
 from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.navigate.train.windows import Windows
-from perilune_train.training.runs import save_weights
-
-_NETWORK = {
-    "size_px": 64,
-    "width": 0.125,
-    "hidden": 16,
-    "sequence_pairs": 4,
-    "batch_sequences": 2,
-    "coarse_epochs": 1,
-    "fine_epochs": 1,
-    "learning_rate": 1e-3,
-}
 
 
 def _settings(**changes):
     return NavigateConfig(
-        **{"precision": "float32", "device": "cpu", "warp": _NETWORK | {"jitter": 1.0}, "stack": _NETWORK} | changes
+        **{"precision": "float32", "device": "cpu", "warp": NETWORK | {"jitter": 1.0}, "stack": NETWORK} | changes
     )
 
 
@@ -43,11 +31,7 @@ def trajectories(dataset_nav):
 
 @pytest.fixture(scope="module")
 def detector(tmp_path_factory):
-    torch.manual_seed(3)
-    architecture = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [4, 8, 16]}
-    path = tmp_path_factory.mktemp("detector") / "best.ckpt"
-    save_weights(path, architecture, YOLOv3(None, **architecture))
-    return path
+    return saved_detector(tmp_path_factory.mktemp("detector"), "cbam_identity", [4, 8, 16])
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +124,7 @@ def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path,
     given = torch.load(detector, weights_only=True)["state_dict"]
 
     def backbone(coarse, fine):
-        network = _NETWORK | {"coarse_epochs": coarse, "fine_epochs": fine}
+        network = NETWORK | {"coarse_epochs": coarse, "fine_epochs": fine}
         (run,) = navigate_run(_settings(fusion="stack", stack=network), dataset_nav, tmp_path, "t", detector, True)
         state = torch.load(run.last, weights_only=True)["state_dict"]
         own = {key.removeprefix("network."): value for key, value in state.items()}
@@ -155,7 +139,7 @@ def test_coarse_stage_leaves_the_detectors_backbone_alone(dataset_nav, tmp_path,
 
 @pytest.mark.usefixtures("no_pictures")
 def test_a_detector_that_does_not_fit(dataset_nav, tmp_path, detector, capsys):
-    settings = _settings(fusion="stack", stack=_NETWORK | {"width": 0.25})
+    settings = _settings(fusion="stack", stack=NETWORK | {"width": 0.25})
     (run,) = navigate_run(settings, dataset_nav, tmp_path, "t", detector, True)
     assert "width" in json.loads(run.metrics.read_text())["network/backbone"]
     with pytest.raises(UserError, match=r"width: got 0\.125"):

@@ -110,7 +110,7 @@ class StackNavigator(nn.Module):
         return (pooled - self.feature_mean) / self.feature_spread if self.standardised else pooled
 
     def measure(self, pooled: Tensor) -> None:
-        """Set mean and spread of a standardised network to those of the averages (pairs, inputs) of training pairs."""
+        """Standardise features by the mean and spread of the averages (pairs, inputs) of training pairs."""
         spread = pooled.std(0)
         self.feature_mean.copy_(pooled.mean(0))
         # Features that hardly vary would otherwise be amplified without limit.

@@ -47,8 +47,8 @@ class FusionConfig(Section):
     learning_rate: Positive
     """Peak learning rate; the paper uses 1e-4."""
     coarse_learning_rate: Positive | None = None
-    """Peak learning rate of the coarse stage, which then has a cosine of its own down to 0. None: that of both stages,
-    as `cycles` says."""
+    """Peak learning rate of the coarse stage, which then has a cosine of its own down to 0. None: `learning_rate`
+    in both stages, as `cycles` says."""
     cycles: Count = 1
     """Cosines of the learning rate. 1: one over both stages. More (the paper: 5): constant in the coarse stage, then
     this number of cosines, each from the peak down to 0, in the fine stage."""

@@ -62,7 +62,7 @@ def predict_pose(
 ) -> Pose:
     """Poses at the later frames of a trajectory's pairs, with the network in evaluation mode.
 
-    `features` (pairs, inputs) are those of the backbone, as `StackNavigator.features` gives them, if they are known.
+    `features` (pairs, inputs) are the backbone's, as `StackNavigator.features` gives them, if they are known.
     """
     if features is None:
         frames = torch.from_numpy(trajectory.shrunk(architecture["size_px"]).images)

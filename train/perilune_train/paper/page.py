@@ -51,8 +51,9 @@ def write_page(root: Path, dataset: Address, about: Sequence[str] = (), headline
     """Write paper.md, paper.json and pictures into the folder of the experiment's runs; returns the page.
 
     `dataset` is the detection dataset of the headline ground. `about` are lines that say how the experiment was made
-    and what was cut. `headline_share` is the equilibrium_share of the headline ground, by default that of the curve
-    with the AP nearest to the paper's. A section without finished runs says so. Raises UserError if no run is finished.
+    and what was cut. `headline_share` is the equilibrium_share of the headline ground, by default the point of the
+    curve with the AP nearest to the paper's. A section without finished runs says so. Raises UserError if no run is
+    finished.
     """
     runs = PaperRuns(root)
     if not root.is_dir():

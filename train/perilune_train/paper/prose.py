@@ -40,7 +40,7 @@ DEVIATIONS = (
     "The navigators' errors are standardised before they enter the loss, and means replace sums over pairs. For the "
     "pose the axes are weighed between metres and spreads. The coarse stage has a higher learning rate of its own (the "
     "paper: 1e-4 in both).",
-    "Features of the backbone are standardised before the LSTM, and its batch statistics stay those of the detector. "
+    "Features of the backbone are standardised before the LSTM, and its batch statistics stay as in the detector. "
     "Poses are evaluated in causal windows as long as the training's, not with a state carried over the descent.",
     "The best epoch on validation is tested.",
 )

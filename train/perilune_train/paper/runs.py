@@ -73,7 +73,7 @@ def navigate_name(navigator: str, reading: str = "pose") -> str:
 
 
 def nearest_share(curve: Mapping[str, Metrics], account: str = "") -> str | None:
-    """Share of the curve, except `lunar`, whose AP on validation is nearest to that of the paper's YOLOv3.
+    """Share of the curve, except `lunar`, at which the AP on validation is nearest to the AP of the paper's YOLOv3.
 
     `account` is "" (usual) or "strict/". None if the curve has no AP.
     """
@@ -118,8 +118,8 @@ class PaperRuns:
     def curve(self, headline: str | None = None) -> dict[str, Metrics]:
         """Metrics of YOLOv3 without attention by equilibrium_share, from sparse to `lunar`.
 
-        Beside the runs of the curve, those on the sparse ground, on the headline ground (with its share) and on our
-        usual one are points of it if their networks are as large as those of the curve.
+        Runs on the sparse, the headline and our usual ground are points too if their networks are as large as in the
+        runs of the curve. `headline` is the share of the headline ground.
         """
         found = {path.name.removeprefix(f"{CURVE}-"): path.name for path in self.root.glob(f"detect/{CURVE}-*")}
         read = {share: finished(self.detector(name)) for share, name in found.items()}

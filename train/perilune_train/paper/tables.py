@@ -110,7 +110,7 @@ def table_3(runs: PaperRuns, reading: str) -> list[str]:
     others: dict[str, list[str]] = {}
     for network, metrics in found.items():
         for method, name in (FLOORS | _METHODS).items():
-            # The features are those of the network's own backbone.
+            # The features come from the network's own backbone.
             title = f"{name} of {network}" if method == "ridge" else name
             if f"baseline/{method}/{_POSITION}" in metrics:
                 others.setdefault(title, [title, "here", *_errors(metrics, f"baseline/{method}"), "-"])

@@ -1,5 +1,7 @@
 """Frames that stay on the device, and whole steps in place of Lightning's: the same training."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from perilune_shared.config import resolve
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_train.detect.config import DetectConfig, LabelSettings
 from perilune_train.detect.data.batches import network_input, training_loader
-from perilune_train.detect.data.resident import ResidentFrames, may_reside, resident_loader
+from perilune_train.detect.data.resident import ResidentFrames, fits, may_reside, resident_loader
 from perilune_train.detect.data.split import load_split
 from perilune_train.detect.train.loss import detection_loss
 from perilune_train.detect.train.run import run_detect
@@ -72,6 +74,13 @@ def test_whole_steps_train_as_ordinary_ones(dataset_detect, tmp_path, monkeypatc
         torch.testing.assert_close(value, runs[1][name], rtol=1e-2, atol=4 * lr, msg=name)
     difference = torch.cat([(value - runs[1][name]).flatten() for name, value in runs[0].items() if value.ndim > 1])
     assert difference.abs().mean() < 0.05 * lr
+
+
+def test_frames_may_take_a_quarter_of_a_gpu(split, monkeypatch):
+    for times, expected in ((4, True), (3, False)):
+        memory = SimpleNamespace(total_memory=times * split.frames.images.nbytes)
+        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _, memory=memory: memory)
+        assert fits(split, torch.device("cuda")) == expected
 
 
 def test_only_plain_training_may_reside():

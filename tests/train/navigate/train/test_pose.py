@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
+from tests.train.navigate.train.small_networks import NETWORK, pose_settings, saved_detector
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.geometry.frames import matrix_from_rotation_vector
 from perilune_train.data.frames import normalised
 from perilune_train.models.navigator import Recurrent, StackNavigator, cell_means
-from perilune_train.models.yolo import YOLOv3
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data.trajectories import load_trajectories
 from perilune_train.navigate.evaluate.floors import Known, mean_poses, ridge_poses
@@ -24,24 +24,10 @@ from perilune_train.navigate.pose import (
 )
 from perilune_train.navigate.train.task import NavigationTask, axis_weights, learning_rate_factor
 from perilune_train.navigate.train.windows import Windows, truth
-from perilune_train.training.runs import save_weights
-
-_NETWORK = {
-    "size_px": 64,
-    "width": 0.125,
-    "hidden": 16,
-    "sequence_pairs": 4,
-    "batch_sequences": 2,
-    "coarse_epochs": 2,
-    "fine_epochs": 1,
-    "learning_rate": 1e-3,
-}
-_POSE = {"target": "pose", "pool": 2, "dropout": 0.2}
 
 
 def settings(fusion="stack", **changes):
-    own = {"precision": "float32", "device": "cpu", "fusion": fusion}
-    return NavigateConfig(**own, warp=_NETWORK, stack=_NETWORK | _POSE | changes)
+    return pose_settings(changes.pop("attention", "cbam_identity"), fusion, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -52,20 +38,16 @@ def trajectories(dataset_nav):
 @pytest.fixture(scope="module")
 def detector(tmp_path_factory):
     """A detector whose whole backbone fits the stack network."""
-    torch.manual_seed(3)
-    architecture = {"in_channels": 1, "width": 0.125, "attention": "cbam_identity", "strides": [8, 16, 32]}
-    path = tmp_path_factory.mktemp("detector") / "best.ckpt"
-    save_weights(path, architecture, YOLOv3(None, **architecture))
-    return path
+    return saved_detector(tmp_path_factory.mktemp("detector"), "cbam_identity", [8, 16, 32])
 
 
 def test_only_stack_estimates_a_pose():
     with pytest.raises(ValidationError, match=r"warp.target=motion, since only stack has another"):
-        NavigateConfig(warp=_NETWORK | {"target": "pose"}, stack=_NETWORK)
+        NavigateConfig(warp=NETWORK | {"target": "pose"}, stack=NETWORK)
     with pytest.raises(ValidationError, match=r"warp.pool=1"):
-        NavigateConfig(warp=_NETWORK | {"pool": 4}, stack=_NETWORK)
+        NavigateConfig(warp=NETWORK | {"pool": 4}, stack=NETWORK)
     with pytest.raises(ValidationError, match=r"pool"):
-        NavigateConfig(warp=_NETWORK, stack=_NETWORK | {"pool": 3})
+        NavigateConfig(warp=NETWORK, stack=NETWORK | {"pool": 3})
 
 
 def test_the_truth_as_output_gives_the_pose(trajectories):

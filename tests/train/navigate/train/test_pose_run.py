@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from tests.helpers import in_process
+from tests.train.navigate.train.small_networks import pose_settings, saved_detector
 
 from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
@@ -17,8 +18,6 @@ from perilune_train.explain.evidence.performance import MotionPerformance
 from perilune_train.explain.inputs import consecutive_pairs
 from perilune_train.explain.navigation import untrained_navigator
 from perilune_train.models.navigator import StackNavigator
-from perilune_train.models.yolo import YOLOv3
-from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.data.trajectories import load_trajectories
 from perilune_train.navigate.network import load_navigator
 from perilune_train.navigate.pose import (
@@ -29,24 +28,10 @@ from perilune_train.navigate.train.run import navigate_run
 from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.report.navigation import navigation_section
 from perilune_train.report.sources import read_run
-from perilune_train.training.runs import save_weights
-
-_NETWORK = {
-    "size_px": 64,
-    "width": 0.125,
-    "hidden": 16,
-    "sequence_pairs": 4,
-    "batch_sequences": 2,
-    "coarse_epochs": 2,
-    "fine_epochs": 1,
-    "learning_rate": 1e-3,
-}
-_POSE = {"target": "pose", "attention": "cbam_last", "pool": 2, "dropout": 0.2}
 
 
 def settings(fusion="stack", **changes):
-    own = {"precision": "float32", "device": "cpu", "fusion": fusion}
-    return NavigateConfig(**own, warp=_NETWORK, stack=_NETWORK | _POSE | changes)
+    return pose_settings(changes.pop("attention", "cbam_last"), fusion, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -57,11 +42,7 @@ def trajectories(dataset_nav):
 @pytest.fixture(scope="module")
 def detector(tmp_path_factory):
     """A detector whose whole backbone fits the stack network."""
-    torch.manual_seed(3)
-    architecture = {"in_channels": 1, "width": 0.125, "attention": "cbam_last", "strides": [8, 16, 32]}
-    path = tmp_path_factory.mktemp("detector") / "best.ckpt"
-    save_weights(path, architecture, YOLOv3(None, **architecture))
-    return path
+    return saved_detector(tmp_path_factory.mktemp("detector"), "cbam_last", [8, 16, 32])
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,8 @@ from perilune_train.detect.data.split import DetectSplit
 _UNCHANGED = AugmentSettings(
     flips_and_turns=False, scale=(1.0, 1.0), gain=0.0, gamma=0.0, stretch=0.0, blur_px=0.0, noise=0.0
 )
+_LARGEST_SHARE = 0.25
+"""Share of the memory of a GPU that resident frames may take."""
 _PORTION = 256
 """Frames whose assignments are computed together."""
 
@@ -104,10 +106,15 @@ def _padded(parts: list[Assignment], device: torch.device) -> ResidentScale:
 
 
 def may_reside(config: DetectConfig) -> bool:
-    """Whether the settings allow frames on the GPU: no augmentation, teacher or guidance, one process, no stream."""
+    """Whether the settings allow resident frames: no augmentation, teacher or guidance, one process, no stream."""
     alone = config.devices == config.num_nodes == 1
     plain = config.teacher is None and config.loss.lambda_guide == 0
     return alone and plain and not config.stream and config.augment == _UNCHANGED
+
+
+def fits(split: DetectSplit, device: torch.device) -> bool:
+    """Whether the frames of a split take at most a quarter of the memory of a GPU; assignments take far less."""
+    return split.frames.images.nbytes <= _LARGEST_SHARE * torch.cuda.get_device_properties(device).total_memory
 
 
 class _Numbers(torch_data.Dataset):

@@ -41,7 +41,7 @@ def suppress(boxes: ArrayLike, scores: ArrayLike, threshold_iou: float, max_coun
 def _kept(boxes: Array, threshold_iou: np.float32, max_count: int) -> NDArray[np.intp]:
     """Places of the boxes (N, 4), x, y, width and height, best first, that suppression keeps, at most `max_count`.
 
-    Kept boxes are listed in the cells of a grid that they touch, so that a box is compared with those near it alone.
+    Kept boxes are listed in the cells of a grid that they touch, so that a box is compared only with those near it.
     Two boxes that overlap touch a common cell, also where the grid's edge takes what lies beyond. A box that touches
     more than `most` cells, or has no area, is kept in a list of its own, and compared with all.
     """

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import Batch, evaluation_loader, network_input, training_loader
-from perilune_train.detect.data.resident import ResidentFrames, may_reside, resident_loader
+from perilune_train.detect.data.resident import ResidentFrames, fits, may_reside, resident_loader
 from perilune_train.detect.data.split import DetectSplit
 from perilune_train.detect.data.streamed import StreamedSplit, streamed_loader
 from perilune_train.detect.evaluate.matching import Detections, joined, match_split
@@ -112,7 +112,9 @@ class DetectTask(lightning.LightningModule):
     @property
     def resides(self) -> bool:
         """Whether the training frames are kept on the device, and steps are captured."""
-        return self.device.type == "cuda" and may_reside(self.config)
+        if self.device.type != "cuda" or isinstance(self.train_split, StreamedSplit):
+            return False
+        return may_reside(self.config) and fits(self.train_split, self.device)
 
     def train_dataloader(self) -> Any:
         # The current epoch is one too low here if the run is resumed after a whole epoch.
@@ -217,7 +219,7 @@ class DetectTask(lightning.LightningModule):
         """Losses of a batch of resident frames; updates the weights. No value is read, so that it may be captured."""
         optimizer: Any = self.optimizers(use_pl_optimizer=False)
         optimizer.zero_grad(set_to_none=True)
-        # Weights that a cache casts once would not be those of the next step.
+        # A cache would keep the casts of the weights, which the step changes.
         kind = self.device.type
         enabled, dtype = torch.is_autocast_enabled(kind), torch.get_autocast_dtype(kind)
         with torch.autocast(kind, dtype, enabled, cache_enabled=False):

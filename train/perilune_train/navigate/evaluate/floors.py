@@ -52,7 +52,7 @@ class Known:
 
 
 def ridge_poses(training: Known, validation: Known, features: list[Array]) -> list[Pose]:
-    """Poses from features (pairs, inputs) of each test trajectory by ridge regression on those of the training pairs.
+    """Poses from features (pairs, inputs) of each test trajectory by ridge regression fitted to the training pairs.
 
     Features are standardised. The penalty is the one of the lowest squared error of position on validation.
     """

@@ -63,7 +63,7 @@ def _ridge(
     """Poses by ridge regression on the features of the backbone as the detector gave it."""
     frozen: Any = build(task.architecture)
     frozen.backbone.load_state_dict(backbone, strict=False)
-    # Scaled as those that the coarse stage stored.
+    # The coarse stage stored its features at this scale.
     for name in ("feature_mean", "feature_spread"):
         getattr(frozen, name).copy_(getattr(task.network, name))
     frozen.to(device, memory_format=torch.channels_last)

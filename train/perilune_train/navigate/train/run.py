@@ -114,7 +114,7 @@ def navigate_run(
         }
         for fusion, spent in seconds.items()
     }
-    # Errors of poses are not those of motions, so no table has both.
+    # Errors of poses and of motions are not comparable, so no table has both.
     of_motions = {fusion: run for fusion, run in folders.items() if getattr(settings, fusion).target == "motion"}
     if "stack" in tasks and "stack" not in of_motions:
         evaluate_pose_run(folders["stack"], tasks["stack"], trajectories, backbone, common["stack"])
@@ -128,7 +128,7 @@ def _evaluate_motions(
 ) -> None:
     """Evaluate networks for motion beside the methods without training; write the tables of the trained ones.
 
-    `common` has those entries of the metrics of each trained run that need no evaluation.
+    `common` has the entries of each trained run's metrics that need no evaluation.
     """
     test = [trajectory for trajectory in trajectories if trajectory.split == "test"]
     classical = baselines([trajectory for trajectory in trajectories if trajectory.split == "train"], test)

@@ -218,7 +218,7 @@ class NavigationTask(lightning.LightningModule):
         for name, module in self.network.backbone.named_modules():
             if isinstance(module, nn.BatchNorm2d):
                 # Statistics of single batches change the features by more than their spread over the trajectories, so a
-                # network for poses keeps those of the detector.
+                # network for poses keeps the detector's statistics.
                 kept = self.coarse or self.own.target == "pose"
                 # The norms of some gates have statistics, but no weight.
                 module.train(not (kept and f"{name}.running_mean" in self.pretrained))
