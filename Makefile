@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-shared results clean
+.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-shared results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -200,7 +200,11 @@ closed-loop: setup ## fly a descent in closed loop: guidance, navigation filter 
 JOBS ?= 2
 # A test marked `slow` kills processes, starts Ray or a browser, or renders the shared manifests again.
 test: setup-dev ## run the tests, in JOBS=2 processes (SLOW=1 also runs those marked slow, as .ci/run does)
-	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --max-worker-restart=0 $(if $(SLOW),,-m "not slow")
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal --max-worker-restart=0 -m "$(if $(SLOW),not hostile,not slow and not hostile)"
+
+test-hostile: setup-dev ## run hostile and broken input through every command; prints the number of inputs, peak memory and longest time
+	@log=$$(mktemp) && trap 'rm -f "$$log"' EXIT && PERILUNE_HOSTILE_LOG="$$log" OMP_NUM_THREADS=1 \
+	  $(BIN)/python -m pytest -n $(JOBS) --dist worksteal --max-worker-restart=0 -m hostile tests/hostile
 
 # Tracing slows every line of every library, on Python before 3.12.
 coverage: setup-dev ## run all tests, the slow ones too, and print their line coverage, which has no target; takes 1.6 times as long
