@@ -43,6 +43,7 @@ NOT_RUN = "Not run."
 _EXPLAINED = ("masks_detect.png", "masks_navigate.png", "pcc_detect.png", "pcc_navigate.png")
 _READINGS = {
     "pose": "Pose in O_L: position and attitude in the landing frame, the reading of the paper",
+    "attitude": "Pose in O_L over descents with attitude noise, on the backbones of the descents without",
     "motion": "Motion from frame to frame",
 }
 
