@@ -18,8 +18,8 @@ from perilune_train.models.navigator import Recurrent, StackNavigator
 from perilune_train.navigate.data.trajectories import Pose, Trajectory
 from perilune_train.navigate.network import Scales, decoded_rotation
 
-_PAIRS = 16
-"""Pairs at a time through the backbone, to bound memory."""
+_PAIRS = {"cpu": 16, "cuda": 32}
+"""Pairs at a time through the backbone, to bound memory. More on a GPU, which would wait for launches of kernels."""
 
 
 def normalised_frames(frames: Tensor) -> Tensor:
@@ -53,8 +53,9 @@ def pooled_features(network: StackNavigator, frames: Tensor, homographies: Tenso
     In portions, on the network's device. With homographies (n, 3, 3) the frames are warped first (`warped_frames`).
     """
     device = next(network.parameters()).device
-    for start in range(0, len(frames) - 1, _PAIRS):
-        span = slice(start, start + _PAIRS + 1)
+    at_once = _PAIRS.get(device.type, 16)
+    for start in range(0, len(frames) - 1, at_once):
+        span = slice(start, start + at_once + 1)
         part = frames[span].to(device, non_blocking=True)
         if homographies is not None:
             part = warped_frames(part, homographies[span].to(device, non_blocking=True))
