@@ -77,6 +77,7 @@ def _ridge(
     validation = [task.validation_trajectories[number] for number in task.validated]
     known = {}
     for split, own in (("train", training), ("val", validation)):
-        stored = [one.cpu().numpy() for one in task.stored.get(split, [])]
+        # Features of views come after those of the trajectories.
+        stored = [one[: sum(t.n_pairs for t in own)].cpu().numpy() for one in task.stored.get(split, [])]
         known[split] = Known(own, stored or features(own))
     return ridge_poses(known["train"], known["val"], features(test))
