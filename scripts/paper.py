@@ -112,6 +112,7 @@ _TWO_CORES = {
     "navigate.workers": "0",
     "navigate.stack.batch_sequences": "1",
     "navigate.stack.accumulate": "8",
+    "navigate.stack.views": "4",
 }
 """Settings that fit two cores and 16 GB."""
 _GPU = {
@@ -123,6 +124,7 @@ _GPU = {
     # Two navigators and three detectors at once need 60 GB so.
     "navigate.stack.batch_sequences": "4",
     "navigate.stack.accumulate": "2",
+    "navigate.stack.views": "8",
 }
 PARTS = {
     Part.WHOLE: Sizes(
@@ -154,8 +156,8 @@ PARTS = {
         seeds=(0, 1, 2),
         navigator_width=1.0,
         more=True,
-        coarse_epochs=104,
-        fine_epochs=6,
+        coarse_epochs=160,
+        fine_epochs=10,
         render_workers=14,
         trainings=6,
         settings=_GPU,
@@ -193,7 +195,7 @@ TINY = Sizes(
     more=True,
     coarse_epochs=2,
     fine_epochs=1,
-    settings={"detect.batch_size": "8", "detect.validate_every": "1"},
+    settings={"detect.batch_size": "8", "detect.validate_every": "1", "navigate.stack.views": "1"},
 )
 """Sizes with PRESET=tiny: all steps in minutes; the networks learn nothing."""
 
@@ -506,7 +508,7 @@ def _navigator(one: Experiment, folder: str, detector: str, attention: str, read
     settings = {"navigate__stack__attention": attention, "navigate__stack__target": target}
     settings |= {"navigate__detector": str(backbone), "navigate__stack__width": str(width)}
     if reading == "motion":
-        settings["navigate__stack__fine_epochs"] = "1"
+        settings |= {"navigate__stack__fine_epochs": "1", "navigate__stack__views": "0"}
     options = one.options("navigate", **settings)
     command = [*program("perilune-train"), "navigate", "train", *options, "--dataset", str(one.data / ground / "nav")]
     return Step(
@@ -604,8 +606,9 @@ def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:
             seconds = navigate_seconds(navigate.model_copy(update={"stack": own}))
             pairs = 0.8 * one.sizes.nav_trajectories * one.sizes.frames
             # Features of the coarse stage are computed once, forward only.
-            fine = 1 if step.title.endswith("motion") else one.sizes.fine_epochs
-            found[step.title] = seconds * pairs * (fine + 1 / 3)
+            motion = step.title.endswith("motion")
+            fine, views = (1, 0) if motion else (one.sizes.fine_epochs, navigate.stack.views)
+            found[step.title] = seconds * pairs * (fine + (1 + views) / 3)
     return found
 
 
