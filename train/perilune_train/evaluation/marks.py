@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 
-from perilune_shared.storage.files import write_text, written_aside
+from perilune_shared.export.foreign_text import for_markdown
+from perilune_shared.storage.files import written_aside
+from perilune_train.evaluation.markdown import write_markdown
 from perilune_train.evaluation.pictures import save_image
 
 _METADATA_KEY = b"terrain_mark"
@@ -27,7 +29,7 @@ def mark_files(folder: Path, names: Iterable[str], mark: str) -> None:
         if path.suffix == ".png":
             mark_picture(path, mark)
         elif path.suffix == ".md":
-            write_text(path, marked_page(path.read_text(encoding="utf-8"), mark))
+            write_markdown(path, marked_page(path.read_text(encoding="utf-8"), mark))
         else:
             mark_table(path, mark)
 
@@ -59,8 +61,8 @@ def marked_page(text: str, mark: str) -> str:
     lines: list[str] = []
     for line in text.split("\n"):
         if line.startswith("## "):
-            line = f"{line} ({short})"
+            line = f"{line} ({for_markdown(short)})"
         lines.append(line)
         if line.startswith("# "):
-            lines += ["", f"**{mark}**"]
+            lines += ["", f"**{for_markdown(mark)}**"]
     return "\n".join(lines)
