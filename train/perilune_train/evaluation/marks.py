@@ -23,15 +23,24 @@ def mark_files(folder: Path, names: Iterable[str], mark: str) -> None:
 
     Skips files that do not exist. Does nothing if `mark` is empty.
     """
-    for path in (folder / name for name in names) if mark else ():
-        if not path.is_file():
-            continue
-        if path.suffix == ".png":
-            mark_picture(path, mark)
-        elif path.suffix == ".md":
-            write_markdown(path, marked_page(path.read_text(encoding="utf-8"), mark))
-        else:
-            mark_table(path, mark)
+    unmarked = [folder / name for name in names if mark and (folder / name).is_file()]
+    try:
+        while unmarked:
+            _mark_file(unmarked[0], mark)
+            del unmarked[0]
+    finally:
+        # After a fault, as a full disk, no file stays that looks as if it needed no mark.
+        for path in unmarked:
+            path.unlink(missing_ok=True)
+
+
+def _mark_file(path: Path, mark: str) -> None:
+    if path.suffix == ".png":
+        mark_picture(path, mark)
+    elif path.suffix == ".md":
+        write_markdown(path, marked_page(path.read_text(encoding="utf-8"), mark))
+    else:
+        mark_table(path, mark)
 
 
 def mark_table(path: Path, mark: str) -> None:
