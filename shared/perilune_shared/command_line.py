@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from perilune_shared.errors import DISK_FAULTS, EXIT_INTERRUPTED, EXIT_USER_ERROR, STOPPED, UserError
+from perilune_shared.errors import DISK_FAULTS, EXIT_INTERRUPTED, EXIT_USER_ERROR, STOPPED, UserError, one_line
 from perilune_shared.threads import described_settings, set_up_program
 
 
@@ -27,6 +27,13 @@ Verbose = Annotated[
 """The option of a program, before the name of the command: `perilune-train -v detect train`."""
 
 
+def _check_arguments() -> None:
+    """Raise UserError on a path that is not UTF-8, which no table, page or library of ours can hold."""
+    for argument in sys.argv[1:]:
+        if any("\ud800" <= sign <= "\udfff" for sign in argument):
+            raise UserError("command line", "argument", argument, "text or a path in UTF-8")
+
+
 def run_command_line(app: Callable[[], object]) -> None:
     """Run a command line; print user errors and disk errors in one line and exit with code 2.
 
@@ -35,6 +42,7 @@ def run_command_line(app: Callable[[], object]) -> None:
     Ctrl-C at the end of the process, when all work is done, is ignored.
     """
     try:
+        _check_arguments()
         set_up_program()
         app()
     except UserError as error:
@@ -42,7 +50,8 @@ def run_command_line(app: Callable[[], object]) -> None:
     except OSError as error:
         if error.errno not in DISK_FAULTS:
             raise
-        message = f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; finished files stay valid"
+        place = one_line(error.filename or "output")
+        message = f"error: {place}: {os.strerror(error.errno)}; finished files stay valid"
     except (KeyboardInterrupt, SystemExit) as stop:
         # Typer turns Ctrl-C into SystemExit with the shell's exit code for it.
         if isinstance(stop, SystemExit) and stop.code != EXIT_INTERRUPTED:
