@@ -60,7 +60,7 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
     """Run a command line; the line to print if a user has caused its end, else None."""
     try:
         set_up_program()
-        for name, value in _UNTRACKED.items():
+        for name, value in (_UNTRACKED | _folders()).items():
             os.environ.setdefault(name, value)
         app()
     except UserError as error:
@@ -79,6 +79,16 @@ def _error_of(app: Callable[[], object], interrupted: list[bool]) -> str | None:
             return f"error: {error.filename or 'output'}: {os.strerror(error.errno)}; finished files stay valid"
         raise
     return None
+
+
+def _folders() -> dict[str, str]:
+    """The variable that puts Matplotlib's list of fonts into perilune's cache folder, if there is a home folder."""
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    home = Path(os.environ.get("HOME", ""))
+    if not given.is_absolute() and not (home.is_absolute() and home.is_dir()):
+        return {}
+    cache = given if given.is_absolute() else home / ".cache"
+    return {"MPLCONFIGDIR": str(cache / "perilune" / "matplotlib")}
 
 
 @contextlib.contextmanager

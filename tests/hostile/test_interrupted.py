@@ -1,15 +1,20 @@
 """Ctrl-C at any moment ends every program and script in one line, with exit code 130, within three seconds."""
 
+import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
+import yaml
 
-from perilune_shared.errors import STOPPED
+from perilune_shared.client import SceneClient
+from perilune_shared.errors import STOPPED, UserError
 from tests.helpers.rendered import QUICK
 from tests.hostile.commands import make_inputs
 
@@ -87,6 +92,43 @@ def test_a_script_ends_with_one_line(name, after_s, folder):
     code = f"sys.path.insert(0, {str(path.parent)!r})\nsys.argv[0] = {str(path)!r}\n"
     code += f"runpy.run_path({str(path)!r}, run_name='__main__')"
     check(*interrupted(code, ("--help",), folder, after_s))
+
+
+LARGE = {
+    "camera": {"width_px": 1024, "height_px": 1024, "horizontal_fov_deg": 40.0},
+    "terrain": {"spacing_px": 4.0},
+    "render": {"samples": 4, "engine": "heightfield"},
+    "scene": {"views": [{"height_m": 300, "reach_m": 400}]},
+}
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.4, 1.0])
+def test_a_server_in_a_large_request_ends_with_one_line(folder, after_s):
+    (folder / "large.yaml").write_text(yaml.safe_dump({"dataset": LARGE}))
+    words = ["serve", "--preset", "tiny", "--scene", "large.yaml", "--port", "0", "--native-port", "0"]
+    command = [sys.executable, "-c", "from perilune_render.cli.program import main; main()", *words]
+    process = subprocess.Popen(command, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stderr is not None
+    for line in process.stderr:
+        if found := re.search(r"perilune_shared\.client at (tcp://\S+)", line):
+            break
+    assert found is not None
+    client = threading.Thread(target=ask, args=(found[1],))
+    client.start()
+    time.sleep(after_s)
+    pressed = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    error = process.stderr.read()
+    process.wait(60)
+    seconds = time.monotonic() - pressed
+    client.join(60)
+    check(process.returncode, error, seconds)
+    assert process.returncode == 130 and STOPPED in error
+
+
+def ask(address: str) -> None:
+    with SceneClient(address, timeout_s=5) as scene, contextlib.suppress(UserError):
+        scene.frame((0.0, 0.0, 300.0), (0.0, 1.0, 0.0, 0.0), depth=True, labels=True)
 
 
 def test_every_script_listens_before_it_imports_libraries():

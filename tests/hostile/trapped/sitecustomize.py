@@ -25,3 +25,15 @@ def _watch(event: str, arguments: tuple) -> None:
 
 if "PERILUNE_TRAP" in os.environ:
     sys.addaudithook(_watch)
+
+if "PERILUNE_CLOCK" in os.environ:
+    import time
+
+    _real = time.time
+
+    def _jumping() -> float:
+        """The time of day, which jumps by ten years back or forth every half second."""
+        now_s = _real()
+        return now_s + (-3e8, 0.0, 3e8)[int(2 * now_s) % 3]
+
+    time.time = _jumping
