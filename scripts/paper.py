@@ -22,6 +22,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
+from perilune_shared.interrupts import end_at_interrupt
+
+end_at_interrupt()
+
 import typer
 
 from perilune_render.config import DatasetConfig
@@ -819,4 +823,5 @@ if __name__ == "__main__":
 
     app = typer.Typer(pretty_exceptions_enable=False, add_completion=False)
     app.command()(main)
-    run_command_line(app)
+    # Longer than for the commands that it starts, which print how to resume.
+    run_command_line(app, ended_after_s=2.5)
