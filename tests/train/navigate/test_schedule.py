@@ -108,3 +108,21 @@ def test_steps_of_summed_gradients_count_once(dataset_nav, monkeypatch):
     schedule = task.configure_optimizers()["lr_scheduler"]["scheduler"]
     total = 3 * -(-batches // 3)
     assert batches == 8 and schedule.lr_lambdas[0](total) < 1e-3 < schedule.lr_lambdas[0](total - 2)
+
+
+def test_a_backbone_from_a_detector_learns_more_slowly(dataset_nav, detector):
+    trajectories = load_trajectories(open_dataset(dataset_nav))
+    backbone = {
+        key.removeprefix("backbone."): value
+        for key, value in load_weights(detector)["state_dict"].items()
+        if key.startswith("backbone.")
+    }
+    for factor, rates in ((1.0, {1e-4}), (0.01, {1e-4, 1e-6})):
+        own = settings(learning_rate=1e-4, backbone_factor=factor)
+        task = NavigationTask(own, "stack", trajectories, backbone)
+        groups = task.configure_optimizers()["optimizer"].param_groups
+        assert {round(group["initial_lr"], 12) for group in groups if group["weight_decay"]} == rates
+        slow = {id(value) for group in groups if group["initial_lr"] < 1e-5 for value in group["params"]}
+        chosen = {name for name, value in task.network.named_parameters() if id(value) in slow}
+        given = {name for name, _ in task.network.named_parameters() if name.startswith("backbone.")}
+        assert chosen == (given if factor < 1 else set())

@@ -49,6 +49,9 @@ class FusionConfig(Section):
     coarse_learning_rate: Positive | None = None
     """Peak learning rate of the coarse stage, which then has a cosine of its own down to 0. None: `learning_rate`
     in both stages, as `cycles` says."""
+    backbone_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Factor on the learning rate of a backbone from a detector in the fine stage. AdamW's first steps are as long for
+    every weight, and a wide network adds them up: with 1 the fine stage can lose what the coarse stage has learned."""
     cycles: Count = 1
     """Cosines of the learning rate. 1: one over both stages. More (the paper: 5): constant in the coarse stage, then
     this number of cosines, each from the peak down to 0, in the fine stage."""
@@ -128,7 +131,7 @@ class NavigateConfig(Section):
     def _only_stack(self) -> "NavigateConfig":
         if self.stack.views and self.stack.target != "pose":
             raise ValueError("stack.target=pose, since stack.views is given")
-        for name in ("target", "pool", "stages", "dropout", "views", "view_spread"):
+        for name in ("target", "pool", "stages", "dropout", "views", "view_spread", "backbone_factor"):
             default = FusionConfig.model_fields[name].default
             if getattr(self.warp, name) != default:
                 raise ValueError(f"warp.{name}={default}, since only stack has another")
