@@ -12,6 +12,7 @@ from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console
 from perilune_train.data.shares import Share
+from perilune_train.detect.inference.detector import check_detector
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.provenance import (
     Provenance,
@@ -20,6 +21,7 @@ from perilune_train.evaluation.provenance import (
     read_provenance,
     training_provenance,
 )
+from perilune_train.models.architecture import NavigatorArchitecture, check_architecture_of
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.covariance import calibrate, stated_covariances
 from perilune_train.navigate.data.stream import Stream
@@ -165,6 +167,7 @@ def _start_of_warp(settings: NavigateConfig) -> dict[str, Any] | None:
     content = load_weights(path)
     expected = {"fusion": "warp", **{key: getattr(own, key) for key in ("size_px", "width", "attention", "hidden")}}
     check_architecture(path, content["architecture"], expected)
+    check_architecture_of(NavigatorArchitecture, content["architecture"], path)
     return content
 
 
@@ -230,6 +233,7 @@ def _detector_backbone(
         console.print(f"stack: backbone {reason}")
         return None, reason, []
     check_architecture(path, content["architecture"], expected)
+    check_detector(content, path)
     weights = content["state_dict"].items()
     state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
     stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)
