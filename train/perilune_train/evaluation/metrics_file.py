@@ -56,3 +56,11 @@ def read_metrics(folder: Path, name: str = METRICS_FILE) -> Metrics:
     if not isinstance(content, dict) or not all(isinstance(value, plain) for value in content.values()):
         raise UserError(path, "metrics", "another structure", "a flat JSON object of numbers and texts")
     return content
+
+
+def has_metrics(folder: Path, name: str = METRICS_FILE) -> bool:
+    """Whether a folder has metrics that are a whole file: an empty or truncated one is none."""
+    try:
+        return bool(read_metrics(folder, name))
+    except UserError:
+        return False

@@ -12,15 +12,17 @@ from torch import nn
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_bytes
 from perilune_train.config import Precision
-from perilune_train.evaluation.metrics_file import METRICS_FILE
+from perilune_train.evaluation.metrics_file import METRICS_FILE, has_metrics
 from perilune_train.evaluation.provenance import RECORD
 from perilune_train.training.checkpoint_file import (
     MOST_STATE_BYTES,
     MOST_WEIGHT_BYTES,
     check_weights,
+    is_whole,
     load_checked,
 )
 from perilune_train.training.half_weights import SUFFIX, read_half
+from perilune_train.training.half_weights import is_whole as half_is_whole
 
 
 @dataclass(frozen=True)
@@ -58,8 +60,17 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether the run is complete."""
-        return self.metrics.is_file()
+        """Whether the run has its metrics, and metrics and weights are whole files."""
+        return self.metrics.is_file() and self.damaged is None
+
+    @property
+    def damaged(self) -> Path | None:
+        """The weights or the metrics, if they are an empty or truncated file; None if they are whole or missing."""
+        if self.best.is_file() and not (half_is_whole if self.best.suffix == SUFFIX else is_whole)(self.best):
+            return self.best
+        if self.metrics.is_file() and not has_metrics(self.root):
+            return self.metrics
+        return None
 
 
 def is_first_process() -> bool:
