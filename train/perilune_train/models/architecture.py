@@ -14,6 +14,7 @@ from perilune_shared.config_errors import user_error_of
 from perilune_shared.errors import UserError
 from perilune_train.config import Attention
 
+_Stride = Annotated[int, Field(ge=1, le=1024)]
 _Metres = Annotated[float, Field(ge=-1e9, le=1e9)]
 _Spread = Annotated[float, Field(ge=1e-9, le=1e9)]
 _Cosine = Annotated[float, Field(ge=-1.001, le=1.001)]
@@ -26,7 +27,7 @@ class DetectorArchitecture(Section):
     in_channels: Literal[1, 3]
     width: Annotated[float, Field(ge=0.125, le=2)]
     attention: Attention
-    strides: tuple[int, int, int]
+    strides: tuple[_Stride, _Stride, _Stride]
 
     @model_validator(mode="after")
     def _known_strides(self) -> "DetectorArchitecture":
