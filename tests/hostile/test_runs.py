@@ -10,6 +10,7 @@ import torch
 
 from perilune_shared.storage.locks import locked
 from perilune_train.cli import main
+from perilune_train.detect.inference.detector import load_detector
 from perilune_train.detect.train import run as detect_training
 from perilune_train.evaluation.metrics_file import write_metrics
 from perilune_train.explain import run as explaining
@@ -117,3 +118,11 @@ def test_scripts_look_into_the_files(script: str, tmp_path: Path) -> None:
         assert done()
     assert json.loads((tmp_path / "metrics.json").read_text())["a"] == 1.0
     shutil.rmtree(tmp_path)
+
+
+def test_weights_are_written_to_be_shared(stored: RunFolder, tmp_path: Path) -> None:
+    out = tmp_path / "weights.safetensors"
+    accepted("shared", main, "detect", "weights", stored.best, "--out", out, memory_mb=600)
+    shutil.copy(out, stored.root)
+    assert stored.finished and stored.best.name == out.name
+    load_detector(stored.best)
