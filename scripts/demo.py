@@ -30,6 +30,7 @@ from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import write_text
 from perilune_shared.threads import usable_cores
 from perilune_train.detect.config import DetectConfig
+from perilune_train.evaluation.metrics_file import has_metrics
 from perilune_train.explain.config import ExplainConfig
 from perilune_train.navigate.config import NavigateConfig
 
@@ -140,14 +141,15 @@ def run_steps(demo: Demo, processes: Processes) -> None:
         beside = processes.start("render navigation frames in the background", demo.render("nav", *options), log)
     processes.run("train the detector", demo.train("detect", "train", dataset=demo.data / "detect"))
     installed = demo.runs / "detect" / f"{demo.name}-installed"
-    if not (installed / "metrics.json").is_file():
+    if not has_metrics(installed):
         place = ["--dataset", str(demo.data / "detect"), "--out", str(installed)]
         processes.run("evaluate the installed detector", ["perilune-train", "detect", "evaluate", *place])
     if beside is not None:
         processes.end(beside, log)
     processes.run("train the navigators", demo.train("navigate", "train", dataset=demo.data / "nav"))
     landing = demo.runs / "navigate" / f"{demo.name}-landing"
-    if not (landing / "monte_carlo.md").is_file():
+    page = landing / "monte_carlo.md"
+    if not (page.is_file() and page.stat().st_size > 0):
         place = ["--draws", str(DRAWS), "--dataset", str(demo.data / "nav"), "--out", str(landing)]
         processes.run("land with the filter", ["perilune-train", "navigate", "monte-carlo", *place])
     processes.run("explain", demo.train("explain", dataset=demo.data))

@@ -581,7 +581,15 @@ def _complete(dataset: Path) -> bool:
 
 
 def _finished(run: Path) -> Callable[[], bool]:
-    return (run / "metrics.json").is_file
+    def whole() -> bool:
+        # Importing torch takes seconds; most runs of a plan are not there yet.
+        if not (run / "metrics.json").is_file():
+            return False
+        from perilune_train.training.runs import RunFolder
+
+        return RunFolder(run).finished
+
+    return whole
 
 
 def estimate(one: Experiment, plan: list[Step]) -> dict[str, float]:

@@ -10,12 +10,27 @@ from perilune_render.config_outputs import FlashLidarConfig, HazardConfig
 from perilune_render.config_scene import SceneConfig
 from perilune_render.config_survey import SurveyConfig
 from perilune_render.config_terrain import TerrainConfig
-from perilune_render.config_values import Count, NotNegative, Positive, Share, Span
+from perilune_render.config_values import (
+    Altitude,
+    Count,
+    Deviation,
+    Electrons,
+    Exposure,
+    Pixels,
+    Seconds,
+    Share,
+    Span,
+    Within,
+)
 from perilune_shared.config import Section
 from perilune_shared.dataset.names import SplitUnit
 from perilune_shared.geometry.inertial_grades import InertialGrade
 from perilune_shared.labels.thresholds import default_label_bound_px
 
+MOST_TRAJECTORIES, MOST_FRAMES = 200_000, 10_000_000
+"""Largest numbers of trajectories and frames of a dataset; all trajectories are planned before the first frame."""
+MOST_MEASUREMENTS = 10_000_000
+"""Largest number of measurements of one instrument along one trajectory."""
 _LEAST_LIMIT = 3.0
 """Smallest limit of that acceleration, in standard deviations on an axis: about half of all draws keep it."""
 
@@ -23,25 +38,25 @@ _LEAST_LIMIT = 3.0
 class FlightConfig(Section):
     """The trajectory: a parabola with smooth Gaussian perturbations."""
 
-    start_altitude_m: Positive = 1500.0
+    start_altitude_m: Altitude = 1500.0
     """Altitude of the first frame above the site, metres."""
-    end_altitude_m: Positive = 200.0
+    end_altitude_m: Altitude = 200.0
     """Altitude of the last frame above the site, metres."""
-    downrange_m: NotNegative = 500.0
+    downrange_m: Annotated[float, Field(ge=0, le=1e6)] = 500.0
     """Horizontal distance from the site at the start, metres."""
-    azimuth_deg: Span = Span(low=0.0, high=0.0)
+    azimuth_deg: Annotated[Span, Within(-720, 720)] = Span(low=0.0, high=0.0)
     """Direction from the site to the start, clockwise from north, drawn for each trajectory, degrees."""
-    duration_s: Positive = 65.0
+    duration_s: Seconds = 65.0
     """Time from the first frame to the last, seconds."""
-    position_sigma_m: NotNegative = 8.0
+    position_sigma_m: Deviation = 8.0
     """Standard deviation of the position from the nominal parabola, per axis, metres."""
-    attitude_sigma_deg: NotNegative = 0.3
+    attitude_sigma_deg: Annotated[float, Field(ge=0, le=90)] = 0.3
     """Standard deviation of the attitude from level, per axis, degrees."""
-    correlation_time_s: Positive = 3.0
+    correlation_time_s: Seconds = 3.0
     """Correlation time of the perturbations (squared-exponential kernel), seconds."""
-    attitude_correlation_time_s: Positive | None = None
+    attitude_correlation_time_s: Seconds | None = None
     """Correlation time of the perturbation of the attitude, seconds; null is correlation_time_s."""
-    max_perturbation_mps2: Positive | None = None
+    max_perturbation_mps2: Annotated[float, Field(gt=0, le=1000)] | None = None
     """Largest acceleration by the perturbation of the position, metres per second squared; null for no limit."""
 
     @model_validator(mode="after")
@@ -75,7 +90,7 @@ class InstrumentsConfig(Section):
     """Inertial measurements per second."""
     range_rate_hz: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Measurements of the laser altimeter per second; 0 for none. Given poses have one at the time of each frame."""
-    range_sigma_m: NotNegative = 0.2
+    range_sigma_m: Deviation = 0.2
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0005
     """Additional standard deviation of a range, share of the range."""
@@ -84,9 +99,9 @@ class InstrumentsConfig(Section):
 class SunConfig(Section):
     """Direction of the Sun, drawn for each scene."""
 
-    azimuth_deg: Span = Span(low=0.0, high=360.0)
+    azimuth_deg: Annotated[Span, Within(-720, 720)] = Span(low=0.0, high=360.0)
     """Azimuth, clockwise from north, degrees."""
-    elevation_deg: Span = Span(low=12.0, high=55.0)
+    elevation_deg: Annotated[Span, Within(0, 90)] = Span(low=12.0, high=55.0)
     """Elevation above the ground plane, above 0 and at most 90, degrees."""
 
     @model_validator(mode="after")
@@ -103,7 +118,7 @@ class KindConfig(Section):
     """Number of scenes, each with its own terrain."""
     trajectories_per_scene: Count
     """Number of trajectories over each scene."""
-    n_frames: Annotated[int, Field(ge=2)]
+    n_frames: Annotated[int, Field(ge=2, le=1_000_000)]
     """Number of frames of each trajectory."""
     split_by: SplitUnit
     """Unit of the split: each scene, trajectory or frame belongs to one split as a whole."""
@@ -117,6 +132,27 @@ class KindConfig(Section):
     """Direction of the Sun."""
     instruments: InstrumentsConfig = InstrumentsConfig()
     """Measurements other than frames."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> "KindConfig":
+        trajectories = self.n_scenes * self.trajectories_per_scene
+        if trajectories > MOST_TRAJECTORIES:
+            product = f"n_scenes x trajectories_per_scene, which is {trajectories}"
+            raise ValueError(f"{product}, at most {MOST_TRAJECTORIES}: lower one of them")
+        frames = trajectories * self.n_frames
+        if frames > MOST_FRAMES:
+            product = f"n_scenes x trajectories_per_scene x n_frames, which is {frames}"
+            raise ValueError(f"{product}, at most {MOST_FRAMES}: lower one of them")
+        rate_hz = max(
+            self.instruments.inertial_rate_hz if self.instruments.inertial_grades else 0, self.instruments.range_rate_hz
+        )
+        measurements = rate_hz * self.flight.duration_s
+        if measurements > MOST_MEASUREMENTS:
+            raise ValueError(
+                f"rate x flight.duration_s, which is {measurements:.3g} measurements of one instrument, at most "
+                f"{MOST_MEASUREMENTS}: lower instruments.inertial_rate_hz, range_rate_hz or flight.duration_s"
+            )
+        return self
 
     @model_validator(mode="after")
     def _shares_below_one(self) -> "KindConfig":
@@ -134,7 +170,7 @@ class LightConfig(Section):
     """Reflectance law and parameter set."""
     sun_angular_diameter_deg: Annotated[float, Field(ge=0, le=5)] = 0.533
     """Angular diameter of the Sun, degrees."""
-    albedo_variation: NotNegative = 1.0
+    albedo_variation: Annotated[float, Field(ge=0, le=10)] = 1.0
     """Strength of bright ejecta, rays and albedo patches; 0 for uniform albedo."""
     bounce: bool = False
     """Whether to add light that other ground scattered once; without it and earthshine, shadows are black."""
@@ -151,40 +187,40 @@ class SensorConfig(Section):
     """Percentile of the frame's radiance factor that automatic exposure uses."""
     exposure_level: Annotated[float, Field(gt=0, le=1)] = 0.8
     """Grey value of that percentile under automatic exposure, share of the largest grey value."""
-    exposure_time_s: Positive = 0.002
+    exposure_time_s: Exposure = 0.002
     """Exposure time if exposure is fixed, seconds."""
-    longest_exposure_s: Positive = 0.02
+    longest_exposure_s: Exposure = 0.02
     """Longest exposure time if exposure is automatic, seconds."""
-    responsivity_e_per_s: Positive = 2e8
+    responsivity_e_per_s: Annotated[float, Field(gt=0, le=1e15)] = 2e8
     """Electrons per second in a pixel at radiance factor 1."""
-    full_well_e: Positive = 30_000.0
+    full_well_e: Annotated[float, Field(gt=0, le=1e9)] = 30_000.0
     """Full-well capacity (saturation), electrons."""
-    gain: Positive = 1.0
+    gain: Annotated[float, Field(gt=0, le=10_000)] = 1.0
     """Gain, relative to the gain at which the full well is the largest grey value."""
     bits: Annotated[int, Field(ge=8, le=16)] = 8
     """Bits of a grey value; above 8 the PNG has 16 bits."""
     black_level_share: Annotated[float, Field(ge=0, lt=0.5)] = 0.0
     """Offset added before quantisation, share of the largest grey value."""
-    read_noise_e: NotNegative = 15.0
+    read_noise_e: Electrons = 15.0
     """Standard deviation of the dark signal, electrons."""
-    dark_current_e_per_s: NotNegative = 50.0
+    dark_current_e_per_s: Electrons = 50.0
     """Mean dark current, electrons per second."""
-    dark_nonuniformity_e: NotNegative = 3.0
+    dark_nonuniformity_e: Electrons = 3.0
     """Standard deviation of the pixels' fixed offsets (DSNU), electrons."""
     gain_nonuniformity: Annotated[float, Field(ge=0, le=0.5)] = 0.005
     """Standard deviation of the pixels' fixed relative response (PRNU)."""
     hot_pixel_share: Share = 2e-5
     """Share of hot pixels."""
-    hot_pixel_e: NotNegative = 6_000.0
+    hot_pixel_e: Electrons = 6_000.0
     """Mean extra signal of the hot pixels in a 2 ms exposure (exponential distribution), electrons."""
-    psf_sigma_px: NotNegative = 0.45
+    psf_sigma_px: Annotated[float, Field(ge=0, le=50)] = 0.45
     """Standard deviation of the point spread function, a discrete Gaussian, pixels; 0 for none."""
     motion_blur: bool = True
     """Whether the camera's motion during the exposure blurs the frame."""
     blur_poses: Annotated[int, Field(ge=1, le=256)] = 1
     """Number of poses during the exposure that are rendered and averaged: exact blur, at so many times the cost. With 1
     one rendering is blurred by the motion of each pixel in the image."""
-    row_time_s: NotNegative = 0.0
+    row_time_s: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Time from the exposure of a row to that of the next (rolling shutter), seconds; 0 exposes all rows at once."""
 
     @model_validator(mode="after")
@@ -205,16 +241,16 @@ class RenderConfig(Section):
     """Number of threads; 0 uses all cores."""
     exr: bool = False
     """Whether to write an EXR (radiance factor, depth, normals, sunlit mask, crater index) for each PNG."""
-    cache_gib: NotNegative = 4.0
+    cache_gib: Annotated[float, Field(ge=0, le=100_000)] = 4.0
     """Size limit of the cache of generated scenes, GiB; 0 disables the cache."""
 
 
 class LabelsConfig(Section):
     """Which craters become labels, by the paper's rule."""
 
-    min_radius_px: Positive = 2.0
+    min_radius_px: Pixels = 2.0
     """Smallest radius of a label, sqrt(a b) of its ellipse, pixels."""
-    max_radius_px: Positive | None = None
+    max_radius_px: Pixels | None = None
     """Largest radius of a label, pixels; null is 50, or width x 50 / 256 in images wider than 256 px."""
 
     @model_validator(mode="after")

@@ -4,12 +4,15 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from perilune_render.config_values import Positive
+from perilune_render.config_values import Pixels
 from perilune_shared.config import Section
 from perilune_shared.dataset.names import CAMERA_PATTERN
 
 CameraName = Annotated[str, Field(pattern=CAMERA_PATTERN)]
 _Angle = Annotated[float, Field(ge=-180, le=180)]
+_Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Point = Annotated[float, Field(ge=-100_000, le=100_000)]
+_Cosine = Annotated[float, Field(ge=-1.01, le=1.01)]
 _Offset = Annotated[float, Field(ge=-20, le=20)]
 _UNIT_TOLERANCE = 1e-3
 
@@ -17,15 +20,15 @@ _UNIT_TOLERANCE = 1e-3
 class DistortionConfig(Section):
     """Brown-Conrady lens distortion in OpenCV's form, on image coordinates divided by the focal length."""
 
-    k1: float = 0.0
+    k1: _Coefficient = 0.0
     """Radial coefficient of r^2."""
-    k2: float = 0.0
+    k2: _Coefficient = 0.0
     """Radial coefficient of r^4."""
-    p1: float = 0.0
+    p1: _Coefficient = 0.0
     """First tangential coefficient."""
-    p2: float = 0.0
+    p2: _Coefficient = 0.0
     """Second tangential coefficient."""
-    k3: float = 0.0
+    k3: _Coefficient = 0.0
     """Radial coefficient of r^6."""
 
 
@@ -38,11 +41,11 @@ class CameraConfig(Section):
     """Image height, pixels."""
     horizontal_fov_deg: Annotated[float, Field(ge=1, le=120)] = 50.0
     """Horizontal field of view over the image width, without distortion, degrees."""
-    focal_length_px: Positive | None = None
+    focal_length_px: Pixels | None = None
     """Focal length, pixels; null computes it from horizontal_fov_deg."""
-    principal_x_px: float | None = None
+    principal_x_px: _Point | None = None
     """Principal point, from the left edge, pixels; null is the image centre."""
-    principal_y_px: float | None = None
+    principal_y_px: _Point | None = None
     """Principal point, from the top edge, pixels; null is the image centre."""
     distortion: DistortionConfig = DistortionConfig()
     """Lens distortion."""
@@ -56,7 +59,7 @@ class MountingConfig(Section):
     turned_deg: tuple[_Angle, _Angle, _Angle] = (0.0, 0.0, 0.0)
     """Turns of the camera about X_B, then Y_B, then Z_B, from its default attitude: view along -Z_B, image x along X_B,
     degrees. [15, 0, 0] turns the view towards Y_B."""
-    rotation_camera_from_body_wxyz: tuple[float, float, float, float] | None = None
+    rotation_camera_from_body_wxyz: tuple[_Cosine, _Cosine, _Cosine, _Cosine] | None = None
     """Unit quaternion in place of turned_deg; (0, 1, 0, 0) is the default attitude."""
 
     @model_validator(mode="after")

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from perilune_render.config_values import NotNegative, Positive, Share
+from perilune_render.config_values import Deviation, Length, Share
 from perilune_shared.config import Section
 
 _LEAST_PX, _MOST_PX = 3, 100
@@ -16,17 +16,17 @@ _ROUNDING = 1e-9
 class HazardConfig(Section):
     """A map of each scene, for a lander of one size: slope, roughness, boulders, shadow, and where it is safe."""
 
-    footprint_m: Positive = 10.0
+    footprint_m: Length = 10.0
     """Diameter of the lander's footprint, metres."""
-    pixel_m: Positive = 0.5
+    pixel_m: Length = 0.5
     """Size of a pixel of the map, metres."""
-    extent_m: Positive = 200.0
+    extent_m: Length = 200.0
     """Side of the square map, centred on the site, metres."""
     max_slope_deg: Annotated[float, Field(gt=0, lt=90)] = 10.0
     """Largest slope of a safe place, degrees."""
-    max_roughness_m: NotNegative = 0.5
+    max_roughness_m: Deviation = 0.5
     """Largest roughness of a safe place, metres."""
-    max_boulder_m: NotNegative = 0.5
+    max_boulder_m: Deviation = 0.5
     """Largest height of a boulder at a safe place, metres."""
     max_shadow_share: Share = 1.0
     """Largest share of shadow at a safe place; 1 for no limit."""
@@ -59,15 +59,15 @@ class FlashLidarConfig(Section):
     """Image height, pixels."""
     horizontal_fov_deg: Annotated[float, Field(ge=0.1, le=120)] = 20.0
     """Field of view over the image width, degrees; the principal point is the image centre."""
-    range_sigma_m: NotNegative = 0.05
+    range_sigma_m: Deviation = 0.05
     """Standard deviation of a range at distance 0, metres."""
     range_sigma_share: Share = 0.0
     """Additional standard deviation of a range, share of the range."""
-    quantisation_m: NotNegative = 0.01
+    quantisation_m: Deviation = 0.01
     """Step of the ranges, metres; 0 for none."""
-    max_range_m: Positive = 2000.0
+    max_range_m: Length = 2000.0
     """Largest range that is measured, metres."""
-    threshold_range_m: Positive = 1500.0
+    threshold_range_m: Length = 1500.0
     """Distance at which ground of mean albedo, seen along its normal, returns the least energy that is detected,
     metres."""
     energy_sigma_share: Annotated[float, Field(ge=0, le=1)] = 0.1

@@ -4,7 +4,6 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from perilune_render.config_values import Positive
 from perilune_shared.config import Section
 
 HIGHEST_M = 20_000.0
@@ -14,9 +13,9 @@ HIGHEST_M = 20_000.0
 class ViewConfig(Section):
     """How far from the site cameras see ground, from one height."""
 
-    height_m: Positive
+    height_m: Annotated[float, Field(gt=0, le=2e6)]
     """Height of a camera above the ground, metres."""
-    reach_m: Positive
+    reach_m: Annotated[float, Field(gt=0, le=2e6)]
     """Largest |x| or |y| from the site of the ground that cameras at this height or below show, metres; with `horizon`,
     of these cameras themselves."""
 
@@ -24,7 +23,7 @@ class ViewConfig(Section):
 class SceneConfig(Section):
     """One scene with given poses, in place of drawn scenes and descents."""
 
-    sun_azimuth_deg: float = 90.0
+    sun_azimuth_deg: Annotated[float, Field(ge=-720, le=720)] = 90.0
     """Azimuth of the Sun, clockwise from north, degrees; a column of the poses overrides it."""
     sun_elevation_deg: Annotated[float, Field(gt=0, le=90)] = 30.0
     """Elevation of the Sun above the ground plane, degrees; a column of the poses overrides it."""

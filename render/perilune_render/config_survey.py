@@ -4,16 +4,16 @@ from typing import Annotated
 
 from pydantic import Field
 
-from perilune_render.config_values import Positive
+from perilune_render.config_values import Altitude
 from perilune_shared.config import Section
 
 
 class SurveyConfig(Section):
     """A pair of images of each scene from one height, one from the west of the site and one from the east."""
 
-    altitude_m: Positive = 4500.0
+    altitude_m: Altitude = 4500.0
     """Height of both cameras above the site, metres."""
-    pixel_m: Positive = 0.6
+    pixel_m: Annotated[float, Field(gt=0, le=1000)] = 0.6
     """Size of a pixel on level ground straight below the camera, metres."""
     convergence_deg: Annotated[float, Field(ge=5, le=60)] = 30.0
     """Angle between the camera axes, degrees; a wider one gives better heights and sees less of the ground twice."""

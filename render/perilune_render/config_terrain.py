@@ -4,9 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from perilune_render.config_values import NotNegative, Positive, Share, Span
+from perilune_render.config_values import Length, Share, Span, Within
 from perilune_shared.config import Section
 
+_Place = Annotated[float, Field(ge=0, le=10_000_000)]
 LARGEST_SPACING_PX = 4.0
 """Largest allowed value of `spacing_px`."""
 
@@ -18,11 +19,11 @@ class CratersConfig(Section):
     """Age of the surface, which sets the number of large craters, Gyr."""
     equilibrium: Literal["trask", "minton", "viper", "chang_e_4"] = "chang_e_4"
     """Equilibrium law: density at which small craters are erased as fast as they form."""
-    equilibrium_share: Span = Span(low=0.9, high=1.7)
+    equilibrium_share: Annotated[Span, Within(0, 100)] = Span(low=0.9, high=1.7)
     """Density of small craters, as a multiple of the equilibrium law, drawn for each scene."""
-    min_diameter_spacings: Annotated[float, Field(ge=1.5)] = 2.2
+    min_diameter_spacings: Annotated[float, Field(ge=1.5, le=1000)] = 2.2
     """Diameter of the smallest crater, local vertex spacings."""
-    max_diameter_m: Positive = 800.0
+    max_diameter_m: Annotated[float, Field(gt=0, le=100_000)] = 800.0
     """Diameter of the largest crater, metres."""
     profile: Literal["fassett_thomson", "pangu"] = "fassett_thomson"
     """Shape of a fresh crater."""
@@ -41,13 +42,13 @@ class CratersConfig(Section):
 class BouldersConfig(Section):
     """The boulder population."""
 
-    density: NotNegative = 0.1
+    density: Annotated[float, Field(ge=0, le=1000)] = 0.1
     """Boulder density on the plain, as a multiple of the published size-frequency law."""
-    field_density: NotNegative = 100.0
+    field_density: Annotated[float, Field(ge=0, le=100_000)] = 100.0
     """Boulder density at the rim of a newly formed crater, as a multiple of that on the plain."""
-    min_diameter_spacings: Annotated[float, Field(ge=0.3)] = 0.7
+    min_diameter_spacings: Annotated[float, Field(ge=0.3, le=1000)] = 0.7
     """Diameter of the smallest boulder, local vertex spacings."""
-    max_diameter_m: Positive = 5.0
+    max_diameter_m: Annotated[float, Field(gt=0, le=1000)] = 5.0
     """Diameter of the largest boulder, metres."""
     n_shapes: Annotated[int, Field(ge=1, le=100)] = 12
     """Number of different rock shapes in a scene."""
@@ -58,9 +59,9 @@ class ReliefConfig(Section):
 
     hurst_exponent: Annotated[float, Field(gt=0, lt=1)] = 0.9
     """Hurst exponent H: slopes fall with wavelength L as L^(H-1)."""
-    rms_slope_deg: Span = Span(low=2.0, high=4.5)
+    rms_slope_deg: Annotated[Span, Within(0, 30)] = Span(low=2.0, high=4.5)
     """RMS slope over wavelengths down to 1 m, without craters, drawn for each scene, degrees."""
-    longest_wavelength_m: Positive = 1600.0
+    longest_wavelength_m: Length = 1600.0
     """Longest wavelength, metres."""
 
     @model_validator(mode="after")
@@ -84,9 +85,9 @@ class ElevationConfig(Section):
     """Latitude of the landing site, degrees; null, with the other site settings, for the middle of the model."""
     site_longitude_deg: Annotated[float, Field(ge=-180, le=360)] | None = None
     """Longitude of the landing site, east positive, degrees."""
-    site_column_px: NotNegative | None = None
+    site_column_px: _Place | None = None
     """Column of the landing site, in place of latitude and longitude, pixels from the left edge of the model."""
-    site_row_px: NotNegative | None = None
+    site_row_px: _Place | None = None
     """Row of the landing site, pixels from the top edge of the model."""
 
     @model_validator(mode="after")

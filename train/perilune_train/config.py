@@ -16,5 +16,10 @@ Strategy = Literal["auto", "ddp", "ddp_find_unused_parameters_true"]
 """auto: no strategy for one process; ddp for several, with a search for unused parameters if some weights are
 frozen."""
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0)]
-Count = Annotated[int, Field(ge=1)]
+Weight = Annotated[float, Field(gt=0, le=1e6)]
+"""Weight of a part of a loss."""
+Rate = Annotated[float, Field(gt=0, le=1000)]
+"""Learning rate. Much smaller ones diverge already, which the training reports."""
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Epochs = Annotated[int, Field(ge=0, le=1_000_000)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]

@@ -20,12 +20,15 @@ from perilune_render.config_terrain import BouldersConfig
 from perilune_render.streams import stream
 from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.grid import Grid
-from perilune_render.terrain.size_frequency import BoulderLaw, draw_diameters, log_bins
+from perilune_render.terrain.size_frequency import BoulderLaw, draw_diameters, expected_numbers, log_bins
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, matrix_from_quaternion
 
 if TYPE_CHECKING:
     import trimesh
 
+MOST_BOULDERS = 3_000_000
+"""Largest mean number of boulders of the plain, or of all fields, in a scene; each needs about 1 kB in a renderer."""
 _BURIED_SHARE = 0.3
 """Share of a boulder's height that is below the ground."""
 _FIELD_DECAY = 0.7
@@ -80,9 +83,7 @@ def draw_boulders(
     if config.density == 0 or smallest >= config.max_diameter_m:
         empty = np.empty(0)
         return Boulders(empty, empty, empty, np.empty(0, np.int64), np.empty((0, 4)))
-    law = BoulderLaw(density=config.density)
-    edges = log_bins(smallest, config.max_diameter_m, 20)
-    half = np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
+    law, edges, half = _bins(config, grid)
     plain = draw_diameters(law, edges, np.square(2 * half), rng)
     reach = half[np.clip(np.searchsorted(edges, plain, side="right") - 1, 0, len(half) - 1)]
     x, y = rng.uniform(-1, 1, (2, len(plain))) * reach
@@ -94,6 +95,27 @@ def draw_boulders(
     drawn = Boulders(x, y, diameter, shape, np.where(rotation[:, :1] < 0, -rotation, rotation))
     on_plain = np.ones(len(plain), bool)
     return drawn.chosen(np.concatenate([on_plain, ~np.isin(host, removed)])) if len(removed) else drawn
+
+
+def _bins(config: BouldersConfig, grid: Grid) -> tuple[BoulderLaw, Array, Array]:
+    """Law, edges of the bins (B + 1,) and half width (B,) of the ground that is fine enough for each, metres."""
+    smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
+    edges = log_bins(smallest, config.max_diameter_m, 20)
+    half = np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
+    return BoulderLaw(density=config.density), edges, half
+
+
+def check_boulders(config: BouldersConfig, grid: Grid) -> None:
+    """Raise UserError if the plain has more boulders than memory, before any is drawn."""
+    if config.density > 0 and config.min_diameter_spacings * float(grid.spacings_m.min()) < config.max_diameter_m:
+        law, edges, half = _bins(config, grid)
+        _check_number(float(expected_numbers(law, edges, np.square(2 * half)).sum()), "density")
+
+
+def _check_number(number: float, setting: str) -> None:
+    if number > MOST_BOULDERS:
+        expected = f"at most {MOST_BOULDERS}: lower {setting}, or raise min_diameter_spacings"
+        raise UserError("dataset.terrain.boulders", "number", f"about {number:.3g} in a scene", expected)
 
 
 def _fields(
@@ -110,7 +132,9 @@ def _fields(
     per_area = np.where(largest > local, law.csfd(local) - law.csfd(np.maximum(largest, local)), 0.0)
     # The integral of exp(-(x - 1) / a) over the plane outside the rim is 2 pi R^2 (a + a^2).
     area = 2 * np.pi * radius**2 * (_FIELD_DECAY + _FIELD_DECAY**2)
-    number = rng.poisson(config.field_density * young * per_area * area)
+    expected = config.field_density * young * per_area * area
+    _check_number(float(expected.sum()), "field_density")
+    number = rng.poisson(expected)
     host = np.repeat(np.arange(len(craters)), number)
     n_small, n_large = law.csfd(local[host]), law.csfd(largest[host])
     share = rng.random(len(host))

@@ -16,8 +16,11 @@ import numpy as np
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.provenance.kernels import njit
 from perilune_render.terrain.envelope import ViewEnvelope
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
+_MOST_RINGS = 1_000_000
+"""Largest number of rings: those of the finest ground that fits in memory are fewer."""
 FAR_GROWTH = 0.07
 """Growth of the vertex spacing beyond the ground in view, metres per metre. This ground only casts shadows: the shadow
 of ground at a distance d enters the view only if it is about d tan(elevation of the Sun) high, and as wide."""
@@ -146,6 +149,9 @@ def grid_of(
         distance = np.concatenate([distance, distance[-1] + far])
         allowed = np.concatenate([allowed, allowed[-1] + FAR_GROWTH * far])
     steps = np.concatenate([[0], np.cumsum(np.diff(distance) / allowed[:-1])])
+    if not steps[-1] <= _MOST_RINGS:
+        expected = f"at most {_MOST_RINGS}: raise dataset.terrain.spacing_px or the lowest altitude"
+        raise UserError("ground", "vertices along a line", f"about {steps[-1]:.3g}", expected)
     n_rings = int(np.ceil(steps[-1]))
     return Grid(n_half, np.interp(np.linspace(0, steps[-1], n_rings + 1), steps, distance), *centre_m)
 

@@ -9,8 +9,8 @@ from perilune_render.config import DatasetConfig
 from perilune_render.config_terrain import TerrainConfig
 from perilune_render.terrain.albedo import add_patches, add_rays, brightness
 from perilune_render.terrain.base import base_of
-from perilune_render.terrain.boulders import Boulders, draw_boulders
-from perilune_render.terrain.craters.population import Craters, draw_craters
+from perilune_render.terrain.boulders import Boulders, check_boulders, draw_boulders
+from perilune_render.terrain.craters.population import Craters, check_craters, draw_craters
 from perilune_render.terrain.craters.removal import indices_of, near
 from perilune_render.terrain.craters.rims import Rims, measure_rims
 from perilune_render.terrain.craters.stamp import Stamped, stamp_craters
@@ -168,6 +168,8 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
     check_levels(config.terrain, view)
     grid = graded_grid(config.terrain, view)
     check_waves(config.terrain.relief, grid)
+    check_craters(config.terrain.craters, grid)
+    check_boulders(config.terrain.boulders, grid)
     model = model_of(config.terrain)
     if model is not None:
         refuse_beyond(model, grid, config.terrain.elevation.outside)

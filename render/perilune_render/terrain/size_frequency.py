@@ -222,13 +222,19 @@ def log_bins(min_diameter_m: float, max_diameter_m: float, per_decade: int = 50)
     return np.geomspace(min_diameter_m, max_diameter_m, max(2, int(np.ceil(per_decade * decades)) + 1))
 
 
+def expected_numbers(law: SizeFrequency, edges_m: Array, areas_m2: Array) -> Array:
+    """Mean number (B,) in each bin of edges_m (B + 1,), for the bins' areas (B,)."""
+    cumulative = law.csfd(edges_m)
+    return np.maximum(cumulative[:-1] - cumulative[1:], 0) * areas_m2
+
+
 def draw_diameters(law: SizeFrequency, edges_m: Array, areas_m2: Array, rng: np.random.Generator) -> Array:
     """Draw diameters (N,), metres, largest bin first, with a Poisson number in each bin for that bin's area.
 
     edges_m (B + 1,) ascending, areas_m2 (B,). Within a bin the law is approximated by a power law.
     """
     cumulative = law.csfd(edges_m)
-    numbers = rng.poisson(np.maximum(cumulative[:-1] - cumulative[1:], 0) * areas_m2)[::-1]
+    numbers = rng.poisson(expected_numbers(law, edges_m, areas_m2))[::-1]
     low, high = np.repeat(edges_m[-2::-1], numbers), np.repeat(edges_m[:0:-1], numbers)
     n_low, n_high = np.repeat(cumulative[-2::-1], numbers), np.repeat(cumulative[:0:-1], numbers)
     slope = np.log(n_high / n_low) / np.log(high / low)

@@ -11,7 +11,7 @@ from pydantic import Field
 from perilune_shared.config import Section
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, le=1e9)]
 
 
 class Selection(Section):
@@ -25,7 +25,7 @@ class Selection(Section):
     """Minimum fraction of the crater's visible pixels that are in sunlight."""
     min_depth_ratio: Share | None = None
     """Minimum ratio of depth to diameter on the finished terrain; lower ratios mean an eroded crater."""
-    min_contrast: float | None = None
+    min_contrast: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
     """Minimum contrast: the crater's own shading in the frame divided by its standard error, from noise and clutter."""
     contrast_pixels: Positive | None = None
     """Largest number of pixels that the contrast counts as independent; in a larger neighbourhood it is reduced by the

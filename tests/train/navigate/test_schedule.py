@@ -118,7 +118,8 @@ def test_a_backbone_from_a_detector_learns_more_slowly(dataset_nav, detector):
         if key.startswith("backbone.")
     }
     for factor, rates in ((1.0, {1e-4}), (0.01, {1e-4, 1e-6})):
-        own = settings(learning_rate=1e-4, backbone_factor=factor)
+        own = settings(learning_rate=1e-4)
+        own = own.model_copy(update={"stack": own.stack.model_copy(update={"backbone_factor": factor})})
         task = NavigationTask(own, "stack", trajectories, backbone)
         groups = task.configure_optimizers()["optimizer"].param_groups
         assert {round(group["initial_lr"], 12) for group in groups if group["weight_decay"]} == rates

@@ -7,8 +7,9 @@ from pydantic import Field, field_validator, model_validator
 from perilune_shared.config import Section
 from perilune_shared.config_errors import nearest
 from perilune_shared.labels.thresholds import SELECTIONS, Selection
-from perilune_train.config import Attention, Count, Device, Fraction, Positive, Precision, Strategy
+from perilune_train.config import Attention, Count, Device, Epochs, Fraction, Precision, Rate, Seed, Strategy, Weight
 
+_Stride = Annotated[int, Field(ge=1, le=1024)]
 COARSEST_STRIDE = 32
 """Pixels; the sides of the network's input are multiples of it."""
 
@@ -82,15 +83,15 @@ class LossSettings(Section):
     """Objectness target of a positive predictor: 1, or the IoU of its box with its label."""
     reduction: Literal["means", "sums"] = "means"
     """means: over the predictors of each scale, scales weighted by 1 / stride. sums: plain sums (the paper)."""
-    lambda_iou: Positive = 0.05
+    lambda_iou: Weight = 0.05
     """Weight of L_ciou."""
-    lambda_obj: Positive = 1.0
+    lambda_obj: Weight = 1.0
     """Weight of L_obj."""
-    lambda_noobj: Positive = 1.0
+    lambda_noobj: Weight = 1.0
     """Weight of negative predictors within L_obj."""
-    lambda_teacher: Positive = 1.0
+    lambda_teacher: Weight = 1.0
     """Weight of the distillation loss from `teacher`; its box and objectness terms have the weights above."""
-    lambda_guide: Annotated[float, Field(ge=0)] = 0.0
+    lambda_guide: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Weight of the guidance of attention gates: 1 - correlation with the labelled craters of the masks of B_11, B_22
     and B_38, the last gates of the stages up to stride 8. 0: gates learn from detection alone (the paper). No effect
     without attention."""
@@ -108,10 +109,10 @@ class EvaluationSettings(Section):
     """Of two detections with a larger IoU, non-maximum suppression removes the one with the lower score."""
     min_score: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Detections below this score are dropped first. The precision-recall curve ends at this score."""
-    max_aspect: Annotated[float, Field(gt=1)] | None = None
+    max_aspect: Annotated[float, Field(gt=1, le=1000)] | None = None
     """Largest ratio of a box's longer to its shorter side; longer boxes are dropped before suppression. A box around
     two craters is longer than a crater seen from above. None keeps all."""
-    max_detections: Count = 2000
+    max_detections: Annotated[int, Field(ge=1, le=100_000)] = 2000
     """Largest number of detections in a frame; the usual 100 would truncate crowded frames."""
     varied_frames: bool = False
     """Choose the score threshold on the validation frames and on copies of them with other contrast, blur and noise,
@@ -124,7 +125,7 @@ class EvaluationSettings(Section):
 class DetectConfig(Section):
     """The section `detect`."""
 
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     """Random seed of weights, anchors, order of frames and augmentation."""
     width: Annotated[float, Field(ge=0.125, le=2)] = 1.0
     """Factor on all channel counts; 1 is the paper's network."""
@@ -133,11 +134,11 @@ class DetectConfig(Section):
     between 0.5 and 1.5 that cannot become constant), or cbam_last (centred gates, one in each stage)."""
     in_channels: Literal[1, 3] = 3
     """Input channels. 3: the grey frame three times, as in the paper's RGB network."""
-    strides: tuple[int, int, int] = (8, 16, 32)
+    strides: tuple[_Stride, _Stride, _Stride] = (8, 16, 32)
     """Strides of the detection heads: 8 16 32 (the paper) or 4 8 16 (better for tiny craters)."""
     epochs: Count = 20
     """Passes over the training frames."""
-    frozen_epochs: Annotated[int, Field(ge=0)] = 0
+    frozen_epochs: Epochs = 0
     """Number of first epochs in which the backbone is frozen except its attention gates. Used only with `init_from`:
     freezing random weights does not help, so without it training starts unfrozen."""
     init_from: str | None = None
@@ -155,15 +156,15 @@ class DetectConfig(Section):
     must be the same; its anchors are used."""
     validate_every: Count = 1
     """Epochs between validations; `epochs` is a multiple of it. The best validated weights are kept."""
-    batch_size: Count = 8
+    batch_size: Annotated[int, Field(ge=1, le=65_536)] = 8
     """Frames of each process in a training step."""
-    learning_rate: Positive = 1e-3
+    learning_rate: Rate = 1e-3
     """Peak learning rate of AdamW: linear warm-up, then a cosine down to a hundredth."""
-    warmup_steps: Annotated[int, Field(ge=0)] = 100
+    warmup_steps: Annotated[int, Field(ge=0, le=100_000_000)] = 100
     """Number of steps of the warm-up."""
-    weight_decay: Annotated[float, Field(ge=0)] = 0.01
+    weight_decay: Annotated[float, Field(ge=0, le=1000)] = 0.01
     """Weight decay of AdamW; each step multiplies it by the learning rate."""
-    gradient_clip: Positive = 10.0
+    gradient_clip: Annotated[float, Field(gt=0, le=1e9)] = 10.0
     """Largest norm of all gradients together; larger gradients are scaled down to it."""
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.998
     """Decay per step of the moving average of the weights; the average is evaluated and saved. At step s the decay is
@@ -174,7 +175,7 @@ class DetectConfig(Section):
     assignment: Literal["several", "one"] = "several"
     """Predictors that learn a label. several: every anchor within anchor_ratio, in the cell of the label's centre and
     in the two nearest cells. one: the anchor of highest IoU in the cell of the centre, as in YOLOv3 (the paper)."""
-    anchor_ratio: Annotated[float, Field(gt=1)] = 2.0
+    anchor_ratio: Annotated[float, Field(gt=1, le=1000)] = 2.0
     """An anchor is assigned to a label if width and height are both within this factor."""
     labels: LabelSettings = LabelSettings()
     """Craters to find."""
@@ -188,13 +189,13 @@ class DetectConfig(Section):
     """Arithmetic: auto (bfloat16 if the hardware supports it), bf16 or float32."""
     device: Device = "auto"
     """Where to compute: auto (the GPU if there is one), cpu or cuda."""
-    devices: Count = 1
+    devices: Annotated[int, Field(ge=1, le=1024)] = 1
     """Processes on each machine, each with its own GPU or part of the CPU; `torchrun --nproc-per-node` overrides it."""
-    num_nodes: Count = 1
+    num_nodes: Annotated[int, Field(ge=1, le=10_000)] = 1
     """Number of machines; `torchrun --nnodes` overrides it."""
     strategy: Strategy = "auto"
     """Lightning's strategy for several processes; auto selects what the settings need."""
-    checkpoint_minutes: Annotated[float, Field(ge=0)] = 10.0
+    checkpoint_minutes: Annotated[float, Field(ge=0, le=100_000)] = 10.0
     """Minutes between saves of the training state within an epoch; 0: after every step. It is always saved after an
     epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0

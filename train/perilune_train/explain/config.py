@@ -5,35 +5,38 @@ from typing import Annotated
 from pydantic import Field
 
 from perilune_shared.config import Section
-from perilune_train.config import Count, Device
+from perilune_train.config import Device, Seed
+
+_Several = Annotated[int, Field(ge=2, le=100_000)]
+_Factor = Annotated[float, Field(gt=0, le=100)]
 
 
 class ExplainConfig(Section):
     """The section `explain`."""
 
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     """Random seed of nulls, intervals, controls and untrained networks."""
-    n_frames: Annotated[int, Field(ge=2)] = 32
+    n_frames: _Several = 32
     """Number of test frames, evenly spaced through the split, for correlations."""
-    n_pairs: Annotated[int, Field(ge=2)] = 48
+    n_pairs: _Several = 48
     """Number of test pairs for correlations, in runs of at most 8 consecutive pairs; at least one run."""
-    n_validation: Annotated[int, Field(ge=2)] = 16
+    n_validation: _Several = 16
     """Number of validation frames and of pairs on which signs and gates are chosen."""
-    n_changed: Annotated[int, Field(ge=2)] = 16
+    n_changed: _Several = 16
     """Number of these test frames for interventions: gates forced, pixels removed, weights randomised."""
-    n_changed_pairs: Annotated[int, Field(ge=2)] = 24
+    n_changed_pairs: _Several = 24
     """Number of these test pairs for interventions."""
-    n_attributed: Annotated[int, Field(ge=1)] = 4
+    n_attributed: Annotated[int, Field(ge=1, le=100_000)] = 4
     """Number of these test frames for Grad-CAM, integrated gradients and occlusion."""
     n_drawn: Annotated[int, Field(ge=1, le=8)] = 3
     """Number of frames and of pairs whose masks are drawn: of high, middle and low altitude."""
     removed_share: Annotated[float, Field(gt=0, lt=0.5)] = 0.2
     """Share of the pixels that is replaced."""
-    integration_steps: Count = 8
+    integration_steps: Annotated[int, Field(ge=1, le=10_000)] = 8
     """Points of the integral of integrated gradients."""
-    occlusion_px: Annotated[int, Field(ge=8)] = 32
+    occlusion_px: Annotated[int, Field(ge=8, le=4096)] = 32
     """Side and stride of the square that occlusion sets to grey, pixels."""
-    ring_factors: tuple[float, float, float, float] = (1.1, 1.2, 1.3, 1.4)
+    ring_factors: tuple[_Factor, _Factor, _Factor, _Factor] = (1.1, 1.2, 1.3, 1.4)
     """alpha_1 to alpha_4: outer radii of the grey rings in the ground-truth mask, divided by the crater's radius."""
     device: Device = "auto"
     """Where to compute: auto (the GPU if there is one), cpu or cuda."""

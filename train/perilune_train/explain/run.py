@@ -31,7 +31,7 @@ from perilune_train.explain.page import claims as page
 from perilune_train.explain.page.claim import Claim
 from perilune_train.explain.page.pictures import CAPTIONS, PICTURES, draw_detector, draw_navigator
 from perilune_train.explain.page.viewer import save_masks
-from perilune_train.training.begin import hashes_of, start_run, state_of
+from perilune_train.training.begin import hashes_of, held, start_run, state_of
 from perilune_train.training.runs import RunFolder
 
 
@@ -58,6 +58,20 @@ def explain_run(
     (unless `allow_overlap`).
     """
     run = RunFolder(runs / "explain" / name)
+    with held(run):
+        return _run(run, settings, detect_data, nav_data, (detector, navigator), overwrite, allow_overlap)
+
+
+def _run(
+    run: RunFolder,
+    settings: ExplainConfig,
+    detect_data: Address,
+    nav_data: Address,
+    checkpoints: tuple[Path | None, Path | None],
+    overwrite: bool,
+    allow_overlap: bool,
+) -> RunFolder:
+    detector, navigator = checkpoints
     detecting = {} if detector is None else {"detection dataset": detect_data, "detector": detector}
     navigating = {} if navigator is None else {"navigation dataset": nav_data, "navigator": navigator}
     inputs = hashes_of(detecting | navigating)

@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from perilune_shared.config import Section
-from perilune_train.config import Attention, Count, Device, Positive, Precision
+from perilune_train.config import Attention, Count, Device, Epochs, Precision, Rate, Seed, Weight
 
+_Few = Annotated[int, Field(ge=1, le=4096)]
 Target = Literal["motion", "pose"]
 
 
@@ -16,11 +17,11 @@ class FusionConfig(Section):
 
     size_px: Annotated[int, Field(ge=32, le=4096, multiple_of=32)]
     """Width to which frames are shrunk for the network, pixels."""
-    width: Positive
+    width: Annotated[float, Field(gt=0, le=2)]
     """Factor on the backbone's channel counts; 1 is the paper's network."""
     attention: Attention = "cbam_identity"
     """Attention after every residual unit."""
-    hidden: Count
+    hidden: Annotated[int, Field(ge=1, le=4096)]
     """Hidden size of each of the two LSTM layers; the paper uses 1000."""
     target: Target = "motion"
     """What stack estimates. motion: the motion from the earlier to the later frame. pose: position and attitude of the
@@ -32,21 +33,21 @@ class FusionConfig(Section):
     """Stages of the backbone of stack; the paper has 5. 4 leaves out the last one."""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
     """Share of the inputs and outputs of the LSTM of stack that a training step sets to 0."""
-    sequence_pairs: Count = 16
+    sequence_pairs: _Few = 16
     """Pairs of frames in a training sequence; the paper's value."""
-    batch_sequences: Count = 8
+    batch_sequences: _Few = 8
     """Sequences in a batch; the paper's value."""
-    accumulate: Count = 1
+    accumulate: _Few = 1
     """Batches whose gradients are summed for a step. On little memory, batch_sequences=1 with accumulate=8 is the
     paper's batch, except that batch norms see one sequence at a time."""
-    coarse_epochs: Annotated[int, Field(ge=0)]
+    coarse_epochs: Epochs
     """Epochs with the loss L^(S1). A backbone from a detector is frozen in them. If a detector gives all of it, its
     features are computed once, and validation comes about ten times in the stage instead of after every epoch."""
-    fine_epochs: Annotated[int, Field(ge=0)]
+    fine_epochs: Epochs
     """Epochs with the loss L^(S2), all weights trained."""
-    learning_rate: Positive
+    learning_rate: Rate
     """Peak learning rate; the paper uses 1e-4."""
-    coarse_learning_rate: Positive | None = None
+    coarse_learning_rate: Rate | None = None
     """Peak learning rate of the coarse stage, which then has a cosine of its own down to 0. None: `learning_rate`
     in both stages, as `cycles` says."""
     backbone_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
@@ -55,7 +56,7 @@ class FusionConfig(Section):
     cycles: Count = 1
     """Cosines of the learning rate. 1: one over both stages. More (the paper: 5): constant in the coarse stage, then
     this number of cosines, each from the peak down to 0, in the fine stage."""
-    jitter: Annotated[float, Field(ge=0)] = 0.0
+    jitter: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Standard deviation of a random extra motion of each training pair, as a fraction of the spread of the residuals
     in the training set."""
     views: Annotated[int, Field(ge=0, le=64)] = 0
@@ -78,23 +79,23 @@ class StreamConfig(Section):
     """Consecutive rendered pairs over one scene, before the next one."""
     share: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Share of the sequences of an epoch that are rendered; the others are those of the dataset."""
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     """Random seed of the poses and the noise of rendered sequences."""
-    timeout_s: Positive = 60.0
+    timeout_s: Annotated[float, Field(gt=0, le=100_000)] = 60.0
     """Longest time to wait for a reply of the server, seconds."""
 
 
 class NavigateConfig(Section):
     """The section `navigate`."""
 
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     """Random seed of weights, order and augmentation."""
     fusion: Literal["both", "warp", "stack"] = "both"
     """Which networks to train."""
-    kappa: Positive = 1.0
+    kappa: Weight = 1.0
     """Weight of the orientation in the coarse loss. Both errors are divided by their spread, so 1 weighs them
     equally."""
-    flow_weight: Annotated[float, Field(ge=0)] = 3.0
+    flow_weight: Annotated[float, Field(ge=0, le=1e6)] = 3.0
     """Weight of the optical flow error (pixels) in the loss of warp."""
     in_channels: Literal[1, 3] = 1
     """Input channels of the stack network; the grey frame is repeated. Must be equal to that of `detector`."""
@@ -108,7 +109,7 @@ class NavigateConfig(Section):
     """Arithmetic: auto (bfloat16 if the hardware supports it), bf16 or float32."""
     device: Device = "auto"
     """Where to compute: auto (the GPU if there is one), cpu or cuda."""
-    checkpoint_minutes: Annotated[float, Field(ge=0)] = 10.0
+    checkpoint_minutes: Annotated[float, Field(ge=0, le=100_000)] = 10.0
     """Minutes between saves of the training state within an epoch; 0: after every step. It is always saved after an
     epoch."""
     workers: Annotated[int, Field(ge=0, le=64)] = 0

@@ -97,7 +97,7 @@ def fusion_of(path: Path, architecture: dict[str, Any]) -> Fusion:
     """Which network a checkpoint holds. Raises UserError if it is no navigator's."""
     fusion = architecture.get("fusion")
     if fusion not in ("warp", "stack"):
-        raise UserError(path, "architecture", sorted(architecture), "a navigate run's checkpoint")
+        raise UserError(path, "architecture", sorted(map(str, architecture)), "a navigate run's checkpoint")
     return fusion
 
 

@@ -12,12 +12,13 @@ from torch import Tensor, nn
 
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array, rotation_vectors
+from perilune_train.models.architecture import NavigatorArchitecture, check_architecture_of, without_memory
 from perilune_train.models.navigator import StackNavigator, State, WarpNavigator
 from perilune_train.navigate.config import Target
 from perilune_train.navigate.data.sequences import Sequence, pair_sequence
 from perilune_train.navigate.data.trajectories import Motion, Trajectory
 from perilune_train.navigate.geometry import euler_from_rotation, mean_rotation, rotation_from_sixd
-from perilune_train.training.runs import check_architecture, load_state, load_weights
+from perilune_train.training.runs import check_architecture, check_tensors, load_state, load_weights
 
 Fusion = Literal["warp", "stack"]
 
@@ -99,10 +100,13 @@ def check_motion(path: Path, architecture: dict[str, Any]) -> None:
 def load_navigator(path: Path, fusion: Fusion) -> tuple[Any, dict[str, Any]]:
     """Load a trained network and its architecture. Raises UserError if the file is of another network."""
     content = load_weights(path)
-    check_architecture(path, content["architecture"], {"fusion": fusion})
-    network = build(content["architecture"])
+    architecture = content["architecture"]
+    check_architecture(path, architecture, {"fusion": fusion})
+    check_architecture_of(NavigatorArchitecture, architecture, path)
+    check_tensors(path, content["state_dict"], without_memory(lambda: build(architecture)))
+    network = build(architecture)
     load_state(network, content["state_dict"], path)
-    return network.eval(), content["architecture"]
+    return network.eval(), architecture
 
 
 @dataclass(frozen=True)

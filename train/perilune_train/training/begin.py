@@ -1,5 +1,6 @@
 """Resume, keep, replace or reject an existing run of the same name."""
 
+import contextlib
 import functools
 import json
 import shutil
@@ -13,6 +14,7 @@ from perilune_shared.dataset.info_file import INFO_NAME
 from perilune_shared.errors import UserError
 from perilune_shared.run_record import run_record
 from perilune_shared.storage.files import sha256_of, write_text
+from perilune_shared.storage.locks import LOCK_NAME, locked
 from perilune_shared.storage.store import Address, open_store
 from perilune_shared.terminal import say
 from perilune_train.training.runs import RunFolder, is_first_process
@@ -40,6 +42,18 @@ def _hash_of(place: Address) -> str | None:
         return store.sha256(INFO_NAME) if store.exists(INFO_NAME) else None
     file = store.folder / INFO_NAME if store.folder.is_dir() else store.folder
     return sha256_of(file) if file.is_file() else None
+
+
+@contextlib.contextmanager
+def held(*folders: RunFolder) -> Iterator[None]:
+    """Hold the folders of runs within the block, so that no second training writes into them.
+
+    Of several processes that train together the first holds them. Raises UserError if another training does.
+    """
+    with contextlib.ExitStack() as locks:
+        for run in folders if is_first_process() else ():
+            locks.enter_context(locked(run.root))
+        yield
 
 
 def state_of(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrite: bool = False) -> State:
@@ -81,7 +95,13 @@ def start_run(run: RunFolder, task: str, config: Section, inputs: Hashes, state:
         return
     if _is_used(run):
         _check_own(run, task)
-        shutil.rmtree(run.root)
+        for path in run.root.iterdir():
+            if path.name.startswith(LOCK_NAME):
+                continue
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
     write_text(run.inputs, json.dumps(dict(inputs), indent=2) + "\n")
     write_text(run.config, to_yaml(task, config))
 
@@ -96,12 +116,17 @@ def _decide(run: RunFolder, task: str, config: Section, inputs: Hashes, overwrit
     if not _is_used(run):
         return "new"
     _check_own(run, task)
+    damaged, finished = run.damaged, run.finished
+    # Without a saved state, weights would be replaced; metrics alone are computed again.
+    lost = damaged == run.best or (run.best.is_file() and not run.last.is_file())
+    if damaged is not None and lost and not overwrite:
+        raise UserError(damaged, "file", "an empty or damaged file", f"a whole file of the run{_REPLACE}")
     # A run without a saved state may be replaced, whatever its settings were.
-    if overwrite or not (run.finished or run.last.is_file()):
+    if overwrite or not (finished or run.last.is_file()):
         return "new"
     check_settings(run, task, config)
-    _check_inputs(run, inputs, skip_missing=run.finished)
-    return "finished" if run.finished else "resume"
+    _check_inputs(run, inputs, skip_missing=finished)
+    return "finished" if finished else "resume"
 
 
 def _is_used(run: RunFolder) -> bool:

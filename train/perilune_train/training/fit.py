@@ -31,9 +31,47 @@ from perilune_train.training.runs import (
 )
 
 _STEPS_BETWEEN_CHECKS = 20
+_EARLY_STEPS, _DIVERGED, _LEAST_LOSS = 10, 1e3, 1e-3
+"""First steps, of which each is checked; a loss of so many times the first one, or of this value, has diverged."""
 _PROCESSES = "processes"
 """Key of the number of processes in last.ckpt. It must not change on resume: it determines the batches of a step."""
 _STATE = {"pytorch-lightning_version", "state_dict", "loops", "optimizer_states", "lr_schedulers", "callbacks"}
+
+
+class StopDiverged(Callback):
+    """End a training whose loss is not finite, or far above the first one; Adam does not return from there.
+
+    Raises UserError with the epoch, the loss and what to lower. The last state from before stays.
+    """
+
+    def __init__(self, run: RunFolder, rate: str):
+        self.run, self.rate = run, rate
+        self.first: float | None = None
+
+    def state_dict(self) -> dict[str, float | None]:
+        return {"first": self.first}
+
+    def load_state_dict(self, state_dict: dict[str, float | None]) -> None:
+        self.first = state_dict["first"]
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx) -> None:
+        # Reading the loss makes the GPU wait, so do it rarely. The last one comes before validation and the state.
+        early = trainer.global_step <= _EARLY_STEPS
+        if early or trainer.is_last_batch or batch_idx % _STEPS_BETWEEN_CHECKS == 0:
+            loss = float(outputs["loss"]) * trainer.accumulate_grad_batches
+            self.first = abs(loss) if self.first is None else self.first
+            if not math.isfinite(loss) or abs(loss) > _DIVERGED * max(self.first, _LEAST_LOSS):
+                self._stop(trainer, f"{loss:g}, the first was {self.first:g}")
+
+    def on_validation_end(self, trainer: lightning.Trainer, pl_module: Any) -> None:
+        # The last step may have ruined weights whose loss was still finite.
+        state = pl_module.evaluated.state_dict().values()
+        if not all(bool(torch.isfinite(tensor).all()) for tensor in state if tensor.is_floating_point()):
+            self._stop(trainer, "weights that are not finite")
+
+    def _stop(self, trainer: lightning.Trainer, found: str) -> None:
+        expected = f"a loss that falls: lower {self.rate}, and give --overwrite"
+        raise UserError(self.run.root, f"loss in epoch {trainer.current_epoch + 1}", found, expected)
 
 
 class KeepBest(Callback):
@@ -207,6 +245,7 @@ def fit(
     checkpoint_minutes: float | None = None,
     accumulate: int = 1,
     validate_every: int = 1,
+    learning_rate: str = "the learning rate",
 ) -> float:
     """Train `task` for a fixed number of epochs; keep the best weights and the last state in the run's folder.
 
@@ -222,7 +261,8 @@ def fit(
     With `resume` training continues from last.ckpt, if the run has one, and gives exactly the result of an
     uninterrupted run. The state is saved after every epoch, and with `checkpoint_minutes` within epochs too; then the
     task's training batches must continue at the position of the checkpoint. Raises UserError if last.ckpt is damaged,
-    of another network or of another number of processes, or if the rank of this process was unknown before.
+    of another network or of another number of processes, if the rank of this process was unknown before, or if the loss
+    diverges; `learning_rate` names the setting to lower then.
     """
     share = own_share(devices, num_nodes)
     devices, num_nodes = machines(devices, num_nodes)
@@ -268,6 +308,7 @@ def fit(
             callbacks=[
                 *([Bar(label)] if is_first_process() else []),
                 LearningRateMonitor("step"),
+                StopDiverged(run, learning_rate),
                 KeepBest(run, monitor, mode),
                 keep_last,
                 threads,

@@ -11,8 +11,11 @@ from safetensors.torch import load, save
 
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_bytes
+from perilune_train.training.checkpoint_file import MOST_WEIGHT_BYTES
 
 SUFFIX = ".safetensors"
+_MOST_HEADER_BYTES = 8_000_000
+_DTYPES = {"F16", "F32", "F64", "I64", "I32", "BOOL"}
 _PLAIN = ("architecture", "terrain")
 """Keys of a checkpoint that are stored as JSON in the header; `terrain` may be missing."""
 
@@ -37,13 +40,39 @@ def read_half(path: Path) -> dict[str, Any]:
     """The content that `write_half` wrote, weights as float32, on the CPU. Raises UserError on any other file."""
     expected = "a file of weights that perilune wrote"
     try:
+        _check_header(path, expected)
         with safetensors.safe_open(path, "pt") as file:
             metadata = file.metadata() or {}
+            kinds = {file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118
         content = {key: json.loads(metadata[key]) for key in _PLAIN if key in metadata}
+        if not kinds <= _DTYPES:
+            raise UserError(path, "weights", f"numbers of type {', '.join(sorted(kinds - _DTYPES))}", expected)
         tensors = load(path.read_bytes())
-    except (safetensors.SafetensorError, ValueError, RecursionError, OSError) as error:
+    except (safetensors.SafetensorError, ValueError, RecursionError, OSError, KeyError) as error:
         raise UserError(path, "weights", str(error) or type(error).__name__, expected) from None
     if not isinstance(content.get("architecture"), dict):
         raise UserError(path, "architecture", "missing", expected)
     content["state_dict"] = {key: t.float() if t.dtype == torch.float16 else t for key, t in tensors.items()}
     return content
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file is a safetensors file from its first byte to its last; reads no tensor."""
+    try:
+        _check_header(path, "")
+        # It refuses a file whose size is not that of its header and its tensors.
+        with safetensors.safe_open(path, "pt"):
+            return True
+    except (safetensors.SafetensorError, UserError, OSError):
+        return False
+
+
+def _check_header(path: Path, expected: str) -> None:
+    """Refuse a file or a header above the limits, before the library reads it."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        header = int.from_bytes(stream.read(8), "little")
+    if size > MOST_WEIGHT_BYTES:
+        raise UserError(path, "weights", f"{size} bytes", f"at most {MOST_WEIGHT_BYTES}")
+    if header > min(_MOST_HEADER_BYTES, size):
+        raise UserError(path, "weights", f"a header of {header} bytes", expected)

@@ -1,7 +1,6 @@
 """A run's folder and weights; choice of device and precision."""
 
 import io
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,17 @@ from torch import nn
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_bytes
 from perilune_train.config import Precision
-from perilune_train.evaluation.metrics_file import METRICS_FILE
+from perilune_train.evaluation.metrics_file import METRICS_FILE, has_metrics
 from perilune_train.evaluation.provenance import RECORD
+from perilune_train.training.checkpoint_file import (
+    MOST_STATE_BYTES,
+    MOST_WEIGHT_BYTES,
+    check_weights,
+    is_whole,
+    load_checked,
+)
 from perilune_train.training.half_weights import SUFFIX, read_half
+from perilune_train.training.half_weights import is_whole as half_is_whole
 
 
 @dataclass(frozen=True)
@@ -53,8 +60,17 @@ class RunFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether the run is complete."""
-        return self.metrics.is_file()
+        """Whether the run has its metrics, and metrics and weights are whole files."""
+        return self.metrics.is_file() and self.damaged is None
+
+    @property
+    def damaged(self) -> Path | None:
+        """The weights or the metrics, if they are an empty or truncated file; None if they are whole or missing."""
+        if self.best.is_file() and not (half_is_whole if self.best.suffix == SUFFIX else is_whole)(self.best):
+            return self.best
+        if self.metrics.is_file() and not has_metrics(self.root):
+            return self.metrics
+        return None
 
 
 def is_first_process() -> bool:
@@ -85,26 +101,29 @@ def save_weights(
 def load_weights(path: Path) -> dict[str, Any]:
     """`{"architecture": settings, "state_dict": tensors}` of a file that `save_weights` or `write_half` wrote.
 
-    The tensors are on the CPU.
+    The tensors are on the CPU, and finite. The architecture is a dictionary of plain values; the loader of each kind of
+    network checks them.
 
     Raises UserError if the file is missing, is damaged or has other content.
     """
     if not path.is_file():
         raise UserError(path, "checkpoint", "no such file", "checkpoints/best.ckpt of a finished run")
     if path.suffix == SUFFIX:
-        return read_half(path)
-    return read_saved(path, "checkpoint", {"architecture", "state_dict"}, "checkpoints/best.ckpt of a run")
+        content = read_half(path)
+    else:
+        keys, expected = {"architecture", "state_dict"}, "checkpoints/best.ckpt of a run"
+        content = read_saved(path, "checkpoint", keys, expected, MOST_WEIGHT_BYTES)
+    if not isinstance(content["architecture"], dict):
+        raise UserError(path, "architecture", type(content["architecture"]).__name__, "settings by name")
+    check_weights(path, "weights", content["state_dict"])
+    return content
 
 
-def read_saved(path: Path, field: str, keys: set[str], expected: str) -> dict[str, Any]:
+def read_saved(
+    path: Path, field: str, keys: set[str], expected: str, most_bytes: int = MOST_STATE_BYTES
+) -> dict[str, Any]:
     """Read a dictionary saved by torch, on the CPU. Raises UserError if the file is damaged or lacks `keys`."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            content = torch.load(path, map_location="cpu", weights_only=True)
-    # Torch does not document its errors; damaged files raise many types.
-    except Exception as error:
-        raise UserError(path, field, str(error) or type(error).__name__, expected) from None
+    content = load_checked(path, field, expected, most_bytes)
     missing = keys - content.keys() if isinstance(content, dict) else keys
     if missing:
         raise UserError(path, field, f"no {', '.join(sorted(missing))}", expected)

@@ -25,12 +25,16 @@ from perilune_render.terrain.size_frequency import (
     NeukumProduction,
     SizeFrequency,
     draw_diameters,
+    expected_numbers,
     log_bins,
 )
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
 ORIGINS = ("primary", "secondary", "elevation model")
 """Values of `Craters.origin`: drawn alone, drawn in a cluster, or read from a catalogue of real ground."""
+MOST_CRATERS = 5_000_000
+"""Largest mean number of craters in a scene; each needs about 1 kB while it is stamped and measured."""
 _LARGEST_VISIBLE_WEAR = 0.11
 """Wear K/R^2 at which a crater has lost three quarters of its depth and is rarely counted."""
 _LARGEST_SECONDARY_M = 30.0
@@ -114,13 +118,11 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
     elevation model already shows.
     """
     rng = stream(seed, "craters")
-    largest = min(config.max_diameter_m, max_diameter_m or np.inf, grid.extent_m / 3)
-    smallest = config.min_diameter_spacings * float(grid.spacings_m.min())
     share = rng.uniform(config.equilibrium_share.low, config.equilibrium_share.high)
     equilibrium = EQUILIBRIA[config.equilibrium](share=share)
     law = Minimum(NeukumProduction(age_gyr=config.surface_age_gyr), equilibrium)
-    edges = log_bins(smallest, max(largest, 1.001 * smallest))
-    half_m = np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
+    smallest, largest = _sizes(config, grid, max_diameter_m)
+    edges, half_m = _bins(config, grid, smallest, largest)
     diameter = draw_diameters(law, edges, np.square(2 * half_m), rng)
     if largest <= smallest:
         diameter = diameter[:0]
@@ -153,6 +155,29 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
         np.where(clustered, ORIGINS.index("secondary"), ORIGINS.index("primary")),
     )
     return craters.chosen(np.argsort(-age, kind="stable"))
+
+
+def _sizes(config: CratersConfig, grid: Grid, max_diameter_m: float | None = None) -> tuple[float, float]:
+    """Smallest and largest diameter of a population, metres."""
+    largest = min(config.max_diameter_m, max_diameter_m or np.inf, grid.extent_m / 3)
+    return config.min_diameter_spacings * float(grid.spacings_m.min()), largest
+
+
+def _bins(config: CratersConfig, grid: Grid, smallest: float, largest: float) -> tuple[Array, Array]:
+    """Edges of the bins (B + 1,) and half width (B,) of the ground that is fine enough for each, metres."""
+    edges = log_bins(smallest, max(largest, 1.001 * smallest))
+    return edges, np.array([grid.half_width_for(low / config.min_diameter_spacings) for low in edges[:-1]])
+
+
+def check_craters(config: CratersConfig, grid: Grid) -> None:
+    """Raise UserError if a scene has more craters than memory, before any is drawn."""
+    equilibrium = EQUILIBRIA[config.equilibrium](share=config.equilibrium_share.high)
+    law = Minimum(NeukumProduction(age_gyr=config.surface_age_gyr), equilibrium)
+    edges, half_m = _bins(config, grid, *_sizes(config, grid))
+    number = float(expected_numbers(law, edges, np.square(2 * half_m)).sum())
+    if number > MOST_CRATERS:
+        expected = f"at most {MOST_CRATERS}: lower equilibrium_share, or raise min_diameter_spacings"
+        raise UserError("dataset.terrain.craters", "number", f"about {number:.3g} in a scene", expected)
 
 
 def _cluster(

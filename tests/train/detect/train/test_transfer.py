@@ -178,7 +178,11 @@ def test_a_run_is_written_as_a_darknet_file_and_comes_back(tmp_path, suffix):
 @pytest.mark.parametrize(
     ("name", "shape", "message"),
     [
-        ("a.bin", {}, "a.bin: --out: got the name a.bin, expected a name that ends in .conv.74 or .weights"),
+        (
+            "a.bin",
+            {},
+            "a.bin: --out: got the name a.bin, expected a name that ends in .safetensors, .conv.74 or .weights",
+        ),
         ("a.conv.74", {"width": 0.125}, "best.ckpt: width: got 0.125, expected 1.0"),
         ("a.weights", {"width": 0.125}, "best.ckpt: width: got 0.125, expected 1.0"),
         ("absent.weights", None, "best.ckpt: checkpoint: got no such file"),

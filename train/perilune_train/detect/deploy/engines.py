@@ -5,7 +5,7 @@ import functools
 import importlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,11 +16,13 @@ from torch import nn
 
 from perilune_shared.errors import UserError
 from perilune_shared.threads import cores_in_affinity, usable_cores
+from perilune_train.training.checkpoint_file import MOST_WEIGHT_BYTES
 
 Array = NDArray[np.float32]
 Engine = Callable[[Array], tuple[Array, Array]]
 """Normalised images (N, C, H, W) in float32 to boxes (N, K, 4) in pixels and scores (N, K)."""
 EnginePrecision = Literal["f32", "bf16"]
+_EXPECTED = "a file written by `perilune-train detect export`"
 
 
 def package(name: str) -> Any:
@@ -110,8 +112,34 @@ def has_bf16() -> bool:
 def _readable(path: Path) -> Any:
     """Raise UserError if an engine cannot read a file; the engines raise their own kinds of RuntimeError."""
     if not path.is_file():
-        raise UserError(path, "network", "no such file", "a file written by `perilune-train detect export`")
+        raise UserError(path, "network", "no such file", _EXPECTED)
+    if path.stat().st_size > MOST_WEIGHT_BYTES:
+        raise UserError(path, "network", f"{path.stat().st_size} bytes", f"at most {MOST_WEIGHT_BYTES}")
     try:
+        if path.suffix == ".onnx":
+            _check_no_other_files(path)
         yield
+    except UserError:
+        raise
     except Exception as error:
-        raise UserError(path, "network", error, "a file written by `perilune-train detect export`") from None
+        raise UserError(path, "network", error, _EXPECTED) from None
+
+
+def _check_no_other_files(path: Path) -> None:
+    """Raise UserError if an ONNX file names files with its tensors: any file of the disk could be read as weights."""
+    model = package("onnx").load(str(path), load_external_data=False)
+    names = [f"a tensor in the file {each.value!r}" for tensor in _tensors(model) for each in tensor.external_data]
+    if names:
+        raise UserError(path, "network", names[0], f"{_EXPECTED}, which holds its own tensors")
+
+
+def _tensors(message: Any) -> Iterator[Any]:
+    """All tensors of a message of protobuf, at any depth."""
+    if message.DESCRIPTOR.name == "TensorProto":
+        yield message
+        return
+    for field, value in message.ListFields():
+        # Only messages have parts; a list of numbers may be long.
+        if field.message_type is not None:
+            for part in value if isinstance(value, Sequence) else [value]:
+                yield from _tensors(part)

@@ -1,7 +1,9 @@
 """A trained detector: its network, settings and device."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ from perilune_shared.threads import warn_if_crowded
 from perilune_train.data.frames import normalised
 from perilune_train.detect.config import DetectConfig
 from perilune_train.detect.data.batches import network_input
+from perilune_train.models.architecture import DetectorArchitecture, check_architecture_of, without_memory
 from perilune_train.models.yolo import YOLOv3
 from perilune_train.training import runs
 from perilune_train.training.fair_threads import FairThreads
@@ -44,12 +47,19 @@ class Detector:
 def load_detector(path: Path) -> YOLOv3:
     """Load the network of a detect run's best.ckpt, in evaluation mode. Raises UserError on another kind of file."""
     content = runs.load_weights(path)
-    architecture = content["architecture"]
-    if set(architecture) != {"in_channels", "width", "attention", "strides"}:
-        raise UserError(path, "architecture", sorted(architecture), "a detect run's checkpoint")
-    network = YOLOv3(None, **architecture)
+    check_detector(content, path)
+    network = YOLOv3(None, **content["architecture"])
     runs.load_state(network, content["state_dict"], path)
     return network.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
+
+
+def check_detector(content: Mapping[str, Any], path: Path) -> None:
+    """Raise UserError unless the content of a checkpoint is a detector's; builds nothing that takes memory."""
+    architecture = content["architecture"]
+    if set(architecture) != set(DetectorArchitecture.model_fields):
+        raise UserError(path, "architecture", sorted(map(str, architecture)), "a detect run's checkpoint")
+    check_architecture_of(DetectorArchitecture, architecture, path)
+    runs.check_tensors(path, content["state_dict"], without_memory(lambda: YOLOv3(None, **architecture)))
 
 
 def open_detector(checkpoint: Path, config: DetectConfig) -> Detector:

@@ -41,7 +41,7 @@ from perilune_train.evaluation.metrics_file import Metrics, write_metrics
 from perilune_train.evaluation.provenance import check_terrain, protocol_of, training_provenance
 from perilune_train.shipped.models import weights_file
 from perilune_train.training import runs
-from perilune_train.training.begin import hashes_of, start_run, state_of
+from perilune_train.training.begin import hashes_of, held, start_run, state_of
 from perilune_train.training.fit import fit, own_share
 
 
@@ -64,6 +64,13 @@ def run_detect(
     """
     console.quiet = not runs.is_first_process()
     run = runs.RunFolder(runs_root / "detect" / name)
+    with held(run):
+        return _run(run, config, dataset_address, overwrite, allow_overlap)
+
+
+def _run(
+    run: runs.RunFolder, config: DetectConfig, dataset_address: Address, overwrite: bool, allow_overlap: bool
+) -> runs.RunFolder:
     inputs = hashes_of(
         {"dataset": dataset_address, "teacher": None if config.teacher is None else Path(config.teacher)}
     )
@@ -114,6 +121,7 @@ def run_detect(
         strategy="ddp_find_unused_parameters_true" if config.strategy == "auto" and frozen_epochs else config.strategy,
         checkpoint_minutes=config.checkpoint_minutes,
         validate_every=config.validate_every,
+        learning_rate=f"detect.learning_rate, which is {config.learning_rate:g}",
     )
     if not runs.is_first_process():
         return run

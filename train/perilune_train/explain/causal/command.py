@@ -63,7 +63,8 @@ def causal(
     if (nav_dataset is None) != (nav_counterfactual is None):
         raise UserError("--nav-dataset", "datasets", "one of two", "--nav-dataset and --nav-counterfactual together")
     # Importing torch and Lightning takes seconds; check the settings first.
-    from perilune_train.explain.causal.run import causal_run
+    from perilune_train.explain.causal.run import causal_folder, causal_run
+    from perilune_train.training.begin import held
     from perilune_train.training.runs import RunFolder
 
     name = name or preset
@@ -74,20 +75,21 @@ def causal(
     if nav_dataset is not None and nav_counterfactual is not None:
         best = navigator or runs / "navigate" / f"{name}-stack" / "checkpoints" / "best.ckpt"
         pose = nav_dataset, nav_counterfactual, best
-    made = causal_run(
-        settings,
-        dataset or f"data/{preset}/detect",
-        counterfactual or f"data/{preset}/causal",
-        RunFolder(own).best,
-        gate or _chosen_gate(runs / "explain" / name),
-        runs,
-        name,
-        split,
-        turned,
-        pose,
-        overwrite,
-        allow_overlap,
-    )
+    with held(causal_folder(runs, name)):
+        made = causal_run(
+            settings,
+            dataset or f"data/{preset}/detect",
+            counterfactual or f"data/{preset}/causal",
+            RunFolder(own).best,
+            gate or _chosen_gate(runs / "explain" / name),
+            runs,
+            name,
+            split,
+            turned,
+            pose,
+            overwrite,
+            allow_overlap,
+        )
     say(f"{made.root}: metrics.json, claims.json, *.parquet, *.png")
 
 

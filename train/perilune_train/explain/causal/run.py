@@ -45,6 +45,11 @@ CAPTIONS = {
 _BATCH = 8
 
 
+def causal_folder(runs: Path, name: str) -> RunFolder:
+    """The folder that `causal_run` writes; a command holds it (`training.begin.held`)."""
+    return RunFolder(runs / "explain" / f"{name}-causal")
+
+
 def causal_run(
     settings: ExplainConfig,
     dataset: Address,
@@ -69,7 +74,7 @@ def causal_run(
     Raises UserError if the existing run has other settings or inputs; if an input is missing or invalid; or if the
     network was fitted to terrain of the frames (unless `allow_overlap`).
     """
-    run = RunFolder(runs / "explain" / f"{name}-causal")
+    run = causal_folder(runs, name)
     inputs = hashes_of(
         {
             "detection dataset": dataset,

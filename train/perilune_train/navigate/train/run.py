@@ -12,6 +12,7 @@ from perilune_shared.dataset.manifest import open_single
 from perilune_shared.storage.store import Address
 from perilune_shared.terminal import console, say
 from perilune_train.data.shares import Share
+from perilune_train.detect.inference.detector import check_detector
 from perilune_train.evaluation.metrics_file import Metrics
 from perilune_train.evaluation.provenance import (
     Provenance,
@@ -20,6 +21,7 @@ from perilune_train.evaluation.provenance import (
     read_provenance,
     training_provenance,
 )
+from perilune_train.models.architecture import NavigatorArchitecture, check_architecture_of
 from perilune_train.navigate.config import NavigateConfig
 from perilune_train.navigate.covariance import calibrate, stated_covariances
 from perilune_train.navigate.data.stream import Stream
@@ -30,7 +32,7 @@ from perilune_train.navigate.network import Fusion, Scales, load_navigator, pred
 from perilune_train.navigate.train.pose_results import check_one_area, evaluate_pose_run
 from perilune_train.navigate.train.task import NavigationTask
 from perilune_train.shipped.models import weights_file
-from perilune_train.training.begin import hashes_of, start_run, state_of
+from perilune_train.training.begin import hashes_of, held, start_run, state_of
 from perilune_train.training.fit import fit, own_share
 from perilune_train.training.runs import (
     RunFolder,
@@ -66,12 +68,25 @@ def navigate_run(
     """
     console.quiet = not is_first_process()
     fusions: list[Fusion] = ["stack", "warp"] if settings.fusion == "both" else [settings.fusion]
+    names = {"warp": name, "stack": f"{name}-stack"}
+    folders = {fusion: RunFolder(runs / "navigate" / names[fusion]) for fusion in fusions}
+    with held(*folders.values()):
+        return _run(folders, settings, dataset_address, detector, overwrite, allow_overlap)
+
+
+def _run(
+    folders: dict[Fusion, RunFolder],
+    settings: NavigateConfig,
+    dataset_address: Address,
+    detector: Path | None,
+    overwrite: bool,
+    allow_overlap: bool,
+) -> list[RunFolder]:
+    fusions = list(folders)
     backbone, source, inherited = _detector_backbone(settings, detector) if "stack" in fusions else (None, "", [])
     inputs: dict[Fusion, dict[str, str | None]] = {"warp": hashes_of({"dataset": dataset_address})}
     used = None if backbone is None else settings.detector or detector
     inputs["stack"] = inputs["warp"] | hashes_of({"detector": used})
-    names = {"warp": name, "stack": f"{name}-stack"}
-    folders = {fusion: RunFolder(runs / "navigate" / names[fusion]) for fusion in fusions}
     states = {fusion: state_of(folders[fusion], "navigate", settings, inputs[fusion], overwrite) for fusion in fusions}
     if set(states.values()) == {"finished"}:
         return list(folders.values())
@@ -165,6 +180,7 @@ def _start_of_warp(settings: NavigateConfig) -> dict[str, Any] | None:
     content = load_weights(path)
     expected = {"fusion": "warp", **{key: getattr(own, key) for key in ("size_px", "width", "attention", "hidden")}}
     check_architecture(path, content["architecture"], expected)
+    check_architecture_of(NavigatorArchitecture, content["architecture"], path)
     return content
 
 
@@ -203,6 +219,7 @@ def _train(run: RunFolder, task: NavigationTask, resume: bool) -> float:
             strategy="ddp_find_unused_parameters_true" if own.coarse_epochs else "auto",
             checkpoint_minutes=settings.checkpoint_minutes,
             accumulate=own.accumulate,
+            learning_rate=f"navigate.{task.fusion}.learning_rate, which is {own.learning_rate:g}",
         )
 
 
@@ -230,6 +247,7 @@ def _detector_backbone(
         say(f"stack: backbone {reason}")
         return None, reason, []
     check_architecture(path, content["architecture"], expected)
+    check_detector(content, path)
     weights = content["state_dict"].items()
     state = {key.removeprefix(_PREFIX): value for key, value in weights if key.startswith(_PREFIX)}
     stages = sum(key.startswith("downs.") and key.endswith("conv.weight") for key in state)

@@ -1,0 +1,260 @@
+"""Checkpoints of torch as untrusted input: read what a file holds before any of its tensors.
+
+A checkpoint is a ZIP with a pickle of plain values and, for each tensor, a file of its numbers. The pickle is read here
+with few instructions and few names, none of which executes anything; tensors become records of their shape. Only if
+sizes, names and values are those that perilune writes, torch reads the same file.
+"""
+
+import pickle
+import struct
+import warnings
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from math import prod
+from pathlib import Path
+from typing import Any, BinaryIO, ClassVar
+
+import torch
+
+from perilune_shared.errors import UserError
+
+MOST_WEIGHT_BYTES, MOST_STATE_BYTES = 2 * 2**30, 12 * 2**30
+"""Largest files: weights of a network of width 2 have half of it; a state has them four times more."""
+_MOST_PICKLE_BYTES = 4_000_000
+_MOST_DIRECTORY_BYTES = 16_000_000
+_MOST_VALUES, _MOST_TEXT, _MOST_DEPTH, _MOST_AXES = 1_000_000, 16_000_000, 50, 8
+_END, _LOCATOR, _END_64 = struct.Struct("<4s4H2LH"), struct.Struct("<4sLQL"), struct.Struct("<4sQ2H2L4Q")
+_ITEM_BYTES = {
+    "DoubleStorage": 8,
+    "FloatStorage": 4,
+    "HalfStorage": 2,
+    "BFloat16Storage": 2,
+    "LongStorage": 8,
+    "IntStorage": 4,
+    "ShortStorage": 2,
+    "CharStorage": 1,
+    "ByteStorage": 1,
+    "BoolStorage": 1,
+}
+# In Python, since the one in C allocates as much memory as a place in its list of values says.
+_Unpickler: Any = vars(pickle)["_Unpickler"]
+_INSTRUCTIONS = (
+    pickle.PROTO, pickle.STOP, pickle.MARK, pickle.NONE, pickle.NEWTRUE, pickle.NEWFALSE, pickle.BININT,
+    pickle.BININT1, pickle.BININT2, pickle.BINFLOAT, pickle.BINUNICODE, pickle.SHORT_BINUNICODE, pickle.EMPTY_LIST,
+    pickle.APPEND, pickle.APPENDS, pickle.EMPTY_TUPLE, pickle.TUPLE, pickle.TUPLE1, pickle.TUPLE2, pickle.TUPLE3,
+    pickle.EMPTY_DICT, pickle.BINPUT, pickle.LONG_BINPUT, pickle.BINGET, pickle.LONG_BINGET, pickle.GLOBAL,
+    pickle.REDUCE, pickle.BINPERSID,
+)  # fmt: skip
+
+
+class _Refused(Exception):
+    """Content that perilune does not write."""
+
+
+@dataclass(frozen=True)
+class TensorRecord:
+    """A tensor of a file that has not been read."""
+
+    shape: tuple[int, ...]
+    """Its shape."""
+
+
+@dataclass(frozen=True)
+class _Storage:
+    """Numbers of tensors, in a file of the ZIP."""
+
+    numbers: int
+    """How many."""
+
+
+def load_checked(path: Path, field: str, expected: str, most_bytes: int) -> Any:
+    """Content of a checkpoint, on the CPU. Raises UserError on anything that perilune does not write.
+
+    Memory and time are bounded by the file's size, and that by `most_bytes`.
+    """
+    size = path.stat().st_size
+    if size > most_bytes:
+        raise UserError(path, field, f"{size} bytes", f"at most {most_bytes}")
+    with path.open("rb") as stream:
+        try:
+            _check(_read_records(stream, size))
+            stream.seek(0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return torch.load(stream, map_location="cpu", weights_only=True)
+        except _Refused as refused:
+            raise UserError(path, field, refused, expected) from None
+        # Neither zipfile nor torch documents its errors; damaged files raise many types.
+        except Exception as error:
+            raise UserError(path, field, f"a damaged file ({type(error).__name__})", expected) from None
+
+
+def check_weights(path: Path, field: str, state: object) -> None:
+    """Raise UserError unless a state is a dictionary of named tensors of finite numbers, with variances of at least 0.
+
+    Networks compute NaN from others, without a message.
+    """
+    expected = "finite weights"
+    if not isinstance(state, dict):
+        raise UserError(path, field, type(state).__name__, "tensors by name")
+    for name, tensor in state.items():
+        if not isinstance(name, str) or not isinstance(tensor, torch.Tensor):
+            raise UserError(path, f"{field}.{name}", type(tensor).__name__, "a tensor")
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            wrong = tensor[~torch.isfinite(tensor)]
+            found = f"{wrong.numel()} of {tensor.numel()} numbers not finite, the first {float(wrong[0])}"
+            raise UserError(path, f"{field}.{name}", found, expected)
+        if name.endswith("running_var") and tensor.numel() and float(tensor.min()) < 0:
+            raise UserError(path, f"{field}.{name}", float(tensor.min()), "a variance of at least 0")
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file is a checkpoint from its first byte to its last, as `load_checked` needs it; reads no tensor."""
+    try:
+        with path.open("rb") as stream:
+            _check(_read_records(stream, path.stat().st_size))
+    except Exception:
+        return False
+    return True
+
+
+def _read_records(stream: BinaryIO, size: int) -> Any:
+    """The pickled values of a checkpoint, its tensors as `TensorRecord`."""
+    _check_directory(stream, size)
+    with zipfile.ZipFile(stream) as archive:
+        entries = archive.infolist()
+        names = {entry.filename: entry.file_size for entry in entries}
+        if len(names) != len(entries) or len({name.partition("/")[0] for name in names}) != 1:
+            raise _Refused("a ZIP with files of one name or of several folders")
+        if any(e.compress_type != zipfile.ZIP_STORED or e.file_size != e.compress_size for e in entries):
+            raise _Refused("a compressed ZIP")
+        if sum(names.values()) > size:
+            raise _Refused("a ZIP whose files overlap")
+        folder = entries[0].filename.partition("/")[0]
+        pickled = f"{folder}/data.pkl"
+        if names.get(pickled, 0) > _MOST_PICKLE_BYTES:
+            raise _Refused(f"a pickle of {names[pickled]} bytes, which is more than {_MOST_PICKLE_BYTES}")
+        return _Records(archive.read(pickled), folder, names).load()
+
+
+def _check_directory(stream: BinaryIO, size: int) -> None:
+    """Refuse a file that is no ZIP, or one with a long list of files: `zipfile` would keep all of it in memory."""
+    start = max(0, size - _END.size - 2**16)
+    stream.seek(start)
+    tail = stream.read(_END.size + 2**16)
+    place = tail.rfind(b"PK\x05\x06")
+    if place < 0 or len(tail) < place + _END.size:
+        raise _Refused("no checkpoint, or the beginning of one")
+    length = _END.unpack_from(tail, place)[5]
+    if length == 0xFFFFFFFF:
+        stream.seek(max(0, start + place - _LOCATOR.size))
+        stream.seek(_LOCATOR.unpack(stream.read(_LOCATOR.size))[2])
+        length = _END_64.unpack(stream.read(_END_64.size))[8]
+    if length > _MOST_DIRECTORY_BYTES:
+        raise _Refused(f"a ZIP with a list of {length} bytes, which is more than {_MOST_DIRECTORY_BYTES}")
+
+
+class _Records(_Unpickler):
+    """Reads a pickle with the instructions and names that `torch.save` needs for tensors and plain values."""
+
+    def __init__(self, content: bytes, folder: str, sizes: Mapping[str, int]):
+        super().__init__(BytesIO(content))
+        self.folder, self.sizes = folder, sizes
+
+    def find_class(self, module: str, name: str) -> Any:
+        known = {
+            "collections.OrderedDict": _ordered,
+            "torch._utils._rebuild_tensor_v2": _tensor,
+            "torch._utils._rebuild_parameter": _parameter,
+            **{f"torch.{kind}": kind for kind in _ITEM_BYTES},
+        }
+        if f"{module}.{name}" not in known:
+            raise _Refused(f"a file that calls {module}.{name}")
+        return known[f"{module}.{name}"]
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        kind, storage, key, _, numbers = pid
+        stored = self.sizes.get(f"{self.folder}/data/{key}", -1)
+        if kind != "storage" or type(numbers) is not int or stored != numbers * _ITEM_BYTES[storage]:
+            raise _Refused(f"{numbers} numbers ({storage}) in {max(stored, 0)} bytes")
+        return _Storage(numbers)
+
+    def load_long1(self) -> None:
+        length = self.read(1)[0]
+        if length > 8:
+            # Equal hashes of such numbers would make a dictionary slow.
+            raise _Refused("an integer of more than 64 bits")
+        self.append(pickle.decode_long(self.read(length)))
+
+    def load_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._set(key, value)
+
+    def load_setitems(self) -> None:
+        items = self.pop_mark()
+        for key, value in zip(items[::2], items[1::2], strict=True):
+            self._set(key, value)
+
+    def load_build(self) -> None:
+        state = self.stack.pop()
+        # torch's own note on versions; other names would replace methods of the dictionary.
+        if not isinstance(self.stack[-1], OrderedDict) or set(state) != {"_metadata"}:
+            raise _Refused("an object with attributes")
+
+    def _set(self, key: object, value: object) -> None:
+        if type(key) not in (str, int) or not isinstance(self.stack[-1], dict):
+            raise _Refused("a dictionary whose keys are neither text nor integers")
+        self.stack[-1][key] = value
+
+    dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
+        **{code[0]: _Unpickler.dispatch[code[0]] for code in _INSTRUCTIONS},
+        pickle.LONG1[0]: load_long1,
+        pickle.SETITEM[0]: load_setitem,
+        pickle.SETITEMS[0]: load_setitems,
+        pickle.BUILD[0]: load_build,
+    }
+
+
+def _ordered() -> OrderedDict:
+    return OrderedDict()
+
+
+def _tensor(
+    storage: _Storage, offset: int, shape: tuple, strides: tuple, grad: bool, hooks: dict, _: object = None
+) -> TensorRecord:
+    """Refuse a tensor beyond its storage, or one that repeats numbers: a copy of it would be larger than the file."""
+    numbers = (offset, *shape, *strides)
+    if not all(type(number) is int and 0 <= number < 2**48 for number in numbers) or len(shape) != len(strides):
+        raise _Refused("a tensor without a shape")
+    if not isinstance(storage, _Storage) or len(shape) > _MOST_AXES or hooks:
+        raise _Refused("a tensor of another kind")
+    last = offset + sum((length - 1) * stride for length, stride in zip(shape, strides, strict=True))
+    if prod(shape) > storage.numbers or (prod(shape) and last >= storage.numbers):
+        raise _Refused(f"a tensor of {shape} in a storage of {storage.numbers} numbers")
+    return TensorRecord(shape)
+
+
+def _parameter(data: TensorRecord, grad: bool, hooks: dict) -> TensorRecord:
+    if not isinstance(data, TensorRecord) or hooks:
+        raise _Refused("a parameter of another kind")
+    return data
+
+
+def _check(content: Any) -> None:
+    """Refuse nesting that is deep, or that repeats parts so often that a text of it would fill the memory."""
+    values, text, left = 0, 0, [(content, 0)]
+    while left:
+        value, depth = left.pop()
+        values += 1
+        text += len(value) if isinstance(value, str) else 0
+        if values > _MOST_VALUES or text > _MOST_TEXT or depth > _MOST_DEPTH:
+            raise _Refused("more values, text or nesting than a checkpoint has")
+        if isinstance(value, dict):
+            left += [(part, depth + 1) for pair in value.items() for part in pair]
+        elif isinstance(value, list | tuple):
+            left += [(part, depth + 1) for part in value]
+        elif not isinstance(value, TensorRecord | str | int | float | None):
+            raise _Refused(f"a value of the type {type(value).__name__}")
