@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from perilune_render.config import DatasetConfig, SensorConfig
-from perilune_render.config_terrain import SITE_FIELDS
+from perilune_render.config_terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig
 from perilune_render.provenance.versions import all_versions, ground_versions
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.metadata import Recipe
@@ -41,8 +41,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, those of the other kind unless the kinds share terrain, optional sections that are not set, and a site in an
-    elevation model if there is none.
+    speed, those of the other kind unless the kinds share terrain, optional sections that are not set, a site in an
+    elevation model if there is none, and what its file states itself.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -55,6 +55,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
             del plain[name]
     for name in SITE_FIELDS:
         if plain["terrain"]["elevation"][name] is None:
+            del plain["terrain"]["elevation"][name]
+    for name in FILE_FIELDS:
+        if plain["terrain"]["elevation"][name] == ElevationConfig.model_fields[name].default:
             del plain["terrain"]["elevation"][name]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]

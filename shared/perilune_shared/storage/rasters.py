@@ -126,6 +126,19 @@ def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
             raise UserError(path, field, found, f"a readable {_NAMES[files.driver]}") from None
 
 
+def label_text(files: RasterFiles) -> str:
+    """The text of a PDS label, up to its end."""
+    with files.paths[0].open("rb") as stream:
+        return _label_in(stream.read(_LARGEST_LABEL_BYTES), files.driver)
+
+
+def _label_in(head: bytes, driver: str) -> str:
+    if driver == "PDS4":
+        return html.unescape(head.decode("utf-8", "replace"))
+    end = _END.search(head)
+    return head[: end.end() if end else None].decode("latin-1")
+
+
 def _driver_of(head: bytes) -> str:
     """GDAL's driver of a file that begins with `head`; empty if it is none of those that are known here."""
     for magic, driver in _MAGIC.items():
@@ -157,13 +170,11 @@ def _hint(path: Path, head: bytes) -> str:
 
 def _named_by_label(path: Path, driver: str, head: bytes, field: str) -> list[str]:
     """Names of the files to which the label of a PDS or ISIS file points."""
-    end = _END.search(head)
+    label = _label_in(head, driver)
+    complete = len(head) < _LARGEST_LABEL_BYTES or (driver != "PDS4" and _END.search(head) is not None)
     if driver == "PDS4":
-        label, complete = html.unescape(head.decode("utf-8", "replace")), len(head) < _LARGEST_LABEL_BYTES
         names = [name.strip() for name in _FILE_NAME.findall(label)]
     else:
-        complete = end is not None or len(head) < _LARGEST_LABEL_BYTES
-        label = head[: end.end() if end else None].decode("latin-1")
         names = [value.strip("\"' ") for _, value in _POINTER.findall(label)]
         names = [name for name in names if not name.isdigit()]
     if not complete:
@@ -213,11 +224,16 @@ def _refuse_references(path: Path, raster: Any, folder: Path, field: str) -> Non
         raise UserError(path, field, f"tags that name another file: {found}", "a raster that refers to no other")
     if any(Path(file).parent != folder for file in raster.files):
         raise UserError(path, field, "a file that refers to one elsewhere", "data in the folder of their label")
-    projection = raster.crs.to_wkt() if raster.crs is not None else ""
-    if found := re.search(r"nadgrids|geoidgrids|\+grids|PARAMETERFILE", projection, re.I):
-        raise UserError(path, "projection", f"{found[0]}, which names a file", "a projection without grids")
+    if raster.crs is not None:
+        refuse_grids(path, raster.crs)
     rows, columns = raster.block_shapes[0]
     together = raster.count if raster.tags(ns="IMAGE_STRUCTURE").get("INTERLEAVE") == "PIXEL" else 1
     if rows * columns * together * _VALUE_BYTES.get(raster.dtypes[0], 16) > _LARGEST_BLOCK_BYTES:
         size = f"blocks of {rows} x {columns} pixels and {together} bands"
         raise UserError(path, field, size, f"blocks of at most {_LARGEST_BLOCK_BYTES} bytes: a tiled raster")
+
+
+def refuse_grids(where: object, crs: Any) -> None:
+    """Raise UserError if a coordinate reference system (`rasterio.crs.CRS`) names files, which PROJ would open."""
+    if found := re.search(r"nadgrids|geoidgrids|\+grids|PARAMETERFILE", crs.to_wkt(), re.I):
+        raise UserError(where, "projection", f"{found[0]}, which names a file", "a projection without grids")
