@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from perilune_render.config import DatasetConfig, SensorConfig
-from perilune_render.config_terrain import SITE_FIELDS
+from perilune_render.config_terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig
 from perilune_render.provenance.versions import all_versions, ground_versions
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.metadata import Recipe
@@ -42,7 +42,7 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
     speed, those of the other kind unless the kinds share terrain, optional sections that are not set, a site in an
-    elevation model if there is none, and columns of a catalogue if none are stated.
+    elevation model if there is none, what its file states itself, and columns of a catalogue if none are stated.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -55,6 +55,9 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
             del plain[name]
     for name in SITE_FIELDS:
         if plain["terrain"]["elevation"][name] is None:
+            del plain["terrain"]["elevation"][name]
+    for name in FILE_FIELDS:
+        if plain["terrain"]["elevation"][name] == ElevationConfig.model_fields[name].default:
             del plain["terrain"]["elevation"][name]
     if not config.terrain.elevation.catalogue_columns.stated:
         del plain["terrain"]["elevation"]["catalogue_columns"]

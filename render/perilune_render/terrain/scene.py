@@ -15,7 +15,13 @@ from perilune_render.terrain.craters.removal import indices_of, near
 from perilune_render.terrain.craters.rims import Rims, measure_rims
 from perilune_render.terrain.craters.stamp import Stamped, stamp_craters
 from perilune_render.terrain.elevation.catalogue import read_catalogue, remark
-from perilune_render.terrain.elevation.model import ElevationModel, read_elevation, refuse_beyond, remarks
+from perilune_render.terrain.elevation.model import (
+    ElevationModel,
+    read_elevation,
+    refuse_beyond,
+    refuse_unseen,
+    remarks,
+)
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.interpolation import value_at
@@ -82,7 +88,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     check_levels(config.terrain, view)
     terrain = config.terrain
     grid = graded_grid(terrain, view)
-    model = model_of(terrain)
+    model = model_of(terrain, grid.extent_m)
     base = base_of(model, grid, terrain, seed)
     height = base.height_m
     base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
@@ -168,8 +174,9 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
     check_levels(config.terrain, view)
     grid = graded_grid(config.terrain, view)
     check_waves(config.terrain.relief, grid)
-    model = model_of(config.terrain)
+    model = model_of(config.terrain, grid.extent_m)
     if model is not None:
+        refuse_unseen(model, grid, config.terrain.elevation)
         refuse_beyond(model, grid, config.terrain.elevation.outside)
         for line in remarks(model, grid, config.terrain.elevation.outside):
             say(line, style="yellow")
@@ -183,9 +190,12 @@ def site_of(config: DatasetConfig) -> tuple[float, float]:
     return _place(config, model_of(config.terrain))
 
 
-def model_of(terrain: TerrainConfig) -> ElevationModel | None:
-    """The elevation model of a configuration, or None. Raises UserError if it cannot be read."""
-    return None if terrain.dem is None else read_elevation(Path(terrain.dem), terrain.elevation)
+def model_of(terrain: TerrainConfig, ground_m: float | None = None) -> ElevationModel | None:
+    """The elevation model of a configuration for ground of side `ground_m` (`read_elevation`), metres, or None.
+
+    Raises UserError if it cannot be read.
+    """
+    return None if terrain.dem is None else read_elevation(Path(terrain.dem), terrain.elevation, ground_m)
 
 
 def _place(config: DatasetConfig, model: ElevationModel | None) -> tuple[float, float]:
