@@ -80,7 +80,7 @@ FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "allow_unseen")
 """Settings that tell what an elevation model's file leaves open."""
 
 
-Rims = Literal["catalogue", "measured"]
+RimSource = Literal["catalogue", "measured"]
 
 
 class CatalogueColumnsConfig(Section):
@@ -140,6 +140,8 @@ class ElevationConfig(Section):
     """Accept a model that has no height within the ground in view."""
     catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()
     """Columns of the catalogue."""
+    rims: RimSource = "measured"
+    """Place and size of a catalogue's craters: measured in the model where a rim is found, or as in the catalogue."""
 
     @model_validator(mode="after")
     def _one_pair(self) -> "ElevationConfig":

@@ -42,7 +42,7 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
     speed, those of the other kind unless the kinds share terrain, optional sections that are not set, a site in an
-    elevation model if there is none, what its file states itself, and columns of a catalogue if none are stated.
+    elevation model if there is none, what its file states itself, and settings of a catalogue that are not used.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -61,6 +61,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
             del plain["terrain"]["elevation"][name]
     if not config.terrain.elevation.catalogue_columns.stated:
         del plain["terrain"]["elevation"]["catalogue_columns"]
+    if config.terrain.catalogue is None:
+        del plain["terrain"]["elevation"]["rims"]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]
     for name in _SINCE:
@@ -102,4 +104,8 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
             if given[name] is None:
                 raise UserError(where, f"terrain.{name}", terrain[name], f"--{name} with a local copy of it")
             terrain[name] = str(given[name])
+    elevation = terrain.get("elevation", {})
+    if terrain.get("catalogue") is not None and isinstance(elevation, dict):
+        # Recipes from before this setting took all rims from the catalogue.
+        terrain["elevation"] = {"rims": "catalogue", **elevation}
     return resolve_over(DatasetConfig, "dataset", str(where), {**settings_of(recipe), "terrain": terrain})

@@ -27,17 +27,19 @@ class FooterLimits:
     """Bytes that each other row takes at least, compressed."""
 
 
-_OF_DATASET = FooterLimits()
+OF_DATASET = FooterLimits()
 
 
 def check_footer(
-    footer: Any, columns: Sequence[tuple[int, str]], n_bytes: int, address: str, limits: FooterLimits = _OF_DATASET
+    footer: Any, columns: Sequence[tuple[int, str]], n_bytes: int, address: str, limits: FooterLimits | None = None
 ) -> None:
     """Check the numbers of rows and values, and the bytes after decompression, of a file of `n_bytes` bytes.
 
-    `footer` is pyarrow's metadata of the file, `columns` has place and path of each column that will be read. Raises
+    `footer` is pyarrow's metadata of the file, `columns` has place and path of each column that will be read; without
+    `limits` they are those of a dataset. Raises
     UserError about `address` if a number exceeds its limit, ValueError if a row group has other columns than the file.
     """
+    limits = limits or OF_DATASET
     most_rows = min(limits.rows, limits.spare_rows + n_bytes // limits.bytes_per_row)
     most_group_rows = min(limits.group_rows, most_rows)
     n_uncompressed, n_rows = 0, 0

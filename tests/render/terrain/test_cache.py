@@ -32,7 +32,9 @@ def same(first, second):
         if dataclasses.is_dataclass(a):
             same(a, b)
         else:
-            assert type(a) is type(b) and np.array_equal(a, b), field.name
+            # Values that are not known are NaN.
+            is_real = isinstance(a, np.ndarray) and a.dtype.kind == "f"
+            assert type(a) is type(b) and np.array_equal(a, b, equal_nan=is_real), field.name
             assert not isinstance(a, np.ndarray) or a.dtype == b.dtype, field.name
 
 

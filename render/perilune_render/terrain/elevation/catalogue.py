@@ -1,13 +1,14 @@
 """Craters of a real elevation model, read from a catalogue; they become labels like generated craters."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from perilune_render.config_terrain import CatalogueColumnsConfig, TerrainConfig
 from perilune_render.terrain.craters.population import Craters
+from perilune_render.terrain.elevation.crests import measure_crests
 from perilune_render.terrain.elevation.model import ElevationModel, raster_places, resolved_m
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
@@ -25,6 +26,8 @@ class Counts:
 
     used: int
     """They become labels."""
+    measured: int
+    """The rims of so many of these are measured in the model, the others are those of the catalogue."""
     outside: int
     """Their centre or rim is outside the ground."""
     unmeasured: int
@@ -42,7 +45,10 @@ class Counts:
             "too small for the model": self.too_small,
             "listed twice": self.duplicate,
         }
-        return ", ".join([f"{self.used} used", *(f"{count} {name}" for name, count in others.items() if count)])
+        used = f"{self.used} used"
+        if self.used:
+            used += f" ({self.measured} rims measured in the model, {self.used - self.measured} as listed)"
+        return ", ".join([used, *(f"{count} {name}" for name, count in others.items() if count)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,42 +65,64 @@ def read_catalogue(path: Path, model: ElevationModel, grid: Grid, config: Terrai
     """The catalogue's craters that the model shows.
 
     These are the craters larger than `resolved_m` with centre and rim on the grid and on measured pixels of the model;
-    smaller craters are generated. Age and fresh depth are unknown (NaN), wear is 0.
+    smaller craters are generated. Place and diameter are those of the crest in the model where it is found, unless the
+    configuration takes those of the catalogue. Age and fresh depth are unknown (NaN), wear is 0.
 
     The columns are recognised (`perilune_shared.storage.tables.catalogues`) or stated in the configuration. Raises
     UserError with the line of an error, and if no crater can be used.
     """
     listed = _listed(path, config.elevation.catalogue_columns)
     smallest_m = resolved_m(model)
-    diameter = listed.diameter_m
     x, y = site_from_selenographic(listed.latitude_deg, listed.longitude_deg, model.latitude_deg, model.longitude_deg)
-    inside = np.maximum(np.abs(x), np.abs(y)) + diameter / 2 < grid.extent_m / 2
-    large = inside & (diameter > smallest_m)
+    near = _inside(grid, x, y, listed.diameter_m)
+    n_outside = int((~near).sum())
+    x, y, listed_m = x[near], y[near], listed.diameter_m[near]
+    large = listed_m > smallest_m
     shown = large.copy()
-    shown[shown] = _measured(model, x[shown], y[shown], diameter[shown])
+    shown[large] = _measured(model, x[large], y[large], listed_m[large])
     chosen = np.flatnonzero(shown)
-    chosen = chosen[~duplicates(x[chosen], y[chosen], diameter[chosen])]
+    n_twice = int(duplicates(x[chosen], y[chosen], listed_m[chosen]).sum())
+    chosen = chosen[~duplicates(x[chosen], y[chosen], listed_m[chosen])]
+    n_unmeasured, n_small = int((large & ~shown).sum()), int((~large).sum())
+    x, y, listed_m = x[chosen], y[chosen], listed_m[chosen]
+    diameter, rms, ratio = listed_m, np.full(len(x), np.nan), np.full(len(x), np.nan)
+    if config.elevation.rims == "measured":
+        crests = measure_crests(model, x, y, listed_m)
+        x, y, diameter = (
+            np.where(crests.found, measured, given)
+            for measured, given in ((crests.x_m, x), (crests.y_m, y), (crests.diameter_m, listed_m))
+        )
+        rms, ratio = crests.rms_share, crests.axis_ratio
+    # A rim that lies farther out than the catalogue says may leave the ground or the model.
+    on_grid = _inside(grid, x, y, diameter)
+    kept = on_grid.copy()
+    kept[on_grid] = _measured(model, x[on_grid], y[on_grid], diameter[on_grid])
     counts = Counts(
-        len(chosen),
-        int((~inside).sum()),
-        int((large & ~shown).sum()),
-        int((inside & ~large).sum()),
-        int(shown.sum()) - len(chosen),
+        used=int(kept.sum()),
+        measured=int(np.isfinite(rms[kept]).sum()),
+        outside=n_outside + int((~on_grid).sum()),
+        unmeasured=n_unmeasured + int((on_grid & ~kept).sum()),
+        too_small=n_small,
+        duplicate=n_twice,
     )
-    if not len(chosen):
+    if not counts.used:
         raise _nothing_used(path, listed, counts, smallest_m)
-    chosen = chosen[np.argsort(-diameter[chosen], kind="stable")]
-    unknown = np.full(len(chosen), np.nan)
+    order = np.flatnonzero(kept)[np.argsort(-diameter[kept], kind="stable")]
+    unknown = np.full(len(order), np.nan)
     craters = Craters.round(
-        x[chosen],
-        y[chosen],
-        diameter[chosen],
+        x[order],
+        y[order],
+        diameter[order],
         unknown,
         unknown,
-        np.zeros(len(chosen)),
+        np.zeros(len(order)),
         config.craters.profile,
         "elevation model",
     )
+    if config.elevation.rims == "measured":
+        craters = replace(
+            craters, listed_diameter_m=listed_m[order], rim_rms_share=rms[order], rim_axis_ratio=ratio[order]
+        )
     return RealCraters(craters, counts)
 
 
@@ -123,6 +151,11 @@ def _nothing_used(path: Path, listed: SurfaceCraters, counts: Counts, smallest_m
         largest, column = listed.diameter_m.max(), listed.names[listed.size]
         expected += f"; the largest of {column} is {largest:.3g} m: state kilometres with {_SETTING}"
     return UserError(path, "craters", counts if len(listed.diameter_m) else "no row", expected)
+
+
+def _inside(grid: Grid, x_m: Array, y_m: Array, diameter_m: Array) -> np.ndarray:
+    """Whether each crater (N,) is on the grid with its rim."""
+    return np.maximum(np.abs(x_m), np.abs(y_m)) + diameter_m / 2 < grid.extent_m / 2
 
 
 def _measured(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) -> np.ndarray:

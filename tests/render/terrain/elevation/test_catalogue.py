@@ -21,7 +21,8 @@ from perilune_shared.geometry.frames import selenographic_from_site
 PIXEL_M = 5.0
 CRATERS = [(120.0, -80.0, 160.0), (-200.0, 150.0, 90.0)]
 GRID = Grid.even(900, 90)
-TERRAIN = config_with().terrain
+TERRAIN = config_with(terrain={"elevation": {"rims": "catalogue"}}).terrain
+"""Places and sizes as the catalogue lists them; `test_crests.py` measures them."""
 
 
 @pytest.fixture
@@ -70,8 +71,10 @@ def test_only_what_the_model_itself_shows_is_taken(tmp_path, model):
     path = written(tmp_path / "c.csv", model, [*CRATERS, *unfit])
     wide = read_catalogue(path, holed, Grid.even(1500, 90), TERRAIN)
     assert len(wide.craters) == 3
-    assert str(wide.counts) == "3 used, 2 outside the model or in its holes, 1 too small for the model"
-    assert str(read_catalogue(path, holed, GRID, TERRAIN).counts).startswith("2 used, 2 outside the ground")
+    others = "2 outside the model or in its holes, 1 too small for the model"
+    assert str(wide.counts) == f"3 used (0 rims measured in the model, 3 as listed), {others}"
+    narrow = read_catalogue(path, holed, GRID, TERRAIN).counts
+    assert str(narrow).startswith("2 used (0 rims measured in the model, 2 as listed), 2 outside the ground")
 
 
 def test_real_craters_are_measured_on_the_model_and_kept_beside_ours(tmp_path, model, camera):
@@ -171,15 +174,15 @@ def test_columns_of_another_catalogue_are_stated(tmp_path, model):
     path = _in_form(tmp_path / "c.csv", model, CRATERS, "other")
     del FORMS["other"]
     columns = {"longitude_deg": "length", "latitude_deg": "breadth", "diameter_km": "size"}
-    stated = config_with(terrain={"elevation": {"catalogue_columns": columns}}).terrain
+    stated = config_with(terrain={"elevation": {"catalogue_columns": columns, "rims": "catalogue"}}).terrain
     assert read_catalogue(path, model, GRID, stated).craters.diameter_m.tolist() == [160, 90]
     columns["diameter_km"] = "wide"
-    stated = config_with(terrain={"elevation": {"catalogue_columns": columns}}).terrain
+    stated = config_with(terrain={"elevation": {"catalogue_columns": columns, "rims": "catalogue"}}).terrain
     with pytest.raises(UserError, match="catalogue_columns: got no column wide, expected columns of breadth, len"):
         read_catalogue(path, model, GRID, stated)
     del columns["diameter_km"]
     with pytest.raises(ValueError, match="longitude_deg, latitude_deg and one of diameter_m"):
-        config_with(terrain={"elevation": {"catalogue_columns": columns}})
+        config_with(terrain={"elevation": {"catalogue_columns": columns, "rims": "catalogue"}})
 
 
 def test_repeated_craters_are_used_once(tmp_path, model):
@@ -188,7 +191,7 @@ def test_repeated_craters_are_used_once(tmp_path, model):
     path = written(tmp_path / "c.csv", model, [*CRATERS, *CRATERS, *slightly, *concentric])
     found = read_catalogue(path, model, GRID, TERRAIN)
     assert np.allclose(found.craters.diameter_m, [160, 90, 70])
-    assert str(found.counts) == "3 used, 4 listed twice"
+    assert str(found.counts) == "3 used (0 rims measured in the model, 3 as listed), 4 listed twice"
 
 
 @pytest.mark.parametrize(
