@@ -39,7 +39,7 @@ DETECT := $(RUNS)/detect/$(NAME)/metrics.json
 NAVIGATE := $(RUNS)/navigate/$(NAME)/metrics.json
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results clean
+.PHONY: help setup setup-dev demo dataset benchmark benchmark-nav benchmark-landing benchmark-frames paper train-detect train-detect-baseline ablate-detect train-nav train-nav-baseline navigate navigate-map navigate-monte-carlo explain explain-causal report closed-loop test test-hostile coverage lint docs docs-build bench-render bench-kill bench-scale bench-requests bench-scaling compare-nac bench-terrain bench-megapixel bench-photometry bench-develop bench-regenerate bench-same-bytes bench-manifest bench-plan bench-memory bench-labels bench-truth bench-contrast bench-train bench-transfer bench-landing bench-motion bench-monte-carlo bench-stream bench-suppress bench-gates bench-engines bench-other-ground bench-profile bench-serve bench-infer bench-latency bench-paper-causes bench-captured bench-pose-limits bench-shared results clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 24
@@ -274,6 +274,9 @@ bench-labels: setup-dev ## label ellipses, compared with rendered rings; writes 
 
 bench-truth: setup-dev ## depth and normals of EXRs, compared with cast rays; writes runs/bench/truth.json
 	@$(BIN)/python -m benchmarks.scene.truth
+
+bench-other-ground: setup-dev ## rims measured over ground of another generator (pip install terraingenpy); writes runs/bench/other_ground.json
+	@$(BIN)/python -m benchmarks.scene.other_ground
 
 bench-engines: setup-dev ## frames of both engines: speed, and agreement of radiance, depth and labels; writes runs/bench/engines.json
 	@$(BIN)/python -m benchmarks.scene.engines

@@ -72,8 +72,46 @@ class ReliefConfig(Section):
 
 
 Outside = Literal["procedural", "refuse", "mirror"]
+METRES_PER_UNIT = {"m": 1.0, "km": 1000.0, "ft": 0.3048, "us-ft": 1200 / 3937, "cm": 0.01, "mm": 0.001}
+"""Units of heights."""
+HeightUnit = Literal["m", "km", "ft", "us-ft", "cm", "mm"]
 SITE_FIELDS = ("site_latitude_deg", "site_longitude_deg", "site_column_px", "site_row_px")
 """Settings of the site in an elevation model: one pair of them, or none."""
+FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "allow_unseen")
+"""Settings that tell what an elevation model's file leaves open."""
+
+
+RimSource = Literal["catalogue", "measured"]
+
+
+class CatalogueColumnsConfig(Section):
+    """Columns of a crater catalogue; null for all of them recognises the columns of known catalogues."""
+
+    longitude_deg: str | None = None
+    """Column of the longitude, east positive, degrees."""
+    latitude_deg: str | None = None
+    """Column of the latitude, degrees."""
+    diameter_m: str | None = None
+    """Column of the diameter, metres; one size is stated."""
+    diameter_km: str | None = None
+    """Column of the diameter, kilometres."""
+    radius_m: str | None = None
+    """Column of the radius, metres."""
+    radius_km: str | None = None
+    """Column of the radius, kilometres."""
+
+    @model_validator(mode="after")
+    def _places_and_one_size(self) -> "CatalogueColumnsConfig":
+        sizes = [name for name in self.stated if not name.endswith("_deg")]
+        if self.stated and (len(self.stated) != 3 or len(sizes) != 1):
+            raise ValueError("longitude_deg, latitude_deg and one of diameter_m, diameter_km, radius_m, radius_km")
+        return self
+
+    @property
+    def stated(self) -> dict[str, str]:
+        """The columns that are stated, by what they contain."""
+        values = {name: getattr(self, name) for name in CatalogueColumnsConfig.model_fields}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 class ElevationConfig(Section):
@@ -89,6 +127,22 @@ class ElevationConfig(Section):
     """Column of the landing site, in place of latitude and longitude, pixels from the left edge of the model."""
     site_row_px: _Place | None = None
     """Row of the landing site, pixels from the top edge of the model."""
+    height_unit: HeightUnit | None = None
+    """Unit of the model's heights; null for the one that its file states, or metres."""
+    band: Annotated[int, Field(ge=1, le=65535)] | None = None
+    """Band of the model that has the heights, from 1; null if it has only one band, or one described as heights."""
+    nodata: Annotated[float, Field(ge=-1e39, le=1e39)] | None = None
+    """Value of pixels without a height, before scale and offset, in addition to the one that the file declares."""
+    crs: (
+        Annotated[str, Field(max_length=5000, pattern=r"^(?i:(EPSG|ESRI|IAU|IAU_\d{4}):\d+$|\+proj=|[A-Z_]+\[)")] | None
+    ) = None
+    """Coordinate reference system of the model, in place of the one in its file: IAU_2015:30135, +proj=..., or WKT."""
+    allow_unseen: bool = False
+    """Accept a model that has no height within the ground in view."""
+    catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()
+    """Columns of the catalogue."""
+    rims: RimSource = "measured"
+    """Place and size of a catalogue's craters: measured in the model where a rim is found, or as in the catalogue."""
 
     @model_validator(mode="after")
     def _one_pair(self) -> "ElevationConfig":
@@ -137,4 +191,4 @@ class TerrainConfig(Section):
     elevation: ElevationConfig = ElevationConfig()
     """Use of the elevation model."""
     catalogue: str | None = None
-    """CSV of the model's craters (longitude_deg, latitude_deg, diameter_m), which become labels, or null."""
+    """CSV or Parquet catalogue of the model's craters, which become labels, or null."""

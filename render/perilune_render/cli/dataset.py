@@ -17,8 +17,10 @@ from perilune_render.cli.options import (
     KindChoice,
     Preset,
     Setting,
+    Unit,
     resolved_config,
     warn_of_size,
+    with_unit,
 )
 from perilune_render.config import DatasetConfig
 from perilune_shared.dataset.names import KINDS
@@ -90,6 +92,7 @@ def dataset(
     config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
+    height_unit: Unit = None,
     catalogue: Catalogue = None,
     kind: Annotated[KindChoice, typer.Option(help="Crater detection, navigation, or both.")] = "both",
     out: Annotated[
@@ -135,10 +138,10 @@ def dataset(
     """Render the datasets of a preset or a manifest. Run the same command again to resume."""
     how = How.of(executor, address, workers, threads, shard, finish, dry_run)
     if manifest is not None:
-        given = [name for name in ("preset", "config", "setting", "kind") if _was_given(context, name)]
+        given = [name for name in ("preset", "config", "setting", "height_unit", "kind") if _was_given(context, name)]
         _render_manifest(manifest, out, dem, catalogue, given, how)
         return
-    resolved = resolved_config(preset, config, setting, dem, catalogue)
+    resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     if kind != "nav":
         warn_of_size(resolved)
     store, failed = open_store(out if out is not None else f"data/{preset}"), False

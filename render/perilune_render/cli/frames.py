@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_render.cli.dataset import How, first_worker, made_or_exit
-from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
+from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
 from perilune_render.config import DatasetConfig
 from perilune_render.config_cameras import CameraConfig
 from perilune_shared.config import resolve_over
@@ -33,6 +33,7 @@ def frames(
     preset: Preset = "small",
     setting: Setting = None,
     dem: Dem = None,
+    height_unit: Unit = None,
     catalogue: Catalogue = None,
     kind: Annotated[Kind, typer.Option(help="What the dataset is for: crater detection or navigation.")] = "nav",
     workers: Annotated[
@@ -48,7 +49,9 @@ def frames(
     resume.
     """
     how = How.of("local", None, workers, threads, None, finish=False, dry_run=False)
-    config = with_camera(resolved_config(preset, scene, setting, dem, catalogue, given_scene=True), camera)
+    config = with_camera(
+        resolved_config(preset, scene, with_unit(setting, height_unit), dem, catalogue, given_scene=True), camera
+    )
     store = open_store(out)
     with first_worker(how, config) as early:
         from perilune_render.dataset.begin import new_info

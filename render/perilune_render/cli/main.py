@@ -17,10 +17,12 @@ from perilune_render.cli.options import (
     KindChoice,
     Preset,
     Setting,
+    Unit,
     first_kind,
     one_kind,
     resolved_config,
     warn_of_size,
+    with_unit,
 )
 from perilune_render.cli.serve import serve
 from perilune_render.cli.spice import spice
@@ -94,11 +96,12 @@ def plan(
     config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
+    height_unit: Unit = None,
     catalogue: Catalogue = None,
     kind: Annotated[KindChoice, typer.Option(help="Crater detection or navigation (detect or nav).")] = "detect",
 ) -> None:
     """Write the plan of a dataset as a manifest without frames. Generates every scene to record its hash."""
-    resolved = resolved_config(preset, config, setting, dem, catalogue)
+    resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     if kind != "nav":
         warn_of_size(resolved)
     from perilune_render.dataset.manifest_only import write_manifest_only
@@ -158,6 +161,7 @@ def preview(
     preset: Preset = "small",
     setting: Setting = None,
     dem: Dem = None,
+    height_unit: Unit = None,
     catalogue: Catalogue = None,
     kind: Annotated[
         KindChoice, typer.Option(help="Dataset whose first scene and trajectory are shown (detect or nav).")
@@ -176,7 +180,9 @@ def preview(
         raise UserError("preview", "--scene or --camera", "no --poses", "--poses as well")
     if scene is not None and config is not None:
         raise UserError("preview", "--scene", f"{scene} and {config}", "one of them")
-    resolved = resolved_config(preset, scene or config, setting, dem, catalogue, given_scene=poses is not None)
+    resolved = resolved_config(
+        preset, scene or config, with_unit(setting, height_unit), dem, catalogue, given_scene=poses is not None
+    )
     resolved = with_camera(resolved, camera)
     if out.suffix != ".png":
         raise UserError(out, "format", out.suffix or "none", ".png")
@@ -201,6 +207,7 @@ def export(
     config: Config = None,
     setting: Setting = None,
     dem: Dem = None,
+    height_unit: Unit = None,
     catalogue: Catalogue = None,
     kind: Annotated[KindChoice, typer.Option(help="Dataset whose first scene is exported (detect or nav).")] = "detect",
     step: Annotated[
@@ -212,7 +219,7 @@ def export(
     ] = Path("scene.glb"),
 ) -> None:
     """Export the first scene of a configuration for other tools (metres, O_L: Z up, Y south, X west)."""
-    resolved = resolved_config(preset, config, setting, dem, catalogue)
+    resolved = resolved_config(preset, config, with_unit(setting, height_unit), dem, catalogue)
     from perilune_render.flight.plan import make_plan
     from perilune_render.terrain.cache import cached_scene
     from perilune_render.terrain.export import MESH_SUFFIXES, RASTER_SUFFIXES, export_mesh, export_raster

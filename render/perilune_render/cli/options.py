@@ -7,7 +7,7 @@ import typer
 
 from perilune_render.config import DatasetConfig
 from perilune_render.config_cameras import CameraConfig
-from perilune_render.config_terrain import SITE_FIELDS
+from perilune_render.config_terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig, HeightUnit
 from perilune_shared.config import resolve
 from perilune_shared.dataset.names import Kind
 from perilune_shared.errors import UserError
@@ -27,11 +27,15 @@ Setting = Annotated[
 ]
 Dem = Annotated[
     Path | None,
-    typer.Option(help="GeoTIFF elevation model as the base; craters below its resolution are added."),
+    typer.Option(help="Elevation model (GeoTIFF, JPEG 2000, PDS3, PDS4, ISIS) as the base; smaller craters are added."),
+]
+Unit = Annotated[
+    HeightUnit | None,
+    typer.Option("--height-unit", help="Unit of the elevation model's heights. [default: the one in its file, or m]"),
 ]
 Catalogue = Annotated[
     Path | None,
-    typer.Option(help="CSV of the elevation model's own craters (longitude_deg, latitude_deg, diameter_m)."),
+    typer.Option(help="Catalogue of the elevation model's own craters, CSV or Parquet."),
 ]
 
 
@@ -60,6 +64,12 @@ def warn_of_size(config: DatasetConfig) -> None:
         if side % 32:
             line = f"dataset.{name}: {side} is not a multiple of 32: the detector cannot be trained on such frames"
             say(line)
+
+
+def with_unit(setting: list[str] | None, height_unit: HeightUnit | None) -> list[str]:
+    """The settings of a command line, with the unit of its elevation model."""
+    unit = [] if height_unit is None else [f"dataset.terrain.elevation.height_unit={height_unit}"]
+    return [*(setting or []), *unit]
 
 
 def resolved_config(
@@ -91,8 +101,8 @@ def resolved_config(
         raise UserError(
             "--catalogue", "catalogue", terrain.catalogue, "--dem as well, the elevation model of this catalogue"
         )
-    for name in SITE_FIELDS:
-        if getattr(terrain.elevation, name) is not None and terrain.dem is None:
-            found = getattr(terrain.elevation, name)
+    for name in (*SITE_FIELDS, *FILE_FIELDS):
+        found = getattr(terrain.elevation, name)
+        if found != ElevationConfig.model_fields[name].default and terrain.dem is None:
             raise UserError("configuration", f"dataset.terrain.elevation.{name}", found, "--dem, an elevation model")
     return resolved.model_copy(update={"terrain": terrain})

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from perilune_render.cli.frames import CameraFile, Scene, read_camera
-from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, resolved_config
+from perilune_render.cli.options import Catalogue, Dem, Preset, Setting, Unit, resolved_config, with_unit
 from perilune_render.config import DatasetConfig
 from perilune_render.config_scene import SceneConfig
 from perilune_shared.errors import UserError
@@ -30,6 +30,7 @@ def serve(
     preset: Preset = "small",
     setting: Setting = None,
     dem: Dem = None,
+    height_unit: Unit = None,
     catalogue: Catalogue = None,
     engine: Annotated[Literal["heightfield", "cycles"], typer.Option(help="Renderer.")] = "heightfield",
     host: Annotated[
@@ -57,7 +58,7 @@ def serve(
     ] = 1,
 ) -> None:
     """Render images at any pose over one scene, for clients of PANGU's protocol and of `perilune_shared.client`."""
-    config = resolved_config(preset, scene, setting, dem, catalogue, given_scene=True)
+    config = resolved_config(preset, scene, with_unit(setting, height_unit), dem, catalogue, given_scene=True)
     if config.cameras:
         expected = "none: the server has one dataset.camera"
         raise UserError("configuration", "dataset.cameras", ", ".join(config.cameras), expected)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from perilune_render.cli.frames import Scene
-from perilune_render.cli.options import Dem, Preset, Setting, resolved_config
+from perilune_render.cli.options import Dem, Preset, Setting, Unit, resolved_config, with_unit
 from perilune_shared.errors import UserError
 from perilune_shared.storage.files import write_text
 from perilune_shared.terminal import answer
@@ -40,9 +40,10 @@ def spice(
     preset: Preset = "small",
     setting: Setting = None,
     dem: Dem = None,
+    height_unit: Unit = None,
 ) -> None:
     """Write the poses of a camera and the Sun from SPICE kernels, for the site of a scene."""
-    config = resolved_config(preset, scene, setting, dem, None, given_scene=True)
+    config = resolved_config(preset, scene, with_unit(setting, height_unit), dem, None, given_scene=True)
     if out.suffix != ".csv":
         raise UserError(out, "format", out.suffix or "none", ".csv")
     from perilune_render.poses.spice import SpiceSource, poses_csv, read_spice

@@ -30,14 +30,15 @@ def real_ground_share(
 
 
 def outline_m(model: ElevationModel) -> Array:
-    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres."""
+    """Points (N, 2) on the edge of an elevation model's raster, in O_L's plane, metres; without those off the map."""
     rows, columns = model.height_m.shape
     along, zero = np.linspace(0, 1, _POINTS_PER_SIDE, endpoint=False), np.zeros(_POINTS_PER_SIDE)
     column = np.concatenate([along, zero + 1, 1 - along, zero]) * columns
     row = np.concatenate([zero, along, zero + 1, 1 - along]) * rows
     latitude, longitude = model.raster.selenographic(column, row)
     x, y = site_from_selenographic(latitude, longitude, model.latitude_deg, model.longitude_deg)
-    return np.stack([x, y], axis=-1)
+    points = np.stack([x, y], axis=-1)
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def draw_outline(

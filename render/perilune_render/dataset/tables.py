@@ -59,6 +59,9 @@ def ground_tables(scene_id: str, scene: Scene) -> dict[str, pa.Table]:
                 "origin": np.array(ORIGINS)[craters.origin],
                 "latitude_deg": latitude,
                 "longitude_deg": longitude,
+                "catalogue_diameter_m": pa.array(craters.listed_diameter_m, from_pandas=True),
+                "rim_rms_share": pa.array(craters.rim_rms_share, from_pandas=True),
+                "rim_axis_ratio": pa.array(craters.rim_axis_ratio, from_pandas=True),
             },
         ),
         "boulders": _table(

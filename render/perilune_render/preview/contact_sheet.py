@@ -18,7 +18,7 @@ from perilune_render.labels.drawing import draw_labels, enlarge, padded, write_s
 from perilune_render.labels.frame_labels import RimCircles
 from perilune_render.preview.map_picture import map_picture
 from perilune_render.preview.site_horizon import shadow_warnings, site_horizon_of
-from perilune_render.preview.site_map import site_map
+from perilune_render.preview.site_map import LARGEST_WIDTH, site_map
 from perilune_render.terrain.cache import cached_scene
 from perilune_render.terrain.elevation.model import ElevationModel
 from perilune_render.terrain.scene import Scene, check_ground, model_of
@@ -43,7 +43,7 @@ def write_preview(plan: Plan, config: DatasetConfig, where: object, path: Path, 
     check_ground(config, plan.view)
     scene = cached_scene(config, plan.view, scene_plan.seed)
     check_trajectories(plan, trajectories, scene, where)
-    model = model_of(config.terrain)
+    model = model_of(config.terrain, LARGEST_WIDTH * scene.grid.extent_m)
     horizon = site_horizon_of(scene, scene_plan.sun_azimuth_deg)
     same_ground = [each for each in plan.scenes if each.seed == scene_plan.seed]
     for line in shadow_warnings(scene, same_ground):

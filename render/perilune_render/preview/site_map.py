@@ -17,7 +17,7 @@ from perilune_shared.geometry.frames import Array
 
 _N_HALF = 450
 """Vertex spacings from the middle of the map to its edge."""
-_LARGEST = 8.0
+LARGEST_WIDTH = 8.0
 """Largest width of the map, as a multiple of the ground's: of a larger model only the part around the site is shown."""
 _MARGIN = 1.03
 _LIFT = 0.02
@@ -51,7 +51,9 @@ def site_map(scene: Scene, model: ElevationModel | None, sun: Array) -> SiteMap:
     shadows the frames do not show.
     """
     ground_half = scene.grid.extent_m / 2
-    outline = None if model is None else outline_m(model)
+    outline = outline_m(model) if model is not None else None
+    if outline is not None and not len(outline):
+        outline = None
     grid = _grid(ground_half, outline)
     x, y = grid.vertices_xy()
     height, known = averaged(scene.height_m, scene.grid, grid).astype(np.float64), np.ones(grid.n_vertices, bool)
@@ -61,8 +63,8 @@ def site_map(scene: Scene, model: ElevationModel | None, sun: Array) -> SiteMap:
         rows, columns = model.height_m.shape
         on = (column >= 0) & (column <= columns) & (row >= 0) & (row <= rows)
         around = ndimage.map_coordinates(model.height_m, [row - 0.5, column - 0.5], order=1, mode="nearest")
-        both = inside & on  # never empty: the site is on the model
-        around += np.median(height[both] - around[both])
+        both = inside & on
+        around += np.median(height[both] - around[both]) if both.any() else 0.0
         known = inside | on
         height = np.where(inside, height, around)
         height[~known] = height[known].min()
@@ -84,8 +86,8 @@ def _grid(ground_half_m: float, outline: Array | None) -> Grid:
     if outline is not None:
         corners = np.stack([np.minimum(corners[0], outline.min(axis=0)), np.maximum(corners[1], outline.max(axis=0))])
     centre, half = corners.mean(axis=0), float(np.ptp(corners, axis=0).max()) / 2
-    if half > _LARGEST * ground_half_m:
-        centre, half = np.zeros(2), _LARGEST * ground_half_m
+    if half > LARGEST_WIDTH * ground_half_m:
+        centre, half = np.zeros(2), LARGEST_WIDTH * ground_half_m
     if outline is not None:
         half *= _MARGIN
     return Grid(_N_HALF, np.array([half]), float(centre[0]), float(centre[1]))

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from perilune_render.config import DatasetConfig, SensorConfig
-from perilune_render.config_terrain import SITE_FIELDS
+from perilune_render.config_terrain import FILE_FIELDS, SITE_FIELDS, ElevationConfig
 from perilune_render.provenance.versions import all_versions, ground_versions
 from perilune_shared.config import resolve_over
 from perilune_shared.dataset.metadata import Recipe
@@ -41,8 +41,8 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     """The settings recorded in a recipe, as plain data.
 
     Files are recorded by name, without their folder. Settings that change no byte of the dataset are left out: those of
-    speed, those of the other kind unless the kinds share terrain, optional sections that are not set, and a site in an
-    elevation model if there is none.
+    speed, those of the other kind unless the kinds share terrain, optional sections that are not set, a site in an
+    elevation model if there is none, what its file states itself, and settings of a catalogue that are not used.
     """
     plain = json.loads(config.model_dump_json())
     for name in _FILES:
@@ -56,6 +56,13 @@ def recorded_settings(config: DatasetConfig, kind: Kind) -> dict[str, Any]:
     for name in SITE_FIELDS:
         if plain["terrain"]["elevation"][name] is None:
             del plain["terrain"]["elevation"][name]
+    for name in FILE_FIELDS:
+        if plain["terrain"]["elevation"][name] == ElevationConfig.model_fields[name].default:
+            del plain["terrain"]["elevation"][name]
+    if not config.terrain.elevation.catalogue_columns.stated:
+        del plain["terrain"]["elevation"]["catalogue_columns"]
+    if config.terrain.catalogue is None:
+        del plain["terrain"]["elevation"]["rims"]
     if plain["render"]["engine"] == DEFAULT_ENGINE:
         del plain["render"]["engine"]
     for name in _SINCE:
@@ -97,4 +104,8 @@ def config_of(recipe: Recipe, where: object, dem: Path | None = None, catalogue:
             if given[name] is None:
                 raise UserError(where, f"terrain.{name}", terrain[name], f"--{name} with a local copy of it")
             terrain[name] = str(given[name])
+    elevation = terrain.get("elevation", {})
+    if terrain.get("catalogue") is not None and isinstance(elevation, dict):
+        # Recipes from before this setting took all rims from the catalogue.
+        terrain["elevation"] = {"rims": "catalogue", **elevation}
     return resolve_over(DatasetConfig, "dataset", str(where), {**settings_of(recipe), "terrain": terrain})

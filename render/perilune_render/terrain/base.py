@@ -7,7 +7,14 @@ import numpy as np
 from perilune_render.config_terrain import ReliefConfig, TerrainConfig
 from perilune_render.terrain.craters.population import Craters
 from perilune_render.terrain.craters.profile import REACH
-from perilune_render.terrain.elevation.model import ElevationModel, base_heights, beyond_m, raster_places, resolved_m
+from perilune_render.terrain.elevation.model import (
+    ElevationModel,
+    base_heights,
+    beyond_m,
+    raster_places,
+    refuse_unseen,
+    resolved_m,
+)
 from perilune_render.terrain.elevation.surroundings import FittedRelief, add_fitted_relief, fitted_relief
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.relief import add_relief
@@ -54,6 +61,7 @@ def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, se
     """The base: an elevation model and its surroundings, or flat ground."""
     if model is None:
         return Base(np.zeros(grid.n_vertices), np.full(grid.n_vertices, np.inf), None, None)
+    refuse_unseen(model, grid, terrain.elevation)
     height, beyond = base_heights(model, grid, terrain.elevation.outside)
     needed = terrain.elevation.outside == "procedural" and bool((beyond > 0).any())
     surroundings = fitted_relief(model, terrain.relief, terrain.craters, seed) if needed else None

@@ -26,6 +26,7 @@ from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.scene import Scene, grow_scene
 from perilune_shared.storage.files import sha256_of, write_bytes, written_aside
+from perilune_shared.storage.rasters import raster_files
 from perilune_shared.storage.store import Store
 
 _PARTS: dict[str, type] = {"grid": Grid, "craters": Craters, "rims": Rims, "boulders": Boulders}
@@ -43,7 +44,8 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
     terrain = config.terrain.model_dump(mode="json")
     for name in ("dem", "catalogue"):
         if terrain[name] is not None and Path(terrain[name]).is_file():
-            terrain[name] = [Path(terrain[name]).name, sha256_of(Path(terrain[name]))]
+            files = raster_files(Path(terrain[name])).paths if name == "dem" else [Path(terrain[name])]
+            terrain[name] = [Path(terrain[name]).name, *(sha256_of(file) for file in files)]
     terrain.pop("max_vertices")  # a limit on meshes, which changes no ground
     versions = ground_versions(with_dem=config.terrain.dem is not None)
     content = {

@@ -16,6 +16,8 @@ from perilune_shared.storage.files import written_aside
 MESH_SUFFIXES = (".glb", ".ply", ".obj", ".stl")
 RASTER_SUFFIXES = (".tif", ".tiff")
 _LARGEST_SIDE = 20_000
+_Y_UP = (".glb", ".obj")
+"""Formats in which readers take Y for up: glTF by its specification, OBJ by habit. PLY and STL keep O_L's axes."""
 _ROWS_AT_ONCE = 256
 
 
@@ -35,7 +37,10 @@ def coarser(grid: Grid, step: int) -> Grid:
 
 
 def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = True) -> None:
-    """Write a mesh of ground and boulders in O_L, metres; `step` multiplies the ground's vertex spacing."""
+    """Write a mesh of ground and boulders, metres; `step` multiplies the ground's vertex spacing.
+
+    The axes are those of O_L (x west, y south, z up); in GLB and OBJ they are x west, y up, z north.
+    """
     import trimesh
 
     grid = scene.grid if step == 1 else coarser(scene.grid, step)
@@ -46,6 +51,10 @@ def export_mesh(scene: Scene, path: Path, *, step: int = 1, boulders: bool = Tru
     if boulders and len(scene.boulders):
         solid = boulder_mesh(scene.boulders, scene.boulder_z_m, scene.grid, scene.seed)
         parts.append(trimesh.Trimesh(*solid, process=False))
+    if path.suffix.lower() in _Y_UP:
+        for part in parts:
+            x, y, z = part.vertices.T
+            part.vertices = np.stack([x, z, -y], axis=-1)
     with written_aside(path) as aside:
         trimesh.util.concatenate(parts).export(aside)
 

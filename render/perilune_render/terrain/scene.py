@@ -14,8 +14,14 @@ from perilune_render.terrain.craters.population import Craters, check_craters, d
 from perilune_render.terrain.craters.removal import indices_of, near
 from perilune_render.terrain.craters.rims import Rims, measure_rims
 from perilune_render.terrain.craters.stamp import Stamped, stamp_craters
-from perilune_render.terrain.elevation.catalogue import read_catalogue
-from perilune_render.terrain.elevation.model import ElevationModel, read_elevation, refuse_beyond, remarks, resolved_m
+from perilune_render.terrain.elevation.catalogue import read_catalogue, remark
+from perilune_render.terrain.elevation.model import (
+    ElevationModel,
+    read_elevation,
+    refuse_beyond,
+    refuse_unseen,
+    remarks,
+)
 from perilune_render.terrain.envelope import ViewEnvelope
 from perilune_render.terrain.grid import Grid, graded_grid
 from perilune_render.terrain.interpolation import value_at
@@ -82,7 +88,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     check_levels(config.terrain, view)
     terrain = config.terrain
     grid = graded_grid(terrain, view)
-    model = model_of(terrain)
+    model = model_of(terrain, grid.extent_m)
     base = base_of(model, grid, terrain, seed)
     height = base.height_m
     base.add_waves(grid, terrain.relief, seed, _ROUGHNESS_M, np.inf)
@@ -97,7 +103,7 @@ def grow_scene(config: DatasetConfig, view: ViewEnvelope, seed: int) -> Scene:
     craters, sag = drawn.chosen(visible), stamped.sag_m[visible]
     n_real = 0
     if model is not None and terrain.catalogue is not None:
-        real = read_catalogue(Path(terrain.catalogue), model, grid, terrain.craters, resolved_m(model))
+        real = read_catalogue(Path(terrain.catalogue), model, grid, terrain).craters
         craters, sag, n_real = real.joined(craters), np.concatenate([np.zeros(len(real)), sag]), len(real)
     removed = indices_of(wanted, n_real, len(craters), seed)
     raised_m = 0.0
@@ -170,13 +176,15 @@ def check_ground(config: DatasetConfig, view: ViewEnvelope) -> None:
     check_waves(config.terrain.relief, grid)
     check_craters(config.terrain.craters, grid)
     check_boulders(config.terrain.boulders, grid)
-    model = model_of(config.terrain)
+    model = model_of(config.terrain, grid.extent_m)
     if model is not None:
+        refuse_unseen(model, grid, config.terrain.elevation)
         refuse_beyond(model, grid, config.terrain.elevation.outside)
         for line in remarks(model, grid, config.terrain.elevation.outside):
             say(line, style="yellow")
         if config.terrain.catalogue is not None:
-            read_catalogue(Path(config.terrain.catalogue), model, grid, config.terrain.craters, resolved_m(model))
+            path = Path(config.terrain.catalogue)
+            say(remark(path, read_catalogue(path, model, grid, config.terrain)), style="yellow")
 
 
 def site_of(config: DatasetConfig) -> tuple[float, float]:
@@ -184,9 +192,12 @@ def site_of(config: DatasetConfig) -> tuple[float, float]:
     return _place(config, model_of(config.terrain))
 
 
-def model_of(terrain: TerrainConfig) -> ElevationModel | None:
-    """The elevation model of a configuration, or None. Raises UserError if it cannot be read."""
-    return None if terrain.dem is None else read_elevation(Path(terrain.dem), terrain.elevation)
+def model_of(terrain: TerrainConfig, ground_m: float | None = None) -> ElevationModel | None:
+    """The elevation model of a configuration for ground of side `ground_m` (`read_elevation`), metres, or None.
+
+    Raises UserError if it cannot be read.
+    """
+    return None if terrain.dem is None else read_elevation(Path(terrain.dem), terrain.elevation, ground_m)
 
 
 def _place(config: DatasetConfig, model: ElevationModel | None) -> tuple[float, float]:

@@ -87,6 +87,27 @@ TABLES: dict[str, pa.Schema] = {
         ),
         _column("latitude_deg", _REAL, "deg", "O_S"),
         _column("longitude_deg", _REAL, "deg", "O_S"),
+        _column(
+            "catalogue_diameter_m",
+            _REAL,
+            "m",
+            "as the catalogue lists it; null unless rims of the catalogue were measured in the elevation model",
+            nullable=True,
+        ),
+        _column(
+            "rim_rms_share",
+            _REAL,
+            "",
+            "r.m.s. distance of the measured crest from its ellipse, divided by its radius; null where not measured",
+            nullable=True,
+        ),
+        _column(
+            "rim_axis_ratio",
+            _REAL,
+            "",
+            "minor axis of this ellipse divided by the major axis; null where not measured",
+            nullable=True,
+        ),
     ),
     "boulders": _table(
         "boulders",
@@ -225,14 +246,20 @@ OPTIONAL_TABLES = ("inertial", "ranges")
 _HAZARD = ("hazard_path", "hazard_sha256", "hazard_bytes")
 _LIDAR = ("lidar_path", "lidar_sha256", "lidar_bytes")
 _ABSENT_IN_FRAMES = ("real_ground_share", "n_craters_above_max_radius", *ANGULAR_VELOCITY, *_LIDAR)
+_MEASURED_RIM = ("catalogue_diameter_m", "rim_rms_share", "rim_axis_ratio")
 MAY_BE_ABSENT: dict[str, tuple[str, ...]] = {
     "scenes": _HAZARD,
+    "craters": _MEASURED_RIM,
     "frames": (*_ABSENT_IN_FRAMES, "camera"),
     "shards": _ABSENT_IN_FRAMES,
 }
 """Columns that a file may lack, by table: they were added without a new schema version. Readers fill them with nulls.
 To add one, append a column with `nullable=True` to its table and add its name here, and to ONLY_IF_USED."""
-ONLY_IF_USED: dict[str, tuple[str, ...]] = {"scenes": _HAZARD, "frames": (*ANGULAR_VELOCITY, *_LIDAR, "camera")}
+ONLY_IF_USED: dict[str, tuple[str, ...]] = {
+    "scenes": _HAZARD,
+    "craters": _MEASURED_RIM,
+    "frames": (*ANGULAR_VELOCITY, *_LIDAR, "camera"),
+}
 """Columns of MAY_BE_ABSENT that are written only if a row has a value, so that other datasets keep their bytes."""
 KEYS: dict[str, list[str]] = {
     "scenes": ["scene_id"],

@@ -36,6 +36,7 @@ _PATTERNS = {
 }
 _POSITIVE = (
     "diameter_m",
+    "catalogue_diameter_m",
     "extent_m",
     "ellipse_a_px",
     "ellipse_b_px",
@@ -63,6 +64,8 @@ _RANGES = {
     "sunlit_fraction": (0, 1),
     "real_ground_share": (0, 1),
     "age_myr": (0, 4600),
+    "rim_rms_share": (0, 1),
+    "rim_axis_ratio": (0, 1),
     "ellipse_theta_rad": (0, np.pi),
 }
 _UNIT_VECTORS = ("rotation_wxyz", "sun_direction")

@@ -9,11 +9,15 @@ from perilune_render.terrain.interpolation import value_at
 from perilune_shared.errors import UserError
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+@pytest.mark.parametrize("suffix", [".ply", ".stl", ".glb", ".obj"])
 def test_a_mesh_is_the_ground_in_metres(scene, tmp_path, suffix):
     path = tmp_path / f"scene{suffix}"
     export_mesh(scene, path, step=4)
     mesh = trimesh.load(path, force="mesh")
+    if suffix in (".glb", ".obj"):
+        # Y is up: Blender and three.js turn such files by this much.
+        x, y, z = mesh.vertices.T
+        mesh.vertices = np.stack([x, -z, y], axis=-1)
     assert mesh.extents[0] == pytest.approx(scene.grid.extent_m, rel=1e-5)
     inner = mesh.vertices[np.abs(mesh.vertices[:, :2]).max(axis=1) < 200]
     assert len(inner) > 1000

@@ -4,12 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from perilune_shared.errors import UserError
 from perilune_shared.export.foreign_text import for_markdown
+from perilune_shared.storage.tables.limits import RUN_TABLE
+from perilune_shared.storage.tables.read import read_table
 from perilune_train.detect.evaluate.figures import draw_curves
 from perilune_train.detect.evaluate.metrics import Curve
 from perilune_train.detect.evaluate.report import CURVE_FILE
@@ -93,15 +91,8 @@ def _terrain(folder: Path, metrics: Metrics, allow_overlap: bool) -> tuple[str, 
 
 def read_curve(path: Path) -> Curve:
     """Read the curve of an evaluation. Raises UserError if it is missing or another table."""
-    if not path.is_file():
-        raise UserError(path, "curve", "no such file", "one that `perilune-train detect evaluate` writes")
-    try:
-        columns = pq.read_table(path, columns=["score", "precision", "recall"])
-    except (pa.ArrowException, OSError, KeyError) as error:
-        raise UserError(path, "curve", error, "columns score, precision and recall") from None
-    if any(not pa.types.is_float64(column.type) for column in columns.columns) or columns.num_columns != 3:
-        raise UserError(path, "curve", columns.schema.to_string(), "columns score, precision and recall, float64")
-    return Curve(*(np.asarray(columns[name]) for name in ("score", "precision", "recall")))
+    columns = read_table(path, RUN_TABLE, {"score": "number", "precision": "number", "recall": "number"})
+    return Curve(*(columns.numbers(name) for name in ("score", "precision", "recall")))
 
 
 def _name(folder: Path) -> str:

@@ -2,12 +2,13 @@
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from perilune_shared.errors import UserError, one_line
+from perilune_shared.errors import one_line
+from perilune_shared.storage.tables.limits import RUN_TABLE
+from perilune_shared.storage.tables.read import read_table
 from perilune_train.evaluation.spread import MIN_UNITS, read_spread
 from perilune_train.report.content import Figure, FramePicture, Section, Table
 from perilune_train.report.frames import LabelledFrames
@@ -146,13 +147,10 @@ def _curves(runs: Sequence[Run], prefix: str) -> list[Figure]:
     return [Figure(html, caption, sources_of(drawn))]
 
 
-def read_columns(path, columns: Sequence[str]) -> dict[str, np.ndarray]:
+def read_columns(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:
     """Columns of a run's table as arrays. Raises UserError if one is missing or the file is damaged."""
-    try:
-        table = pq.read_table(path, columns=list(columns))
-        return {name: table[name].to_numpy() for name in columns}
-    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
-        raise UserError(path, "table", error, f"the columns {', '.join(columns)}") from None
+    read = read_table(path, RUN_TABLE, dict.fromkeys(columns, "number"))
+    return {name: read.numbers(name) for name in columns}
 
 
 def _bins(runs: Sequence[Run], prefix: str) -> list[Figure]:

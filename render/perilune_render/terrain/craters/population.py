@@ -69,6 +69,12 @@ class Craters:
     """Cosine and sine coefficients of harmonics 1 to 3 of the rim's height, relative to the height (N, 6)."""
     origin: np.ndarray
     """Index into ORIGINS (N,)."""
+    listed_diameter_m: Array
+    """Diameters in the catalogue where rims were measured in its elevation model, metres (N,); otherwise NaN."""
+    rim_rms_share: Array
+    """R.m.s. distance of such a rim from its ellipse, divided by its radius (N,); NaN where it was not measured."""
+    rim_axis_ratio: Array
+    """Minor axis of this ellipse divided by the major axis (N,); NaN where it was not measured."""
 
     def __len__(self) -> int:
         return len(self.x_m)
@@ -100,7 +106,10 @@ class Craters:
         even = np.zeros((n, 6))
         kind = np.full(n, ORIGINS.index(origin))
         not_flat = np.zeros(n, bool)
-        return cls(x_m, y_m, diameter_m, fresh_depth_m, rim, age_myr, wear_m2, not_flat, even, even.copy(), kind)
+        unknown = [np.full(n, np.nan) for _ in range(3)]
+        return cls(
+            x_m, y_m, diameter_m, fresh_depth_m, rim, age_myr, wear_m2, not_flat, even, even.copy(), kind, *unknown
+        )
 
 
 def diffusivity_m2_per_myr(diameter_m: Array) -> Array:
@@ -153,6 +162,7 @@ def draw_craters(config: CratersConfig, grid: Grid, seed: int, max_diameter_m: f
         config.irregularity * np.clip(rng.normal(0, 0.0035, (n, 6)), -0.008, 0.008),
         config.irregularity * rng.normal(0, 0.06, (n, 6)),
         np.where(clustered, ORIGINS.index("secondary"), ORIGINS.index("primary")),
+        *(np.full(n, np.nan) for _ in range(3)),
     )
     return craters.chosen(np.argsort(-age, kind="stable"))
 

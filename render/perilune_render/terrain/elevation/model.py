@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
 
 from perilune_render.config_terrain import ElevationConfig, Outside
 from perilune_render.terrain.elevation.continuation import continued, distance_in_holes_m, margin_m, mean_slope
+from perilune_render.terrain.elevation.height_band import height_band
 from perilune_render.terrain.elevation.quantisation import smoothed, step_of
-from perilune_render.terrain.elevation.site import RasterMap, Site, site_in
+from perilune_render.terrain.elevation.resampled import resampled
+from perilune_render.terrain.elevation.site import RasterMap, Site, circle_of, refuse_hole, site_in, site_within
+from perilune_render.terrain.elevation.window import UNSTATED_GROUND_M, chosen_window, read_window, smooth_over
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, selenographic_from_site
 from perilune_shared.storage.files import sha256_of
+from perilune_shared.storage.rasters import RasterFiles, opened_raster, raster_files, refuse_grids
 
 if TYPE_CHECKING:
     import rasterio
 
 _AT_THE_MIDDLE = ElevationConfig()
+_FIELD = "dataset.terrain.elevation"
 _LARGEST_PIXELS = 100_000_000
+"""Number of pixels of a model with the ground beyond its edge."""
 _RESOLVED_PIXELS = 4.0
 """Diameter from which a model shows a crater, pixels."""
 _SWELL_M = 120.0
@@ -41,7 +48,7 @@ class ElevationModel:
     known: np.ndarray
     """Whether a pixel has a height in the raster (rows, columns)."""
     raster: RasterMap
-    """Where the raster's columns and rows are on the Moon."""
+    """Where the columns and rows are on the Moon."""
     latitude_deg: float
     """Latitude of the site, degrees."""
     longitude_deg: float
@@ -58,53 +65,88 @@ class ElevationModel:
     """File name (without folder and special characters) and SHA-256."""
 
 
-def read_elevation(path: Path, config: ElevationConfig = _AT_THE_MIDDLE) -> ElevationModel:
-    """Read a GeoTIFF elevation model; its site is the one of `config`, or the raster's middle.
+def read_elevation(
+    path: Path, config: ElevationConfig = _AT_THE_MIDDLE, ground_m: float | None = None
+) -> ElevationModel:
+    """Read an elevation model; its site is the one of `config`, or the raster's middle.
 
-    Raises UserError if it is missing, unreadable, too large, empty, or has no pixel size or no projection of the Moon,
-    or if the site is outside it or in a hole.
+    `ground_m` is the side of the ground around the site for which the model is needed, metres: of a raster of more than
+    LARGEST_PIXELS only this part is read, at a lower resolution if it has as many pixels; None reads a part of a usual
+    size. Where the raster's map is cut within this ground, its columns are rearranged, or it is resampled.
+
+    Raises UserError if the model is missing, unreadable, empty, or has no pixel size or no projection of the Moon,
+    if the site is outside it or in a hole, and if its values cannot be heights (`elevation.height_band`).
     Holes (nodata, NaN) are filled with the nearest known height. Heights may be elevations or radii: only differences
     matter, since the site is set to height 0. Quantised heights are smoothed within half a step
     (`perilune_render.terrain.elevation.quantisation`).
     """
-    # Imported where it is used, since it takes a fifth of a second.
-    import rasterio
-    from rasterio.errors import RasterioError
-
-    if not path.is_file():
-        raise UserError(path, "dem", "no such file", "a GeoTIFF elevation model")
-    try:
-        with rasterio.open(path) as raster:
-            if raster.width * raster.height > _LARGEST_PIXELS:
-                raise UserError(path, "size", f"{raster.width} x {raster.height}", f"at most {_LARGEST_PIXELS} pixels")
-            height = raster.read(1, masked=True).astype(np.float64).filled(np.nan)
-            # Some products store integers with a scale and an offset.
-            height = height * raster.scales[0] + raster.offsets[0]
-            transform, crs = raster.transform, raster.crs
-    except RasterioError as error:
-        raise UserError(path, "dem", error.__cause__ or error, "a readable GeoTIFF") from None
-    if transform.is_identity or transform.determinant == 0:
-        raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
-    if crs is None:
-        raise UserError(path, "projection", "none", "a coordinate reference system of the Moon")
-    _refuse_other_bodies(path, crs)
+    files = raster_files(path, field="dem")
+    with opened_raster(files, "dem") as file:
+        band = height_band(path, files, file, config)
+        whole = _map_of(path, file, config)
+        site = site_in(path, whole, config)
+        window = chosen_window(whole, site, ground_m)
+        raster_map = whole.part(window.top, window.left, window.shape, window.step) if window.cut else whole
+        height = read_window(band, whole, window)
+        used = {Path(name).name for name in file.files}
+    site = site_within(whole, raster_map, site)
+    sides = _pixel_sides_m(raster_map, site)
+    height = band.in_metres(height, min(n * side for n, side in zip(height.shape, sides, strict=True)))
     known = np.isfinite(height)
     if known.sum() < 16:
         raise UserError(path, "heights", f"{known.sum()} known", "an elevation model with data")
     if not known.all():
         nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
         height = height[tuple(nearest)]
-    raster_map = RasterMap(transform, crs, height.shape)
-    site = site_in(path, raster_map, known, config)
-    sides = _pixel_sides_m(raster_map, site)
-    hole = distance_in_holes_m(known, sides)
+    if config.site_px is not None or config.site_deg is not None:
+        refuse_hole(path, whole, raster_map, known, site)
     step = step_of(height[known], float(np.mean(sides)))
     if step:
         height = smoothed(height, step)
-    plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
-    source = f"{plain_name} sha256:{sha256_of(path)}"
+    if not smooth_over(raster_map, site, UNSTATED_GROUND_M if ground_m is None else ground_m):
+        pixel = sides[0] if whole.circle is not None else float(np.mean(sides))
+        height, known, raster_map = resampled(
+            height, known, raster_map, site, pixel, UNSTATED_GROUND_M if ground_m is None else ground_m
+        )
+        site = Site(*raster_map.middle, site.latitude_deg, site.longitude_deg)
+        sides = _pixel_sides_m(raster_map, site)
+    hole = distance_in_holes_m(known, sides)
     place, pixel = (site.latitude_deg, site.longitude_deg), float(np.mean(sides))
-    return ElevationModel(height, known, raster_map, *place, pixel, sides, step, hole, source)
+    return ElevationModel(height, known, raster_map, *place, pixel, sides, step, hole, _source_of(files, used))
+
+
+def _map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
+    """The map of an open raster. Raises UserError if it has no pixel size or is not one of the Moon."""
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    transform, crs = file.transform, file.crs
+    if config.crs is not None:
+        try:
+            crs = CRS.from_user_input(config.crs)
+        except CRSError as error:
+            expected = "a coordinate reference system of the Moon: IAU_2015:30135, +proj=..., or WKT"
+            raise UserError("configuration", f"{_FIELD}.crs", error, expected) from None
+        refuse_grids(path, crs)
+    if transform.is_identity or transform.determinant == 0 or not np.isfinite(tuple(transform)).all():
+        raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
+    if crs is None:
+        expected = f"a coordinate reference system of the Moon in the file, or {_FIELD}.crs"
+        raise UserError(path, "projection", "none", expected)
+    _refuse_other_bodies(path, crs)
+    return RasterMap(transform, crs, (file.height, file.width), circle_of(crs))
+
+
+def _source_of(files: RasterFiles, used: set[str]) -> str:
+    """File name (without folder and special characters) and SHA-256 of a raster.
+
+    Of several files it is the hash of their hashes. A world file counts only if it was used.
+    """
+    path = files.paths[0]
+    plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
+    hashes = [sha256_of(file) for name, file in files.named if file == path or name in used]
+    together = hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
+    return f"{plain_name} sha256:{together}"
 
 
 def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
@@ -173,18 +215,44 @@ def refuse_beyond(model: ElevationModel, grid: Grid, outside: Outside) -> None:
         )
 
 
+def refuse_unseen(model: ElevationModel, grid: Grid, config: ElevationConfig) -> None:
+    """Raises UserError if no ground in view has a height in the model, unless the configuration allows this."""
+    if not config.allow_unseen and _real_share(model, grid) == 0:
+        found = f"no height within {grid.extent_m:.0f} m x {grid.extent_m:.0f} m of ground"
+        place = f"latitude {model.latitude_deg:.4f}, longitude {model.longitude_deg:.4f}"
+        raise UserError(
+            model.source,
+            "dem",
+            f"{found} around {place}",
+            f"a model or a site ({_FIELD}.site_*) with heights there, or {_FIELD}.allow_unseen=true",
+        )
+
+
+def _real_share(model: ElevationModel, grid: Grid) -> float:
+    """Share of the ground, a square around the site, that is known in the model."""
+    net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 129)
+    return float((beyond_m(model, *raster_places(model, *np.meshgrid(net, net))) == 0).mean())
+
+
+def _percent(share: float) -> str:
+    """A share in percent, with as many decimals as it takes to differ from 0 and 100 %."""
+    text = f"{share:.0%}"
+    if 0 < share < 1 and text in ("0%", "100%"):
+        text = f"{min(max(share, 0.0001), 0.9999):.2%}"
+    return text
+
+
 def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
     """Messages to the user about a model, one per line, shown before its ground is generated."""
     lines = []
     name = model.source.split(" sha256:")[0]
     if model.step_m:
         lines.append(f"{name}: heights are in steps of {model.step_m:.3g} m; they are smoothed within half a step")
-    net = np.linspace(-grid.extent_m / 2, grid.extent_m / 2, 129)
-    share = float((beyond_m(model, *raster_places(model, *np.meshgrid(net, net))) == 0).mean())
+    share = _real_share(model, grid)
     if share < 1:
         rest = "procedural" if outside == "procedural" else "its mirror image"
         side = f"{grid.extent_m:.0f} m"
-        lines.append(f"{name}: {share:.0%} of the ground, {side} x {side}, is real, the rest {rest}")
+        lines.append(f"{name}: {_percent(share)} of the ground, {side} x {side}, is real, the rest {rest}")
     return lines
 
 

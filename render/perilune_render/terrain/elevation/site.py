@@ -33,6 +33,8 @@ class RasterMap:
     """Coordinate reference system."""
     shape: tuple[int, int]
     """Numbers of rows and columns."""
+    circle: float | None = None
+    """Width of 360 degrees of longitude in projected coordinates; None if the map does not repeat (`circle_of`)."""
 
     @property
     def middle(self) -> tuple[float, float]:
@@ -52,12 +54,25 @@ class RasterMap:
         import rasterio.warp
 
         east, north = (np.array(v) for v in rasterio.warp.transform(_MOON, self.crs, longitude_deg, latitude_deg))
-        if self.crs.is_geographic:
+        if self.circle is not None:
             # A raster may count longitudes from 0 or from -180, and may extend across either.
             middle = (self.transform @ self.middle)[0]
-            east += 360 * np.round((middle - east) / 360)
+            east += self.circle * np.round((middle - east) / self.circle)
         column, row = ~self.transform @ (east, north)
         return column, row
+
+    @property
+    def circle_px(self) -> float | None:
+        """Columns of 360 degrees of longitude; None if the map does not repeat along its rows."""
+        turned = self.transform.b != 0 or self.transform.d != 0
+        return None if self.circle is None or turned else self.circle / abs(self.transform.a)
+
+    def part(self, top: int, left: int, shape: tuple[int, int], step: int = 1) -> RasterMap:
+        """The map of a raster of which each pixel is step x step of this one, from a row and a column on."""
+        import rasterio
+
+        place = rasterio.Affine.translation(left, top) @ rasterio.Affine.scale(step)
+        return RasterMap(self.transform @ place, self.crs, shape, self.circle)
 
     def covers(self, column: float, row: float) -> bool:
         """Whether raster coordinates are in the raster; False for NaN."""
@@ -78,11 +93,29 @@ class Site:
     """Longitude, degrees, -180 to 180."""
 
 
-def site_in(path: Path, raster: RasterMap, known: np.ndarray, config: ElevationConfig) -> Site:
+def circle_of(crs: rasterio.crs.CRS) -> float | None:
+    """Width of 360 degrees of longitude in a system's coordinates; None unless meridians are even vertical lines."""
+    import rasterio.warp
+
+    if crs.is_geographic:
+        return 360.0
+    longitude, latitude = (each.ravel() for each in np.meshgrid(np.arange(-180.0, 180.0, 10.0), [-40.0, 0.0, 40.0]))
+    x, y = (np.reshape(v, (3, 36)) for v in rasterio.warp.transform(_MOON, crs, longitude, latitude))
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        return None
+    steps = np.diff(x, axis=1)
+    circle = 36 * float(np.median(steps))
+    tolerance = 1e-6 * abs(circle)
+    # One step may lead from one edge of the map to the other.
+    jumps = np.abs(steps - circle / 36) > tolerance
+    even = (jumps.sum(axis=1) <= 1).all() and np.allclose(x, x[0], rtol=0, atol=tolerance)
+    return abs(circle) if circle and even and np.allclose(y, y[:, :1], rtol=0, atol=tolerance) else None
+
+
+def site_in(path: Path, raster: RasterMap, config: ElevationConfig) -> Site:
     """The site that a configuration states, or the raster's middle.
 
-    Raises UserError if a stated site is outside the raster or in a hole (`known` (rows, columns) is false), and if the
-    raster's map is not one of the Moon.
+    Raises UserError if a stated site is outside the raster, and if the raster's map is not one of the Moon.
     """
     from rasterio._err import CPLE_BaseError
     from rasterio.errors import RasterioError
@@ -99,8 +132,6 @@ def site_in(path: Path, raster: RasterMap, known: np.ndarray, config: ElevationC
             latitude, longitude = (float(v[0]) for v in raster.selenographic([column], [row]))
     except (RasterioError, CPLE_BaseError) as error:
         raise UserError(path, "projection", error, "a coordinate reference system of the Moon") from None
-    if pixel is not None or degrees is not None:
-        _refuse_hole(path, raster, known, column, row)
     return Site(column, row, latitude, longitude)
 
 
@@ -135,13 +166,18 @@ def _refuse_outside(path: Path, raster: RasterMap, column: float, row: float, fo
     raise UserError(path, f"{_FIELD}_*_{unit}", found, expected)
 
 
-def _refuse_hole(path: Path, raster: RasterMap, known: np.ndarray, column: float, row: float) -> None:
-    i, j = min(int(row), raster.shape[0] - 1), min(int(column), raster.shape[1] - 1)
+def refuse_hole(path: Path, raster: RasterMap, part: RasterMap, known: np.ndarray, site: Site) -> None:
+    """Raise UserError if the site, with column and row of a part of the raster, has no height.
+
+    `known` (rows, columns) tells which pixels of the part have one.
+    """
+    i, j = min(int(site.row), part.shape[0] - 1), min(int(site.column), part.shape[1] - 1)
     if known[i, j]:
         return
     rows, columns = np.nonzero(known)
     k = int(np.argmin((rows - i) ** 2 + (columns - j) ** 2))
-    near = columns[k] + 0.5, rows[k] + 0.5
+    near = _between(part, raster, float(columns[k]) + 0.5, float(rows[k]) + 0.5)
+    column, row = _between(part, raster, site.column, site.row)
     latitude, longitude = raster.selenographic([near[0]], [near[1]])
     raise UserError(
         path,
@@ -150,3 +186,20 @@ def _refuse_hole(path: Path, raster: RasterMap, known: np.ndarray, column: float
         f"a pixel with a height; the nearest is column {near[0]}, row {near[1]} "
         f"(latitude {latitude[0]:.6f}, longitude {longitude[0]:.6f})",
     )
+
+
+def site_within(raster: RasterMap, part: RasterMap, site: Site) -> Site:
+    """The site with column and row of a part of the raster."""
+    column, row = _between(raster, part, site.column, site.row)
+    return Site(column, row, site.latitude_deg, site.longitude_deg)
+
+
+def _between(raster: RasterMap, other: RasterMap, column: float, row: float) -> tuple[float, float]:
+    """Raster coordinates in `other`, of the same projection."""
+    if raster.transform == other.transform:
+        return column, row
+    column, row = ~other.transform @ (raster.transform @ (column, row))
+    circle = other.circle_px
+    if circle is not None:
+        column += circle * round((other.middle[0] - column) / circle)
+    return column, row

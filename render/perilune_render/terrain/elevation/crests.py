@@ -1,0 +1,187 @@
+"""Measure the rim crests of catalogued craters in an elevation model.
+
+A catalogue's diameter is often the one at formation, or was marked by hand on an image; worn rims lie farther out. The
+crest is where the profile of heights from the centre outwards is highest, in each of 36 directions, above a plane that
+is fitted to the ground around the crater. An ellipse through these places gives centre and diameter.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.terrain.elevation.model import ElevationModel, raster_places
+from perilune_shared.geometry.frames import Array
+
+LEAST_PIXELS = 8.0
+"""Diameter from which a crest is measured, pixels of the model."""
+_N_AZIMUTHS, _N_RADII = 36, 64
+_NEAR, _FAR = 0.5, 2.0
+"""Reach of the profiles, radii of the crater."""
+_SEARCH = 0.3
+"""A crest is searched within this share of the radius at which the median profile is highest."""
+_PLANE_FROM = 1.5
+"""Radius from which the plane is fitted, radii of the crater."""
+_LEAST_SHARE = 0.7
+"""Least share of the directions with a crest."""
+_LARGEST_RMS = 0.1
+"""Largest r.m.s. distance of the crest from the ellipse, radii."""
+_LEAST_RATIO = 0.7
+"""Least ratio of the ellipse's axes."""
+_LARGEST_SHIFT = 0.4
+"""Largest distance between the centres of catalogue and crest, radii of the crater."""
+_LEAST_DEPTH = 0.02
+"""Least depth of the centre below the crest, diameters."""
+_OUTLIER = 2.5
+_CHUNK = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Crests:
+    """Rims of N craters as they lie in the model; NaN where no crest was found."""
+
+    x_m: Array
+    """x of the centres of the ellipses, O_L, metres (N,)."""
+    y_m: Array
+    """y of the centres of the ellipses, O_L, metres (N,)."""
+    diameter_m: Array
+    """Diameters of circles with the area of the ellipses, metres (N,)."""
+    rms_share: Array
+    """R.m.s. distance of the crest from the ellipse, divided by the mean radius (N,)."""
+    axis_ratio: Array
+    """Minor axis of the ellipse divided by the major axis (N,)."""
+
+    @property
+    def found(self) -> np.ndarray:
+        """Whether a crest was found (N,)."""
+        return np.isfinite(self.diameter_m)
+
+
+def measure_crests(model: ElevationModel, x_m: Array, y_m: Array, diameter_m: Array) -> Crests:
+    """Measure the crests of craters at places (N,) of O_L with catalogued diameters (N,)."""
+    found = np.full((5, len(x_m)), np.nan)
+    large = np.flatnonzero(diameter_m >= LEAST_PIXELS * model.pixel_m)
+    for start in range(0, len(large), _CHUNK):
+        own = large[start : start + _CHUNK]
+        radius = diameter_m[own] / 2
+        x, y, scale = x_m[own], y_m[own], radius
+        # The second pass is centred on the first's ellipse, and sized by it.
+        for _ in range(2):
+            fit = _fit(model, x, y, scale)
+            x, y, scale = fit.x_m, fit.y_m, fit.radius_m
+        shift = np.hypot(x - x_m[own], y - y_m[own]) / radius
+        growth = scale / radius
+        good = fit.good & (shift <= _LARGEST_SHIFT) & (growth > _NEAR) & (growth < _FAR)
+        rows = np.stack([x, y, 2 * scale, fit.rms_share, fit.axis_ratio])
+        found[:, own] = np.where(good, rows, np.nan)
+    return Crests(*found)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Ellipses of N craters; where no crest was found, the craters as they were given."""
+
+    x_m: Array
+    y_m: Array
+    radius_m: Array
+    rms_share: Array
+    axis_ratio: Array
+    good: np.ndarray
+
+
+def _fit(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array) -> _Fit:
+    angle = 2 * np.pi * np.arange(_N_AZIMUTHS) / _N_AZIMUTHS
+    share = np.linspace(_NEAR, _FAR, _N_RADII)
+    unit_x, unit_y = np.cos(angle)[:, None] * share, np.sin(angle)[:, None] * share
+    height = _heights(model, x_m, y_m, radius_m, unit_x, unit_y)
+    height -= _plane(height, unit_x, unit_y, share)
+    crest, has_crest = _crest_shares(height, share)
+    shape = np.stack([np.ones_like(angle), *(f(n * angle) for n in (1, 2) for f in (np.cos, np.sin))], axis=1)
+    weight = has_crest.astype(float)
+    for _ in range(4):
+        normal = np.einsum("na,ai,aj->nij", weight, shape, shape) + 1e-9 * np.eye(5)
+        terms = np.linalg.solve(normal, np.einsum("na,ai,na->ni", weight, shape, crest)[..., None])[..., 0]
+        residual = np.abs(crest - terms @ shape.T)
+        spread = 1.4826 * np.ma.median(np.ma.masked_array(residual, ~has_crest), axis=1).filled(np.inf)
+        weight = (has_crest & (residual <= np.maximum(_OUTLIER * spread, 0.01)[:, None])).astype(float)
+    n_used = weight.sum(axis=1)
+    mean, swing = terms[:, 0], np.hypot(terms[:, 3], terms[:, 4])
+    major, minor = np.maximum(mean + swing, 1e-3), np.maximum(mean - swing, 1e-3)
+    rms = np.sqrt((weight * residual**2).sum(axis=1) / np.maximum(n_used, 1)) / np.maximum(mean, 1e-3)
+    floor = _heights(model, x_m, y_m, radius_m, np.zeros((1, 1)), np.zeros((1, 1)))[:, 0, 0]
+    rim = _rim_level(model, x_m, y_m, radius_m, terms @ shape.T, angle)
+    good = (n_used >= _LEAST_SHARE * _N_AZIMUTHS) & (rms <= _LARGEST_RMS) & (minor / major >= _LEAST_RATIO)
+    good &= (mean > _NEAR) & (mean < _FAR) & (rim - floor >= _LEAST_DEPTH * 2 * radius_m)
+    moved = good[:, None] * terms[:, 1:3] * radius_m[:, None]
+    radius = np.where(good, np.sqrt(np.maximum(major * minor, 1e-6)), 1) * radius_m
+    return _Fit(x_m + moved[:, 0], y_m + moved[:, 1], radius, rms, minor / major, good)
+
+
+def _crest_shares(height_m: Array, share: Array) -> tuple[Array, np.ndarray]:
+    """Radius of the crest in each direction (N, A), shares of the radius, and whether there is one (N, A).
+
+    A crest is a maximum of the profile (N, A, R) inside the range about the highest place of the median profile, not at
+    the end of this range.
+    """
+    step = share[1] - share[0]
+    around = share[np.median(height_m, axis=1).argmax(axis=1)]
+    inside = np.abs(share - around[:, None]) <= _SEARCH * around[:, None]
+    at = np.where(inside[:, None], height_m, -np.inf).argmax(axis=2)
+    first, last = inside.argmax(axis=1), inside.shape[1] - 1 - inside[:, ::-1].argmax(axis=1)
+    has_crest = (at > first[:, None]) & (at < last[:, None])
+    at = np.clip(at, 1, len(share) - 2)
+    below, top, above = (np.take_along_axis(height_m, (at + d)[..., None], axis=2)[..., 0] for d in (-1, 0, 1))
+    bend = np.minimum(below - 2 * top + above, -1e-12)
+    return share[at] + step * np.clip((below - above) / (2 * bend), -0.5, 0.5), has_crest
+
+
+def _plane(height_m: Array, unit_x: Array, unit_y: Array, share: Array) -> Array:
+    """Heights (N, A, R) of the planes that are fitted by least squares to the ground around each crater."""
+    outside = share >= _PLANE_FROM
+    basis = np.stack([np.ones_like(unit_x), unit_x, unit_y], axis=-1)
+    solver = np.linalg.pinv(basis[:, outside].reshape(-1, 3))
+    terms = height_m[:, :, outside].reshape(len(height_m), -1) @ solver.T
+    return np.einsum("ni,ari->nar", terms, basis)
+
+
+def _rim_level(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array, crest: Array, angle: Array) -> Array:
+    """Mean height (N,) of the model along a crest (N, A), in shares of the radius."""
+    reach = crest * radius_m[:, None]
+    return _at(model, x_m[:, None] + reach * np.cos(angle), y_m[:, None] + reach * np.sin(angle)).mean(axis=1)
+
+
+def _heights(model: ElevationModel, x_m: Array, y_m: Array, radius_m: Array, unit_x: Array, unit_y: Array) -> Array:
+    """Heights (N, A, R) of the model at places about centres (N,), in radii."""
+    scale = radius_m[:, None, None]
+    return _at(model, x_m[:, None, None] + scale * unit_x, y_m[:, None, None] + scale * unit_y)
+
+
+def _at(model: ElevationModel, x_m: Array, y_m: Array) -> Array:
+    """Heights of the model at places of O_L of any shape, metres, by cubic convolution."""
+    column, row = raster_places(model, x_m, y_m)
+    return _cubic(model.height_m, row - 0.5, column - 0.5)
+
+
+def _cubic(height_m: Array, row: Array, column: Array) -> Array:
+    """Heights at rows and columns of pixel centres, of any shape.
+
+    Catmull-Rom weights of 4 x 4 pixels: without the filter that a spline would run over the whole model.
+    """
+    n_rows, n_columns = height_m.shape
+    row, column = np.clip(row, 0, n_rows - 1), np.clip(column, 0, n_columns - 1)
+    top, left = np.floor(row).astype(int), np.floor(column).astype(int)
+    total = np.zeros(np.shape(row))
+    for dy, by_row in zip((-1, 0, 1, 2), _weights(row - top), strict=True):
+        rows = np.clip(top + dy, 0, n_rows - 1)
+        for dx, by_column in zip((-1, 0, 1, 2), _weights(column - left), strict=True):
+            total += by_row * by_column * height_m[rows, np.clip(left + dx, 0, n_columns - 1)]
+    return total
+
+
+def _weights(t: Array) -> list[Array]:
+    """Weights of the pixels before, at, after and two after a place that lies `t` pixels after one."""
+    return [
+        0.5 * t * (-1 + t * (2 - t)),
+        1 + t * t * (-2.5 + 1.5 * t),
+        0.5 * t * (1 + t * (4 - 3 * t)),
+        0.5 * t * t * (t - 1),
+    ]

@@ -1,0 +1,143 @@
+"""The part of a raster that a scene needs: small rasters whole, of large ones a window at the scene's resolution.
+
+A raster of the whole Moon is cut anew where the scene's ground lies across its left or right edge: its columns repeat.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from perilune_render.terrain.elevation.height_band import HeightBand
+from perilune_render.terrain.elevation.site import RasterMap, Site
+from perilune_shared.geometry.frames import Array, selenographic_from_site
+
+LARGEST_PIXELS = 2**24
+"""Number of pixels up to which a raster is read whole, and of the largest window."""
+UNSTATED_GROUND_M = 20_000.0
+"""Side of the ground for which a large model is read if the caller does not need a certain one, metres."""
+_AROUND = 1.25
+"""Half-width of a window as a multiple of the ground's, so that statistics and interpolation have more than it."""
+_LEAST_PX = 64
+"""Least number of pixels around the ground in a window."""
+_NET = 65
+_ROUGH_PX = 0.5
+"""Deviation from smooth coordinates from which a map is cut or resampled, pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A part of a raster; a pixel of it is a mean over step x step pixels of the raster."""
+
+    top: int
+    """First row."""
+    left: int
+    """First column; below 0 or beyond the last column where the columns of the raster repeat."""
+    shape: tuple[int, int]
+    """Rows and columns of the part."""
+    step: int
+    """Rows, and columns, of the raster for one of the part."""
+    cut: bool
+    """Whether the part is not the whole raster."""
+
+
+def chosen_window(raster: RasterMap, site: Site, ground_m: float | None) -> Window:
+    """The part of a raster to read for square ground around a site, metres; None for ground of any usual size."""
+    rows, columns = raster.shape
+    net = np.linspace(-0.5, 0.5, 9) * (UNSTATED_GROUND_M if ground_m is None else ground_m) * _AROUND
+    column, row = _places_about(raster, site, *np.meshgrid(net, net))
+    around = repeat_px(raster)
+    across = around and (column.min() < 4 or column.max() > columns - 4)
+    if rows * columns <= LARGEST_PIXELS:
+        left = round(site.column - around / 2) if across else 0
+        return Window(0, left, (rows, around if across else columns), 1, bool(across))
+    margin = _LEAST_PX
+    top, bottom = (int(np.clip(edge, 0, rows)) for edge in (row.min() - margin, row.max() + margin + 1))
+    left, right = (int(edge) for edge in (np.floor(column.min() - margin), np.ceil(column.max() + margin)))
+    if not across:
+        left, right = max(left, 0), min(right, columns)
+    elif right - left > around:
+        left, right = round(site.column - around / 2), round(site.column - around / 2) + around
+    step = int(np.ceil(np.sqrt(max((bottom - top) * (right - left), 1) / LARGEST_PIXELS)))
+    if across:
+        # A pixel of the part must not have columns from both sides of the edge.
+        edge = 0 if left < 0 else around
+        left = edge - step * -(-(edge - left) // step)
+    return Window(top, left, (max((bottom - top) // step, 1), max((right - left) // step, 1)), step, True)
+
+
+def repeat_px(raster: RasterMap) -> int:
+    """Number of columns after which those of a raster repeat, 0 if it does not show all longitudes."""
+    circle, columns = raster.circle_px, raster.shape[1]
+    if circle is None:
+        return 0
+    if abs(circle - round(circle)) < 0.05 and columns >= round(circle) - 1:
+        return round(circle)
+    return columns if abs(circle - columns) < 1 else 0
+
+
+def read_window(band: HeightBand, raster: RasterMap, window: Window) -> Array:
+    """Heights (rows, columns) of a window in the file's unit, NaN where the raster has none."""
+    from rasterio.windows import Window as Part
+
+    rows, step = window.shape[0], window.step
+    found = []
+    for first, count in _runs(raster, window):
+        if first is None:
+            found.append(np.full((rows, count), np.nan))
+        else:
+            found.append(band.read(Part(first, window.top, count * step, rows * step), (rows, count)))
+    return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
+
+
+def smooth_over(raster: RasterMap, site: Site, ground_m: float) -> bool:
+    """Whether a raster's coordinates vary smoothly over square ground around a site, so that they can be interpolated.
+
+    They do not where the map is cut, as at longitude 180, and around a pole of a cylindrical map.
+    """
+    from scipy.interpolate import RectBivariateSpline
+
+    net = np.linspace(-ground_m / 2, ground_m / 2, _NET)
+    between = (net[1:] + net[:-1]) / 2
+    known = [places_of(raster, site, *np.meshgrid(each, each)) for each in (net, between)]
+    if not all(np.isfinite(place).all() for pair in known for place in pair):
+        return False
+    off = [
+        np.abs(RectBivariateSpline(net, net, at).ev(*np.meshgrid(between, between, indexing="ij")) - there).max()
+        for at, there in zip(*known, strict=True)
+    ]
+    return max(off) < _ROUGH_PX
+
+
+def places_of(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+    """Column and row of places (...) of O_L's plane, metres."""
+    latitude, longitude = selenographic_from_site(x_m, y_m, site.latitude_deg, site.longitude_deg)
+    column, row = raster.places(np.ravel(latitude), np.ravel(longitude))
+    return column.reshape(np.shape(x_m)), row.reshape(np.shape(x_m))
+
+
+def _places_about(raster: RasterMap, site: Site, x_m: Array, y_m: Array) -> tuple[Array, Array]:
+    """Finite columns and rows of places (N,); columns are the nearest to the site's where the map repeats."""
+    column, row = places_of(raster, site, x_m, y_m)
+    good = np.isfinite(column) & np.isfinite(row)
+    column, row = column[good], row[good]
+    circle = raster.circle_px
+    if circle is not None:
+        column = column + circle * np.round((site.column - column) / circle)
+    return np.append(column, site.column), np.append(row, site.row)
+
+
+def _runs(raster: RasterMap, window: Window) -> list[tuple[int | None, int]]:
+    """First column in the raster, None where it has none, and number of the window's columns, of its parts."""
+    columns, step, around = raster.shape[1], window.step, repeat_px(raster)
+    runs: list[tuple[int | None, int]] = []
+    place, left = window.left, window.shape[1]
+    while left > 0:
+        first = place % around if around else place
+        most = (min(columns, around) if around else columns) - first
+        has = most >= step
+        count = min(most // step if has else max((around - first) // step, 1), left)
+        runs.append((first if has else None, count))
+        place, left = place + count * step, left - count
+    return runs

@@ -1,0 +1,239 @@
+"""Open rasters from outside with rasterio: a few documented formats, and only the files that belong to them.
+
+GDAL, which rasterio calls, opens more than a user expects: text in any of a hundred formats that refers to other files
+or to addresses, also where it is named `.tif`, and files beside a raster or named in its tags. So the format is
+recognised here, its driver alone is used, and the raster is opened through a temporary folder that holds links to
+nothing but its own files. rasterio is optional in some packages, so it is imported where it is used.
+"""
+
+import contextlib
+import html
+import os
+import re
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from perilune_shared.errors import UserError
+
+MODEL_DRIVERS = ("GTiff", "JP2OpenJPEG", "PDS", "PDS4", "ISIS3")
+"""GDAL's drivers for elevation models. A Cloud Optimized GeoTIFF is a GeoTIFF."""
+PICTURE_DRIVERS = (*MODEL_DRIVERS, "PNG", "JPEG")
+"""GDAL's drivers for pictures."""
+_NAMES = {
+    "GTiff": "GeoTIFF",
+    "JP2OpenJPEG": "JPEG 2000",
+    "PDS": "PDS3",
+    "PDS4": "PDS4",
+    "ISIS3": "ISIS cube",
+    "PNG": "PNG",
+    "JPEG": "JPEG",
+}
+_MAGIC = {
+    b"II*\0": "GTiff",
+    b"MM\0*": "GTiff",
+    b"II+\0": "GTiff",
+    b"MM\0+": "GTiff",
+    b"\0\0\0\x0cjP  \r\n\x87\n": "JP2OpenJPEG",
+    b"\xff\x4f\xff\x51": "JP2OpenJPEG",
+    b"\x89PNG\r\n\x1a\n": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+}
+_OPTIONS = {"GDAL_PAM_ENABLED": "NO", "CPL_VSIL_CURL_ALLOWED_FILENAME": "none", "PROJ_NETWORK": "OFF"}
+_LARGEST_LABEL_BYTES = 2**22
+_LARGEST_WORLD_FILE_BYTES = 4096
+_LARGEST_BLOCK_BYTES = 2**29
+"""Largest block (tile or strip) of a raster with all bands that it interleaves, bytes: GDAL decodes whole blocks."""
+_VALUE_BYTES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "uint32": 4, "int32": 4, "float32": 4}
+_END = re.compile(rb"\r?\nE(?:ND|nd)\r?\n")
+_POINTER = re.compile(r"^[ \t]*(\^\w+|FILE_NAME)[ \t]*=[ \t\r\n]*\(?[ \t]*(\"[^\"]*\"|'[^']*'|[^\s,)]+)", re.M | re.I)
+_FILE_NAME = re.compile(r"<(?:\w+:)?file_name\b[^>]*>(.*?)</", re.S)
+
+
+@dataclass(frozen=True, slots=True)
+class RasterFiles:
+    """The files of a raster and the driver that reads them."""
+
+    driver: str
+    """GDAL's short name of the driver."""
+    named: tuple[tuple[str, Path], ...]
+    """Name and path of the file that is opened, then of the data behind a label and of a world file, if there are any.
+    A label may name its data in another letter case than the file has."""
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All files, the one that is opened first."""
+        return tuple(path for _, path in self.named)
+
+
+def raster_files(path: Path, drivers: Sequence[str] = MODEL_DRIVERS, field: str = "raster") -> RasterFiles:
+    """The files of a raster in one of the formats that `drivers` read; nothing is opened by GDAL.
+
+    Raises UserError if the file is missing or of another format, if a label names a file outside its folder, or if one
+    of the files is not a regular file.
+    """
+    if not path.is_file():
+        found = "no such file" if not path.exists() else "a folder, a pipe or a device"
+        raise UserError(path, field, found, _expected(drivers))
+    with path.open("rb") as stream:
+        head = stream.read(_LARGEST_LABEL_BYTES)
+    driver = _driver_of(head)
+    if driver not in drivers:
+        text = "XML text, which can refer to other files" if head.lstrip().startswith(b"<") else "another format"
+        found = _NAMES.get(driver, text)
+        raise UserError(path, field, found, _expected(drivers) + _hint(path, head))
+    files = {path.name: path}
+    if driver in ("PDS", "PDS4", "ISIS3"):
+        for name in _named_by_label(path, driver, head, field):
+            if (beside := _beside(path, name, field)) is not None:
+                files.setdefault(name, beside)
+    for beside in _world_file(path):
+        files.setdefault(beside.name, beside)
+    return RasterFiles(driver, tuple(files.items()))
+
+
+@contextlib.contextmanager
+def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
+    """Open a raster: a `rasterio.DatasetReader` for the time of the block. Needs rasterio.
+
+    Files beside the raster that are not in `files` (.aux.xml, .ovr, .msk) are not read. Raises UserError if the raster
+    cannot be read, within the block too, if its tags or its projection refer to other files, or if one of its blocks is
+    too large.
+    """
+    import rasterio
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import CRSError, RasterioError
+
+    path = files.paths[0]
+    with tempfile.TemporaryDirectory(prefix="perilune-raster-") as folder:
+        for name, file in files.named:
+            (Path(folder) / name).symlink_to(file.resolve())
+        try:
+            with rasterio.Env(**_OPTIONS):
+                with warnings.catch_warnings():
+                    # A raster without a place is reported by whoever needs the place.
+                    warnings.simplefilter("ignore")
+                    raster = rasterio.open(Path(folder) / path.name, driver=files.driver, sharing=False)
+                with raster:
+                    _refuse_references(path, raster, Path(folder), field)
+                    yield raster
+        # GDAL's own errors are not wrapped everywhere.
+        except (RasterioError, CRSError, CPLE_BaseError) as error:
+            found = str(error.__cause__ or error).replace(f"{folder}{os.sep}", "")
+            raise UserError(path, field, found, f"a readable {_NAMES[files.driver]}") from None
+
+
+def label_text(files: RasterFiles) -> str:
+    """The text of a PDS label, up to its end."""
+    with files.paths[0].open("rb") as stream:
+        return _label_in(stream.read(_LARGEST_LABEL_BYTES), files.driver)
+
+
+def _label_in(head: bytes, driver: str) -> str:
+    if driver == "PDS4":
+        return html.unescape(head.decode("utf-8", "replace"))
+    end = _END.search(head)
+    return head[: end.end() if end else None].decode("latin-1")
+
+
+def _driver_of(head: bytes) -> str:
+    """GDAL's driver of a file that begins with `head`; empty if it is none of those that are known here."""
+    for magic, driver in _MAGIC.items():
+        if head.startswith(magic):
+            return driver
+    start = head[: 2**16]
+    if start.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+        return "PDS4" if b"Product_Observational" in start and b"<VRTDataset" not in start else ""
+    if b"IsisCube" in start:
+        return "ISIS3"
+    return "PDS" if b"PDS_VERSION_ID" in start else ""
+
+
+def _expected(drivers: Sequence[str]) -> str:
+    names = [_NAMES[driver] for driver in drivers]
+    return f"a readable {', '.join(names[:-1])} or {names[-1]} file"
+
+
+def _hint(path: Path, head: bytes) -> str:
+    """What to do with a file of another format."""
+    if b"<VRTDataset" in head[: 2**16]:
+        return f"; make one of it with: gdal_translate {path.name} {path.stem}.tif"
+    for suffix in (".lbl", ".LBL", ".xml"):
+        label = path.with_suffix(suffix)
+        if label != path and label.is_file():
+            return f"; the data of a label are opened by the label, {label.name}"
+    return ""
+
+
+def _named_by_label(path: Path, driver: str, head: bytes, field: str) -> list[str]:
+    """Names of the files to which the label of a PDS or ISIS file points."""
+    label = _label_in(head, driver)
+    complete = len(head) < _LARGEST_LABEL_BYTES or (driver != "PDS4" and _END.search(head) is not None)
+    if driver == "PDS4":
+        names = [name.strip() for name in _FILE_NAME.findall(label)]
+    else:
+        names = [value.strip("\"' ") for _, value in _POINTER.findall(label)]
+        names = [name for name in names if not name.isdigit()]
+    if not complete:
+        raise UserError(path, field, "a label without an end", f"a label of at most {_LARGEST_LABEL_BYTES} bytes")
+    if "/vsi" in label.lower():
+        raise UserError(path, field, "a label with '/vsi', which GDAL takes for an address", "names of files")
+    if driver == "PDS" and re.search(r"=\s*\"?COMPRESSED_FILE", label, re.I):
+        raise UserError(path, field, "compressed data behind a label", "uncompressed PDS3 data")
+    if driver == "ISIS3" and re.search(r"Format\s*=\s*\"?GeoTIFF", label, re.I):
+        raise UserError(path, field, "an ISIS label of a GeoTIFF", "a cube, or the GeoTIFF itself")
+    for name in names:
+        if re.search(r"[/\\\0]", name) or name in ("", ".", ".."):
+            raise UserError(path, field, f"a label that points to {name!r}", "names of files in its own folder")
+    return names
+
+
+def _beside(path: Path, name: str, field: str) -> Path | None:
+    """The file of this name, or of this name in other letter case, in the folder of a label; None if there is none."""
+    folder = path.resolve().parent
+    beside = path.parent / name
+    if not beside.exists():
+        # Labels often have another letter case than the files.
+        same = (entry for entry in path.parent.iterdir() if entry.name.lower() == name.lower())
+        beside = next(same, beside)
+    if not beside.exists():
+        return None  # GDAL names the data that it misses; other pointers may be to documents that are not here
+    if not beside.is_file():
+        raise UserError(beside, field, "a folder, a pipe or a device", f"a file, as {path.name} says")
+    if not beside.resolve().is_relative_to(folder):
+        raise UserError(beside, field, "a link that leaves the folder", f"a file beside {path.name}")
+    return beside
+
+
+def _world_file(path: Path) -> list[Path]:
+    """The world file (.tfw, .pgw, ...) beside a raster, in a list, if there is one."""
+    suffix = path.suffix.lower().removeprefix(".")
+    for ending in (f"{suffix[:1]}{suffix[-1:]}w", f"{suffix}w", "wld"):
+        for beside in (path.with_suffix(f".{ending}"), path.with_suffix(f".{ending.upper()}")):
+            if beside.is_file() and beside.stat().st_size <= _LARGEST_WORLD_FILE_BYTES:
+                return [beside]
+    return []
+
+
+def _refuse_references(path: Path, raster: Any, folder: Path, field: str) -> None:
+    """Raise UserError if an open raster refers to other files, or if one of its blocks is too large."""
+    if found := raster.tags(ns="OVERVIEWS"):
+        raise UserError(path, field, f"tags that name another file: {found}", "a raster that refers to no other")
+    if any(Path(file).parent != folder for file in raster.files):
+        raise UserError(path, field, "a file that refers to one elsewhere", "data in the folder of their label")
+    if raster.crs is not None:
+        refuse_grids(path, raster.crs)
+    rows, columns = raster.block_shapes[0]
+    together = raster.count if raster.tags(ns="IMAGE_STRUCTURE").get("INTERLEAVE") == "PIXEL" else 1
+    if rows * columns * together * _VALUE_BYTES.get(raster.dtypes[0], 16) > _LARGEST_BLOCK_BYTES:
+        size = f"blocks of {rows} x {columns} pixels and {together} bands"
+        raise UserError(path, field, size, f"blocks of at most {_LARGEST_BLOCK_BYTES} bytes: a tiled raster")
+
+
+def refuse_grids(where: object, crs: Any) -> None:
+    """Raise UserError if a coordinate reference system (`rasterio.crs.CRS`) names files, which PROJ would open."""
+    if found := re.search(r"nadgrids|geoidgrids|\+grids|PARAMETERFILE", crs.to_wkt(), re.I):
+        raise UserError(where, "projection", f"{found[0]}, which names a file", "a projection without grids")
