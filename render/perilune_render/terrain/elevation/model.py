@@ -59,6 +59,8 @@ class ElevationModel:
     """Ground size of a pixel from row to row and from column to column, metres."""
     step_m: float
     """Quantisation step of the raster's heights if it makes terraces, metres; otherwise 0."""
+    read_step: int
+    """Pixels of the raster along a side of one of these, more than 1 if the raster is too large for the ground."""
     hole_m: Array | None
     """Distance of each pixel (rows, columns) from the nearest known one, metres; None without holes."""
     source: str
@@ -80,7 +82,7 @@ def read_elevation(
     matter, since the site is set to height 0. Quantised heights are smoothed within half a step
     (`perilune_render.terrain.elevation.quantisation`).
     """
-    files = raster_files(path, field="dem")
+    files = raster_files(path, field="dem", tiles=config.vrt_files)
     with opened_raster(files, "dem") as file:
         band = height_band(path, files, file, config)
         whole = _map_of(path, file, config)
@@ -112,7 +114,9 @@ def read_elevation(
         sides = _pixel_sides_m(raster_map, site)
     hole = distance_in_holes_m(known, sides)
     place, pixel = (site.latitude_deg, site.longitude_deg), float(np.mean(sides))
-    return ElevationModel(height, known, raster_map, *place, pixel, sides, step, hole, _source_of(files, used))
+    return ElevationModel(
+        height, known, raster_map, *place, pixel, sides, step, window.step, hole, _source_of(files, used)
+    )
 
 
 def _map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
@@ -144,7 +148,7 @@ def _source_of(files: RasterFiles, used: set[str]) -> str:
     """
     path = files.paths[0]
     plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
-    hashes = [sha256_of(file) for name, file in files.named if file == path or name in used]
+    hashes = [sha256_of(file) for name, file in files.named if file == path or Path(name).name in used]
     together = hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
     return f"{plain_name} sha256:{together}"
 
@@ -246,6 +250,11 @@ def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
     """Messages to the user about a model, one per line, shown before its ground is generated."""
     lines = []
     name = model.source.split(" sha256:")[0]
+    if model.read_step > 1:
+        lines.append(
+            f"{name}: read at {model.pixel_m:.3g} m, {model.read_step} x {model.read_step} of its pixels, since the "
+            f"ground is {grid.extent_m / 1000:.3g} km wide"
+        )
     if model.step_m:
         lines.append(f"{name}: heights are in steps of {model.step_m:.3g} m; they are smoothed within half a step")
     share = _real_share(model, grid)
