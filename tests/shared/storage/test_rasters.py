@@ -49,6 +49,12 @@ def test_the_data_behind_a_label_belong_to_the_raster(tmp_path):
         assert {file.name for file in raster_files(path).paths} == {file.name for file in folder.iterdir()}
 
 
+def test_the_data_of_a_label_are_opened_by_the_label(tmp_path):
+    pds3(tmp_path, GROUND)
+    with pytest.raises(UserError, match=r"the data of a label are opened by the label, ground\.LBL"):
+        raster_files(tmp_path / "ground.IMG")
+
+
 def test_a_label_of_another_letter_case(tmp_path):
     path = pds3(tmp_path, GROUND)
     (tmp_path / "ground.IMG").rename(tmp_path / "GROUND.img")

@@ -135,7 +135,9 @@ def _map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
     if transform.is_identity or transform.determinant == 0 or not np.isfinite(tuple(transform)).all():
         raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
     if crs is None:
-        expected = f"a coordinate reference system of the Moon in the file, or {_FIELD}.crs"
+        beside = path.with_name(f"{path.name}.aux.xml")
+        hint = f" ({beside.name} is not read: gdal_translate can join it to the file)" if beside.is_file() else ""
+        expected = f"a coordinate reference system of the Moon in the file{hint}, or {_FIELD}.crs"
         raise UserError(path, "projection", "none", expected)
     _refuse_other_bodies(path, crs)
     return RasterMap(transform, crs, (file.height, file.width), circle_of(crs))
