@@ -1,8 +1,10 @@
 """Rasters are opened by the drivers of documented formats alone, with no file but their own."""
 
 import os
+import re
 import socket
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -267,3 +269,14 @@ def test_tiles_are_rasters_that_refer_to_nothing(tmp_path):
     (tmp_path / TILES[1]).symlink_to("/etc/passwd")
     with pytest.raises(UserError, match="a path without links that leave"):
         raster_files(path, tiles=TILES)
+
+
+@pytest.mark.parametrize("package", ["shared/perilune_shared", "render/perilune_render"])
+def test_no_other_module_reads_rasters(package):
+    root = Path(__file__).parents[3]
+    reads = re.compile(r"(?:rasterio|gdal)\.open\((?![^)]*\"w\")|WarpedVRT|rasterio\.shutil", re.I)
+    found = [path for path in (root / package).rglob("*.py") if reads.search(path.read_text(encoding="utf-8"))]
+    assert [path.name for path in found if path.name != "rasters.py"] == []
+    assert reads.search("with rasterio.open(path) as raster:") and not reads.search(
+        'rasterio.open(aside, "w", **profile)'
+    )
