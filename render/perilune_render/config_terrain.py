@@ -77,7 +77,7 @@ METRES_PER_UNIT = {"m": 1.0, "km": 1000.0, "ft": 0.3048, "us-ft": 1200 / 3937, "
 HeightUnit = Literal["m", "km", "ft", "us-ft", "cm", "mm"]
 SITE_FIELDS = ("site_latitude_deg", "site_longitude_deg", "site_column_px", "site_row_px")
 """Settings of the site in an elevation model: one pair of them, or none."""
-FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "allow_unseen")
+FILE_FIELDS = ("height_unit", "band", "nodata", "crs", "vrt_files", "allow_unseen")
 """Settings that tell what an elevation model's file leaves open."""
 
 
@@ -137,6 +137,8 @@ class ElevationConfig(Section):
         Annotated[str, Field(max_length=5000, pattern=r"^(?i:(EPSG|ESRI|IAU|IAU_\d{4}):\d+$|\+proj=|[A-Z_]+\[)")] | None
     ) = None
     """Coordinate reference system of the model, in place of the one in its file: IAU_2015:30135, +proj=..., or WKT."""
+    vrt_files: Annotated[list[str], Field(min_length=1, max_length=10_000)] | None = None
+    """The model is a VRT, GDAL's text that joins rasters; it may refer to these files, paths from its folder."""
     allow_unseen: bool = False
     """Accept a model that has no height within the ground in view."""
     catalogue_columns: CatalogueColumnsConfig = CatalogueColumnsConfig()

@@ -18,6 +18,7 @@ from perilune_render.terrain.elevation.model import (
 from perilune_render.terrain.elevation.surroundings import FittedRelief, add_fitted_relief, fitted_relief
 from perilune_render.terrain.grid import Grid
 from perilune_render.terrain.relief import add_relief
+from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import Array
 
 
@@ -63,6 +64,8 @@ def base_of(model: ElevationModel | None, grid: Grid, terrain: TerrainConfig, se
         return Base(np.zeros(grid.n_vertices), np.full(grid.n_vertices, np.inf), None, None)
     refuse_unseen(model, grid, terrain.elevation)
     height, beyond = base_heights(model, grid, terrain.elevation.outside)
+    if not np.isfinite(height).all():
+        raise UserError(model.source, "heights", "ground without a height", "an elevation model with a finite ground")
     needed = terrain.elevation.outside == "procedural" and bool((beyond > 0).any())
     surroundings = fitted_relief(model, terrain.relief, terrain.craters, seed) if needed else None
     return Base(height, beyond, model, surroundings)

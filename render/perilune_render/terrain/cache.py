@@ -44,8 +44,9 @@ def scene_key(config: DatasetConfig, view: ViewEnvelope, seed: int) -> str:
     terrain = config.terrain.model_dump(mode="json")
     for name in ("dem", "catalogue"):
         if terrain[name] is not None and Path(terrain[name]).is_file():
-            files = raster_files(Path(terrain[name])).paths if name == "dem" else [Path(terrain[name])]
-            terrain[name] = [Path(terrain[name]).name, *(sha256_of(file) for file in files)]
+            path = Path(terrain[name])
+            files = raster_files(path, tiles=config.terrain.elevation.vrt_files).paths if name == "dem" else (path,)
+            terrain[name] = [path.name, *(sha256_of(file) for file in files)]
     terrain.pop("max_vertices")  # a limit on meshes, which changes no ground
     versions = ground_versions(with_dem=config.terrain.dem is not None)
     content = {

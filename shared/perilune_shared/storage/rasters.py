@@ -10,14 +10,17 @@ import contextlib
 import html
 import os
 import re
+import shutil
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 from perilune_shared.errors import UserError
+from perilune_shared.storage.files import inside
 
 MODEL_DRIVERS = ("GTiff", "JP2OpenJPEG", "PDS", "PDS4", "ISIS3")
 """GDAL's drivers for elevation models. A Cloud Optimized GeoTIFF is a GeoTIFF."""
@@ -31,6 +34,7 @@ _NAMES = {
     "ISIS3": "ISIS cube",
     "PNG": "PNG",
     "JPEG": "JPEG",
+    "VRT": "VRT",
 }
 _MAGIC = {
     b"II*\0": "GTiff",
@@ -42,6 +46,12 @@ _MAGIC = {
     b"\x89PNG\r\n\x1a\n": "PNG",
     b"\xff\xd8\xff": "JPEG",
 }
+_VRT_ELEMENTS = re.compile(
+    "VRTDataset|SRS|GeoTransform|Metadata|MDI|VRTRasterBand|Description|UnitType|Offset|Scale|NoDataValue|"
+    "HideNoDataValue|ColorInterp|SimpleSource|ComplexSource|SourceFilename|SourceBand|SourceProperties|SrcRect|DstRect|"
+    "NODATA|ScaleOffset|ScaleRatio|UseMaskBand"
+)
+"""Elements of a VRT that joins rasters; others compute, or refer to more files."""
 _OPTIONS = {"GDAL_PAM_ENABLED": "NO", "CPL_VSIL_CURL_ALLOWED_FILENAME": "none", "PROJ_NETWORK": "OFF"}
 _LARGEST_LABEL_BYTES = 2**22
 _LARGEST_WORLD_FILE_BYTES = 4096
@@ -69,11 +79,18 @@ class RasterFiles:
         return tuple(path for _, path in self.named)
 
 
-def raster_files(path: Path, drivers: Sequence[str] = MODEL_DRIVERS, field: str = "raster") -> RasterFiles:
-    """The files of a raster in one of the formats that `drivers` read; nothing is opened by GDAL.
+def raster_files(
+    path: Path,
+    drivers: Sequence[str] = MODEL_DRIVERS,
+    field: str = "raster",
+    tiles: Sequence[str] | None = None,
+) -> RasterFiles:
+    """The files of a raster in one of the formats that `drivers` read; nothing but tiles is opened by GDAL.
 
-    Raises UserError if the file is missing or of another format, if a label names a file outside its folder, or if one
-    of the files is not a regular file.
+    `tiles` permits a VRT, GDAL's text that joins several rasters, and lists all files that it may refer to, by their
+    paths from its folder. Raises UserError if the file is missing or of another format, if a label names a file outside
+    its folder, if a VRT refers to more than `tiles` or does more than join them, or if one of the files is not a
+    regular file.
     """
     if not path.is_file():
         found = "no such file" if not path.exists() else "a folder, a pipe or a device"
@@ -81,6 +98,8 @@ def raster_files(path: Path, drivers: Sequence[str] = MODEL_DRIVERS, field: str 
     with path.open("rb") as stream:
         head = stream.read(_LARGEST_LABEL_BYTES)
     driver = _driver_of(head)
+    if tiles is not None:
+        return _vrt_files(path, head, field, tiles)
     if driver not in drivers:
         text = "XML text, which can refer to other files" if head.lstrip().startswith(b"<") else "another format"
         found = _NAMES.get(driver, text)
@@ -110,7 +129,13 @@ def opened_raster(files: RasterFiles, field: str = "raster") -> Iterator[Any]:
     path = files.paths[0]
     with tempfile.TemporaryDirectory(prefix="perilune-raster-") as folder:
         for name, file in files.named:
-            (Path(folder) / name).symlink_to(file.resolve())
+            (Path(folder) / name).parent.mkdir(parents=True, exist_ok=True)
+            if files.driver == "VRT" and file == path:
+                shutil.copyfile(
+                    file, Path(folder) / name
+                )  # GDAL follows a link to a VRT, and looks for its tiles there
+            else:
+                (Path(folder) / name).symlink_to(file.resolve())
         try:
             with rasterio.Env(**_OPTIONS):
                 with warnings.catch_warnings():
@@ -160,7 +185,7 @@ def _expected(drivers: Sequence[str]) -> str:
 def _hint(path: Path, head: bytes) -> str:
     """What to do with a file of another format."""
     if b"<VRTDataset" in head[: 2**16]:
-        return f"; make one of it with: gdal_translate {path.name} {path.stem}.tif"
+        return f"; make one of it with: gdal_translate {path.name} {path.stem}.tif, or list its tiles in vrt_files"
     for suffix in (".lbl", ".LBL", ".xml"):
         label = path.with_suffix(suffix)
         if label != path and label.is_file():
@@ -189,6 +214,32 @@ def _named_by_label(path: Path, driver: str, head: bytes, field: str) -> list[st
         if re.search(r"[/\\\0]", name) or name in ("", ".", ".."):
             raise UserError(path, field, f"a label that points to {name!r}", "names of files in its own folder")
     return names
+
+
+def _vrt_files(path: Path, head: bytes, field: str, tiles: Sequence[str]) -> RasterFiles:
+    """The files of a VRT that joins the given tiles and does nothing else; see `raster_files`."""
+    if b"<VRTDataset" not in head[: 2**16] or len(head) >= _LARGEST_LABEL_BYTES or b"<!" in head:
+        raise UserError(path, field, "no VRT, or a long one", "a VRT with the tiles of vrt_files")
+    try:
+        elements = list(ElementTree.fromstring(head).iter())
+    except ElementTree.ParseError as error:
+        raise UserError(path, field, error, "a VRT") from None
+    files = {path.name: path}
+    for element in elements:
+        name = (element.text or "").strip()
+        if not _VRT_ELEMENTS.fullmatch(element.tag) or "subClass" in element.attrib:
+            found = f"a VRT with {element.tag} {element.get('subClass', '')}".rstrip()
+            raise UserError(path, field, found, "a VRT that only joins rasters")
+        if element.tag != "SourceFilename":
+            continue
+        if element.get("relativeToVRT") != "1" or name not in tiles:
+            raise UserError(path, field, f"a VRT that refers to {name!r}", f"its tiles: {', '.join(tiles)}")
+        if name in files:
+            continue
+        files[name] = inside(path.parent, name)
+        with opened_raster(raster_files(files[name], ("GTiff", "JP2OpenJPEG"), field), field):
+            pass  # refused here if its tags refer to other files
+    return RasterFiles("VRT", tuple(files.items()))
 
 
 def _beside(path: Path, name: str, field: str) -> Path | None:
@@ -222,7 +273,7 @@ def _refuse_references(path: Path, raster: Any, folder: Path, field: str) -> Non
     """Raise UserError if an open raster refers to other files, or if one of its blocks is too large."""
     if found := raster.tags(ns="OVERVIEWS"):
         raise UserError(path, field, f"tags that name another file: {found}", "a raster that refers to no other")
-    if any(Path(file).parent != folder for file in raster.files):
+    if any(not Path(file).is_relative_to(folder) for file in raster.files):
         raise UserError(path, field, "a file that refers to one elsewhere", "data in the folder of their label")
     if raster.crs is not None:
         refuse_grids(path, raster.crs)

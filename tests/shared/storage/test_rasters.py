@@ -1,8 +1,10 @@
 """Rasters are opened by the drivers of documented formats alone, with no file but their own."""
 
 import os
+import re
 import socket
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,6 +49,12 @@ def test_the_data_behind_a_label_belong_to_the_raster(tmp_path):
         folder.mkdir()
         path = kind(folder, GROUND)
         assert {file.name for file in raster_files(path).paths} == {file.name for file in folder.iterdir()}
+
+
+def test_the_data_of_a_label_are_opened_by_the_label(tmp_path):
+    pds3(tmp_path, GROUND)
+    with pytest.raises(UserError, match=r"the data of a label are opened by the label, ground\.LBL"):
+        raster_files(tmp_path / "ground.IMG")
 
 
 def test_a_label_of_another_letter_case(tmp_path):
@@ -189,3 +197,86 @@ def test_errors_name_the_raster_and_not_the_temporary_folder(tmp_path):
     with pytest.raises(UserError, match=r"ground\.tif: raster: got ") as caught:
         read(path)
     assert "perilune-raster-" not in str(caught.value)
+
+
+def mosaic(folder, names=("a/ground.tif", "b/ground.tif"), **changes):
+    """A VRT of two tiles side by side; `changes` replaces text in it."""
+    sources = ""
+    for k, name in enumerate(names):
+        (folder / name).parent.mkdir(exist_ok=True)
+        tiff((folder / name).parent, GROUND + 10 * k)
+        place = f'<DstRect xOff="{60 * k}" yOff="0" xSize="60" ySize="50"/>'
+        sources += (
+            f'<SimpleSource><SourceFilename relativeToVRT="1">{name}</SourceFilename><SourceBand>1</SourceBand>'
+            f'<SrcRect xOff="0" yOff="0" xSize="60" ySize="50"/>{place}</SimpleSource>'
+        )
+    text = (
+        '<VRTDataset rasterXSize="120" rasterYSize="50"><GeoTransform>0,5,0,0,0,-5</GeoTransform>'
+        f'<VRTRasterBand dataType="Float32" band="1">{sources}</VRTRasterBand></VRTDataset>'
+    )
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    (folder / "all.vrt").write_text(text)
+    return folder / "all.vrt"
+
+
+TILES = ("a/ground.tif", "b/ground.tif")
+
+
+def test_a_vrt_is_read_if_its_tiles_are_listed(tmp_path):
+    path = mosaic(tmp_path)
+    with pytest.raises(UserError, match=r"XML text.*gdal_translate all\.vrt all\.tif, or list its tiles in vrt_files"):
+        raster_files(path)
+    files = raster_files(path, tiles=TILES)
+    assert [name for name, _ in files.named] == ["all.vrt", *TILES]
+    with opened_raster(files) as raster:
+        assert np.array_equal(raster.read(1), np.hstack([GROUND, GROUND + 10]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"b/ground.tif": "c/ground.tif"}, "a VRT that refers to 'c/ground.tif'"),
+        ({"b/ground.tif": "../b.tif"}, "a VRT that refers to '../b.tif'"),
+        ({"b/ground.tif": "/etc/passwd"}, "a VRT that refers to '/etc/passwd'"),
+        ({"b/ground.tif": "/vsicurl/http://127.0.0.1/a.tif"}, "a VRT that refers to"),
+        ({'relativeToVRT="1"': 'relativeToVRT="0"'}, "a VRT that refers to"),
+        ({' relativeToVRT="1"': ""}, "a VRT that refers to"),
+        ({'band="1"': 'band="1" subClass="VRTRawRasterBand"'}, "VRTRasterBand VRTRawRasterBand"),
+        ({'band="1"': 'band="1" subClass="VRTDerivedRasterBand"'}, "VRTRasterBand VRTDerivedRasterBand"),
+        ({"<SourceBand>": "<OpenOptions><OOI key='a'>b</OOI></OpenOptions><SourceBand>"}, "a VRT with OpenOptions"),
+        ({"<GeoTransform>": "<PixelFunctionCode>x</PixelFunctionCode><GeoTransform>"}, "a VRT with PixelFunctionCode"),
+        ({"<VRTDataset ": "<!DOCTYPE a [<!ENTITY b SYSTEM '/etc/passwd'>]><VRTDataset "}, "got no VRT"),
+        ({"</VRTDataset>": ""}, "no element found"),
+    ],
+)
+def test_a_vrt_that_does_more_than_join_its_tiles_is_refused(tmp_path, changes, text):
+    with pytest.raises(UserError, match=text):
+        raster_files(mosaic(tmp_path, **changes), tiles=TILES)
+
+
+def test_tiles_are_rasters_that_refer_to_nothing(tmp_path):
+    path = mosaic(tmp_path)
+    (tmp_path / "other.vrt").write_text(raw_vrt(tmp_path, 25, 30))
+    with rasterio.open(tmp_path / TILES[1], "r+") as file:
+        file.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"{tmp_path}/other.vrt")
+    with pytest.raises(UserError, match="tags that name another file"):
+        raster_files(path, tiles=TILES)
+    (tmp_path / TILES[1]).write_text((tmp_path / "other.vrt").read_text())
+    with pytest.raises(UserError, match="XML text"):
+        raster_files(path, tiles=TILES)
+    (tmp_path / TILES[1]).unlink()
+    (tmp_path / TILES[1]).symlink_to("/etc/passwd")
+    with pytest.raises(UserError, match="a path without links that leave"):
+        raster_files(path, tiles=TILES)
+
+
+@pytest.mark.parametrize("package", ["shared/perilune_shared", "render/perilune_render"])
+def test_no_other_module_reads_rasters(package):
+    root = Path(__file__).parents[3]
+    reads = re.compile(r"(?:rasterio|gdal)\.open\((?![^)]*\"w\")|WarpedVRT|rasterio\.shutil", re.I)
+    found = [path for path in (root / package).rglob("*.py") if reads.search(path.read_text(encoding="utf-8"))]
+    assert [path.name for path in found if path.name != "rasters.py"] == []
+    assert reads.search("with rasterio.open(path) as raster:") and not reads.search(
+        'rasterio.open(aside, "w", **profile)'
+    )

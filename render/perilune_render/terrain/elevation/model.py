@@ -6,7 +6,7 @@ import hashlib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
@@ -16,16 +16,16 @@ from perilune_render.terrain.elevation.continuation import continued, distance_i
 from perilune_render.terrain.elevation.height_band import height_band
 from perilune_render.terrain.elevation.quantisation import smoothed, step_of
 from perilune_render.terrain.elevation.resampled import resampled
-from perilune_render.terrain.elevation.site import RasterMap, Site, circle_of, refuse_hole, site_in, site_within
+from perilune_render.terrain.elevation.site import RasterMap, Site, map_of, refuse_hole, site_in, site_within
 from perilune_render.terrain.elevation.window import UNSTATED_GROUND_M, chosen_window, read_window, smooth_over
 from perilune_render.terrain.grid import Grid
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array, selenographic_from_site
 from perilune_shared.storage.files import sha256_of
-from perilune_shared.storage.rasters import RasterFiles, opened_raster, raster_files, refuse_grids
+from perilune_shared.storage.rasters import RasterFiles, opened_raster, raster_files
 
 if TYPE_CHECKING:
-    import rasterio
+    pass
 
 _AT_THE_MIDDLE = ElevationConfig()
 _FIELD = "dataset.terrain.elevation"
@@ -59,6 +59,8 @@ class ElevationModel:
     """Ground size of a pixel from row to row and from column to column, metres."""
     step_m: float
     """Quantisation step of the raster's heights if it makes terraces, metres; otherwise 0."""
+    read_step: int
+    """Pixels of the raster along a side of one of these, more than 1 if the raster is too large for the ground."""
     hole_m: Array | None
     """Distance of each pixel (rows, columns) from the nearest known one, metres; None without holes."""
     source: str
@@ -80,10 +82,10 @@ def read_elevation(
     matter, since the site is set to height 0. Quantised heights are smoothed within half a step
     (`perilune_render.terrain.elevation.quantisation`).
     """
-    files = raster_files(path, field="dem")
+    files = raster_files(path, field="dem", tiles=config.vrt_files)
     with opened_raster(files, "dem") as file:
         band = height_band(path, files, file, config)
-        whole = _map_of(path, file, config)
+        whole = map_of(path, file, config)
         site = site_in(path, whole, config)
         window = chosen_window(whole, site, ground_m)
         raster_map = whole.part(window.top, window.left, window.shape, window.step) if window.cut else whole
@@ -112,29 +114,9 @@ def read_elevation(
         sides = _pixel_sides_m(raster_map, site)
     hole = distance_in_holes_m(known, sides)
     place, pixel = (site.latitude_deg, site.longitude_deg), float(np.mean(sides))
-    return ElevationModel(height, known, raster_map, *place, pixel, sides, step, hole, _source_of(files, used))
-
-
-def _map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
-    """The map of an open raster. Raises UserError if it has no pixel size or is not one of the Moon."""
-    from rasterio.crs import CRS
-    from rasterio.errors import CRSError
-
-    transform, crs = file.transform, file.crs
-    if config.crs is not None:
-        try:
-            crs = CRS.from_user_input(config.crs)
-        except CRSError as error:
-            expected = "a coordinate reference system of the Moon: IAU_2015:30135, +proj=..., or WKT"
-            raise UserError("configuration", f"{_FIELD}.crs", error, expected) from None
-        refuse_grids(path, crs)
-    if transform.is_identity or transform.determinant == 0 or not np.isfinite(tuple(transform)).all():
-        raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
-    if crs is None:
-        expected = f"a coordinate reference system of the Moon in the file, or {_FIELD}.crs"
-        raise UserError(path, "projection", "none", expected)
-    _refuse_other_bodies(path, crs)
-    return RasterMap(transform, crs, (file.height, file.width), circle_of(crs))
+    return ElevationModel(
+        height, known, raster_map, *place, pixel, sides, step, window.step, hole, _source_of(files, used)
+    )
 
 
 def _source_of(files: RasterFiles, used: set[str]) -> str:
@@ -144,23 +126,9 @@ def _source_of(files: RasterFiles, used: set[str]) -> str:
     """
     path = files.paths[0]
     plain_name = re.sub(r"[^A-Za-z0-9._-]", "_", path.name)[-100:].lstrip("._-")
-    hashes = [sha256_of(file) for name, file in files.named if file == path or name in used]
+    hashes = [sha256_of(file) for name, file in files.named if file == path or Path(name).name in used]
     together = hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
     return f"{plain_name} sha256:{together}"
-
-
-def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
-    """Raises UserError unless the ellipsoid of a coordinate system has the Moon's radius, within one percent.
-
-    PROJ refuses to transform between bodies, but its error message states neither body.
-    """
-    found = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
-    radius = float(found[2]) if found else 0.0
-    if abs(radius / MOON_RADIUS_M - 1) > 0.01:
-        name = f"{found[1]}, radius {radius / 1000:.0f} km" if found else "none on a sphere or ellipsoid"
-        raise UserError(
-            path, "projection", name, f"a coordinate reference system of the Moon ({MOON_RADIUS_M / 1000:.0f} km)"
-        )
 
 
 def raster_places(model: ElevationModel, x_m: Array, y_m: Array) -> tuple[Array, Array]:
@@ -246,6 +214,11 @@ def remarks(model: ElevationModel, grid: Grid, outside: Outside) -> list[str]:
     """Messages to the user about a model, one per line, shown before its ground is generated."""
     lines = []
     name = model.source.split(" sha256:")[0]
+    if model.read_step > 1:
+        lines.append(
+            f"{name}: read at {model.pixel_m:.3g} m, {model.read_step} x {model.read_step} of its pixels, since the "
+            f"ground is {grid.extent_m / 1000:.3g} km wide"
+        )
     if model.step_m:
         lines.append(f"{name}: heights are in steps of {model.step_m:.3g} m; they are smoothed within half a step")
     share = _real_share(model, grid)

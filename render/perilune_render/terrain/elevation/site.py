@@ -1,13 +1,14 @@
-"""The landing site in an elevation model: its middle, or a chosen place; raster coordinates of places on the Moon.
+"""The map of an elevation model, and the landing site in it: its middle, or a chosen place.
 
 Raster coordinates are column and row, 0 at the raster's top left corner; the first pixel's centre is at 0.5, 0.5.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,12 +16,14 @@ from numpy.typing import ArrayLike
 from perilune_render.config_terrain import ElevationConfig
 from perilune_shared.errors import UserError
 from perilune_shared.geometry.frames import MOON_RADIUS_M, Array
+from perilune_shared.storage.rasters import refuse_grids
 
 if TYPE_CHECKING:
     import rasterio
 
 _MOON = f"+proj=longlat +R={MOON_RADIUS_M:.0f} +no_defs"
-_FIELD = "dataset.terrain.elevation.site"
+_ELEVATION = "dataset.terrain.elevation"
+_FIELD = f"{_ELEVATION}.site"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +94,44 @@ class Site:
     """Latitude, degrees."""
     longitude_deg: float
     """Longitude, degrees, -180 to 180."""
+
+
+def map_of(path: Path, file: Any, config: ElevationConfig) -> RasterMap:
+    """The map of an open raster. Raises UserError if it has no pixel size or is not one of the Moon."""
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    transform, crs = file.transform, file.crs
+    if config.crs is not None:
+        try:
+            crs = CRS.from_user_input(config.crs)
+        except CRSError as error:
+            expected = "a coordinate reference system of the Moon: IAU_2015:30135, +proj=..., or WKT"
+            raise UserError("configuration", f"{_ELEVATION}.crs", error, expected) from None
+        refuse_grids(path, crs)
+    if transform.is_identity or transform.determinant == 0 or not np.isfinite(tuple(transform)).all():
+        raise UserError(path, "pixel size", "none", "a geotransform with the pixel's size")
+    if crs is None:
+        beside = path.with_name(f"{path.name}.aux.xml")
+        hint = f" ({beside.name} is not read: gdal_translate can join it to the file)" if beside.is_file() else ""
+        expected = f"a coordinate reference system of the Moon in the file{hint}, or {_ELEVATION}.crs"
+        raise UserError(path, "projection", "none", expected)
+    _refuse_other_bodies(path, crs)
+    return RasterMap(transform, crs, (file.height, file.width), circle_of(crs))
+
+
+def _refuse_other_bodies(path: Path, crs: rasterio.crs.CRS) -> None:
+    """Raises UserError unless the ellipsoid of a coordinate system has the Moon's radius, within one percent.
+
+    PROJ refuses to transform between bodies, but its error message states neither body.
+    """
+    found = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([0-9.eE+]+)', crs.to_wkt())
+    radius = float(found[2]) if found else 0.0
+    if abs(radius / MOON_RADIUS_M - 1) > 0.01:
+        name = f"{found[1]}, radius {radius / 1000:.0f} km" if found else "none on a sphere or ellipsoid"
+        raise UserError(
+            path, "projection", name, f"a coordinate reference system of the Moon ({MOON_RADIUS_M / 1000:.0f} km)"
+        )
 
 
 def circle_of(crs: rasterio.crs.CRS) -> float | None:

@@ -100,6 +100,9 @@ def test_large_maps_are_read_by_window_across_the_seam_too(tmp_path, monkeypatch
     for latitude, longitude in ((10.0, 0.1), (-20.0, 359.9), (30.0, 100.0), (75.0, 0.0)):
         error, real = worst(path, latitude, longitude)
         assert error < 2 and real == 1, (longitude, error, real)
+    for latitude, longitude in ((90.0, 0.0), (-88.0, 170.0)):
+        error, real = worst(path, latitude, longitude)
+        assert error < 60 and real == 1, (latitude, error, real)
     # Wider ground has wider pixels: 700 km at 20,000 pixels.
     error, real = worst(path, 0.0, 0.0, 2_000_000.0)
     assert error < 20 and real == 1

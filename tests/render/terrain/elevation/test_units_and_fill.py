@@ -271,6 +271,13 @@ def test_a_projection_of_the_configuration(tmp_path):
         read_elevation(path, ElevationConfig(crs="+proj=nothing +R=1737400"))
 
 
+def test_a_projection_beside_the_file_is_named_and_not_read(tmp_path):
+    path = write(tmp_path / "a.tif", rough(n=200), None, PLACED)
+    (tmp_path / "a.tif.aux.xml").write_text("<PAMDataset><SRS>x</SRS></PAMDataset>")
+    with pytest.raises(UserError, match=r"projection: got none, expected .*a\.tif\.aux\.xml is not read"):
+        read_elevation(path)
+
+
 def test_every_file_of_a_model_is_in_its_hash(tmp_path):
     height, corner = on_the_map()
     path = pds3(tmp_path, height, corner_deg=corner)
