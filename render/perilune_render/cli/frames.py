@@ -23,13 +23,24 @@ Scene = Annotated[
 CameraFile = Annotated[
     Path | None, typer.Option(help="YAML file with the settings of `dataset.camera`, in place of those of --scene.")
 ]
+CameraAxes = Annotated[
+    str | None,
+    typer.Option(
+        help="Axes of the camera in the poses that point right, down and forward in the image: `opencv` (x,y,z), "
+        "`blender` (x,-y,-z) or three axes. [default: those that the file states, or opencv]"
+    ),
+]
 
 
 def frames(
-    poses: Annotated[Path, typer.Option(help="Poses: .csv, .parquet or .tum, with the frame stated in its header.")],
+    poses: Annotated[
+        Path,
+        typer.Option(help="Poses: CSV, Parquet, TUM, EuRoC or KITTI, with the frame stated in its header."),
+    ],
     out: Annotated[str, typer.Option(help="Folder or address of the new dataset.")],
     scene: Scene = None,
     camera: CameraFile = None,
+    camera_axes: CameraAxes = None,
     preset: Preset = "small",
     setting: Setting = None,
     dem: Dem = None,
@@ -58,7 +69,7 @@ def frames(
         from perilune_render.provenance.recipe import recipe_of
         from perilune_render.terrain.scene import site_of
 
-        given = read_poses(poses, *site_of(config))
+        given = read_poses(poses, *site_of(config), camera_axes)
         plan, config = given_plan(given, config, kind, poses)
         begun = new_info(config, plan, recipe_of(config, kind, preset))
         made = made_or_exit(Job(plan, config, begun, str(poses)), store, how, early)
