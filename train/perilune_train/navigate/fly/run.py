@@ -26,6 +26,7 @@ from perilune_train.navigate.filter.lander import Lander, Surroundings
 from perilune_train.navigate.filter.propagate import InertialNoise
 from perilune_train.navigate.filter.state import ATTITUDE, POSITION
 from perilune_train.navigate.fly.catalogue import read_catalogue
+from perilune_train.navigate.fly.clocks import check_clocks
 from perilune_train.navigate.fly.picture import draw_flight
 from perilune_train.navigate.fly.settings import FlightPrior, read_camera, read_prior
 from perilune_train.navigate.fly.tables import FrameFiles, read_frame_files, read_instruments
@@ -61,8 +62,10 @@ def read_descent(
     record, expected = read_camera(camera), read_prior(prior)
     craters = read_catalogue(catalogue, expected.catalogue_use)
     files = read_frame_files(frames, record.intrinsics())
-    true = read_truth(truth, files.time_s) if truth else None
-    return Descent(record, expected, files, read_instruments(imu, ranges), craters, true)
+    true = read_truth(truth, files.time_s, np.array(record.rotation_camera_from_body)) if truth else None
+    instruments = read_instruments(imu, ranges)
+    check_clocks(frames, files.time_s, imu, ranges, instruments)
+    return Descent(record, expected, files, instruments, craters, true)
 
 
 def fly_descent(
