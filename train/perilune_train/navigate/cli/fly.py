@@ -34,13 +34,18 @@ def fly(
         raise UserError("--live", "name", live, "a name that ends in .png")
     run = run or shipped_run("detect")
     # torch takes seconds to load.
-    from perilune_train.navigate.fly.run import fly_descent, read_descent
+    from perilune_train.navigate.fly.run import doubts_of, fly_descent, read_descent
 
     descent = read_descent(frames, camera, catalogue, imu, prior, ranges, truth)
+    for doubt in doubts_of(descent):
+        console.print(f"warning: {imu}: {doubt}", soft_wrap=True, markup=False)
     table = fly_descent(descent, run, out, typer.echo, live)
     counts = ", ".join(f"{count} {status}" for status, count in table["status"].value_counts().items())
     written = "estimates.parquet, estimates.csv, flight.png"
     console.print(f"{out}: {len(table)} frames ({counts}); {written}", soft_wrap=True)
+    if (table["status"] == "lost").any():
+        for doubt in doubts_of(descent, is_lost=True):
+            console.print(f"a possible cause of the status lost: {imu}: {doubt}", soft_wrap=True, markup=False)
     if "error_x_m" in table:
         length = (table[[f"error_{axis}_m" for axis in "xyz"]] ** 2).sum(axis=1)
         rms, end = length.mean() ** 0.5, length.iloc[-1] ** 0.5
