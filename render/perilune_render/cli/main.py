@@ -185,7 +185,7 @@ def preview(
         raise UserError("preview", "--scene", f"{scene} and {config}", "one of them")
     resolved = resolved_config(preset, scene or config, setting, dem, catalogue, given_scene=poses is not None)
     resolved = with_camera(resolved, camera)
-    if out.suffix != ".png":
+    if out.suffix.lower() != ".png":
         raise UserError(out, "format", out.suffix or "none", ".png")
     from perilune_render.flight.plan import make_plan
     from perilune_render.poses.file import read_poses

@@ -40,6 +40,7 @@ _LARGEST_S = 1e11
 """Above every clock in seconds; nanoseconds since 1970 are 1e18."""
 _MATRIX_TOLERANCE = 0.01
 """Largest deviation of a rotation matrix that rounding of its digits explains."""
+_IDENTITY_TOLERANCE = 1e-6
 _EULER = re.compile(r"(roll|pitch|yaw|euler|heading|omega|phi|kappa|rot_?[xyz]$|r[xyz]$)", re.IGNORECASE)
 _MATRIX = re.compile(r"(r|m|rot)_?[0-3][0-3]$", re.IGNORECASE)
 
@@ -205,7 +206,7 @@ def _kitti(path: Path, columns: Columns) -> Columns:
     rotation: Array = poses[:, :, :3]
     off = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2), initial=0)
     columns.check(_KITTI[0], (off <= _MATRIX_TOLERANCE) & (np.linalg.det(rotation) > 0), "the matrix of a rotation")
-    if len(poses) and np.array_equal(poses[0], np.eye(4)[:3]):
+    if len(poses) and np.abs(poses[0] - np.eye(4)[:3]).max() < _IDENTITY_TOLERANCE:
         found = "the identity at the first pose, so poses relative to the first camera"
         raise UserError(path, "poses of a KITTI file", found, "poses from the camera to the site, O_L or O_W")
     quaternions = np.stack([quaternion_from_matrix(each) for each in rotation]) if len(poses) else np.zeros((0, 4))

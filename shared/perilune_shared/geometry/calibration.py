@@ -25,6 +25,7 @@ _WIDTH, _HEIGHT = ("image_width", "width"), ("image_height", "height")
 _SIZE = ("resolution", "image_size", "imagesize")
 _BROWN = ("plumb_bob", "radtan", "radial-tangential", "rational_polynomial", "brown_conrady", "none")
 _EQUIDISTANT = ("equidistant", "fisheye", "kannala_brandt", "kannala_brandt4")
+_LARGEST_SIDE_PX = 100_000
 _LARGEST_FIT_PX = 0.05
 """Largest error of a Brown-Conrady distortion that replaces an equidistant one."""
 _WIDEST_RAD = np.radians(80)
@@ -152,8 +153,8 @@ def _camera(
 ) -> Camera:
     """The camera of a pinhole with a distortion model by name; without one by the number of coefficients."""
     width, height = (int(value) for value in size)
-    if [width, height] != list(size) or min(width, height) < 1:
-        raise UserError(path, "image size", list(size), "two whole numbers above 0")
+    if [width, height] != list(size) or not 1 <= min(size) <= max(size) <= _LARGEST_SIDE_PX:
+        raise UserError(path, "image size", list(size), f"two whole numbers from 1 to {_LARGEST_SIDE_PX}")
     fx, fy, cx, cy = intrinsics
     if min(fx, fy) <= 0:
         raise UserError(path, "focal length", min(fx, fy), "above 0, pixels")

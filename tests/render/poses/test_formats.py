@@ -5,6 +5,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from rich.progress import Progress
 from tests.helpers import in_process
 from tests.helpers.scenes import config_with
 
@@ -12,7 +13,9 @@ from perilune_render.cli.main import main
 from perilune_render.config_scene import SceneConfig, ViewConfig
 from perilune_render.poses.file import read_poses
 from perilune_render.poses.plan import given_plan
+from perilune_shared.dataset.manifest import open_dataset
 from perilune_shared.errors import UserError
+from perilune_shared.export.trajectory import export_kitti, export_tum
 from perilune_shared.geometry.frames import matrix_from_quaternion, matrix_from_rotation_vector, quaternion_from_matrix
 
 SITE = (-45.5, 177.6)
@@ -263,3 +266,20 @@ def test_the_commands_have_the_option(tmp_path):
     done = in_process.call(main, "preview", "--out", tmp_path / "a.png", "--camera-axes", "blender")
     assert done.returncode == 2 and "got no --poses" in done.stderr
     assert sorted(each.name for each in tmp_path.iterdir()) == ["poses.tum"]
+
+
+def test_the_export_of_a_dataset_is_read_as_it_lies(quick, tmp_path):
+    dataset = open_dataset(quick / "nav")
+    with Progress(disable=True) as progress:
+        export_tum(dataset, tmp_path / "tum", progress)
+        export_kitti(dataset, tmp_path / "kitti", progress)
+    (row, *_) = dataset.table("trajectories", ["scene_id", "trajectory_id"]).to_pylist()
+    truth = dataset.table("frames", None, row["scene_id"], row["trajectory_id"]).sort_by("time_s")
+    found = read_poses(tmp_path / "tum" / row["scene_id"] / f"{row['trajectory_id']}.txt", *SITE)
+    assert np.array_equal(found.position_m, np.array(truth["position_m"].to_pylist()))
+    assert np.allclose(
+        matrix_from_quaternion(found.rotation_wxyz), matrix_from_quaternion(truth["rotation_wxyz"].to_pylist())
+    )
+    kitti_file = tmp_path / "kitti" / row["scene_id"] / f"{row['trajectory_id']}.txt"
+    with pytest.raises(UserError, match="poses of a KITTI file: got the identity at the first pose"):
+        read_poses(kitti_file, *SITE)
