@@ -119,8 +119,13 @@ def _check_attitudes(poses: GivenPoses, rig: Rig, where: object, *, horizon: boo
         if fitting:
             n = int(chosen[np.argmin(shown)])
             share = "all frames" if not shown.any() else f"{(~shown).mean():.0%} of the frames"
-            found = f"an attitude whose view leaves the ground, as in {share}"
-            expected = f"views of the ground, as all frames have by {', or by '.join(fitting)}"
+            view, ground, sky = (
+                ("a view of the sky alone", "some ground in view", "")
+                if horizon
+                else ("a view with the horizon", "a view of the ground alone", "; or dataset.scene.horizon=true")
+            )
+            found = f"{view}, as in {share}"
+            expected = f"{ground}, as in all frames by {', or by '.join(fitting)}{sky}"
             raise UserError(where, f"{poses.origin(n)}: pose at {poses.time_s[n]:g} s", found, expected)
 
 

@@ -228,7 +228,7 @@ def test_views_that_leave_the_ground_name_the_readings_that_would_show_it(tmp_pa
     config = config_with(scene=SceneConfig(views=views))
     with pytest.raises(UserError) as raised:
         given_plan(given, config, "nav", tmp_path / name)
-    assert "view leaves the ground, as in " in str(raised.value) and hint in str(raised.value)
+    assert "a view with the horizon, as in " in str(raised.value) and hint in str(raised.value)
     assert len(given_plan(read(tmp_path, csv(), "right.csv"), config, "nav", "right.csv")[0].trajectories) == 1
 
 
@@ -252,7 +252,7 @@ def test_two_mistakes_together_are_named(tmp_path):
 
 def test_a_view_that_no_other_reading_repairs_is_refused_as_before(tmp_path):
     given = read(tmp_path, csv() + "3,0,0,800,0.7071067811865476,0.7071067811865476,0,0\n", "poses.csv")
-    with pytest.raises(UserError, match="a view with the horizon, expected a view of the ground alone"):
+    with pytest.raises(UserError, match="a view with the horizon, expected a view of the ground alone; state"):
         given_plan(given, config_with(scene=SceneConfig()), "nav", "poses.csv")
 
 
